@@ -1,0 +1,331 @@
+//! The validated configuration: every value is in range, every name resolved, every default filled in.
+//!
+//! Nothing below this type needs to check again or to know what YAML is.
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
+
+use crate::model::{
+    Durability, History, InstanceName, LaneName, QosProfile, Reliability, RouteId, SubscriberState,
+    TopicName, TrafficClass, TypeName,
+};
+
+/// The whole configuration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Which bridge this is; the namespace of its shared memory.
+    pub instance: InstanceName,
+    /// Where the publishers are.
+    pub input: DdsNetwork,
+    /// The bytes of a graph identifier in `ros_discovery_info`: 24 up to ROS 2 Humble, 16 since Iron.
+    pub graph_gid_bytes: usize,
+    /// The routes, in the order of the file.
+    pub routes: Vec<Route>,
+    /// The lanes: `critical`, `noncritical`, then the user's, in the order of the file.
+    pub lanes: Vec<Lane>,
+    /// Shared memory.
+    pub shared_memory: SharedMemory,
+    /// How long a lane keeps its last policy when control is gone, in milliseconds.
+    pub policy_hold_ms: u64,
+    /// Scheduling of the ingress process.
+    pub ingress_scheduling: Scheduling,
+    /// Scheduling of the control process.
+    pub control_scheduling: Scheduling,
+    /// The classifier (paper, section III-C).
+    pub classifier: Classifier,
+    /// Probing (paper, section III-C).
+    pub probes: Probes,
+    /// The safety supervisor (paper, section III-E).
+    pub safety: Safety,
+    /// Authentication of control messages.
+    pub security: Security,
+    /// Diagnostics.
+    pub diagnostics: Diagnostics,
+    /// States forced by hand, by subscriber id.
+    pub overrides: BTreeMap<String, SubscriberState>,
+    /// Known subscribers, and the lane each is on.
+    pub subscribers: BTreeMap<String, LaneName>,
+}
+
+impl Settings {
+    /// The lane of that name.
+    pub fn lane(&self, name: &LaneName) -> Option<&Lane> {
+        self.lanes.iter().find(|lane| lane.name == *name)
+    }
+}
+
+/// One DDS domain and the network interfaces used in it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DdsNetwork {
+    /// DDS domain, 0 to 232.
+    pub domain_id: u16,
+    /// Interfaces or addresses to use; empty for all.
+    pub interfaces: Vec<NetworkSelector>,
+}
+
+/// A network interface, by name or by one of its addresses.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum NetworkSelector {
+    /// Such as `wlan0`.
+    Name(String),
+    /// Such as `192.168.0.7`.
+    Address(Ipv4Addr),
+}
+
+/// One input topic.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Route {
+    /// The user's name for it.
+    pub id: RouteId,
+    /// What ingress subscribes to.
+    pub input_topic: TopicName,
+    /// The message type; `None` is found by discovery.
+    pub message_type: Option<TypeName>,
+    /// What ingress asks of the publisher.
+    pub input_qos: InputQos,
+    /// The largest sample taken in, in bytes of serialized payload.
+    pub max_sample_bytes: usize,
+    /// Samples kept in shared memory for a lane that comes back: what a `TRANSIENT_LOCAL` lane offers to late
+    /// joiners after it was restarted, and what a restarted lane catches up with.
+    pub retained_samples: usize,
+}
+
+/// What the ingress reader asks of the publisher. A policy that is `None` follows what the publisher offers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct InputQos {
+    /// RELIABILITY.
+    pub reliability: Option<Reliability>,
+    /// DURABILITY.
+    pub durability: Option<Durability>,
+    /// HISTORY of the reader: what may wait between the DDS library and ingress.
+    pub history: Option<History>,
+    /// DEADLINE in milliseconds.
+    pub deadline_ms: Option<u64>,
+}
+
+/// One lane: a process, its DDS participant and a writer for each route.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lane {
+    /// Its name.
+    pub name: LaneName,
+    /// Critical or noncritical.
+    pub class: TrafficClass,
+    /// Where its subscribers are.
+    pub network: DdsNetwork,
+    /// What it forwards: one for each route that it serves, in the order of the routes.
+    pub outputs: Vec<Output>,
+    /// Samples for each route that may wait for the lane in shared memory.
+    pub queue_depth: usize,
+    /// Samples that the lane may hold in shared memory at once, for each route, while DDS sends them.
+    pub max_borrowed: usize,
+    /// Samples of at least so many bytes are handed to DDS by reference, smaller ones copied.
+    pub by_reference_min_bytes: usize,
+    /// Unacknowledged samples that a RELIABLE writer of the lane may have outstanding.
+    pub window_samples: usize,
+    /// Rates and staleness by mode. A critical lane has no use for them.
+    pub rates: LaneRates,
+    /// Scheduling of the lane's process.
+    pub scheduling: Scheduling,
+}
+
+/// One route on one lane.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Output {
+    /// Index into [`Settings::routes`].
+    pub route: usize,
+    /// What the lane publishes to.
+    pub topic: TopicName,
+    /// How.
+    pub qos: QosProfile,
+}
+
+/// The rate policy of a noncritical lane, by mode.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LaneRates {
+    /// In NORMAL mode.
+    pub normal: RatePolicy,
+    /// In DEGRADED mode.
+    pub degraded: RatePolicy,
+}
+
+/// The rate policy of a noncritical lane in one mode. It applies to each route of the lane by itself, but for
+/// `max_bytes_per_s`, which all routes of the lane share.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RatePolicy {
+    /// Samples per second; 0 forwards nothing.
+    pub max_rate_hz: f64,
+    /// Payload bytes per second over all routes of the lane; `None` is unlimited.
+    pub max_bytes_per_s: Option<u64>,
+    /// A sample older than this by its source timestamp is dropped; 0 never.
+    pub stale_threshold_ms: u64,
+    /// What gives way when more samples wait than tokens come.
+    pub drop_policy: DropPolicy,
+    /// Samples that may wait in the lane, for each route; at least 1.
+    pub queue_samples: usize,
+}
+
+/// What gives way when more samples wait than tokens come (`noncritical_drop_policy`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DropPolicy {
+    /// The freshest sample is sent; older ones that wait are superseded.
+    DropOldest,
+    /// The oldest sample is sent; a new one that finds the queue full is dropped.
+    DropLatest,
+    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is full.
+    DropStale,
+}
+
+/// Shared memory of one bridge.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SharedMemory {
+    /// The folder of the bridge's own files; `None` lets the program choose (see `config/README.md`).
+    pub root_path: Option<PathBuf>,
+    /// Local programs that may tap a route at once.
+    pub max_taps: usize,
+}
+
+/// How the operating system schedules a process.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Scheduling {
+    /// The scheduling policy.
+    pub policy: SchedulingPolicy,
+    /// 1 to 99 for FIFO and round robin, 0 otherwise.
+    pub priority: u8,
+    /// CPUs that the process may run on; empty for all.
+    pub cpus: Vec<usize>,
+    /// Whether to lock the process' memory (`mlockall`).
+    pub lock_memory: bool,
+}
+
+/// A scheduling policy of Linux.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum SchedulingPolicy {
+    /// `SCHED_OTHER`.
+    #[default]
+    Other,
+    /// `SCHED_FIFO`.
+    Fifo,
+    /// `SCHED_RR`.
+    RoundRobin,
+}
+
+/// Thresholds and hysteresis of the classifier.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Classifier {
+    /// Whether subscribers are classified at all.
+    pub enabled: bool,
+    /// The one responder that counts; `None` for any.
+    pub subscriber_id: Option<String>,
+    /// Evaluations per second.
+    pub evaluate_rate_hz: f64,
+    /// Loss, 0 to 1, above which a reading speaks for demotion.
+    pub demote_loss_threshold: f64,
+    /// Loss, 0 to 1, below which a reading speaks for promotion.
+    pub promote_loss_threshold: f64,
+    /// Mean RTT above which a reading speaks for demotion.
+    pub demote_rtt_ms: f64,
+    /// Mean RTT below which a reading speaks for promotion.
+    pub promote_rtt_ms: f64,
+    /// Consecutive readings that it takes.
+    pub hysteresis_count: u32,
+    /// Whether UNKNOWN is a state of its own; otherwise it is treated as CRITICAL.
+    pub allow_unknown_state: bool,
+}
+
+/// Active probing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Probes {
+    /// Whether probes are sent.
+    pub enabled: bool,
+    /// Probes per second.
+    pub rate_hz: f64,
+    /// Shown as a warning above it; decides nothing.
+    pub rtt_threshold_ms: f64,
+    /// Shown as a warning above it; decides nothing.
+    pub loss_threshold: f64,
+    /// Shown as a warning above it; decides nothing.
+    pub jitter_threshold_ms: f64,
+    /// Probes in the sliding window.
+    pub window_size: usize,
+    /// Consecutive readings before a warning is shown or withdrawn.
+    pub hysteresis_count: u32,
+    /// A response later than this counts as lost.
+    pub timeout_ms: u64,
+    /// Topic of the requests.
+    pub request_topic: TopicName,
+    /// Topic of the responses.
+    pub response_topic: TopicName,
+}
+
+/// What the safety supervisor preserves and gives up.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Safety {
+    /// Whether the critical path is preserved in DEGRADED.
+    pub preserve_critical_path: bool,
+    /// Whether noncritical lanes may be degraded at all.
+    pub allow_noncritical_degrade: bool,
+    /// Samples waiting in a noncritical lane that count as an overflowing queue.
+    pub max_noncritical_queue: usize,
+    /// Whether overload takes the noncritical lanes first.
+    pub overload_drop_noncritical_first: bool,
+}
+
+/// What is done about control messages that do not authenticate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrustMode {
+    /// They are refused.
+    DefaultDeny,
+    /// They are accepted and logged.
+    Permissive,
+    /// They are accepted.
+    Off,
+}
+
+/// Where the shared secret is. The secret itself is never held in the settings, so that it cannot be logged.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum SecretSource {
+    /// The file's first line.
+    File(PathBuf),
+    /// The value of this environment variable.
+    Environment(String),
+    /// `security.hmac_secret` of the configuration file itself, as the original package has it.
+    ConfigFile,
+}
+
+/// Authentication of control messages.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Security {
+    /// What is done about messages that do not authenticate.
+    pub trust_mode: TrustMode,
+    /// Whether probes are signed.
+    pub enable_probe_hmac: bool,
+    /// Where the secret is; `None` when there is none.
+    pub secret: Option<SecretSource>,
+    /// How old a signed message may be.
+    pub replay_window_ms: u64,
+    /// Probes and responses that are looked at per second, of one sender.
+    pub max_probe_rate_hz: u32,
+    /// Whether an override may name a subscriber by its node name.
+    pub allow_legacy_node_name_overrides: bool,
+}
+
+/// Diagnostics.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Diagnostics {
+    /// Whether they are published.
+    pub enabled: bool,
+    /// Topic of the original's JSON diagnostics.
+    pub topic: TopicName,
+    /// Address of the Prometheus page; `None` for none.
+    pub metrics: Option<MetricsListener>,
+}
+
+/// Where the Prometheus page is served.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum MetricsListener {
+    /// TCP; a loopback address.
+    Tcp(IpAddr, u16),
+    /// A unix socket.
+    Unix(PathBuf),
+}

@@ -1,0 +1,124 @@
+//! Why a sample was not forwarded: a closed list, so that every sample taken in can be accounted for.
+
+use std::fmt;
+
+macro_rules! drop_reasons {
+    ($($(#[doc = $doc:literal])+ $variant:ident = $label:literal,)+) => {
+        /// Why a sample was dropped. The list is closed: a new way to lose a sample needs a new name here.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[repr(u8)]
+        pub enum DropReason {
+            $($(#[doc = $doc])+ $variant,)+
+        }
+
+        impl DropReason {
+            /// Every reason, in the order of its index.
+            pub const ALL: &'static [Self] = &[$(Self::$variant,)+];
+
+            /// The number of reasons.
+            pub const COUNT: usize = Self::ALL.len();
+
+            /// The name under which logs, `status` and metrics show it.
+            pub const fn label(self) -> &'static str {
+                match self {
+                    $(Self::$variant => $label,)+
+                }
+            }
+        }
+    };
+}
+
+drop_reasons! {
+    /// Ingress: larger than the route's `max_sample_bytes`.
+    TooLarge = "too_large",
+    /// Ingress: no free slot in the route's shared-memory pool.
+    PoolExhausted = "pool_exhausted",
+    /// Ingress: an encapsulation that DDS does not define, or a payload the DDS library could not decode.
+    Malformed = "malformed",
+    /// Lane: a hole in the route's sequence, left by an ingress process that died between numbering a
+    /// sample and publishing it.
+    IngressDied = "ingress_died",
+    /// Lane: overwritten in the lane's shared-memory queue before the lane took it.
+    QueueOverflow = "queue_overflow",
+    /// Lane: published while no process served the lane.
+    LaneDown = "lane_down",
+    /// Lane: the message type of the route is not known yet, so that there is no writer.
+    NoWriter = "no_writer",
+    /// Critical lane: the writer's window of unacknowledged samples is full.
+    WindowFull = "window_full",
+    /// Lane: the DDS library refused the sample for another reason.
+    WriteFailed = "write_failed",
+    /// Noncritical lane: older than the stale threshold.
+    Stale = "stale",
+    /// Noncritical lane: a fresher sample was there when the token came.
+    Superseded = "superseded",
+    /// Noncritical lane: the lane's queue was full.
+    QueueFull = "queue_full",
+    /// Noncritical lane: the lane is suspended.
+    Suspended = "suspended",
+    /// Any lane: forwarding is stopped (emergency).
+    Stopped = "stopped",
+    /// Any lane: already forwarded before, and seen again after a restart.
+    Duplicate = "duplicate",
+    /// Any lane: still waiting when the process was told to shut down.
+    Shutdown = "shutdown",
+}
+
+impl fmt::Display for DropReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.label())
+    }
+}
+
+/// How many samples were dropped, for each reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct DropCounts([u64; DropReason::COUNT]);
+
+impl DropCounts {
+    /// Counts `n` more drops for `reason`.
+    pub fn add(&mut self, reason: DropReason, n: u64) {
+        self.0[reason as usize] += n;
+    }
+
+    /// Drops for `reason`.
+    pub const fn get(&self, reason: DropReason) -> u64 {
+        self.0[reason as usize]
+    }
+
+    /// Drops for all reasons together.
+    pub fn total(&self) -> u64 {
+        self.0.iter().sum()
+    }
+
+    /// The reasons that occurred, with their counts.
+    pub fn iter(&self) -> impl Iterator<Item = (DropReason, u64)> + '_ {
+        DropReason::ALL.iter().map(|&reason| (reason, self.get(reason))).filter(|&(_, n)| n > 0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_has_its_own_index_and_label() {
+        for (index, reason) in DropReason::ALL.iter().enumerate() {
+            assert_eq!(*reason as usize, index);
+            let same = DropReason::ALL.iter().filter(|other| other.label() == reason.label());
+            assert_eq!(same.count(), 1, "{reason}");
+        }
+    }
+
+    #[test]
+    fn counts_add_up() {
+        let mut counts = DropCounts::default();
+        counts.add(DropReason::Stale, 2);
+        counts.add(DropReason::TooLarge, 1);
+        counts.add(DropReason::Stale, 3);
+        assert_eq!(counts.get(DropReason::Stale), 5);
+        assert_eq!(counts.total(), 6);
+        let listed: Vec<_> = counts.iter().collect();
+        assert_eq!(listed, [(DropReason::TooLarge, 1), (DropReason::Stale, 5)]);
+    }
+}

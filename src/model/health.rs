@@ -1,0 +1,291 @@
+//! What every process shows of itself in shared memory: plain records of fixed size, so that a reader needs
+//! nothing of the process that wrote them, not even that it is still alive.
+
+use super::drops::DropCounts;
+use super::modes::LaneMode;
+use super::sample::WriterGuid;
+use super::time::MonotonicNs;
+
+/// What ingress has done on one route. `received = published + drops`, always.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct IngressCounters {
+    /// Samples taken from the DDS reader.
+    pub received: u64,
+    /// Payload bytes of those.
+    pub received_bytes: u64,
+    /// Samples published to the lanes; also the sequence of the last one, because ingress numbers without gaps.
+    pub published: u64,
+    /// Samples received and not published.
+    pub drops: DropCounts,
+    /// Samples that the publisher numbered and the DDS reader never gave us: lost before the bridge.
+    pub lost_upstream: u64,
+    /// Writers matched at present.
+    pub writers: u64,
+    /// When the last sample was taken.
+    pub last_received_at: MonotonicNs,
+}
+
+/// What one lane has done on one route.
+///
+/// `last_sequence - first_sequence = forwarded + drops` whenever no sample waits in the lane; while some wait,
+/// the difference is `waiting`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct LaneCounters {
+    /// The route's sequence when the lane began to account for it.
+    pub first_sequence: u64,
+    /// The highest sequence that the lane has accounted for or holds.
+    pub last_sequence: u64,
+    /// Samples given to the DDS writer.
+    pub forwarded: u64,
+    /// Payload bytes of those.
+    pub forwarded_bytes: u64,
+    /// Of the forwarded, those handed over by reference.
+    pub by_reference: u64,
+    /// Of the forwarded, those published while the lane was down and caught up with afterwards.
+    pub caught_up: u64,
+    /// Samples taken or missed and not forwarded.
+    pub drops: DropCounts,
+    /// Samples waiting in the lane at present.
+    pub waiting: u64,
+    /// The sequence of the last forwarded sample.
+    pub last_forwarded_sequence: u64,
+    /// When that was.
+    pub last_forwarded_at: MonotonicNs,
+    /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes from.
+    pub last_writer_guid: WriterGuid,
+    /// See `last_writer_guid`.
+    pub last_writer_sequence: i64,
+    /// Readers matched at present.
+    pub readers: u64,
+}
+
+impl LaneCounters {
+    /// Samples that the lane was offered since it began to account.
+    pub fn received(&self) -> u64 {
+        self.last_sequence.saturating_sub(self.first_sequence)
+    }
+
+    /// Whether every sample offered is forwarded, waiting, or dropped for a named reason.
+    pub fn is_whole(&self) -> bool {
+        self.received() == self.forwarded + self.drops.total() + self.waiting
+    }
+}
+
+/// What a process is and that it turns.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct ProcessHealth {
+    /// Process id.
+    pub pid: u64,
+    /// When it came up.
+    pub started_at: MonotonicNs,
+    /// When its data path last turned: a sample handled, or an idle turn that tested the wake-up source.
+    pub alive_at: MonotonicNs,
+    /// Turns of the data path.
+    pub turns: u64,
+    /// How often a process of this role was started in this bridge, this one included.
+    pub starts: u64,
+    /// The mode that the process applies, as [`LaneMode`]'s number.
+    pub mode: u8,
+    /// Always 0.
+    pub reserved: [u8; 7],
+    /// The epoch of the policy that the process applies.
+    pub policy_epoch: u64,
+}
+
+/// What the policy board says to one lane.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct LanePolicy {
+    /// Grows by one with each change; 0 means that nobody has set a policy yet.
+    pub epoch: u64,
+    /// When it was written, or confirmed by a control process that is alive.
+    pub written_at: MonotonicNs,
+    /// When it ends, if it is an override by hand; 0 never.
+    pub expires_at: MonotonicNs,
+    /// The mode, as [`LaneMode`]'s number.
+    pub mode: u8,
+    /// 1 when set by hand, 0 when by control.
+    pub by_hand: u8,
+    /// Always 0.
+    pub reserved: [u8; 6],
+}
+
+impl LanePolicy {
+    /// The mode; a number that is none reads as normal.
+    pub fn mode(&self) -> LaneMode {
+        LaneMode::from_u8(self.mode).unwrap_or_default()
+    }
+}
+
+/// Text of at most 127 bytes that can live in shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(C)]
+pub struct FixedText {
+    length: u8,
+    bytes: [u8; 127],
+}
+
+impl FixedText {
+    /// The text, cut at 127 bytes.
+    pub fn new(text: &str) -> Self {
+        let mut cut = text.len().min(127);
+        while !text.is_char_boundary(cut) {
+            cut -= 1;
+        }
+        let mut bytes = [0; 127];
+        bytes[..cut].copy_from_slice(&text.as_bytes()[..cut]);
+        Self { length: cut as u8, bytes }
+    }
+
+    /// The text; empty when the bytes are not UTF-8, which only a foreign writer could bring about.
+    pub fn as_str(&self) -> &str {
+        let length = usize::from(self.length).min(self.bytes.len());
+        std::str::from_utf8(&self.bytes[..length]).unwrap_or("")
+    }
+}
+
+impl Default for FixedText {
+    fn default() -> Self {
+        Self { length: 0, bytes: [0; 127] }
+    }
+}
+
+/// What ingress has found out about a route, for lanes that cannot discover the publisher themselves.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct RouteInfo {
+    /// The DDS type name of the input topic; empty while unknown.
+    pub dds_type: FixedText,
+}
+
+/// Sub-buckets of each octave; the relative width of a bucket is 1/16, so that a quantile is at most 6.3 % off.
+const SUB_BUCKETS: usize = 16;
+/// Octaves from 2^10 ns (1 µs) up to 2^37 ns (137 s).
+const OCTAVES: usize = 27;
+const LOWEST_BIT: u32 = 10;
+
+/// Latencies in log-linear buckets: 1 µs to 137 s, a relative width of 1/16. Counts only grow; a reader that
+/// wants a window subtracts two readings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(C)]
+pub struct LatencyHistogram {
+    counts: [u64; SUB_BUCKETS * OCTAVES],
+    /// The largest value recorded, in nanoseconds.
+    pub max_ns: u64,
+}
+
+impl Default for LatencyHistogram {
+    fn default() -> Self {
+        Self { counts: [0; SUB_BUCKETS * OCTAVES], max_ns: 0 }
+    }
+}
+
+impl LatencyHistogram {
+    /// Counts one latency. Values outside the range count in the first or last bucket.
+    pub fn record(&mut self, latency_ns: u64) {
+        self.counts[Self::bucket(latency_ns)] += 1;
+        self.max_ns = self.max_ns.max(latency_ns);
+    }
+
+    /// Latencies counted.
+    pub fn count(&self) -> u64 {
+        self.counts.iter().sum()
+    }
+
+    /// The latency below or at which a share of `quantile` (0 to 1) of all counted ones lies, in nanoseconds,
+    /// as the upper edge of its bucket; `None` when nothing was counted.
+    pub fn quantile_ns(&self, quantile: f64) -> Option<u64> {
+        let total = self.count();
+        if total == 0 {
+            return None;
+        }
+        let rank = ((quantile.clamp(0.0, 1.0) * total as f64).ceil() as u64).max(1);
+        let mut seen = 0;
+        for (bucket, count) in self.counts.iter().enumerate() {
+            seen += count;
+            if seen >= rank {
+                return Some(Self::upper_edge_ns(bucket).min(self.max_ns.max(1)));
+            }
+        }
+        Some(self.max_ns)
+    }
+
+    /// What was counted since `earlier`, a former reading of the same histogram. The maximum stays that of all.
+    pub fn since(&self, earlier: &Self) -> Self {
+        let mut difference = *self;
+        for (count, before) in difference.counts.iter_mut().zip(earlier.counts.iter()) {
+            *count = count.saturating_sub(*before);
+        }
+        difference
+    }
+
+    /// Upper edges of the buckets in nanoseconds, with their counts, smallest first.
+    pub fn buckets(&self) -> impl Iterator<Item = (u64, u64)> + '_ {
+        self.counts.iter().enumerate().map(|(bucket, &count)| (Self::upper_edge_ns(bucket), count))
+    }
+
+    fn bucket(latency_ns: u64) -> usize {
+        let clamped = latency_ns.clamp(1 << LOWEST_BIT, (1 << (LOWEST_BIT + OCTAVES as u32)) - 1);
+        let octave = clamped.ilog2() - LOWEST_BIT;
+        let within = (clamped >> (octave + LOWEST_BIT - SUB_BUCKETS.ilog2())) as usize - SUB_BUCKETS;
+        octave as usize * SUB_BUCKETS + within
+    }
+
+    fn upper_edge_ns(bucket: usize) -> u64 {
+        let octave = (bucket / SUB_BUCKETS) as u32 + LOWEST_BIT;
+        let within = (bucket % SUB_BUCKETS + SUB_BUCKETS + 1) as u64;
+        within << (octave - SUB_BUCKETS.ilog2())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::DropReason;
+
+    #[test]
+    fn quantiles_are_within_a_bucket_of_the_truth() {
+        let mut histogram = LatencyHistogram::default();
+        assert_eq!(histogram.quantile_ns(0.5), None);
+        for value in 1..=10_000u64 {
+            histogram.record(value * 1_000);
+        }
+        for quantile in [0.01, 0.5, 0.9, 0.99, 0.999] {
+            let truth = quantile * 10_000.0 * 1_000.0;
+            let found = histogram.quantile_ns(quantile).unwrap() as f64;
+            assert!(found >= truth && found <= truth * 1.0626, "{quantile}: {found} for {truth}");
+        }
+        assert_eq!(histogram.quantile_ns(1.0), Some(10_000_000));
+    }
+
+    #[test]
+    fn values_out_of_range_are_counted_all_the_same() {
+        let mut histogram = LatencyHistogram::default();
+        histogram.record(0);
+        histogram.record(u64::MAX);
+        assert_eq!(histogram.count(), 2);
+        assert_eq!(histogram.max_ns, u64::MAX);
+        assert_eq!(histogram.since(&histogram).count(), 0);
+    }
+
+    #[test]
+    fn a_lane_is_whole_when_every_sample_is_somewhere() {
+        let mut counters =
+            LaneCounters { first_sequence: 10, last_sequence: 20, forwarded: 7, ..Default::default() };
+        assert!(!counters.is_whole());
+        counters.drops.add(DropReason::Stale, 2);
+        counters.waiting = 1;
+        assert!(counters.is_whole());
+    }
+
+    #[test]
+    fn fixed_text_cuts_between_characters() {
+        assert_eq!(FixedText::new("sensor").as_str(), "sensor");
+        assert_eq!(FixedText::default().as_str(), "");
+        let long = "ä".repeat(100);
+        assert_eq!(FixedText::new(&long).as_str(), "ä".repeat(63));
+    }
+}

@@ -1,0 +1,22 @@
+//! The vocabulary of the project: plain values with names and units, shared by every other layer.
+//!
+//! Nothing here does anything but hold, check and convert itself. The terms are those of DDS, RTPS, ROS 2 and
+//! teletraffic engineering; each is defined at the type that carries its name.
+
+mod drops;
+mod health;
+mod modes;
+mod names;
+mod qos;
+mod sample;
+mod time;
+
+pub use drops::{DropCounts, DropReason};
+pub use health::{
+    FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, ProcessHealth, RouteInfo,
+};
+pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
+pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
+pub use qos::{Durability, History, QosProfile, Reliability};
+pub use sample::{Encapsulation, SampleHeader, WriterGuid};
+pub use time::{MonotonicNs, SourceTimestamp, WallNs};

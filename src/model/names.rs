@@ -1,0 +1,200 @@
+//! Names that have been checked once and cannot be wrong afterwards.
+
+use std::fmt;
+
+/// Why a string is not a name of the kind asked for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NameError {
+    /// What the string was to be.
+    pub kind: &'static str,
+    /// What is allowed, as a phrase that completes "must be …".
+    pub allowed: &'static str,
+}
+
+impl fmt::Display for NameError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "not a {}: must be {}", self.kind, self.allowed)
+    }
+}
+
+impl std::error::Error for NameError {}
+
+macro_rules! checked_name {
+    ($(#[doc = $doc:literal])+ $name:ident, $kind:literal, $allowed:literal, $check:path) => {
+        $(#[doc = $doc])+
+        #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub struct $name(String);
+
+        impl $name {
+            /// What is allowed, as a phrase that completes "must be …".
+            pub const ALLOWED: &'static str = $allowed;
+
+            /// The name as text.
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl TryFrom<&str> for $name {
+            type Error = NameError;
+
+            fn try_from(text: &str) -> Result<Self, NameError> {
+                if $check(text) {
+                    Ok(Self(text.to_owned()))
+                } else {
+                    Err(NameError { kind: $kind, allowed: $allowed })
+                }
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&self.0)
+            }
+        }
+    };
+}
+
+checked_name! {
+    /// A lane: `critical`, `noncritical`, `rviz`, … It becomes part of file names, unit names and node names.
+    LaneName, "lane name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", is_short_name
+}
+
+checked_name! {
+    /// One bridge among several on a host; the namespace of its shared memory.
+    InstanceName, "instance name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", is_short_name
+}
+
+checked_name! {
+    /// The user's name for a route, unique in a configuration.
+    RouteId, "route id", "1 to 64 characters of A-Z, a-z, 0-9, _, - and .", is_route_id
+}
+
+checked_name! {
+    /// A fully qualified ROS 2 topic name.
+    TopicName, "topic name",
+    "an absolute ROS 2 topic name of at most 246 characters: /tokens of A-Z, a-z, 0-9 and _, none beginning with a digit",
+    is_topic_name
+}
+
+impl LaneName {
+    /// The name of the lane of the critical subscribers.
+    pub fn critical() -> Self {
+        Self("critical".to_owned())
+    }
+
+    /// The name of the lane that noncritical subscribers are on unless the user says otherwise.
+    pub fn noncritical() -> Self {
+        Self("noncritical".to_owned())
+    }
+}
+
+impl TopicName {
+    /// The DDS topic that a ROS 2 topic is (REP 2009 prefix `rt`): `/scan` is `rt/scan`.
+    pub fn to_dds(&self) -> String {
+        format!("rt{}", self.0)
+    }
+}
+
+/// A ROS 2 message type, such as `sensor_msgs/msg/LaserScan`.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TypeName {
+    package: String,
+    name: String,
+}
+
+impl TypeName {
+    /// What is allowed, as a phrase that completes "must be …".
+    pub const ALLOWED: &'static str = "package/msg/Name or package/Name, such as sensor_msgs/msg/LaserScan";
+
+    /// The type as DDS names it: `sensor_msgs::msg::dds_::LaserScan_`.
+    pub fn to_dds(&self) -> String {
+        format!("{}::msg::dds_::{}_", self.package, self.name)
+    }
+
+    /// The ROS 2 type that a DDS type name stands for; `None` when it is not that of a ROS 2 message.
+    pub fn from_dds(dds: &str) -> Option<Self> {
+        let (package, name) = dds.split_once("::msg::dds_::")?;
+        Self::try_from(format!("{package}/msg/{}", name.strip_suffix('_')?).as_str()).ok()
+    }
+}
+
+impl TryFrom<&str> for TypeName {
+    type Error = NameError;
+
+    fn try_from(text: &str) -> Result<Self, NameError> {
+        let parts: Vec<&str> = text.split('/').collect();
+        let (package, name) = match parts[..] {
+            [package, name] | [package, "msg", name] => (package, name),
+            _ => ("", ""),
+        };
+        if is_token(package) && is_token(name) {
+            Ok(Self { package: package.to_owned(), name: name.to_owned() })
+        } else {
+            Err(NameError { kind: "message type", allowed: Self::ALLOWED })
+        }
+    }
+}
+
+impl fmt::Display for TypeName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/msg/{}", self.package, self.name)
+    }
+}
+
+fn is_short_name(text: &str) -> bool {
+    text.len() <= 24
+        && text.starts_with(|c: char| c.is_ascii_lowercase())
+        && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
+}
+
+fn is_route_id(text: &str) -> bool {
+    (1..=64).contains(&text.len())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.'))
+}
+
+fn is_token(text: &str) -> bool {
+    text.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}
+
+/// DDS limits a topic name to 255 characters; 246 leaves room for every prefix ROS 2 knows.
+fn is_topic_name(text: &str) -> bool {
+    text.len() <= 246 && text.strip_prefix('/').is_some_and(|rest| rest.split('/').all(is_token))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn topic_names_become_dds_names() {
+        let topic = TopicName::try_from("/robot_1/scan").unwrap();
+        assert_eq!(topic.to_dds(), "rt/robot_1/scan");
+        for wrong in ["", "/", "scan", "/scan/", "//scan", "/2d", "/a b", "/~", "/{x}"] {
+            assert!(TopicName::try_from(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn both_spellings_of_a_type_are_the_same_type() {
+        let long = TypeName::try_from("sensor_msgs/msg/LaserScan").unwrap();
+        assert_eq!(long, TypeName::try_from("sensor_msgs/LaserScan").unwrap());
+        assert_eq!(long.to_dds(), "sensor_msgs::msg::dds_::LaserScan_");
+        assert_eq!(TypeName::from_dds(&long.to_dds()), Some(long.clone()));
+        assert_eq!(long.to_string(), "sensor_msgs/msg/LaserScan");
+        for wrong in ["", "LaserScan", "a/srv/B", "a/msg/", "a/b/c/d", "a b/C"] {
+            assert!(TypeName::try_from(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn lane_names_fit_into_file_names() {
+        assert_eq!(LaneName::try_from("rviz_2").unwrap().as_str(), "rviz_2");
+        for wrong in ["", "2d", "Rviz", "a-b", "a/b", "a_name_that_is_too_long_for_us"] {
+            assert!(LaneName::try_from(wrong).is_err(), "{wrong:?}");
+        }
+        let error = LaneName::try_from("Rviz").unwrap_err().to_string();
+        assert!(error.contains("lane name") && error.contains("a-z"), "{error}");
+    }
+}

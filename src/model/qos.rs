@@ -1,0 +1,72 @@
+//! The DDS Quality of Service policies that a route can be given (DDS 1.4 clause 2.2.3).
+
+/// RELIABILITY.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Reliability {
+    /// A lost sample stays lost.
+    BestEffort,
+    /// A lost sample is repaired while the writer has it.
+    Reliable,
+}
+
+/// HISTORY.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum History {
+    /// The last `depth` samples; at least 1.
+    KeepLast {
+        /// Samples.
+        depth: u32,
+    },
+    /// All samples, up to the resource limits.
+    KeepAll,
+}
+
+/// DURABILITY.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Durability {
+    /// A late joiner gets what is published from then on.
+    Volatile,
+    /// A late joiner also gets the writer's history.
+    TransientLocal,
+}
+
+/// The policies of one reader or writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct QosProfile {
+    /// RELIABILITY.
+    pub reliability: Reliability,
+    /// HISTORY.
+    pub history: History,
+    /// DURABILITY.
+    pub durability: Durability,
+    /// LIFESPAN in milliseconds; `None` is infinite.
+    pub lifespan_ms: Option<u64>,
+    /// DEADLINE in milliseconds; `None` is infinite.
+    pub deadline_ms: Option<u64>,
+}
+
+impl QosProfile {
+    /// The paper's critical writer (section III-B): RELIABLE, KEEP_LAST 10, VOLATILE.
+    pub const CRITICAL: Self = Self {
+        reliability: Reliability::Reliable,
+        history: History::KeepLast { depth: 10 },
+        durability: Durability::Volatile,
+        lifespan_ms: None,
+        deadline_ms: None,
+    };
+
+    /// The paper's noncritical writer (section III-B): BEST_EFFORT, KEEP_LAST 5, VOLATILE.
+    pub const NONCRITICAL: Self = Self {
+        reliability: Reliability::BestEffort,
+        history: History::KeepLast { depth: 5 },
+        ..Self::CRITICAL
+    };
+
+    /// HISTORY depth in samples; `None` for KEEP_ALL.
+    pub const fn depth(&self) -> Option<u32> {
+        match self.history {
+            History::KeepLast { depth } => Some(depth),
+            History::KeepAll => None,
+        }
+    }
+}
