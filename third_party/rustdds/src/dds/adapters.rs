@@ -142,6 +142,22 @@ pub mod no_key {
         .map(Self::transform_decoded)
     }
 
+    /// Like [`from_bytes_with`](Self::from_bytes_with), but the decoder also
+    /// sees the two option bytes of the encapsulation header.
+    fn from_encapsulated_with<'de, S>(
+      input_bytes: &'de [u8],
+      encoding: RepresentationIdentifier,
+      options: [u8; 2],
+      decoder: S,
+    ) -> Result<D, S::Error>
+    where
+      S: Decode<'de, Self::Decoded>,
+    {
+      decoder
+        .decode_encapsulated(input_bytes, encoding, options)
+        .map(Self::transform_decoded)
+    }
+
     /// Deserialize data from bytes to an object.
     /// `encoding` must be something given by `supported_encodings()`, or
     /// implementation may fail with Err or `panic!()`.
@@ -192,6 +208,20 @@ pub mod no_key {
       input_bytes: &'de [u8],
       encoding: RepresentationIdentifier,
     ) -> Result<Decoded, Self::Error>;
+
+    /// Like [`decode_bytes`](Self::decode_bytes), with the two option bytes
+    /// of the encapsulation header, which a decoder may ignore.
+    fn decode_encapsulated(
+      self,
+      input_bytes: &'de [u8],
+      encoding: RepresentationIdentifier,
+      _options: [u8; 2],
+    ) -> Result<Decoded, Self::Error>
+    where
+      Self: Sized,
+    {
+      self.decode_bytes(input_bytes, encoding)
+    }
   }
 
   /// trait for connecting a Serializer implementation and DataWriter
@@ -207,6 +237,12 @@ pub mod no_key {
     fn output_encoding() -> RepresentationIdentifier;
 
     fn to_bytes(value: &D) -> Result<Bytes, Self::Error>;
+
+    /// The encapsulation header of this value: what encoding it is in, and the
+    /// two option bytes.
+    fn output_encapsulation(_value: &D) -> (RepresentationIdentifier, [u8; 2]) {
+      (Self::output_encoding(), [0, 0])
+    }
   }
 }
 

@@ -372,10 +372,10 @@ where
       }
     };
 
-    let ddsdata = DDSData::new(SerializedPayload::new_from_bytes(
-      SA::output_encoding(),
-      send_buffer,
-    ));
+    let (encoding, options) = SA::output_encapsulation(&data);
+    let mut payload = SerializedPayload::new_from_bytes(encoding, send_buffer);
+    payload.representation_options = options;
+    let ddsdata = DDSData::new(payload);
 
     // Admission allocates the sequence number and stores the sample only if the
     // reliable send window has room; otherwise it blocks up to
@@ -1037,10 +1037,10 @@ where
       }
     };
 
-    let dds_data = DDSData::new(SerializedPayload::new_from_bytes(
-      SA::output_encoding(),
-      send_buffer,
-    ));
+    let (encoding, options) = SA::output_encapsulation(&data);
+    let mut payload = SerializedPayload::new_from_bytes(encoding, send_buffer);
+    payload.representation_options = options;
+    let dds_data = DDSData::new(payload);
 
     let timeout = self.qos().reliable_max_blocking_time();
 

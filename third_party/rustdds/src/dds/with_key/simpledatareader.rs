@@ -244,7 +244,12 @@ where
           .iter()
           .find(|r| **r == serialized_payload.representation_identifier)
         {
-          match DA::from_bytes_with(&serialized_payload.value, *recognized_rep_id, decoder) {
+          match DA::from_encapsulated_with(
+            &serialized_payload.value,
+            *recognized_rep_id,
+            serialized_payload.representation_options,
+            decoder,
+          ) {
             // Data update, decoded ok
             Ok(payload) => {
               let p = Sample::Value(payload);
