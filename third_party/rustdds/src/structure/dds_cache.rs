@@ -453,7 +453,7 @@ impl TopicCache {
       ChangesInRange::Reliable(self.get_changes_in_range_reliable(last_read_sn))
     } else {
       ChangesInRange::BestEffort(
-        self.get_changes_in_range_best_effort(latest_instant, Timestamp::now()),
+        self.get_changes_in_range_best_effort(latest_instant, Timestamp::INFINITE),
       )
     }
   }
