@@ -7,10 +7,12 @@
 //! - [`policy`]: pure decisions; time is an argument.
 //! - [`config`]: YAML to validated settings.
 //! - [`clock`]: the only reader of the operating system's clocks.
+//! - [`dds`]: the RTPS edge, on RustDDS.
 
 #![warn(missing_docs)]
 
 pub mod clock;
 pub mod config;
+pub mod dds;
 pub mod model;
 pub mod policy;

@@ -3,7 +3,7 @@
 
 use super::drops::DropCounts;
 use super::modes::LaneMode;
-use super::sample::WriterGuid;
+use super::sample::Guid;
 use super::time::MonotonicNs;
 
 /// What ingress has done on one route. `received = published + drops`, always.
@@ -54,7 +54,7 @@ pub struct LaneCounters {
     /// When that was.
     pub last_forwarded_at: MonotonicNs,
     /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes from.
-    pub last_writer_guid: WriterGuid,
+    pub last_writer_guid: Guid,
     /// See `last_writer_guid`.
     pub last_writer_sequence: i64,
     /// Readers matched at present.

@@ -18,5 +18,5 @@ pub use health::{
 pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use qos::{Durability, History, QosProfile, Reliability};
-pub use sample::{Encapsulation, SampleHeader, WriterGuid};
+pub use sample::{Encapsulation, Guid, SampleHeader};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};

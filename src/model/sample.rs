@@ -24,10 +24,10 @@ impl Encapsulation {
     }
 }
 
-/// The GUID of a DDS writer (RTPS 2.5 clause 8.2.4.1): 12 bytes of participant prefix, 4 of entity id.
+/// The GUID of a DDS entity (RTPS 2.5 clause 8.2.4.1): 12 bytes of participant prefix, 4 of entity id.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(transparent)]
-pub struct WriterGuid(pub [u8; 16]);
+pub struct Guid(pub [u8; 16]);
 
 /// The fixed header of one sample in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,7 +45,7 @@ pub struct SampleHeader {
     /// The sequence number that the publisher's DDS writer gave the sample.
     pub writer_sequence: i64,
     /// The publisher's DDS writer.
-    pub writer_guid: WriterGuid,
+    pub writer_guid: Guid,
     /// How the payload is encoded.
     pub encapsulation: Encapsulation,
     /// Always 0; keeps the size a multiple of 8 without bytes that nobody wrote.

@@ -1,0 +1,26 @@
+//! The RTPS edge: a participant, a raw reader, a raw writer and discovery, on RustDDS.
+//!
+//! Payloads pass as the bytes that were on the wire, with their encapsulation header, and are never decoded;
+//! that is why any message type will do. No RustDDS type leaves this module, so that another DDS library could
+//! stand behind it.
+
+mod discovery;
+mod error;
+mod graph;
+mod network;
+mod participant;
+mod payload;
+mod qos;
+mod reader;
+mod writer;
+
+pub use discovery::{Discovery, Endpoint};
+pub use error::DdsError;
+pub use graph::encode_graph;
+pub use participant::{Participant, ParticipantOptions};
+pub use qos::ReaderQos;
+pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};
+pub use writer::{RawWriter, WriteError, WriterEvent};
+
+/// RustDDS, in the version that ros2-client uses, so that there is one of it.
+use ros2_client::dds::rustdds;

@@ -1,0 +1,209 @@
+//! One DDS participant, which is one ROS 2 node.
+
+use bytes::Bytes;
+
+use super::discovery::{Discovery, translate};
+use super::error::DdsError;
+use super::graph;
+use super::network;
+use super::qos::{self, ReaderQos};
+use super::reader::RawReader;
+use super::rustdds::{
+    DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, Publisher, QosPolicies,
+    RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind,
+};
+use super::writer::RawWriter;
+use crate::config::DdsNetwork;
+use crate::model::{Durability, Guid, History, QosProfile, Reliability, SourceTimestamp};
+
+/// What a participant is made of.
+#[derive(Clone, Debug)]
+pub struct ParticipantOptions<'a> {
+    /// Domain and interfaces.
+    pub network: &'a DdsNetwork,
+    /// The ROS 2 namespace of the node, such as `/adaptive_bridge`.
+    pub namespace: String,
+    /// The name under which ROS 2 shows the process.
+    pub node_name: String,
+    /// Length of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
+    pub graph_gid_bytes: usize,
+}
+
+/// A DDS participant with its node's entry in the ROS 2 graph.
+pub struct Participant {
+    participant: DomainParticipant,
+    publisher: Publisher,
+    subscriber: Subscriber,
+    listener: DomainParticipantStatusListener,
+    graph: RawWriter,
+    namespace: String,
+    node_name: String,
+    graph_gid_bytes: usize,
+    readers: Vec<Guid>,
+    writers: Vec<Guid>,
+}
+
+/// Each participant offers its graph entry as `rmw_dds_common` does: the last one, reliably, to late joiners.
+const GRAPH_QOS: QosProfile = QosProfile {
+    reliability: Reliability::Reliable,
+    history: History::KeepLast { depth: 1 },
+    durability: Durability::TransientLocal,
+    lifespan_ms: None,
+    deadline_ms: None,
+};
+
+/// Graph entries that may be unacknowledged; one is written for each endpoint made or dropped.
+const GRAPH_WINDOW_SAMPLES: usize = 1024;
+
+impl Participant {
+    /// Joins the domain and announces the node.
+    ///
+    /// # Errors
+    /// An interface is not on this host, or the DDS library cannot open its sockets.
+    pub fn open(options: &ParticipantOptions) -> Result<Self, DdsError> {
+        let what = || format!("a participant in DDS domain {}", options.network.domain_id);
+        let mut builder = DomainParticipantBuilder::new(options.network.domain_id);
+        let addresses = network::addresses(&options.network.interfaces)?;
+        if !addresses.is_empty() {
+            builder = builder.with_only_networks(addresses);
+        }
+        let participant = builder.build().map_err(|error| DdsError::library(what(), error))?;
+        let none = QosPolicies::qos_none();
+        let publisher =
+            participant.create_publisher(&none).map_err(|error| DdsError::library(what(), error))?;
+        let subscriber =
+            participant.create_subscriber(&none).map_err(|error| DdsError::library(what(), error))?;
+        let listener = participant.status_listener();
+        let graph = make_writer(
+            &participant,
+            &publisher,
+            graph::TOPIC,
+            graph::TYPE,
+            &qos::of_writer(&GRAPH_QOS, GRAPH_WINDOW_SAMPLES),
+        )?;
+        let opened = Self {
+            participant,
+            publisher,
+            subscriber,
+            listener,
+            graph,
+            namespace: options.namespace.clone(),
+            node_name: options.node_name.clone(),
+            graph_gid_bytes: options.graph_gid_bytes,
+            readers: Vec::new(),
+            writers: Vec::new(),
+        };
+        opened.announce();
+        Ok(opened)
+    }
+
+    /// The participant's GUID.
+    pub fn guid(&self) -> Guid {
+        Guid(self.participant.guid().to_bytes())
+    }
+
+    /// Whether an endpoint is one of this participant's own.
+    pub fn owns(&self, endpoint: Guid) -> bool {
+        endpoint.0[..12] == self.guid().0[..12]
+    }
+
+    /// A reader of `topic`, a DDS topic name, and its place in the node's graph entry.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_reader(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        reader_qos: &ReaderQos,
+    ) -> Result<RawReader, DdsError> {
+        let policies = qos::of_reader(reader_qos);
+        let what = || format!("a reader of {topic}");
+        let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
+        let inner = self
+            .subscriber
+            .create_simple_datareader_no_key(&made_topic, Some(policies))
+            .map_err(|error| DdsError::library(what(), error))?;
+        let guid = Guid(inner.guid().to_bytes());
+        self.readers.push(guid);
+        self.announce();
+        Ok(RawReader { inner, guid })
+    }
+
+    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has at
+    /// most `window_samples` unacknowledged samples.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_writer(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        writer_qos: &QosProfile,
+        window_samples: usize,
+    ) -> Result<RawWriter, DdsError> {
+        let policies = qos::of_writer(writer_qos, window_samples);
+        let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, &policies)?;
+        self.writers.push(writer.guid());
+        self.announce();
+        Ok(writer)
+    }
+
+    /// Takes a dropped reader or writer out of the node's graph entry.
+    pub fn forget(&mut self, endpoint: Guid) {
+        self.readers.retain(|guid| *guid != endpoint);
+        self.writers.retain(|guid| *guid != endpoint);
+        self.announce();
+    }
+
+    /// The next change in what other participants have, if there is one.
+    pub fn poll_discovery(&self) -> Option<Discovery> {
+        loop {
+            if let Some(change) = translate(self.listener.try_recv_status()?) {
+                return Some(change);
+            }
+        }
+    }
+
+    fn announce(&self) {
+        let entry = graph::encode_graph(
+            self.guid(),
+            &self.namespace,
+            &self.node_name,
+            &self.readers,
+            &self.writers,
+            self.graph_gid_bytes,
+        );
+        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one does.
+        if let Err(error) = self.graph.write(Bytes::from(entry), graph::ENCAPSULATION, SourceTimestamp::NONE)
+        {
+            tracing::warn!(node = self.node_name, %error, "ROS 2 graph entry not published");
+        }
+    }
+}
+
+fn make_topic(
+    participant: &DomainParticipant,
+    name: &str,
+    dds_type: &str,
+    policies: &QosPolicies,
+) -> Result<Topic, DdsError> {
+    participant
+        .create_topic(name.to_owned(), dds_type.to_owned(), policies, TopicKind::NoKey)
+        .map_err(|error| DdsError::library(format!("the topic {name}"), error))
+}
+
+fn make_writer(
+    participant: &DomainParticipant,
+    publisher: &Publisher,
+    topic: &str,
+    dds_type: &str,
+    policies: &QosPolicies,
+) -> Result<RawWriter, DdsError> {
+    let made_topic = make_topic(participant, topic, dds_type, policies)?;
+    let inner = publisher
+        .create_datawriter_no_key(&made_topic, Some(policies.clone()))
+        .map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
+    let guid = Guid(inner.guid().to_bytes());
+    Ok(RawWriter { inner, guid })
+}

@@ -1,0 +1,99 @@
+//! Our QoS in RustDDS' terms, and back.
+
+use super::rustdds::policy;
+use super::rustdds::{Duration, QosPolicies, QosPolicyBuilder};
+use crate::model::{Durability, History, QosProfile, Reliability};
+
+/// Data representation identifiers (XTypes 1.3 clause 7.6.3.1.1).
+const XCDR1: i16 = 0;
+const XML: i16 = 1;
+const XCDR2: i16 = 2;
+
+/// What a reader asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReaderQos {
+    /// RELIABILITY.
+    pub reliability: Reliability,
+    /// DURABILITY.
+    pub durability: Durability,
+    /// Samples that may wait between the DDS library and us; at least 1.
+    pub depth: u32,
+    /// DEADLINE in milliseconds; `None` is infinite.
+    pub deadline_ms: Option<u64>,
+}
+
+/// A reader's policies. It accepts every data representation, because we do not look inside.
+pub(super) fn of_reader(qos: &ReaderQos) -> QosPolicies {
+    let depth = i32::try_from(qos.depth).unwrap_or(i32::MAX);
+    let mut builder = QosPolicyBuilder::new()
+        .durability(durability(qos.durability))
+        .history(policy::History::KeepLast { depth })
+        .resource_limits(resource_limits(depth));
+    if let Some(ms) = qos.deadline_ms {
+        builder = builder.deadline(policy::Deadline(duration_ms(ms)));
+    }
+    builder = match qos.reliability {
+        Reliability::BestEffort => builder.best_effort(),
+        Reliability::Reliable => builder.reliable(Duration::ZERO),
+    };
+    builder.build().with_data_representation(policy::DataRepresentation { value: vec![XCDR1, XCDR2, XML] })
+}
+
+/// A writer's policies. `window_samples` bounds what may be unacknowledged, and a full window is reported at
+/// once (`max_blocking_time` zero) instead of waited for.
+pub(super) fn of_writer(qos: &QosProfile, window_samples: usize) -> QosPolicies {
+    let window = i32::try_from(window_samples).unwrap_or(i32::MAX);
+    let mut builder = QosPolicyBuilder::new()
+        .durability(durability(qos.durability))
+        .history(match qos.history {
+            History::KeepLast { depth } => {
+                policy::History::KeepLast { depth: i32::try_from(depth).unwrap_or(i32::MAX) }
+            }
+            History::KeepAll => policy::History::KeepAll,
+        })
+        .resource_limits(resource_limits(window));
+    if let Some(ms) = qos.lifespan_ms {
+        builder = builder.lifespan(policy::Lifespan { duration: duration_ms(ms) });
+    }
+    if let Some(ms) = qos.deadline_ms {
+        builder = builder.deadline(policy::Deadline(duration_ms(ms)));
+    }
+    match qos.reliability {
+        Reliability::BestEffort => builder.best_effort(),
+        Reliability::Reliable => builder.reliable(Duration::ZERO),
+    }
+    .build()
+}
+
+/// What an endpoint announced; a policy that is absent has its DDS default (DDS 1.4 clause 2.2.3), which for
+/// RELIABILITY differs between readers and writers.
+pub(super) fn reliability_of(qos: &QosPolicies, default: Reliability) -> Reliability {
+    match qos.reliability() {
+        Some(policy::Reliability::BestEffort) => Reliability::BestEffort,
+        Some(policy::Reliability::Reliable { .. }) => Reliability::Reliable,
+        None => default,
+    }
+}
+
+/// See [`reliability_of`].
+pub(super) fn durability_of(qos: &QosPolicies) -> Durability {
+    match qos.durability() {
+        Some(policy::Durability::Volatile) | None => Durability::Volatile,
+        Some(_) => Durability::TransientLocal,
+    }
+}
+
+fn durability(durability: Durability) -> policy::Durability {
+    match durability {
+        Durability::Volatile => policy::Durability::Volatile,
+        Durability::TransientLocal => policy::Durability::TransientLocal,
+    }
+}
+
+fn resource_limits(max_samples: i32) -> policy::ResourceLimits {
+    policy::ResourceLimits { max_samples, max_instances: 1, max_samples_per_instance: max_samples }
+}
+
+fn duration_ms(ms: u64) -> Duration {
+    Duration::from_std(std::time::Duration::from_millis(ms))
+}

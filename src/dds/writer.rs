@@ -1,0 +1,134 @@
+//! A DDS writer of raw payloads that never waits.
+
+use std::fmt;
+
+use bytes::Bytes;
+
+use super::payload::{Raw, RawPayload};
+use super::rustdds::no_key::DataWriter;
+use super::rustdds::{
+    DataWriterStatus, GUID, StatusEvented, Timestamp, WriteOptionsBuilder,
+    dds::result::WriteError as DdsWriteError,
+};
+use crate::model::{Encapsulation, Guid, SourceTimestamp};
+
+/// Why a sample was not written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WriteError {
+    /// The window of unacknowledged samples is full: a matched RELIABLE reader lags.
+    WindowFull,
+    /// The DDS library refused for another reason.
+    Refused,
+}
+
+impl fmt::Display for WriteError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::WindowFull => "the window of unacknowledged samples is full",
+            Self::Refused => "the DDS library refused the sample",
+        })
+    }
+}
+
+impl std::error::Error for WriteError {}
+
+/// A change of who a writer is matched with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WriterEvent {
+    /// A reader came or went.
+    Matched {
+        /// The reader.
+        reader: Guid,
+        /// Whether it came.
+        joined: bool,
+        /// Readers matched at present.
+        readers: u64,
+    },
+    /// A reader asks for more than the writer offers.
+    Incompatible {
+        /// The reader.
+        reader: Guid,
+    },
+}
+
+/// A DDS writer of raw payloads.
+pub struct RawWriter {
+    pub(super) inner: DataWriter<RawPayload, Raw>,
+    pub(super) guid: Guid,
+}
+
+impl RawWriter {
+    /// The writer's GUID.
+    pub fn guid(&self) -> Guid {
+        self.guid
+    }
+
+    /// Hands a sample to the DDS library and returns at once. The library keeps `payload` until every matched
+    /// RELIABLE reader has acknowledged it, and lets go of it some time after that.
+    ///
+    /// # Errors
+    /// The sample was not taken and `payload` is let go of.
+    pub fn write(
+        &self,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+    ) -> Result<(), WriteError> {
+        self.write_with(payload, encapsulation, timestamp, None)
+    }
+
+    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, whom
+    /// the DDS protocol has no way to give the history.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn write_to(
+        &self,
+        reader: Guid,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+    ) -> Result<(), WriteError> {
+        self.write_with(payload, encapsulation, timestamp, Some(reader))
+    }
+
+    fn write_with(
+        &self,
+        bytes: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+        reader: Option<Guid>,
+    ) -> Result<(), WriteError> {
+        let mut options = WriteOptionsBuilder::new();
+        if timestamp != SourceTimestamp::NONE {
+            options = options.source_timestamp(Timestamp::from_ticks(timestamp.0));
+        }
+        if let Some(reader) = reader {
+            options = options.to_single_reader(GUID::from_bytes(reader.0));
+        }
+        match self.inner.write_with_options(RawPayload { bytes, encapsulation }, options.build()) {
+            Ok(_) => Ok(()),
+            Err(DdsWriteError::WouldBlock { .. }) => Err(WriteError::WindowFull),
+            Err(_) => Err(WriteError::Refused),
+        }
+    }
+
+    /// The next change of matching, if there is one.
+    pub fn poll_event(&self) -> Option<WriterEvent> {
+        loop {
+            match self.inner.try_recv_status()? {
+                DataWriterStatus::PublicationMatched { current, reader, .. } => {
+                    return Some(WriterEvent::Matched {
+                        reader: Guid(reader.to_bytes()),
+                        joined: current.count_change() > 0,
+                        readers: u64::try_from(current.count()).unwrap_or(0),
+                    });
+                }
+                DataWriterStatus::OfferedIncompatibleQos { reader, .. } => {
+                    return Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()) });
+                }
+                _ => {}
+            }
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The RTPS edge against itself: two participants of this process, over real sockets.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Wake, Waker};
+use std::time::{Duration, Instant};
+
+use adaptive_bridge::config::DdsNetwork;
+use adaptive_bridge::dds::{
+    Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take, WriteError,
+    WriterEvent,
+};
+use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp};
+use bytes::Bytes;
+
+const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
+
+fn participant(name: &str, domain_id: u16) -> Participant {
+    Participant::open(&ParticipantOptions {
+        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
+        namespace: "/adaptive_bridge".into(),
+        node_name: name.into(),
+        graph_gid_bytes: 16,
+    })
+    .unwrap()
+}
+
+fn reader_qos(reliability: Reliability, durability: Durability) -> ReaderQos {
+    ReaderQos { reliability, durability, depth: 64, deadline_ms: None }
+}
+
+struct Flag(AtomicBool);
+
+impl Wake for Flag {
+    fn wake(self: Arc<Self>) {
+        self.0.store(true, Ordering::Release);
+    }
+}
+
+/// Takes one sample, patiently; the waker must have announced it.
+fn take_one(reader: &RawReader) -> Option<(Vec<u8>, Encapsulation, SourceTimestamp)> {
+    let flag = Arc::new(Flag(AtomicBool::new(false)));
+    let waker = Waker::from(Arc::clone(&flag));
+    let give_up = Instant::now() + Duration::from_secs(20);
+    loop {
+        reader.arm(&waker);
+        let mut taken = None;
+        match reader.take(&mut |payload, encapsulation| taken = Some((payload.to_vec(), encapsulation))) {
+            Take::Sample(origin) => {
+                let (payload, encapsulation) = taken?;
+                return Some((payload, encapsulation, origin.source_timestamp));
+            }
+            Take::Malformed => panic!("malformed"),
+            Take::Empty => {}
+        }
+        while !flag.0.swap(false, Ordering::AcqRel) {
+            if Instant::now() > give_up {
+                return None;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+fn wait_for_reader(writer: &RawWriter) {
+    let give_up = Instant::now() + Duration::from_secs(20);
+    loop {
+        match writer.poll_event() {
+            Some(WriterEvent::Matched { joined: true, .. }) => return,
+            Some(_) => {}
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+        assert!(Instant::now() < give_up, "no reader was matched");
+    }
+}
+
+#[test]
+fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
+    let mut here = participant("here", 70);
+    let mut there = participant("there", 70);
+    let reader = there
+        .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let kinds = [[0, 1, 0, 0], [0, 0, 0, 3], [0, 7, 0, 2], [0, 0x0b, 0, 1], [0, 1, 0, 0]];
+    for (length, kind) in [0, 4, 2_948, 65_536, 4 << 20].into_iter().zip(kinds) {
+        let payload: Vec<u8> = (0..length).map(|at: usize| (at * 7 + length) as u8).collect();
+        let timestamp = SourceTimestamp(0x6900_0000_1234_5678 + length as u64);
+        writer.write(Bytes::from(payload.clone()), Encapsulation(kind), timestamp).unwrap();
+        let (taken, encapsulation, taken_timestamp) = take_one(&reader).expect("nothing arrived");
+        assert_eq!(taken.len(), payload.len());
+        assert!(taken == payload, "{length} bytes changed on the way");
+        assert_eq!(encapsulation, Encapsulation(kind));
+        assert_eq!(taken_timestamp, timestamp);
+    }
+}
+
+#[test]
+fn a_full_window_is_reported_at_once_and_the_sample_is_not_kept() {
+    let mut here = participant("here", 71);
+    let mut there = participant("there", 71);
+    let reader = there
+        .create_reader("rt/full", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/full", TYPE, &QosProfile::CRITICAL, 4).unwrap();
+    wait_for_reader(&writer);
+    let payload = Bytes::from(vec![0; 1 << 20]);
+    let mut refused = 0;
+    for _ in 0..200 {
+        if let Err(error) = writer.write(payload.clone(), Encapsulation::CDR_LE, SourceTimestamp::NONE) {
+            assert_eq!(error, WriteError::WindowFull);
+            refused += 1;
+        }
+    }
+    assert!(refused > 0, "200 MiB were taken with a window of four samples");
+    assert!(take_one(&reader).is_some());
+}
+
+#[test]
+fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
+    let mut here = participant("here", 72);
+    let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::NONCRITICAL };
+    let writer = here.create_writer("rt/map", TYPE, &qos, 64).unwrap();
+    writer.write(Bytes::from_static(b"a map..."), Encapsulation::CDR_LE, SourceTimestamp(1)).unwrap();
+    let mut there = participant("there", 72);
+    let reader = there
+        .create_reader("rt/map", TYPE, &reader_qos(Reliability::BestEffort, Durability::TransientLocal))
+        .unwrap();
+    let give_up = Instant::now() + Duration::from_secs(20);
+    let joined = loop {
+        if let Some(WriterEvent::Matched { reader, joined: true, .. }) = writer.poll_event() {
+            break reader;
+        }
+        assert!(Instant::now() < give_up);
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT writer
+    // when that is over, so the reader's end is asked.
+    while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
+        assert!(Instant::now() < give_up);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    writer
+        .write_to(joined, Bytes::from_static(b"map again..."), Encapsulation::CDR_LE, SourceTimestamp(1))
+        .unwrap();
+    assert_eq!(take_one(&reader).unwrap().0, b"map again...");
+}
+
+#[test]
+fn a_late_joiner_of_a_reliable_transient_local_writer_gets_its_history() {
+    let mut here = participant("here", 73);
+    let qos = QosProfile {
+        durability: Durability::TransientLocal,
+        history: History::KeepLast { depth: 1 },
+        ..QosProfile::CRITICAL
+    };
+    let writer = here.create_writer("rt/tf_static", TYPE, &qos, 64).unwrap();
+    writer.write(Bytes::from_static(b"kept"), Encapsulation::CDR_LE, SourceTimestamp(1)).unwrap();
+    let mut there = participant("there", 73);
+    let reader = there
+        .create_reader("rt/tf_static", TYPE, &reader_qos(Reliability::Reliable, Durability::TransientLocal))
+        .unwrap();
+    assert_eq!(take_one(&reader).unwrap().0, b"kept");
+}
