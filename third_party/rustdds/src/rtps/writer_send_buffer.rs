@@ -395,6 +395,21 @@ impl WriterSendBuffer {
     }
   }
 
+  /// Like [`remove_changes_before`](Self::remove_changes_before), for the few
+  /// changes that one acknowledgement releases.
+  pub fn pop_changes_before(&self, remove_before: SequenceNumber) {
+    let mut inner = self.shared.inner.lock().unwrap();
+    while let Some(entry) = inner.changes.first_entry() {
+      if *entry.key() >= remove_before {
+        break;
+      }
+      entry.remove();
+    }
+    // Not past what has been written: a reader may acknowledge ahead of us.
+    let written_before = inner.last_seq.plus_1();
+    inner.first_seq = max(inner.first_seq, remove_before.min(written_before));
+  }
+
   // --- wait_for_acknowledgments support ---
 
   /// Has every matched reliable reader acknowledged everything up to and
