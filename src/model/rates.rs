@@ -45,6 +45,7 @@ pub enum DropPolicy {
     DropOldest,
     /// The oldest sample is sent; a new one that finds the queue full is dropped.
     DropLatest,
-    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is full.
+    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is
+    /// full.
     DropStale,
 }
