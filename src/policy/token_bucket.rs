@@ -12,11 +12,11 @@ use crate::model::{LaneMode, LaneRates, MonotonicNs};
 /// The highest rate of a [`TokenBucket`], in hertz.
 pub const MAX_RATE_HZ: f64 = 100_000.0;
 
-/// How much lateness, of the consumer's wake-up and of the publisher together, costs no rate: 50 ms.
+/// What accrues in this time is added to every burst, so that late wake-ups cost no rate: 50 ms.
 ///
-/// A bucket that is full loses what accrues, so this much at the rate is added to every burst. The latest
-/// wake-up of an idle machine without real-time scheduling was 2.3 ms; 50 ms are twenty times that and cover
-/// a loaded machine, and are still short enough that a burst is half a sample at 10 Hz.
+/// Two wake-ups may be late one after the other, that for the token and that for a sample, so this covers 25
+/// ms each. The latest on an idle machine without real-time scheduling was 2.3 ms; ten times that leaves room
+/// for a loaded one, and is still only half a sample at 10 Hz.
 pub const BURST_WINDOW_NS: u64 = 50_000_000;
 
 /// One token. Credit counts nanohertz times nanoseconds, which is 10⁻¹⁸ of a token: a rate of 0.01 Hz is then
@@ -26,13 +26,14 @@ const TOKEN: u128 = 1_000_000_000_000_000_000;
 /// One byte in units of (byte per second) × nanosecond.
 const BYTE: i128 = 1_000_000_000;
 
-/// The burst, in tokens, at which a lane reaches `rate_hz`: two tokens and what accrues in
+/// The burst, in tokens, with which a lane reaches `rate_hz`: two tokens and what accrues in
 /// [`BURST_WINDOW_NS`].
 ///
-/// One token is the one that the next sample takes. The second accrues while that sample is awaited: it may
-/// come a whole input interval after the token was there, which at an input rate just above the target is the
-/// time of one more. The rest accrues while the consumer or the publisher is late. With wake-ups up to 3 ms
-/// late, one token gives 9.85 Hz of 10 and 396 Hz of 1,000, two give 10.00 and 710, this gives all.
+/// Nothing is lost while the burst is at least 1 + rate × (jitter + 2 × lateness): one token, which the next
+/// sample takes, and what accrues while the publisher or the consumer is late. The second token is for a
+/// jitter of a whole input interval, peak to peak; the rest for lateness. With wake-ups up to 3 ms late, a
+/// burst of one token gives 9.85 Hz of 10 and 396 of 1,000, two tokens 710 of 1,000, one token and 50 ms
+/// 0.483 of 0.5 under that jitter, and this gives all of each.
 pub fn burst_for(rate_hz: f64) -> f64 {
     2.0 + usable_rate(rate_hz) * (BURST_WINDOW_NS as f64 / 1e9)
 }
