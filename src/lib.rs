@@ -8,11 +8,19 @@
 //! - [`config`]: YAML to validated settings.
 //! - [`clock`]: the only reader of the operating system's clocks.
 //! - [`dds`]: the RTPS edge, on RustDDS.
+//! - [`shm`]: the shared-memory edge, on iceoryx2.
+//! - [`telemetry`]: what the processes show: readings of the boards, logs.
+//! - [`process`]: the roles; the only place where the edges meet policy.
+//! - [`cli`]: one file for each subcommand.
 
 #![warn(missing_docs)]
 
+pub mod cli;
 pub mod clock;
 pub mod config;
 pub mod dds;
 pub mod model;
 pub mod policy;
+pub mod process;
+pub mod shm;
+pub mod telemetry;

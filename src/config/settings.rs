@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
+pub use crate::model::{DropPolicy, LaneRates, RatePolicy};
 use crate::model::{
     Durability, History, InstanceName, LaneName, QosProfile, Reliability, RouteId, SubscriberState,
     TopicName, TrafficClass, TypeName,
@@ -138,42 +139,6 @@ pub struct Output {
     pub topic: TopicName,
     /// How.
     pub qos: QosProfile,
-}
-
-/// The rate policy of a noncritical lane, by mode.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LaneRates {
-    /// In NORMAL mode.
-    pub normal: RatePolicy,
-    /// In DEGRADED mode.
-    pub degraded: RatePolicy,
-}
-
-/// The rate policy of a noncritical lane in one mode. It applies to each route of the lane by itself, but for
-/// `max_bytes_per_s`, which all routes of the lane share.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RatePolicy {
-    /// Samples per second; 0 forwards nothing.
-    pub max_rate_hz: f64,
-    /// Payload bytes per second over all routes of the lane; `None` is unlimited.
-    pub max_bytes_per_s: Option<u64>,
-    /// A sample older than this by its source timestamp is dropped; 0 never.
-    pub stale_threshold_ms: u64,
-    /// What gives way when more samples wait than tokens come.
-    pub drop_policy: DropPolicy,
-    /// Samples that may wait in the lane, for each route; at least 1.
-    pub queue_samples: usize,
-}
-
-/// What gives way when more samples wait than tokens come (`noncritical_drop_policy`).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DropPolicy {
-    /// The freshest sample is sent; older ones that wait are superseded.
-    DropOldest,
-    /// The oldest sample is sent; a new one that finds the queue full is dropped.
-    DropLatest,
-    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is full.
-    DropStale,
 }
 
 /// Shared memory of one bridge.

@@ -58,8 +58,6 @@ drop_reasons! {
     Suspended = "suspended",
     /// Any lane: forwarding is stopped (emergency).
     Stopped = "stopped",
-    /// Any lane: already forwarded before, and seen again after a restart.
-    Duplicate = "duplicate",
     /// Any lane: still waiting when the process was told to shut down.
     Shutdown = "shutdown",
 }

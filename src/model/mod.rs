@@ -8,6 +8,7 @@ mod health;
 mod modes;
 mod names;
 mod qos;
+mod rates;
 mod sample;
 mod time;
 
@@ -18,5 +19,6 @@ pub use health::{
 pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use qos::{Durability, History, QosProfile, Reliability};
+pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{Encapsulation, Guid, SampleHeader};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};

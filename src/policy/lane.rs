@@ -1,0 +1,439 @@
+//! What a lane does with a sample: the rate, the bytes, the staleness and the mode taken together.
+
+use super::lane_queue::{Allowance, LaneQueue, Stamps};
+use super::token_bucket::{ByteBudget, TokenBucket, burst_for};
+use crate::model::{
+    DropReason, LaneMode, LanePolicy, LaneRates, MonotonicNs, RatePolicy, TrafficClass, WallNs,
+};
+
+/// What a noncritical lane does next on one route.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Decision<T> {
+    /// Send this sample. Its token and bytes are taken. Ask again: there may be another.
+    Send(T, Stamps),
+    /// Neither token nor bytes until then: whatever arrives meanwhile may wait in shared memory, and no
+    /// wake-up is worth its cost.
+    SleepUntil(MonotonicNs),
+    /// The next sample can be sent as soon as it arrives, and none waits.
+    WaitForSample,
+    /// This mode forwards nothing. What is offered is dropped, and may be taken out of shared memory at
+    /// leisure.
+    Closed,
+}
+
+/// One route on a noncritical lane: a token bucket and a queue, set by the mode.
+///
+/// The caller takes all samples out of shared memory whenever it is awake, offers them, and then polls until
+/// the answer is not [`Decision::Send`]. It allocates when made and never afterwards.
+#[derive(Debug)]
+pub struct RouteShaper<T> {
+    rates: LaneRates,
+    mode: LaneMode,
+    bucket: TokenBucket,
+    queue: LaneQueue<T>,
+}
+
+impl<T> RouteShaper<T> {
+    /// A route in normal mode with one token.
+    pub fn new(rates: LaneRates, now: MonotonicNs) -> Self {
+        let capacity = rates.normal.queue_samples.max(rates.degraded.queue_samples);
+        let mut shaper = Self {
+            rates,
+            mode: LaneMode::Normal,
+            bucket: TokenBucket::new(0.0, 1.0, now),
+            queue: LaneQueue::new(rates.normal.drop_policy, capacity),
+        };
+        // Nothing waits yet that could be dropped.
+        shaper.set_mode(LaneMode::Normal, now, |_, _, _| {});
+        shaper
+    }
+
+    /// The mode that applies.
+    pub const fn mode(&self) -> LaneMode {
+        self.mode
+    }
+
+    /// Samples waiting.
+    pub fn waiting(&self) -> usize {
+        self.queue.len()
+    }
+
+    /// Changes the mode from the next sample on. A mode that forwards nothing drops what waits; in any other,
+    /// what has no place in the new mode's queue gives way. A lane that was suspended earns no tokens for
+    /// that time.
+    pub fn set_mode(&mut self, mode: LaneMode, now: MonotonicNs, on_drop: impl FnMut(T, Stamps, DropReason)) {
+        self.mode = mode;
+        match self.forwarding() {
+            Ok(rate) => {
+                self.bucket.set_rate(rate.max_rate_hz, burst_for(rate.max_rate_hz), now);
+                self.queue.set_policy(rate.drop_policy, rate.queue_samples, on_drop);
+            }
+            Err(reason) => {
+                self.bucket.set_rate(0.0, 1.0, now);
+                self.queue.clear(reason, on_drop);
+            }
+        }
+    }
+
+    /// Takes in a sample, in the order of the route's sequence.
+    pub fn offer(&mut self, item: T, stamps: Stamps, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
+        match self.forwarding() {
+            Ok(_) => self.queue.offer(item, stamps, on_drop),
+            Err(reason) => on_drop(item, stamps, reason),
+        }
+    }
+
+    /// What to do at `now`. `budget` is that of the lane, in the same mode ([`ByteBudget::set_mode`]); the
+    /// routes that share it are to be polled in [`TurnOrder`].
+    pub fn poll(
+        &mut self,
+        budget: &mut ByteBudget,
+        now: MonotonicNs,
+        now_wall: WallNs,
+        on_drop: impl FnMut(T, Stamps, DropReason),
+    ) -> Decision<T> {
+        let stale_threshold_ms = match self.forwarding() {
+            Ok(rate) => rate.stale_threshold_ms,
+            Err(_) => return Decision::Closed,
+        };
+        let ready_at = match (self.bucket.ready_at(now), budget.ready_at(now)) {
+            (Some(token_at), Some(bytes_at)) => token_at.max(bytes_at),
+            _ => return Decision::Closed,
+        };
+        if ready_at > now {
+            return Decision::SleepUntil(ready_at);
+        }
+        let allowance = Allowance {
+            now,
+            now_wall,
+            tokens: self.bucket.tokens(now),
+            bytes: budget.balance_bytes(now),
+            stale_threshold_ms,
+        };
+        match self.queue.take(&allowance, on_drop) {
+            Some((item, stamps)) => {
+                let taken = self.bucket.try_take(now) && budget.try_take(stamps.bytes, now);
+                debug_assert!(taken, "both were ready");
+                Decision::Send(item, stamps)
+            }
+            None => Decision::WaitForSample,
+        }
+    }
+
+    /// Drops every waiting sample for `reason`, at a shutdown for instance.
+    pub fn clear(&mut self, reason: DropReason, on_drop: impl FnMut(T, Stamps, DropReason)) {
+        self.queue.clear(reason, on_drop);
+    }
+
+    /// The rate policy that applies, or why nothing is forwarded. A rate of 0 is how the original's files
+    /// suspend a lane in a mode, and counts as that.
+    fn forwarding(&self) -> Result<RatePolicy, DropReason> {
+        match self.rates.in_mode(self.mode) {
+            Some(rate) if rate.max_rate_hz > 0.0 && rate.max_bytes_per_s != Some(0) => Ok(*rate),
+            _ if self.mode == LaneMode::Stopped => Err(DropReason::Stopped),
+            _ => Err(DropReason::Suspended),
+        }
+    }
+}
+
+/// Whose turn it is among the routes of a lane that share a [`ByteBudget`]: the one after that which sent
+/// last is asked first. In a fixed order the first route would take every byte when they don't suffice for
+/// all.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct TurnOrder {
+    first: usize,
+}
+
+impl TurnOrder {
+    /// The indices of `routes` routes, in the order in which to poll them now.
+    pub fn order(self, routes: usize) -> impl Iterator<Item = usize> {
+        let first = if self.first < routes { self.first } else { 0 };
+        (first..routes).chain(0..first)
+    }
+
+    /// Route `index` has sent a sample.
+    pub const fn sent(&mut self, index: usize) {
+        self.first = index + 1;
+    }
+}
+
+/// Why a critical lane drops a sample in `mode`; `None` forwards it. Only a stop does: degraded and suspended
+/// are what the noncritical lanes give up so that the critical ones need not.
+pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
+    match mode {
+        LaneMode::Normal | LaneMode::Degraded | LaneMode::Suspended => None,
+        LaneMode::Stopped => Some(DropReason::Stopped),
+    }
+}
+
+/// The mode that a lane applies, given what the policy board says.
+///
+/// - Nobody has set a policy yet: normal.
+/// - Set by hand: as set, until it expires.
+/// - Set by control: as set, while control confirms it at least every `policy_hold_ms`.
+/// - Expired or unconfirmed: the safe default, which is full rate for a critical lane and degraded for a
+///   noncritical one. So a stop that control ordered does not outlive control.
+pub const fn effective_mode(
+    policy: &LanePolicy,
+    class: TrafficClass,
+    now: MonotonicNs,
+    policy_hold_ms: u64,
+) -> LaneMode {
+    if policy.epoch == 0 {
+        return LaneMode::Normal;
+    }
+    let holds = if policy.by_hand != 0 {
+        policy.expires_at.0 == 0 || now.0 < policy.expires_at.0
+    } else {
+        now.since(policy.written_at) <= policy_hold_ms.saturating_mul(1_000_000)
+    };
+    if holds {
+        match LaneMode::from_u8(policy.mode) {
+            Some(mode) => mode,
+            None => LaneMode::Normal,
+        }
+    } else {
+        match class {
+            TrafficClass::Critical => LaneMode::Normal,
+            TrafficClass::Noncritical => LaneMode::Degraded,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{DropPolicy, SourceTimestamp};
+
+    const RATES: LaneRates = LaneRates {
+        normal: RatePolicy {
+            max_rate_hz: 10.0,
+            max_bytes_per_s: None,
+            stale_threshold_ms: 200,
+            drop_policy: DropPolicy::DropOldest,
+            queue_samples: 5,
+        },
+        degraded: RatePolicy {
+            max_rate_hz: 4.0,
+            max_bytes_per_s: Some(1_000),
+            stale_threshold_ms: 100,
+            drop_policy: DropPolicy::DropStale,
+            queue_samples: 2,
+        },
+    };
+
+    fn at_ms(ms: u64) -> MonotonicNs {
+        MonotonicNs(ms * 1_000_000)
+    }
+
+    fn stamps(sequence: u64, taken_at: MonotonicNs) -> Stamps {
+        Stamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
+    }
+
+    /// A route, its budget, and what was dropped; the item is its own sequence.
+    struct Bench {
+        shaper: RouteShaper<u64>,
+        budget: ByteBudget,
+        dropped: Vec<(u64, DropReason)>,
+    }
+
+    impl Bench {
+        fn new(rates: LaneRates) -> Self {
+            let budget = ByteBudget::new(rates.normal.max_bytes_per_s, at_ms(0));
+            Self { shaper: RouteShaper::new(rates, at_ms(0)), budget, dropped: Vec::new() }
+        }
+
+        fn offer(&mut self, sequence: u64, ms: u64) {
+            let dropped = &mut self.dropped;
+            self.shaper.offer(sequence, stamps(sequence, at_ms(ms)), |item, _, reason| {
+                dropped.push((item, reason));
+            });
+        }
+
+        fn poll(&mut self, ms: u64) -> Decision<u64> {
+            let dropped = &mut self.dropped;
+            self.shaper.poll(&mut self.budget, at_ms(ms), WallNs(0), |item, _, reason| {
+                dropped.push((item, reason));
+            })
+        }
+
+        fn set_mode(&mut self, mode: LaneMode, ms: u64) {
+            let dropped = &mut self.dropped;
+            self.budget.set_mode(&RATES, mode, at_ms(ms));
+            self.shaper.set_mode(mode, at_ms(ms), |item, _, reason| dropped.push((item, reason)));
+        }
+    }
+
+    fn sent(decision: Decision<u64>) -> Option<u64> {
+        match decision {
+            Decision::Send(item, _) => Some(item),
+            _ => None,
+        }
+    }
+
+    #[test]
+    fn the_lane_waits_for_a_sample_then_sleeps_until_the_next_token() {
+        let mut bench = Bench::new(RATES);
+        assert_eq!(bench.poll(0), Decision::WaitForSample);
+        bench.offer(1, 7);
+        assert_eq!(sent(bench.poll(7)), Some(1));
+        assert_eq!(bench.poll(7), Decision::SleepUntil(at_ms(100)), "the 7 ms of waiting are not lost");
+    }
+
+    #[test]
+    fn without_a_token_the_lane_sleeps_also_when_samples_wait() {
+        let mut bench = Bench::new(RATES);
+        bench.offer(1, 0);
+        assert_eq!(sent(bench.poll(0)), Some(1));
+        assert_eq!(bench.poll(0), Decision::SleepUntil(at_ms(100)));
+        bench.offer(2, 30);
+        bench.offer(3, 60);
+        assert_eq!(bench.poll(99), Decision::SleepUntil(at_ms(100)));
+        assert_eq!(sent(bench.poll(100)), Some(3));
+        assert_eq!(bench.dropped, [(2, DropReason::Superseded)]);
+    }
+
+    #[test]
+    fn a_stale_sample_takes_no_token() {
+        let mut bench = Bench::new(RATES);
+        bench.offer(1, 0);
+        assert_eq!(bench.poll(201), Decision::WaitForSample);
+        assert_eq!(bench.dropped, [(1, DropReason::Stale)]);
+        bench.offer(2, 201);
+        assert_eq!(sent(bench.poll(201)), Some(2));
+    }
+
+    #[test]
+    fn a_lane_in_debt_of_bytes_sleeps_until_it_is_paid() {
+        let mut bench = Bench::new(RATES);
+        bench.set_mode(LaneMode::Degraded, 0);
+        let big = Stamps { bytes: 3_000, ..stamps(1, at_ms(0)) };
+        bench.shaper.offer(1, big, |_, _, _| {});
+        assert_eq!(sent(bench.poll(0)), Some(1));
+        bench.offer(2, 1_000);
+        assert_eq!(bench.poll(1_000), Decision::SleepUntil(at_ms(3_000)));
+    }
+
+    #[test]
+    fn suspended_and_stopped_drop_what_waits_and_what_is_offered() {
+        for (mode, reason) in
+            [(LaneMode::Suspended, DropReason::Suspended), (LaneMode::Stopped, DropReason::Stopped)]
+        {
+            let mut bench = Bench::new(RATES);
+            bench.offer(1, 0);
+            bench.set_mode(mode, 1);
+            bench.offer(2, 2);
+            assert_eq!(bench.poll(2), Decision::Closed);
+            assert_eq!(bench.dropped, [(1, reason), (2, reason)]);
+            assert_eq!(bench.shaper.waiting(), 0);
+        }
+    }
+
+    #[test]
+    fn a_suspended_lane_earns_no_tokens() {
+        let mut bench = Bench::new(RATES);
+        bench.offer(1, 0);
+        assert_eq!(sent(bench.poll(0)), Some(1));
+        bench.set_mode(LaneMode::Suspended, 0);
+        bench.set_mode(LaneMode::Normal, 60_000);
+        assert_eq!(bench.poll(60_000), Decision::SleepUntil(at_ms(60_100)));
+    }
+
+    #[test]
+    fn a_new_mode_brings_its_rate_queue_and_threshold_with_it() {
+        let mut bench = Bench::new(RATES);
+        for sequence in 1..=5 {
+            bench.offer(sequence, 0);
+        }
+        bench.set_mode(LaneMode::Degraded, 0);
+        assert_eq!(bench.shaper.waiting(), 2);
+        assert_eq!(sent(bench.poll(0)), Some(4));
+        assert_eq!(bench.poll(0), Decision::SleepUntil(at_ms(250)), "4 Hz");
+        assert_eq!(bench.poll(250), Decision::WaitForSample);
+        let reasons: Vec<_> = bench.dropped.iter().map(|&(_, reason)| reason).collect();
+        let full = DropReason::QueueFull;
+        assert_eq!(reasons, [full, full, full, DropReason::Stale]);
+    }
+
+    #[test]
+    fn a_rate_of_zero_in_a_mode_suspends_the_lane_in_it() {
+        for closed in [
+            RatePolicy { max_rate_hz: 0.0, ..RATES.normal },
+            RatePolicy { max_rate_hz: f64::NAN, ..RATES.normal },
+            RatePolicy { max_bytes_per_s: Some(0), ..RATES.normal },
+        ] {
+            let mut bench = Bench::new(LaneRates { normal: closed, ..RATES });
+            bench.offer(1, 0);
+            assert_eq!(bench.poll(0), Decision::Closed);
+            assert_eq!(bench.dropped, [(1, DropReason::Suspended)]);
+        }
+    }
+
+    #[test]
+    fn clearing_drops_what_waits_for_the_reason_given() {
+        let mut bench = Bench::new(RATES);
+        bench.offer(1, 0);
+        let dropped = &mut bench.dropped;
+        bench.shaper.clear(DropReason::Shutdown, |item, _, reason| dropped.push((item, reason)));
+        assert_eq!(bench.dropped, [(1, DropReason::Shutdown)]);
+    }
+
+    #[test]
+    fn turns_begin_after_the_route_that_sent_last() {
+        let mut turns = TurnOrder::default();
+        assert_eq!(turns.order(3).collect::<Vec<_>>(), [0, 1, 2]);
+        turns.sent(0);
+        assert_eq!(turns.order(3).collect::<Vec<_>>(), [1, 2, 0]);
+        turns.sent(2);
+        assert_eq!(turns.order(3).collect::<Vec<_>>(), [0, 1, 2]);
+        assert_eq!(turns.order(0).count(), 0);
+    }
+
+    #[test]
+    fn a_critical_sample_goes_on_in_every_mode_but_a_stop() {
+        for mode in [LaneMode::Normal, LaneMode::Degraded, LaneMode::Suspended] {
+            assert_eq!(critical_drop(mode), None);
+        }
+        assert_eq!(critical_drop(LaneMode::Stopped), Some(DropReason::Stopped));
+    }
+
+    #[test]
+    fn a_policy_by_control_holds_while_it_is_confirmed() {
+        let policy = LanePolicy {
+            epoch: 4,
+            written_at: at_ms(1_000),
+            mode: LaneMode::Stopped as u8,
+            ..LanePolicy::default()
+        };
+        let effective = |class, ms| effective_mode(&policy, class, at_ms(ms), 2_000);
+        for ms in [0, 1_000, 3_000] {
+            assert_eq!(effective(TrafficClass::Critical, ms), LaneMode::Stopped);
+        }
+        assert_eq!(effective(TrafficClass::Critical, 3_001), LaneMode::Normal);
+        assert_eq!(effective(TrafficClass::Noncritical, 3_001), LaneMode::Degraded);
+    }
+
+    #[test]
+    fn a_policy_by_hand_holds_until_it_expires() {
+        let mut policy = LanePolicy {
+            epoch: 1,
+            expires_at: at_ms(5_000),
+            mode: LaneMode::Suspended as u8,
+            by_hand: 1,
+            ..LanePolicy::default()
+        };
+        let class = TrafficClass::Noncritical;
+        assert_eq!(effective_mode(&policy, class, at_ms(4_999), 0), LaneMode::Suspended);
+        assert_eq!(effective_mode(&policy, class, at_ms(5_000), 0), LaneMode::Degraded);
+        policy.expires_at = at_ms(0);
+        assert_eq!(effective_mode(&policy, class, MonotonicNs(u64::MAX), 0), LaneMode::Suspended);
+    }
+
+    #[test]
+    fn without_a_policy_every_lane_is_normal() {
+        let policy = LanePolicy { mode: LaneMode::Stopped as u8, by_hand: 1, ..LanePolicy::default() };
+        for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
+            assert_eq!(effective_mode(&policy, class, at_ms(9), 1), LaneMode::Normal);
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! What the number of a sample says about those that are missing.
+//!
+//! Ingress numbers the samples of a route 1, 2, 3, … without a gap, also across its restarts, so a lane that
+//! sees numbers `a` and then `b` did not get `b - a - 1` samples, and knows it without asking anybody.
+
+/// What a lane makes of the number of the sample it just took.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sighting {
+    /// The next one, or the first that the lane ever saw.
+    InOrder,
+    /// So many samples before this one are missing. The caller knows why: its queue overflowed, no process
+    /// served the lane, or an ingress process died.
+    AfterGap(u64),
+    /// Accounted for before.
+    Duplicate,
+}
+
+/// Keeps the account of one route on one lane: every number in `first()+1 ..= last()` was seen or is missing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SequenceTracker {
+    first: u64,
+    last: u64,
+    begun: bool,
+}
+
+impl SequenceTracker {
+    /// A lane that never saw a sample of the route. The account begins at the first one it sees, so that what
+    /// was published before the lane existed does not count as missing.
+    pub const fn new() -> Self {
+        Self { first: 0, last: 0, begun: false }
+    }
+
+    /// Goes on with the account of a former process: `first` and `last` are what its tracker showed
+    /// (`first_sequence` and `last_sequence` of the lane's counters). What was published since is then
+    /// missing or yet to be seen. Both 0 stand for a process that never saw a sample, if `last` is below
+    /// `first` the account is damaged and begins anew at `first`.
+    pub const fn resume(first: u64, last: u64) -> Self {
+        let last = if last < first { first } else { last };
+        Self { first, last, begun: last > 0 }
+    }
+
+    /// The number before the first one accounted for.
+    pub const fn first(&self) -> u64 {
+        self.first
+    }
+
+    /// The highest number accounted for.
+    pub const fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// Accounts for `sequence`, and for those missing before it. 0 is a number that ingress never gives; it
+    /// reads as a duplicate.
+    pub const fn see(&mut self, sequence: u64) -> Sighting {
+        if sequence <= self.last || sequence == 0 {
+            return Sighting::Duplicate;
+        }
+        if !self.begun {
+            self.begun = true;
+            self.first = sequence - 1;
+            self.last = sequence;
+            return Sighting::InOrder;
+        }
+        let missing = sequence - self.last - 1;
+        self.last = sequence;
+        if missing == 0 { Sighting::InOrder } else { Sighting::AfterGap(missing) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_account_begins_at_the_first_sample_seen() {
+        let mut tracker = SequenceTracker::new();
+        assert_eq!(tracker.see(500), Sighting::InOrder);
+        assert_eq!((tracker.first(), tracker.last()), (499, 500));
+        assert_eq!(tracker.see(501), Sighting::InOrder);
+    }
+
+    #[test]
+    fn a_gap_counts_the_missing_and_not_the_one_seen() {
+        let mut tracker = SequenceTracker::new();
+        tracker.see(1);
+        assert_eq!(tracker.see(5), Sighting::AfterGap(3));
+        assert_eq!(tracker.see(6), Sighting::InOrder);
+    }
+
+    #[test]
+    fn repeated_and_older_numbers_are_duplicates_and_change_nothing() {
+        let mut tracker = SequenceTracker::new();
+        tracker.see(3);
+        let before = tracker;
+        for sequence in [3, 2, 1, 0] {
+            assert_eq!(tracker.see(sequence), Sighting::Duplicate);
+        }
+        assert_eq!(tracker, before);
+        assert_eq!(SequenceTracker::new().see(0), Sighting::Duplicate);
+    }
+
+    #[test]
+    fn a_resumed_account_names_what_was_missed_meanwhile() {
+        let mut tracker = SequenceTracker::resume(10, 40);
+        assert_eq!(tracker.see(40), Sighting::Duplicate);
+        assert_eq!(tracker.see(43), Sighting::AfterGap(2));
+        assert_eq!(tracker.first(), 10);
+        assert_eq!(SequenceTracker::resume(0, 0).see(7), Sighting::InOrder);
+        assert_eq!(SequenceTracker::resume(9, 4), SequenceTracker::resume(9, 9));
+    }
+
+    #[test]
+    fn the_largest_number_overflows_nothing() {
+        let mut tracker = SequenceTracker::new();
+        tracker.see(1);
+        assert_eq!(tracker.see(u64::MAX), Sighting::AfterGap(u64::MAX - 2));
+        assert_eq!(tracker.see(u64::MAX), Sighting::Duplicate);
+    }
+}
