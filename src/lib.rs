@@ -7,6 +7,7 @@
 //! - [`policy`]: pure decisions; time is an argument.
 //! - [`config`]: YAML to validated settings.
 //! - [`clock`]: the only reader of the operating system's clocks.
+//! - [`shm`]: the shared-memory edge: samples, wake-ups, boards, locks and what dead processes leave behind.
 
 #![warn(missing_docs)]
 
@@ -14,3 +15,4 @@ pub mod clock;
 pub mod config;
 pub mod model;
 pub mod policy;
+pub mod shm;
