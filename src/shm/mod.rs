@@ -17,6 +17,7 @@ mod error;
 mod header;
 mod node;
 mod root;
+mod segment;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
