@@ -1,0 +1,471 @@
+//! Latest values in shared memory, which readers poll without waiting.
+//!
+//! All boards of an instance are one segment, which the first process creates and which belongs to none: it
+//! stays until the last process of the instance has left, so a process that died finds its counters again.
+//!
+//! A value is kept twice. Its one writer fills the copy that is not shown, then shows it by counting up the
+//! version. A writer that dies within an update therefore leaves the former value, whole. A reader copies the
+//! shown one, and again if the version has moved meanwhile: it waits for nobody and never sees half a value.
+//! The counts of a histogram are single words, and are counted in place.
+
+use std::marker::PhantomData;
+use std::mem::MaybeUninit;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{Ordering, fence};
+
+use nix::fcntl::FlockArg;
+
+use super::error::ShmError;
+use super::root::{FileLock, InstanceDir, SHM_DIR, fnv1a};
+use super::segment::Segment;
+use super::wake::{LaneSleeper, LaneWaker};
+use crate::config::Settings;
+use crate::model::{
+    IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram, ProcessHealth,
+    RouteId, RouteInfo,
+};
+
+/// What the boards must have room for. All processes of an instance must agree on it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BridgeShape {
+    /// The lanes; a lane's number is its place here.
+    pub lanes: Vec<LaneName>,
+    /// The routes; a route's number is its place here.
+    pub routes: Vec<RouteId>,
+}
+
+impl BridgeShape {
+    /// The shape of a configured bridge.
+    pub fn of(settings: &Settings) -> Self {
+        Self {
+            lanes: settings.lanes.iter().map(|lane| lane.name.clone()).collect(),
+            routes: settings.routes.iter().map(|route| route.id.clone()).collect(),
+        }
+    }
+
+    /// A number that differs when lanes, routes or the layout of a value differ.
+    fn fingerprint(&self) -> u64 {
+        let mut text = format!("{LAYOUT_VERSION} {}", Layout::of(self).words);
+        for lane in &self.lanes {
+            text.push_str(&format!(" lane {lane}"));
+        }
+        for route in &self.routes {
+            text.push_str(&format!(" route {route}"));
+        }
+        fnv1a(text.as_bytes())
+    }
+}
+
+/// A process that shows its health.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ProcessRole {
+    /// Ingress.
+    Ingress,
+    /// Control.
+    Control,
+    /// The egress of the lane of that number.
+    Egress(usize),
+}
+
+/// A stage of a sample's way whose latency is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// From the publisher's source timestamp to ingress; recorded by ingress.
+    DdsIn,
+    /// From ingress to the lane of that number; recorded by the lane.
+    Shm(usize),
+    /// Within the lane of that number, up to its DDS writer.
+    DdsOut(usize),
+    /// From the source timestamp to the DDS writer of the lane of that number.
+    Age(usize),
+}
+
+/// Counts up when the meaning of a word changes.
+const LAYOUT_VERSION: u32 = 1;
+/// "ABboards", so that a foreign file is not taken for boards.
+const MAGIC: u64 = 0x4142_626f_6172_6473;
+/// Words of a cache line, on which every value begins, so that two writers never share one.
+const LINE: usize = 8;
+const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
+/// Retries of a reader. A writer would have to finish an update within the nanoseconds of each single copy.
+const READ_ATTEMPTS: usize = 1_000;
+
+/// A type that may be copied through shared memory word by word.
+///
+/// # Safety
+/// `repr(C)`, without padding, of a size that is a multiple of 8 bytes, and every bit pattern is a value.
+unsafe trait Plain: Copy + Default {
+    /// Its size in words.
+    const WORDS: usize = {
+        assert!(size_of::<Self>() % 8 == 0);
+        size_of::<Self>() / 8
+    };
+}
+
+// SAFETY: `repr(C)`; words of 8 bytes, then `mode` and 7 reserved bytes, then a word; integers only.
+unsafe impl Plain for ProcessHealth {}
+// SAFETY: `repr(C)`, 64-bit integers only.
+unsafe impl Plain for IngressCounters {}
+// SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
+unsafe impl Plain for LaneCounters {}
+// SAFETY: `repr(C)`; three words, then 8 single bytes; integers only.
+unsafe impl Plain for LanePolicy {}
+// SAFETY: `repr(C)`, 128 bytes of text, which is checked when it is looked at.
+unsafe impl Plain for RouteInfo {}
+// SAFETY: `repr(C)`, 64-bit integers only.
+unsafe impl Plain for LatencyHistogram {}
+
+const _: () = {
+    assert!(size_of::<ProcessHealth>() == 7 * 8);
+    assert!(size_of::<LanePolicy>() == 4 * 8);
+    assert!(size_of::<RouteInfo>() == 16 * 8);
+    assert!(size_of::<LaneCounters>() % 8 == 0 && size_of::<IngressCounters>() % 8 == 0);
+};
+
+/// A value that is kept twice: a line for its version, then the two copies, each on lines of its own.
+#[derive(Debug)]
+struct Cell<T> {
+    at: usize,
+    _type: PhantomData<T>,
+}
+
+impl<T> Clone for Cell<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Cell<T> {}
+
+impl<T: Plain> Cell<T> {
+    const WORDS: usize = LINE + 2 * Self::COPY_WORDS;
+    const COPY_WORDS: usize = T::WORDS.next_multiple_of(LINE);
+
+    fn at(at: usize) -> Self {
+        Self { at, _type: PhantomData }
+    }
+
+    fn copy_at(self, version: u64) -> usize {
+        self.at + LINE + (version % 2) as usize * Self::COPY_WORDS
+    }
+
+    fn read(self, segment: &Segment) -> Option<T> {
+        for _ in 0..READ_ATTEMPTS {
+            let version = segment.word(self.at).load(Ordering::Acquire);
+            let value = load(segment, self.copy_at(version));
+            // The writer begins to fill this copy again only after it has counted the version up. If we have
+            // read a word of that, this fence makes us see the new version.
+            fence(Ordering::Acquire);
+            if segment.word(self.at).load(Ordering::Relaxed) == version {
+                return Some(value);
+            }
+        }
+        None
+    }
+
+    fn write(self, segment: &Segment, value: &T) {
+        let version = segment.word(self.at).load(Ordering::Relaxed).wrapping_add(1);
+        // Whoever reads a word of what follows also sees that the version was counted up before.
+        fence(Ordering::Release);
+        let to = self.copy_at(version);
+        for word in 0..T::WORDS {
+            // SAFETY: `T` has `WORDS` words, all of them initialised, as `Plain` promises.
+            let word_value = unsafe { (&raw const *value).cast::<u64>().add(word).read_unaligned() };
+            segment.word(to + word).store(word_value, Ordering::Relaxed);
+        }
+        segment.word(self.at).store(version, Ordering::Release);
+    }
+}
+
+fn load<T: Plain>(segment: &Segment, at: usize) -> T {
+    let mut value = MaybeUninit::<T>::uninit();
+    for word in 0..T::WORDS {
+        let word_value = segment.word(at + word).load(Ordering::Relaxed);
+        // SAFETY: `T` has `WORDS` words.
+        unsafe { value.as_mut_ptr().cast::<u64>().add(word).write_unaligned(word_value) };
+    }
+    // SAFETY: all words are written, and every bit pattern is a value, as `Plain` promises.
+    unsafe { value.assume_init() }
+}
+
+/// Where everything is, in words.
+#[derive(Clone, Copy, Debug)]
+struct Layout {
+    lanes: usize,
+    routes: usize,
+    wake: usize,
+    health: usize,
+    policy: usize,
+    route_info: usize,
+    ingress: usize,
+    lane: usize,
+    histograms: usize,
+    words: usize,
+}
+
+impl Layout {
+    fn of(shape: &BridgeShape) -> Self {
+        let (lanes, routes) = (shape.lanes.len(), shape.routes.len());
+        let wake = LINE;
+        let health = wake + lanes * LINE;
+        let policy = health + (2 + lanes) * Cell::<ProcessHealth>::WORDS;
+        let route_info = policy + lanes * Cell::<LanePolicy>::WORDS;
+        let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
+        let lane = ingress + routes * Cell::<IngressCounters>::WORDS;
+        let histograms = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
+        let words = histograms + routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE);
+        Self { lanes, routes, wake, health, policy, route_info, ingress, lane, histograms, words }
+    }
+
+    fn health(&self, role: ProcessRole) -> Cell<ProcessHealth> {
+        let place = match role {
+            ProcessRole::Ingress => 0,
+            ProcessRole::Control => 1,
+            ProcessRole::Egress(lane) => 2 + self.check_lane(lane),
+        };
+        Cell::at(self.health + place * Cell::<ProcessHealth>::WORDS)
+    }
+
+    fn policy(&self, lane: usize) -> Cell<LanePolicy> {
+        Cell::at(self.policy + self.check_lane(lane) * Cell::<LanePolicy>::WORDS)
+    }
+
+    fn route_info(&self, route: usize) -> Cell<RouteInfo> {
+        Cell::at(self.route_info + self.check_route(route) * Cell::<RouteInfo>::WORDS)
+    }
+
+    fn ingress(&self, route: usize) -> Cell<IngressCounters> {
+        Cell::at(self.ingress + self.check_route(route) * Cell::<IngressCounters>::WORDS)
+    }
+
+    fn lane(&self, lane: usize, route: usize) -> Cell<LaneCounters> {
+        let place = self.check_lane(lane) * self.routes + self.check_route(route);
+        Cell::at(self.lane + place * Cell::<LaneCounters>::WORDS)
+    }
+
+    fn histogram(&self, stage: Stage, route: usize) -> usize {
+        let of_lane = |lane: usize, stage: usize| 1 + 3 * self.check_lane(lane) + stage;
+        let place = match stage {
+            Stage::DdsIn => 0,
+            Stage::Shm(lane) => of_lane(lane, 0),
+            Stage::DdsOut(lane) => of_lane(lane, 1),
+            Stage::Age(lane) => of_lane(lane, 2),
+        };
+        let index = place * self.routes + self.check_route(route);
+        self.histograms + index * HISTOGRAM_WORDS.next_multiple_of(LINE)
+    }
+
+    fn wake(&self, lane: usize) -> usize {
+        self.wake + self.check_lane(lane) * LINE
+    }
+
+    /// Numbers come from the configuration that the shape was made of; another one is a defect of the caller.
+    fn check_lane(&self, lane: usize) -> usize {
+        assert!(lane < self.lanes, "lane {lane} of {}", self.lanes);
+        lane
+    }
+
+    fn check_route(&self, route: usize) -> usize {
+        assert!(route < self.routes, "route {route} of {}", self.routes);
+        route
+    }
+}
+
+/// All boards of an instance.
+///
+/// # Panics
+/// All methods, when the number of a lane or route is not one of the [`BridgeShape`].
+#[derive(Clone, Debug)]
+pub struct Boards {
+    segment: Arc<Segment>,
+    layout: Layout,
+    policy_lock: PathBuf,
+}
+
+impl Boards {
+    /// The boards of an instance that runs, or did until its last process was killed; for processes that look
+    /// only, such as `status`. `None` when there are none.
+    pub fn find(root: &Path, instance: &InstanceName, shape: &BridgeShape) -> Result<Option<Self>, ShmError> {
+        let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(None) };
+        let layout = Layout::of(shape);
+        let Some(segment) = Segment::open(&Self::path(&dir), layout.words)? else { return Ok(None) };
+        Self::new(&dir, segment, layout, shape).map(Some)
+    }
+
+    pub(super) fn open_or_create(dir: &InstanceDir, shape: &BridgeShape) -> Result<Self, ShmError> {
+        let layout = Layout::of(shape);
+        let path = Self::path(dir);
+        let segment = match Segment::open(&path, layout.words)? {
+            Some(segment) => segment,
+            None => Segment::create(&path, layout.words, &[MAGIC, shape.fingerprint()])?,
+        };
+        Self::new(dir, segment, layout, shape)
+    }
+
+    fn path(dir: &InstanceDir) -> PathBuf {
+        Path::new(SHM_DIR).join(format!("{}boards", dir.prefix))
+    }
+
+    fn new(
+        dir: &InstanceDir,
+        segment: Segment,
+        layout: Layout,
+        shape: &BridgeShape,
+    ) -> Result<Self, ShmError> {
+        let first = [0, 1].map(|at| segment.word(at).load(Ordering::Relaxed));
+        if first != [MAGIC, shape.fingerprint()] {
+            return Err(ShmError::Incompatible {
+                what: "the boards were set up with other lanes, other routes, or by another version"
+                    .to_owned(),
+                path: dir.path.clone(),
+            });
+        }
+        Ok(Self { segment: Arc::new(segment), layout, policy_lock: dir.path.join("policy.lock") })
+    }
+
+    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster than
+    /// it can be read, which only a runaway writer does; so for all readings.
+    pub fn health(&self, role: ProcessRole) -> Option<ProcessHealth> {
+        self.layout.health(role).read(&self.segment)
+    }
+
+    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a time:
+    /// the holder of the role's lock.
+    pub fn health_writer(&self, role: ProcessRole) -> BoardWriter<ProcessHealth> {
+        self.writer(self.layout.health(role))
+    }
+
+    /// What ingress has counted on a route.
+    pub fn ingress(&self, route: usize) -> Option<IngressCounters> {
+        self.layout.ingress(route).read(&self.segment)
+    }
+
+    /// Counts for ingress on a route, beginning where its predecessor ended.
+    pub fn ingress_writer(&self, route: usize) -> BoardWriter<IngressCounters> {
+        self.writer(self.layout.ingress(route))
+    }
+
+    /// What a lane has counted on a route.
+    pub fn lane(&self, lane: usize, route: usize) -> Option<LaneCounters> {
+        self.layout.lane(lane, route).read(&self.segment)
+    }
+
+    /// Counts for a lane on a route, beginning where its predecessor ended.
+    pub fn lane_writer(&self, lane: usize, route: usize) -> BoardWriter<LaneCounters> {
+        self.writer(self.layout.lane(lane, route))
+    }
+
+    /// What ingress found out about a route.
+    pub fn route_info(&self, route: usize) -> Option<RouteInfo> {
+        self.layout.route_info(route).read(&self.segment)
+    }
+
+    /// Writes what ingress found out about a route.
+    pub fn route_info_writer(&self, route: usize) -> BoardWriter<RouteInfo> {
+        self.writer(self.layout.route_info(route))
+    }
+
+    /// The latencies of a stage on a route. Counts that are being recorded meanwhile may be in or not.
+    pub fn histogram(&self, stage: Stage, route: usize) -> LatencyHistogram {
+        load(&self.segment, self.layout.histogram(stage, route))
+    }
+
+    /// Records latencies of a stage on a route. One writer at a time, as for the counters.
+    pub fn histogram_writer(&self, stage: Stage, route: usize) -> HistogramWriter {
+        let upper_edges_ns = LatencyHistogram::default().buckets().map(|(edge_ns, _)| edge_ns).collect();
+        HistogramWriter {
+            segment: self.segment.clone(),
+            at: self.layout.histogram(stage, route),
+            upper_edges_ns,
+        }
+    }
+
+    /// The policy of a lane; epoch 0 when nobody has set one.
+    pub fn policy(&self, lane: usize) -> Option<LanePolicy> {
+        self.layout.policy(lane).read(&self.segment)
+    }
+
+    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy and
+    /// gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns what
+    /// was written.
+    pub fn set_policy(
+        &self,
+        lane: usize,
+        change: impl FnOnce(LanePolicy) -> LanePolicy,
+    ) -> Result<LanePolicy, ShmError> {
+        let cell = self.layout.policy(lane);
+        let _one_at_a_time = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
+        let before = cell.read(&self.segment).unwrap_or_default();
+        let mut after = change(before);
+        after.epoch = before.epoch;
+        let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
+        if before.epoch == 0 || !only_time_differs {
+            after.epoch += 1;
+        }
+        cell.write(&self.segment, &after);
+        Ok(after)
+    }
+
+    /// Wakes a lane.
+    pub fn waker(&self, lane: usize) -> LaneWaker {
+        LaneWaker::new(self.segment.clone(), self.layout.wake(lane))
+    }
+
+    /// Sleeps for a lane; one at a time.
+    pub fn sleeper(&self, lane: usize) -> LaneSleeper {
+        LaneSleeper::new(self.segment.clone(), self.layout.wake(lane))
+    }
+
+    fn writer<T: Plain>(&self, cell: Cell<T>) -> BoardWriter<T> {
+        let value = cell.read(&self.segment).unwrap_or_default();
+        BoardWriter { segment: self.segment.clone(), cell, value }
+    }
+}
+
+/// The one writer of one value on a board. Dropping it leaves the value where it is.
+#[derive(Debug)]
+pub struct BoardWriter<T> {
+    segment: Arc<Segment>,
+    cell: Cell<T>,
+    value: T,
+}
+
+#[expect(private_bounds, reason = "only the types of the boards are written")]
+impl<T: Plain> BoardWriter<T> {
+    /// The value as last written.
+    pub fn get(&self) -> &T {
+        &self.value
+    }
+
+    /// Changes the value and shows it. A process that dies within leaves the value as it was before.
+    pub fn update<R>(&mut self, change: impl FnOnce(&mut T) -> R) -> R {
+        let result = change(&mut self.value);
+        self.cell.write(&self.segment, &self.value);
+        result
+    }
+}
+
+/// The one writer of one histogram.
+#[derive(Debug)]
+pub struct HistogramWriter {
+    segment: Arc<Segment>,
+    at: usize,
+    /// The upper edge of each bucket, exclusive.
+    upper_edges_ns: Box<[u64]>,
+}
+
+impl HistogramWriter {
+    /// Counts one latency, as [`LatencyHistogram::record`] does.
+    pub fn record(&mut self, latency_ns: u64) {
+        let above = self.upper_edges_ns.partition_point(|&edge_ns| edge_ns <= latency_ns);
+        let bucket = above.min(HISTOGRAM_WORDS - 2);
+        let count = self.segment.word(self.at + bucket);
+        count.store(count.load(Ordering::Relaxed).wrapping_add(1), Ordering::Relaxed);
+        // The maximum stands behind the counts.
+        let max_ns = self.segment.word(self.at + HISTOGRAM_WORDS - 1);
+        if latency_ns > max_ns.load(Ordering::Relaxed) {
+            max_ns.store(latency_ns, Ordering::Relaxed);
+        }
+    }
+}

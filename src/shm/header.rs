@@ -1,0 +1,137 @@
+//! The sample header as shared memory carries it, and the check of what was read there.
+
+use std::fmt;
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::model::{Encapsulation, MonotonicNs, SampleHeader, SourceTimestamp, WriterGuid};
+
+/// The size of a [`SampleHeader`] in shared memory.
+pub const HEADER_BYTES: usize = size_of::<SampleHeader>();
+
+/// What is wrong with a header that was read from shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum HeaderError {
+    /// Not [`HEADER_BYTES`] long.
+    WrongLength,
+    /// Sequences begin at 1.
+    SequenceZero,
+    /// The reserved field is not 0.
+    ReservedNotZero,
+    /// The payload is longer than the route allows.
+    PayloadTooLong,
+}
+
+impl fmt::Display for HeaderError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::WrongLength => "a sample header of the wrong length",
+            Self::SequenceZero => "a sample header with sequence 0",
+            Self::ReservedNotZero => "a sample header whose reserved field is not 0",
+            Self::PayloadTooLong => "a sample longer than its route allows",
+        })
+    }
+}
+
+impl std::error::Error for HeaderError {}
+
+/// Reads a header from bytes that any process may have written. Every encapsulation and every timestamp is
+/// let through: they are forwarded as they came.
+pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
+    let bytes: &[u8; HEADER_BYTES] = bytes.try_into().map_err(|_| HeaderError::WrongLength)?;
+    let word = |at: usize| {
+        let mut word = [0; 8];
+        word.copy_from_slice(&bytes[at..at + 8]);
+        u64::from_ne_bytes(word)
+    };
+    let mut writer_guid = WriterGuid::default();
+    writer_guid.0.copy_from_slice(&bytes[40..56]);
+    let header = SampleHeader {
+        sequence: word(0),
+        source_timestamp: SourceTimestamp(word(8)),
+        taken_at: MonotonicNs(word(16)),
+        published_at: MonotonicNs(word(24)),
+        writer_sequence: word(32).cast_signed(),
+        writer_guid,
+        encapsulation: Encapsulation([bytes[56], bytes[57], bytes[58], bytes[59]]),
+        reserved: u32::from_ne_bytes([bytes[60], bytes[61], bytes[62], bytes[63]]),
+    };
+    check(&header)?;
+    Ok(header)
+}
+
+pub(super) fn check(header: &SampleHeader) -> Result<(), HeaderError> {
+    if header.sequence == 0 {
+        Err(HeaderError::SequenceZero)
+    } else if header.reserved != 0 {
+        Err(HeaderError::ReservedNotZero)
+    } else {
+        Ok(())
+    }
+}
+
+/// A [`SampleHeader`] as iceoryx2's user header.
+#[derive(Clone, Copy, Debug)]
+#[repr(transparent)]
+pub(super) struct WireHeader(pub(super) SampleHeader);
+
+/// No byte of the header is padding, so that none is left unwritten.
+const _: () = assert!(HEADER_BYTES == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 && align_of::<SampleHeader>() == 8);
+
+// SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle of
+// a process, no destructor, every bit pattern valid. The name stands for exactly this layout, and the service's
+// name carries the version.
+unsafe impl ZeroCopySend for WireHeader {
+    unsafe fn type_name() -> &'static str {
+        "ab1::SampleHeader"
+    }
+}
+
+impl Default for WireHeader {
+    fn default() -> Self {
+        Self(SampleHeader {
+            sequence: 0,
+            source_timestamp: SourceTimestamp::NONE,
+            taken_at: MonotonicNs(0),
+            published_at: MonotonicNs(0),
+            writer_sequence: 0,
+            writer_guid: WriterGuid::default(),
+            encapsulation: Encapsulation([0; 4]),
+            reserved: 0,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bytes_of(header: WireHeader) -> [u8; HEADER_BYTES] {
+        // SAFETY: both are 64 bytes, and the header has no padding (asserted above).
+        unsafe { std::mem::transmute(header) }
+    }
+
+    #[test]
+    fn a_header_is_read_as_it_was_written() {
+        let mut wire = WireHeader::default();
+        wire.0.sequence = 0x0102_0304_0506_0708;
+        wire.0.source_timestamp = SourceTimestamp(u64::MAX);
+        wire.0.taken_at = MonotonicNs(3);
+        wire.0.published_at = MonotonicNs(4);
+        wire.0.writer_sequence = -1;
+        wire.0.writer_guid = WriterGuid([7; 16]);
+        wire.0.encapsulation = Encapsulation([1, 2, 3, 4]);
+        assert_eq!(decode_header(&bytes_of(wire)), Ok(wire.0));
+    }
+
+    #[test]
+    fn headers_that_ingress_never_writes_are_refused() {
+        let mut wire = WireHeader::default();
+        assert_eq!(decode_header(&bytes_of(wire)), Err(HeaderError::SequenceZero));
+        wire.0.sequence = 1;
+        wire.0.reserved = 1;
+        assert_eq!(decode_header(&bytes_of(wire)), Err(HeaderError::ReservedNotZero));
+        assert_eq!(decode_header(&[0; HEADER_BYTES - 1]), Err(HeaderError::WrongLength));
+        assert_eq!(decode_header(&[]), Err(HeaderError::WrongLength));
+    }
+}

@@ -1,0 +1,32 @@
+//! The shared-memory edge: how samples, wake-ups, counters and policies cross between the processes of one
+//! bridge.
+//!
+//! - [`ShmNode`]: the membership of one process in one bridge instance; cleans up after dead processes.
+//! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of fixed
+//!   size (iceoryx2 publish-subscribe).
+//! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
+//! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
+//! - [`RoleLock`]: at most one process for each role.
+//!
+//! No type of iceoryx2 leaves this module. What may be killed, stopped or restarted at any moment is every
+//! process; `docs/decisions/0004-shared-memory.md` says how each primitive bears it.
+
+mod board;
+mod channel;
+mod error;
+mod header;
+mod node;
+mod root;
+mod segment;
+mod wake;
+
+pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
+pub use channel::{
+    LaneQueue, LoanError, PoolSize, PublishError, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample,
+    Slot, SubscriberRole, TakeError,
+};
+pub use error::ShmError;
+pub use header::{HEADER_BYTES, HeaderError, decode_header};
+pub use node::{CleanUp, ShmNode};
+pub use root::{RoleLock, default_root};
+pub use wake::{LaneSleeper, LaneWaker, Woken};

@@ -1,0 +1,183 @@
+//! The membership of one process in one bridge instance.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeBuilder, NodeState, NodeView};
+use iceoryx2::prelude::{
+    CallbackProgression, FileName, LogLevel, SemanticString, SignalHandlingMode, set_log_level,
+};
+
+use super::board::{Boards, BridgeShape};
+use super::error::ShmError;
+use super::root::{InstanceDir, Membership};
+use super::segment::{commit_files, require_free};
+use crate::model::InstanceName;
+
+/// Samples are released on whatever thread DDS drops them.
+pub(super) type Service = iceoryx2::service::ipc_threadsafe::Service;
+
+/// What a service, a connection or the boards of a small bridge take beside the pool.
+const SMALL_BYTES: u64 = 512 * 1024;
+
+/// What a process found and removed of dead ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CleanUp {
+    /// Dead processes whose ports, queues and pools were removed.
+    pub dead_processes: usize,
+    /// Dead processes that could not be cleaned up now; the next clean-up tries again.
+    pub failed: usize,
+    /// Stray files that were removed because no process of the instance was alive.
+    pub stray_files: usize,
+}
+
+/// The membership of this process in one bridge instance; one for each process.
+#[derive(Clone, Debug)]
+pub struct ShmNode {
+    shared: Arc<NodeShared>,
+    cleaned_up: CleanUp,
+}
+
+/// What every port and every sample keeps alive. The fields are dropped in this order: the node's own files go
+/// first, then the membership.
+#[derive(Debug)]
+pub(super) struct NodeShared {
+    node: Node<Service>,
+    membership: Membership,
+}
+
+impl ShmNode {
+    /// Joins the instance in `root`, and first cleans up what dead processes of the instance left behind.
+    ///
+    /// Nothing but the arguments configures iceoryx2: no `iceoryx2.toml` of the working folder, of the user or
+    /// of the system is read. It installs no signal handler.
+    pub fn open(root: &Path, instance: &InstanceName, process: &str) -> Result<Self, ShmError> {
+        quieten();
+        let (membership, stray_files) = Membership::join(root, instance)?;
+        let dir = membership.dir();
+        require_free(SMALL_BYTES, "joining the bridge")?;
+        for folder in ["nodes", "services"] {
+            // iceoryx2 would create them with mode 0755.
+            private_folder(&dir.path.join(folder))?;
+        }
+        let config = config_of(dir)?;
+        let mut cleaned_up = clean_up_dead(dir, &config);
+        cleaned_up.stray_files = stray_files;
+        let name = process.try_into().map_err(|error| failed(dir, "to name the process", &error))?;
+        let node = NodeBuilder::new()
+            .name(&name)
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<Service>()
+            .map_err(|error| failed(dir, "to join the bridge", &error))?;
+        Ok(Self { shared: Arc::new(NodeShared { node, membership }), cleaned_up })
+    }
+
+    /// What `open` cleaned up.
+    pub fn cleaned_up(&self) -> CleanUp {
+        self.cleaned_up
+    }
+
+    /// Cleans up after processes that died since; for processes that run for long, once a second, say.
+    pub fn clean_up(&self) -> CleanUp {
+        clean_up_dead(self.shared.dir(), self.shared.node.config())
+    }
+
+    /// The boards of the instance; the first process creates them, the others find them.
+    pub fn boards(&self, shape: &BridgeShape) -> Result<Boards, ShmError> {
+        Boards::open_or_create(self.shared.dir(), shape)
+    }
+
+    pub(super) fn shared(&self) -> &Arc<NodeShared> {
+        &self.shared
+    }
+}
+
+impl NodeShared {
+    pub(super) fn dir(&self) -> &InstanceDir {
+        self.membership.dir()
+    }
+
+    pub(super) fn node(&self) -> &Node<Service> {
+        &self.node
+    }
+
+    /// Gives everything that iceoryx2 set up in shared memory its pages.
+    pub(super) fn commit(&self, what: &str) -> Result<(), ShmError> {
+        commit_files(&self.dir().shm_files(), what)
+    }
+
+    /// Fails when shared memory has no room for that many bytes and what comes with every port.
+    pub(super) fn require_free(&self, bytes: u64, what: &str) -> Result<(), ShmError> {
+        require_free(bytes + SMALL_BYTES, what)
+    }
+}
+
+/// The log of iceoryx2 goes to `tracing`. It reports every operation that fails, also those that are expected
+/// to, so it is warnings only, unless somebody asks for more under the name of its crate.
+fn quieten() {
+    let debug = tracing::enabled!(target: "iceoryx2_bb_loggers::tracing", tracing::Level::DEBUG);
+    set_log_level(if debug { LogLevel::Debug } else { LogLevel::Warn });
+}
+
+fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
+    let path = iceoryx2::prelude::Path::new(dir.path.as_os_str().as_encoded_bytes())
+        .map_err(|error| failed(dir, "to use the folder's path", &format!("{error:?}")))?;
+    let prefix = FileName::new(dir.prefix.as_bytes())
+        .map_err(|error| failed(dir, "to use the instance's name", &format!("{error:?}")))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&path);
+    config.global.prefix = prefix;
+    // All cleaning up is done by `clean_up_dead`.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
+}
+
+/// Removes what dead processes left: their ports with queues and pools, and services that nobody uses any more.
+///
+/// This is done here and not by iceoryx2 itself because, for a process that died after its details were removed
+/// or before they were written, iceoryx2 falls back to the configuration file of the working folder.
+fn clean_up_dead(dir: &InstanceDir, config: &Config) -> CleanUp {
+    let mut result = CleanUp::default();
+    let listed = Node::<Service>::list(config, |state| {
+        if let NodeState::Dead(dead) = state {
+            let cleaned = if dead.details().is_some() {
+                dead.try_remove_stale_resources().is_ok()
+            } else {
+                remove_monitor(dir, &dead.id().value().to_string())
+            };
+            result.dead_processes += usize::from(cleaned);
+            result.failed += usize::from(!cleaned);
+        }
+        CallbackProgression::Continue
+    });
+    if listed.is_err() {
+        result.failed += 1;
+    }
+    result
+}
+
+/// Removes the rest of a dead process whose details are gone. They go last, after all its ports.
+fn remove_monitor(dir: &InstanceDir, id: &str) -> bool {
+    let start = format!("{}{id}.", dir.prefix);
+    let entries = fs::read_dir(dir.path.join("nodes")).into_iter().flatten().flatten();
+    entries
+        .filter(|entry| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes()))
+        .all(|entry| fs::remove_file(entry.path()).is_ok())
+}
+
+fn private_folder(path: &Path) -> Result<(), ShmError> {
+    use std::os::unix::fs::DirBuilderExt;
+    match fs::DirBuilder::new().recursive(true).mode(0o700).create(path) {
+        Ok(()) => Ok(()),
+        Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),
+    }
+}
+
+pub(super) fn failed(dir: &InstanceDir, what: &str, error: &dyn std::fmt::Display) -> ShmError {
+    ShmError::Failed { what: what.to_owned(), path: dir.path.clone(), reason: error.to_string() }
+}

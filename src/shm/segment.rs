@@ -1,0 +1,179 @@
+//! A piece of shared memory of 64-bit words, which outlives every process that maps it.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::ErrorKind;
+use std::num::NonZeroUsize;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU32, AtomicU64};
+
+use nix::errno::Errno;
+use nix::fcntl::posix_fallocate;
+use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
+use nix::sys::statvfs::statvfs;
+
+use super::error::ShmError;
+use super::root::SHM_DIR;
+
+/// Shared memory, mapped. All access is by atomics, so that what another process writes meanwhile is a value
+/// like any other.
+#[derive(Debug)]
+pub(super) struct Segment {
+    start: NonNull<u64>,
+    words: usize,
+}
+
+// SAFETY: the mapping belongs to the process, not to a thread, and is reached by atomics only.
+unsafe impl Send for Segment {}
+// SAFETY: as above.
+unsafe impl Sync for Segment {}
+
+impl Segment {
+    /// Opens the segment of that path, which has to have that many words; `None` when there is none.
+    pub(super) fn open(path: &Path, words: usize) -> Result<Option<Self>, ShmError> {
+        let file = match OpenOptions::new().read(true).write(true).open(path) {
+            Ok(file) => file,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(failed("to open shared memory", path, &error)),
+        };
+        let metadata = file.metadata().map_err(|error| failed("to look at shared memory", path, &error))?;
+        if metadata.len() != words as u64 * 8 {
+            return Err(ShmError::Incompatible {
+                what: format!("the boards have {} bytes, not {}", metadata.len(), words * 8),
+                path: path.to_owned(),
+            });
+        }
+        Self::map(&file, path, words).map(Some)
+    }
+
+    /// Creates the segment, all zeroes but for the first words, or opens the one that another process created
+    /// first. It appears under its name when it is complete, so nobody ever sees half of it.
+    pub(super) fn create(path: &Path, words: usize, first: &[u64]) -> Result<Self, ShmError> {
+        let draft = path.with_extension(format!("draft{}", std::process::id()));
+        let made =
+            Self::create_at(&draft, words, first).and_then(|segment| match fs::hard_link(&draft, path) {
+                Ok(()) => Ok(Some(segment)),
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(None),
+                Err(error) => Err(failed("to name shared memory", path, &error)),
+            });
+        let _ = fs::remove_file(&draft);
+        match made? {
+            Some(segment) => Ok(segment),
+            None => Self::open(path, words)?.ok_or_else(|| ShmError::Failed {
+                what: "to open shared memory".to_owned(),
+                path: path.to_owned(),
+                reason: "it is there and not there".to_owned(),
+            }),
+        }
+    }
+
+    fn create_at(path: &Path, words: usize, first: &[u64]) -> Result<Self, ShmError> {
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(true)
+            .mode(0o600)
+            .open(path)
+            .map_err(|error| failed("to create shared memory", path, &error))?;
+        commit(&file, words as u64 * 8, "the boards of the bridge")?;
+        let segment = Self::map(&file, path, words)?;
+        for (at, &word) in first.iter().enumerate() {
+            segment.word(at).store(word, std::sync::atomic::Ordering::Relaxed);
+        }
+        Ok(segment)
+    }
+
+    fn map(file: &File, path: &Path, words: usize) -> Result<Self, ShmError> {
+        let length = NonZeroUsize::new(words * 8).ok_or_else(|| ShmError::Failed {
+            what: "to map shared memory".to_owned(),
+            path: path.to_owned(),
+            reason: "it is empty".to_owned(),
+        })?;
+        let protection = ProtFlags::PROT_READ | ProtFlags::PROT_WRITE;
+        // SAFETY: a new mapping at an address that the kernel chooses, of a file that has that length.
+        let start = unsafe { mmap(None, length, protection, MapFlags::MAP_SHARED, file, 0) }
+            .map_err(|errno| failed("to map shared memory", path, &errno.into()))?;
+        Ok(Self { start: start.cast(), words })
+    }
+
+    /// The word at that place. The places are computed from the layout, once; one outside is a defect of ours.
+    pub(super) fn word(&self, at: usize) -> &AtomicU64 {
+        assert!(at < self.words, "word {at} of {}", self.words);
+        // SAFETY: within the mapping, which lives as long as `self`; mappings are aligned to a page, so each
+        // word to 8 bytes; and every access, in every process, is atomic.
+        unsafe { AtomicU64::from_ptr(self.start.add(at).as_ptr()) }
+    }
+
+    /// The lower-addressed half of the word at that place.
+    pub(super) fn half(&self, at: usize) -> &AtomicU32 {
+        assert!(at < self.words, "word {at} of {}", self.words);
+        // SAFETY: as for `word`; such a word is only ever used by halves.
+        unsafe { AtomicU32::from_ptr(self.start.add(at).as_ptr().cast()) }
+    }
+}
+
+impl Drop for Segment {
+    fn drop(&mut self) {
+        // SAFETY: `map` mapped exactly this, and all references into it borrow `self`.
+        let _ = unsafe { munmap(self.start.cast(), self.words * 8) };
+    }
+}
+
+fn failed(what: &str, path: &Path, error: &std::io::Error) -> ShmError {
+    match error.kind() {
+        ErrorKind::PermissionDenied => ShmError::Permission { what: what.to_owned(), path: path.to_owned() },
+        _ => ShmError::Failed { what: what.to_owned(), path: path.to_owned(), reason: error.to_string() },
+    }
+}
+
+/// The bytes that are free in [`SHM_DIR`].
+pub(super) fn free_bytes() -> u64 {
+    statvfs(SHM_DIR).map_or(0, |stat| stat.blocks_available() * stat.fragment_size())
+}
+
+/// Says so when shared memory has not that many bytes free: what finds none at its first touch dies of SIGBUS.
+pub(super) fn require_free(needed_bytes: u64, what: &str) -> Result<(), ShmError> {
+    let free_bytes = free_bytes();
+    if free_bytes < needed_bytes {
+        return Err(ShmError::NoRoom {
+            what: what.to_owned(),
+            needed_bytes,
+            free_bytes,
+            path: SHM_DIR.into(),
+        });
+    }
+    Ok(())
+}
+
+/// Gives a file in shared memory all its pages now.
+fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
+    loop {
+        return match posix_fallocate(file, 0, bytes.cast_signed()) {
+            Ok(()) => Ok(()),
+            Err(Errno::EINTR) => continue,
+            Err(Errno::ENOSPC) => Err(ShmError::NoRoom {
+                what: what.to_owned(),
+                needed_bytes: bytes,
+                free_bytes: free_bytes(),
+                path: SHM_DIR.into(),
+            }),
+            Err(errno) => Err(failed("to reserve shared memory", Path::new(SHM_DIR), &errno.into())),
+        };
+    }
+}
+
+/// Gives files in shared memory all their pages now. iceoryx2 only sets the length of its segments; a page that
+/// is first touched when the file system is full is a SIGBUS in the middle of a sample.
+pub(super) fn commit_files(files: &[std::path::PathBuf], what: &str) -> Result<(), ShmError> {
+    for path in files {
+        // A file that is gone or not readable yet belongs to a process that starts or ends just now.
+        let Ok(file) = OpenOptions::new().read(true).write(true).open(path) else { continue };
+        let Ok(metadata) = file.metadata() else { continue };
+        if metadata.len() > 0 && metadata.blocks() * 512 < metadata.len() {
+            commit(&file, metadata.len(), what)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,135 @@
+//! How ingress wakes a lane: a futex in the boards' memory.
+//!
+//! A count of wakes, and a flag that says whether the lane sleeps. A wake counts, and calls the kernel only if
+//! the flag is up; a lane puts the flag up, looks at the count once more, and sleeps only if nothing came. Both
+//! sides write before they read, sequentially consistent, so one of them sees the other: no wake is lost. No
+//! descriptor and no buffer is involved that could fill up while a lane is stopped.
+//! `docs/decisions/0004-shared-memory.md` has the measurements.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use nix::errno::Errno;
+use nix::libc;
+
+use super::segment::Segment;
+use crate::clock;
+
+/// Why a [`LaneSleeper`] returned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Woken {
+    /// There was a wake since the last return, or a signal came.
+    Woken,
+    /// The time is over and nobody woke the lane.
+    TimedOut,
+}
+
+/// The two words of a lane, on a cache line of their own.
+#[derive(Clone, Debug)]
+struct WakeWords {
+    segment: Arc<Segment>,
+    at: usize,
+}
+
+impl WakeWords {
+    fn wakes(&self) -> &AtomicU32 {
+        self.segment.half(self.at)
+    }
+
+    fn asleep(&self) -> &AtomicU32 {
+        self.segment.half(self.at + 1)
+    }
+}
+
+/// Wakes one lane; any process or thread may hold any number of them.
+#[derive(Clone, Debug)]
+pub struct LaneWaker {
+    words: WakeWords,
+}
+
+impl LaneWaker {
+    pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
+        Self { words: WakeWords { segment, at } }
+    }
+
+    /// Wakes the lane. Never blocks, also while the lane is stopped; several wakes before the lane looks are
+    /// one. Calls the kernel only if the lane sleeps.
+    pub fn wake(&self) {
+        self.words.wakes().fetch_add(1, Ordering::SeqCst);
+        if self.words.asleep().load(Ordering::SeqCst) != 0 {
+            futex_wake(self.words.wakes());
+        }
+    }
+}
+
+/// Sleeps until its lane is woken; one for each lane.
+#[derive(Debug)]
+pub struct LaneSleeper {
+    words: WakeWords,
+    seen: u32,
+}
+
+impl LaneSleeper {
+    pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
+        let words = WakeWords { segment, at };
+        // What came before is unknown, so the first sleep ends at once.
+        let seen = words.wakes().load(Ordering::SeqCst).wrapping_sub(1);
+        Self { words, seen }
+    }
+
+    /// Sleeps until a wake, or for `timeout` at most. A wake that came since the last return ends it at once;
+    /// so does the first sleep of a new lane process, and a signal.
+    pub fn sleep(&mut self, timeout: Duration) -> Woken {
+        if self.look() {
+            return Woken::Woken;
+        }
+        let timeout_ns = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
+        let deadline = clock::monotonic().plus_ns(timeout_ns);
+        let mut left_ns = timeout_ns;
+        let woken = loop {
+            if left_ns == 0 {
+                break Woken::TimedOut;
+            }
+            self.words.asleep().store(1, Ordering::SeqCst);
+            if self.look() {
+                break Woken::Woken;
+            }
+            // The kernel looks at the count once more, and sleeps only if it is still the one that we saw.
+            let interrupted = futex_wait(self.words.wakes(), self.seen, left_ns) == Err(Errno::EINTR);
+            if self.look() || interrupted {
+                break Woken::Woken;
+            }
+            left_ns = deadline.since(clock::monotonic());
+        };
+        self.words.asleep().store(0, Ordering::Relaxed);
+        woken
+    }
+
+    /// Whether there was a wake since the last look.
+    fn look(&mut self) -> bool {
+        let wakes = self.words.wakes().load(Ordering::SeqCst);
+        let woken = wakes != self.seen;
+        self.seen = wakes;
+        woken
+    }
+}
+
+fn futex_wait(word: &AtomicU32, expected: u32, timeout_ns: u64) -> Result<(), Errno> {
+    // A futex that other processes use, so without FUTEX_PRIVATE_FLAG; a relative timeout runs on
+    // CLOCK_MONOTONIC.
+    let timeout = libc::timespec {
+        tv_sec: i64::try_from(timeout_ns / 1_000_000_000).unwrap_or(i64::MAX),
+        tv_nsec: (timeout_ns % 1_000_000_000).cast_signed(),
+    };
+    // SAFETY: the word and the timeout live until the call returns, and the kernel writes to neither.
+    let result = unsafe {
+        libc::syscall(libc::SYS_futex, word.as_ptr(), libc::FUTEX_WAIT, expected, &raw const timeout)
+    };
+    Errno::result(result).map(drop)
+}
+
+fn futex_wake(word: &AtomicU32) {
+    // SAFETY: the kernel uses the address of the word only. It cannot fail on a word that is mapped.
+    unsafe { libc::syscall(libc::SYS_futex, word.as_ptr(), libc::FUTEX_WAKE, 1) };
+}
