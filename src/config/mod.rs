@@ -1,9 +1,27 @@
 //! The configuration: YAML in, validated [`Settings`] out, or every problem of the file at once.
+//!
+//! `yaml` turns text into a tree of values that know their lines; `keys` has the list of all keys and finds the
+//! unknown ones; `field` reads one value, checks it and reports it; the other modules put the settings together,
+//! a file for each part.
 
+mod control;
+mod environment;
+mod field;
+mod keys;
+mod lanes;
+mod load;
+mod problem;
+mod qos;
+mod rates;
+mod routes;
 mod settings;
+mod yaml;
 
+pub use keys::KEYS;
+pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, parse};
+pub use problem::{ConfigError, Place, Problem};
 pub use settings::{
     Classifier, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates, MetricsListener,
     NetworkSelector, Output, Probes, RatePolicy, Route, Safety, Scheduling, SchedulingPolicy, SecretSource,
-    Security, Settings, SharedMemory, TrustMode,
+    Security, Settings, SharedMemory, TrustMode, Verbosity,
 };

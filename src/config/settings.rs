@@ -124,7 +124,7 @@ pub struct Lane {
     pub by_reference_min_bytes: usize,
     /// Unacknowledged samples that a RELIABLE writer of the lane may have outstanding.
     pub window_samples: usize,
-    /// Rates and staleness by mode. A critical lane has no use for them.
+    /// Rates and staleness by mode. A critical lane has no use for them: there the rate is infinite.
     pub rates: LaneRates,
     /// Scheduling of the lane's process.
     pub scheduling: Scheduling,
@@ -280,10 +280,29 @@ pub struct Security {
 pub struct Diagnostics {
     /// Whether they are published.
     pub enabled: bool,
+    /// How often, in milliseconds.
+    pub publish_interval_ms: u64,
     /// Topic of the original's JSON diagnostics.
     pub topic: TopicName,
+    /// What is logged where `RUST_LOG` says nothing.
+    pub verbosity: Verbosity,
     /// Address of the Prometheus page; `None` for none.
     pub metrics: Option<MetricsListener>,
+}
+
+/// The least severe level that is logged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verbosity {
+    /// What failed.
+    Error,
+    /// Also what is wrong and goes on.
+    Warn,
+    /// Also what happens seldom.
+    Info,
+    /// Also what helps to find a fault.
+    Debug,
+    /// Everything.
+    Trace,
 }
 
 /// Where the Prometheus page is served.

@@ -1,0 +1,270 @@
+//! What the control process does: classifier, probes, safety, security, diagnostics, subscribers.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use super::field::Field;
+use super::qos::DAY_MS;
+use super::rates::MAX_QUEUE;
+use super::settings::{
+    Classifier, Diagnostics, Lane, MetricsListener, Probes, Safety, SecretSource, Security, TrustMode,
+    Verbosity,
+};
+use crate::model::{LaneName, SubscriberState, TopicName};
+
+/// Slowest and fastest rate of something periodic in the control process.
+const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
+
+/// The longest round trip worth a threshold: an hour.
+const MAX_RTT_MS: f64 = 3_600_000.0;
+
+const TRUST_MODES: &[(&str, TrustMode)] = &[
+    ("default_deny", TrustMode::DefaultDeny),
+    ("permissive", TrustMode::Permissive),
+    ("off", TrustMode::Off),
+];
+
+const VERBOSITIES: &[(&str, Verbosity)] = &[
+    ("error", Verbosity::Error),
+    ("warn", Verbosity::Warn),
+    ("info", Verbosity::Info),
+    ("debug", Verbosity::Debug),
+    ("trace", Verbosity::Trace),
+];
+
+const STATES: &[(&str, SubscriberState)] = &[
+    ("UNKNOWN", SubscriberState::Unknown),
+    ("CRITICAL", SubscriberState::Critical),
+    ("NONCRITICAL", SubscriberState::Noncritical),
+];
+
+/// `classifier`.
+pub(super) fn classifier(root: &Field<'_>) -> Classifier {
+    let section = root.section("classifier");
+    let subscriber = section.get("subscriber_id").text().filter(|id| !id.is_empty());
+    let demote_loss = section.get("demote_loss_threshold");
+    let promote_loss = section.get("promote_loss_threshold");
+    let demote_rtt = section.get("demote_rtt_ms");
+    let promote_rtt = section.get("promote_rtt_ms");
+    let classifier = Classifier {
+        enabled: section.get("enabled").flag().unwrap_or(true),
+        subscriber_id: subscriber.map(str::to_owned),
+        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(RATES_HZ).unwrap_or(2.0),
+        demote_loss_threshold: demote_loss.decimal(0.0..=1.0).unwrap_or(0.015),
+        promote_loss_threshold: promote_loss.decimal(0.0..=1.0).unwrap_or(0.005),
+        demote_rtt_ms: demote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(50.0),
+        promote_rtt_ms: promote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(35.0),
+        hysteresis_count: hysteresis(&section),
+        allow_unknown_state: section.get("allow_unknown_state").flag().unwrap_or(true),
+    };
+    check_below(
+        (&promote_loss, classifier.promote_loss_threshold),
+        (&demote_loss, classifier.demote_loss_threshold),
+    );
+    check_below((&promote_rtt, classifier.promote_rtt_ms), (&demote_rtt, classifier.demote_rtt_ms));
+    classifier
+}
+
+/// Without a gap between the thresholds a subscriber would be promoted and demoted in turn.
+fn check_below((promote, low): (&Field<'_>, f64), (demote, high): (&Field<'_>, f64)) {
+    if low < high || promote.was_reported() || demote.was_reported() {
+        return;
+    }
+    // Where only the other one is given, that is the one to change.
+    if promote.is_given() {
+        promote.report::<()>(&format!("must be below {} ({high})", demote.path));
+    } else {
+        demote.report::<()>(&format!("must be above {} ({low})", promote.path));
+    }
+}
+
+fn hysteresis(section: &Field<'_>) -> u32 {
+    let count = section.get("hysteresis_count").whole(1..=1_000);
+    count.and_then(|count| u32::try_from(count).ok()).unwrap_or(3)
+}
+
+/// `probes`. `max_probe_rate_hz` is what a responder lets through.
+pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
+    let section = root.section("probes");
+    let rate = section.get("rate_hz");
+    let request = section.get("request_topic");
+    let response = section.get("response_topic");
+    let probes = Probes {
+        enabled: section.get("enabled").flag().unwrap_or(true),
+        rate_hz: rate.decimal(RATES_HZ).unwrap_or(5.0),
+        rtt_threshold_ms: section.get("rtt_threshold_ms").decimal(0.0..=MAX_RTT_MS).unwrap_or(100.0),
+        loss_threshold: section.get("loss_threshold").decimal(0.0..=1.0).unwrap_or(0.05),
+        jitter_threshold_ms: section.get("jitter_threshold_ms").decimal(0.0..=MAX_RTT_MS).unwrap_or(25.0),
+        window_size: section.get("window_size").count(1..=10_000).unwrap_or(50),
+        hysteresis_count: hysteresis(&section),
+        timeout_ms: section.get("timeout_ms").whole(1..=60_000).unwrap_or(500),
+        request_topic: topic(&request, "/adaptive_bridge/probe_req"),
+        response_topic: topic(&response, "/adaptive_bridge/probe_resp"),
+    };
+    if probes.rate_hz > f64::from(max_probe_rate_hz) && !rate.was_reported() {
+        // Probes above the limit are not answered, and would count as lost.
+        let allowed = format!("must be at most security.max_probe_rate_hz ({max_probe_rate_hz})");
+        rate.report_value(&probes.rate_hz.to_string(), allowed);
+    }
+    if probes.request_topic == probes.response_topic && !request.was_reported() && !response.was_reported() {
+        let given = if response.is_given() { response } else { request };
+        given.report::<()>("must be another topic than that of the other direction");
+    }
+    probes
+}
+
+fn topic(field: &Field<'_>, default: &str) -> TopicName {
+    let given = field.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+    // The defaults are topic names, as the tests of this module show.
+    #[allow(clippy::expect_used)]
+    given.unwrap_or_else(|| TopicName::try_from(default).expect("a default topic name"))
+}
+
+/// `safety`.
+pub(super) fn safety(root: &Field<'_>) -> Safety {
+    let section = root.section("safety");
+    let flag = |name: &str| section.get(name).flag().unwrap_or(true);
+    Safety {
+        preserve_critical_path: flag("preserve_critical_path"),
+        allow_noncritical_degrade: flag("allow_noncritical_degrade"),
+        max_noncritical_queue: section.get("max_noncritical_queue").count(1..=MAX_QUEUE).unwrap_or(50),
+        overload_drop_noncritical_first: flag("overload_drop_noncritical_first"),
+    }
+}
+
+/// `security`. The secret itself is looked at only to see whether there is one.
+pub(super) fn security(root: &Field<'_>) -> Security {
+    let section = root.section("security");
+    let inline = section.get("hmac_secret");
+    let file = section.get("hmac_secret_file");
+    let variable = section.get("hmac_secret_env");
+    let in_config = inline.text().filter(|secret| !secret.is_empty()).map(|_| SecretSource::ConfigFile);
+    let in_file = file.parsed("an absolute path", absolute_path).map(SecretSource::File);
+    let in_variable = variable.parsed("the name of an environment variable: A-Z, a-z, 0-9 and _", |name| {
+        let is_name = !name.is_empty()
+            && !name.starts_with(|first: char| first.is_ascii_digit())
+            && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
+        is_name.then(|| SecretSource::Environment(name.to_owned()))
+    });
+    let sources: Vec<(Field<'_>, SecretSource)> =
+        [(inline, in_config), (file, in_file), (variable, in_variable)]
+            .into_iter()
+            .filter_map(|(field, source)| source.map(|source| (field, source)))
+            .collect();
+    if let [(first, _), others @ ..] = sources.as_slice() {
+        for (field, _) in others {
+            field.report_key(&format!("must not be given beside {}: one source of the secret", first.path));
+        }
+    }
+    let rate = section.get("max_probe_rate_hz").whole(1..=10_000);
+    Security {
+        trust_mode: section.get("trust_mode").choice(TRUST_MODES).unwrap_or(TrustMode::DefaultDeny),
+        enable_probe_hmac: section.get("enable_probe_hmac").flag().unwrap_or(false),
+        secret: sources.into_iter().next().map(|(_, source)| source),
+        replay_window_ms: section.get("replay_window_ms").whole(1..=DAY_MS).unwrap_or(30_000),
+        max_probe_rate_hz: rate.and_then(|rate| u32::try_from(rate).ok()).unwrap_or(20),
+        allow_legacy_node_name_overrides: section
+            .get("allow_legacy_node_name_overrides")
+            .flag()
+            .unwrap_or(true),
+    }
+}
+
+/// `diagnostics`.
+pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
+    let section = root.section("diagnostics");
+    let interval_s = section.get("publish_interval_s").decimal(0.01..=3_600.0).unwrap_or(1.0);
+    Diagnostics {
+        enabled: section.get("enabled").flag().unwrap_or(true),
+        publish_interval_ms: (interval_s * 1_000.0).round() as u64,
+        topic: topic(&section.get("topic"), "/adaptive_bridge/diagnostics"),
+        verbosity: section.get("verbosity").choice(VERBOSITIES).unwrap_or(Verbosity::Info),
+        metrics: section.get("metrics").parsed(
+            "a loopback address and port such as 127.0.0.1:9464, or unix: and an absolute path",
+            metrics_listener,
+        ),
+    }
+}
+
+/// The page shows what runs on the robot to whoever can reach it: nobody beyond the machine.
+fn metrics_listener(text: &str) -> Option<MetricsListener> {
+    if let Some(path) = text.strip_prefix("unix:") {
+        // `sockaddr_un` has room for 107 bytes and a zero (unix(7)).
+        return absolute_path(path).filter(|_| path.len() <= 107).map(MetricsListener::Unix);
+    }
+    let address: SocketAddr = text.parse().ok()?;
+    let is_usable = address.ip().is_loopback() && address.port() != 0;
+    is_usable.then(|| MetricsListener::Tcp(address.ip(), address.port()))
+}
+
+/// A path that means the same whatever the working directory.
+pub(super) fn absolute_path(text: &str) -> Option<PathBuf> {
+    let is_path = text.starts_with('/') && !text.contains('\0');
+    is_path.then(|| PathBuf::from(text))
+}
+
+/// `overrides`: states forced by hand.
+pub(super) fn overrides(root: &Field<'_>) -> BTreeMap<String, SubscriberState> {
+    let entries = root.get("overrides").entries();
+    let states = entries.into_iter().filter_map(|(id, field)| {
+        check_id(id, &field);
+        field.choice(STATES).map(|state| (id.to_owned(), state))
+    });
+    states.collect()
+}
+
+/// `subscribers`: the lane of each, as `id: lane` or `id: {lane: lane}`.
+pub(super) fn subscribers(root: &Field<'_>, lanes: &[Lane]) -> BTreeMap<String, LaneName> {
+    let names: Vec<&str> = lanes.iter().map(|lane| lane.name.as_str()).collect();
+    let entries = root.get("subscribers").entries();
+    let on_lanes = entries.into_iter().filter_map(|(id, field)| {
+        check_id(id, &field);
+        let lane = if field.is_map() { field.get("lane") } else { field };
+        if !lane.is_given() && !lane.is_null() {
+            return lane.report("must be a lane");
+        }
+        let found =
+            lane.reference("a lane", &names, |name| lanes.iter().find(|lane| lane.name.as_str() == name));
+        found.map(|lane| (id.to_owned(), lane.name.clone()))
+    });
+    on_lanes.collect()
+}
+
+/// A subscriber's id travels in every probe.
+fn check_id(id: &str, field: &Field<'_>) {
+    if !(1..=128).contains(&id.len()) || id.chars().any(char::is_control) {
+        field.report_key("must be a subscriber's id: 1 to 128 bytes without control characters");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::problem::Problems;
+
+    #[test]
+    fn the_default_topics_are_topic_names() {
+        let problems = Problems::default();
+        let root = Field::root(None, &problems);
+        assert_eq!(probes(&root, 20).request_topic.as_str(), "/adaptive_bridge/probe_req");
+        assert_eq!(probes(&root, 20).response_topic.as_str(), "/adaptive_bridge/probe_resp");
+        assert_eq!(diagnostics(&root).topic.as_str(), "/adaptive_bridge/diagnostics");
+        assert!(problems.into_inner().is_empty());
+    }
+
+    #[test]
+    fn the_metrics_page_is_for_this_machine_only() {
+        let tcp = |address: &str| MetricsListener::Tcp(address.parse().unwrap(), 9464);
+        assert_eq!(metrics_listener("127.0.0.1:9464"), Some(tcp("127.0.0.1")));
+        assert_eq!(metrics_listener("[::1]:9464"), Some(tcp("::1")));
+        let unix = MetricsListener::Unix("/run/bridge.sock".into());
+        assert_eq!(metrics_listener("unix:/run/bridge.sock"), Some(unix));
+        let long = format!("unix:/{}", "x".repeat(107));
+        for wrong in
+            ["0.0.0.0:9464", "127.0.0.1:0", "127.0.0.1", "192.168.0.1:80", "unix:run.sock", "", &long]
+        {
+            assert_eq!(metrics_listener(wrong), None, "{wrong:?}");
+        }
+    }
+}

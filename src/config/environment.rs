@@ -1,0 +1,86 @@
+//! The environment variables of ROS 2 that stand in where the file says nothing.
+
+use std::net::Ipv4Addr;
+
+use super::problem::{Place, Problem, Problems, shown};
+use super::settings::NetworkSelector;
+
+/// What the environment says.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Environment {
+    /// `ROS_DOMAIN_ID`; 0 without it, as in ROS 2.
+    pub domain_id: u16,
+    /// Bytes of a graph identifier in the distribution that `ROS_DISTRO` names.
+    pub graph_gid_bytes: usize,
+    localhost_only: bool,
+}
+
+impl Environment {
+    /// Reads the variables through `env`. An empty one counts as not set, as in ROS 2.
+    pub fn read(env: &dyn Fn(&str) -> Option<String>, problems: &Problems) -> Self {
+        let variable = |name: &str| env(name).filter(|value| !value.is_empty());
+        let refuse = |name: &str, value: &str, allowed: &str| {
+            problems.report(Problem {
+                place: Place::Environment,
+                key: name.to_owned(),
+                value: Some(shown(value)),
+                allowed: allowed.to_owned(),
+                hint: None,
+            });
+        };
+
+        let mut domain_id = 0;
+        if let Some(value) = variable("ROS_DOMAIN_ID") {
+            match value.parse() {
+                Ok(id) if id <= 232 => domain_id = id,
+                _ => refuse("ROS_DOMAIN_ID", &value, "must be a whole number from 0 to 232"),
+            }
+        }
+        let mut localhost_only = false;
+        if let Some(value) = variable("ROS_LOCALHOST_ONLY") {
+            match value.as_str() {
+                "0" => {}
+                "1" => localhost_only = true,
+                _ => refuse("ROS_LOCALHOST_ONLY", &value, "must be 0 or 1"),
+            }
+        }
+        if let Some(value) = variable("ROS_AUTOMATIC_DISCOVERY_RANGE") {
+            match value.as_str() {
+                "SUBNET" | "SYSTEM_DEFAULT" => {}
+                "LOCALHOST" => localhost_only = true,
+                "OFF" => refuse(
+                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+                    &value,
+                    "must not be OFF: a bridge without discovery finds neither publishers nor subscribers",
+                ),
+                _ => refuse(
+                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+                    &value,
+                    "must be one of SUBNET, LOCALHOST, SYSTEM_DEFAULT",
+                ),
+            }
+        }
+        if let Some(value) = variable("ROS_STATIC_PEERS") {
+            refuse(
+                "ROS_STATIC_PEERS",
+                &value,
+                "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces with \
+                 ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
+            );
+        }
+        // The identifier shrank from 24 to 16 bytes in Iron.
+        let graph_gid_bytes = match variable("ROS_DISTRO").as_deref() {
+            Some("foxy" | "galactic" | "humble") => 24,
+            _ => 16,
+        };
+        Self { domain_id, graph_gid_bytes, localhost_only }
+    }
+
+    /// The interfaces to use where the file names none: all, or the loopback one.
+    pub fn default_interfaces(&self) -> Vec<NetworkSelector> {
+        match self.localhost_only {
+            true => vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)],
+            false => Vec::new(),
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! A value of the file at its key path, and the ways to read it. A wrong value is reported, and then counts as
+//! not given: the reader goes on, so that one run finds every problem.
+
+use std::ops::RangeInclusive;
+
+use super::keys::joined;
+use super::problem::{Place, Problem, Problems, did_you_mean, shown};
+use super::yaml::{Content, Node};
+
+/// A place in the file, with or without a value.
+#[derive(Clone, Debug)]
+pub(super) struct Field<'a> {
+    /// Its key path, such as `topics[0].id`.
+    pub path: String,
+    /// The line of its key, or of the nearest key above it that there is.
+    pub line: usize,
+    node: Option<&'a Node>,
+    problems: &'a Problems,
+}
+
+impl<'a> Field<'a> {
+    /// The whole file.
+    pub fn root(node: Option<&'a Node>, problems: &'a Problems) -> Self {
+        Self { path: String::new(), line: 1, node, problems }
+    }
+
+    /// Whether there is a value, and not null.
+    pub fn is_given(&self) -> bool {
+        self.value().is_some()
+    }
+
+    /// Whether the key is there with the value null, which is otherwise the same as not being there.
+    pub fn is_null(&self) -> bool {
+        self.node.is_some_and(Node::is_null)
+    }
+
+    fn value(&self) -> Option<&'a Node> {
+        self.node.filter(|node| !node.is_null())
+    }
+
+    /// The field of this name in a mapping; without a value if this is no mapping or has no such key.
+    pub fn get(&self, name: &str) -> Self {
+        let entry = match self.value().map(|node| &node.content) {
+            Some(Content::Map(entries)) => entries.iter().find(|entry| entry.key == name),
+            _ => None,
+        };
+        Self {
+            path: joined(&self.path, name),
+            line: entry.map_or(self.line, |entry| entry.line),
+            node: entry.map(|entry| &*entry.value),
+            problems: self.problems,
+        }
+    }
+
+    /// The field of this name, which must be a mapping if it is there.
+    pub fn section(&self, name: &str) -> Self {
+        let section = self.get(name);
+        section.entries();
+        section
+    }
+
+    /// Whether this is a mapping.
+    pub fn is_map(&self) -> bool {
+        matches!(self.value().map(|node| &node.content), Some(Content::Map(_)))
+    }
+
+    /// The keys of a mapping with their fields, each key once; none if there is no value.
+    pub fn entries(&self) -> Vec<(&'a str, Self)> {
+        let Some(node) = self.value() else { return Vec::new() };
+        let Content::Map(entries) = &node.content else {
+            self.report::<()>("must be a mapping (`key: value`)");
+            return Vec::new();
+        };
+        let mut seen = std::collections::HashSet::new();
+        let once = entries.iter().filter(|entry| seen.insert(entry.key.as_str()));
+        once.map(|entry| {
+            let path = joined(&self.path, &shown(&entry.key));
+            let field = Self { path, line: entry.line, node: Some(&entry.value), problems: self.problems };
+            (entry.key.as_str(), field)
+        })
+        .collect()
+    }
+
+    /// The items of a list; `None` if there is no value, or another.
+    pub fn items(&self) -> Option<Vec<Self>> {
+        let Content::List(items) = &self.value()?.content else {
+            return self.report("must be a list");
+        };
+        let items = items.iter().enumerate().map(|(index, item)| Self {
+            path: format!("{}[{index}]", self.path),
+            line: item.line,
+            node: Some(item),
+            problems: self.problems,
+        });
+        Some(items.collect())
+    }
+
+    /// The text of a scalar and whether it is plain.
+    fn scalar(&self) -> Option<(&'a str, bool)> {
+        match &self.value()?.content {
+            Content::Scalar { text, plain } => Some((text, *plain)),
+            _ => None,
+        }
+    }
+
+    /// A truth value.
+    pub fn flag(&self) -> Option<bool> {
+        const ALLOWED: &str = "must be true or false";
+        self.value()?;
+        match self.scalar() {
+            Some(("true" | "True" | "TRUE", true)) => Some(true),
+            Some(("false" | "False" | "FALSE", true)) => Some(false),
+            Some(("yes" | "Yes" | "YES" | "on" | "On" | "ON", _) | ("true", false)) => {
+                self.report_with(ALLOWED, Some(did_you_mean("true")))
+            }
+            Some(("no" | "No" | "NO" | "off" | "Off" | "OFF", _) | ("false", false)) => {
+                self.report_with(ALLOWED, Some(did_you_mean("false")))
+            }
+            _ => self.report(ALLOWED),
+        }
+    }
+
+    /// A whole number; `10.0` is one too.
+    pub fn whole(&self, range: RangeInclusive<u64>) -> Option<u64> {
+        let allowed = format!("must be a whole number from {} to {}", range.start(), range.end());
+        self.whole_where(&allowed, |number| range.contains(&number))
+    }
+
+    /// A whole number that fulfils a condition.
+    pub fn whole_where(&self, allowed: &str, accept: impl Fn(u64) -> bool) -> Option<u64> {
+        self.value()?;
+        self.number(allowed, |text| parse_whole(text).filter(|&number| accept(number)))
+    }
+
+    /// A whole number that memory can be counted in.
+    pub fn count(&self, range: RangeInclusive<u64>) -> Option<usize> {
+        self.whole(range).and_then(|number| usize::try_from(number).ok())
+    }
+
+    /// A finite number.
+    pub fn decimal(&self, range: RangeInclusive<f64>) -> Option<f64> {
+        self.value()?;
+        let allowed = format!("must be a number from {} to {}", range.start(), range.end());
+        self.number(&allowed, |text| parse_decimal(text).filter(|number| range.contains(number)))
+    }
+
+    fn number<T>(&self, allowed: &str, parse: impl Fn(&str) -> Option<T>) -> Option<T> {
+        match self.scalar() {
+            Some((text, true)) => parse(text).or_else(|| self.report(allowed)),
+            Some((text, false)) if parse(text).is_some() => {
+                self.report_with(allowed, Some("remove the quotes".to_owned()))
+            }
+            _ => self.report(allowed),
+        }
+    }
+
+    /// Text. A number or truth value is not, unless in quotes: `id: 010` would change on its way through YAML.
+    pub fn text(&self) -> Option<&'a str> {
+        self.value()?;
+        match self.scalar() {
+            Some((text, true)) if parse_decimal(text).is_some() || matches!(text, "true" | "false") => {
+                self.report_with("must be text", Some("put it in quotes".to_owned()))
+            }
+            Some((text, _)) => Some(text),
+            None => self.report("must be text"),
+        }
+    }
+
+    /// Text that a parser of it accepts.
+    pub fn parsed<T>(&self, allowed: &str, parse: impl FnOnce(&str) -> Option<T>) -> Option<T> {
+        let text = self.text()?;
+        parse(text).or_else(|| self.report(&format!("must be {allowed}")))
+    }
+
+    /// One of a few words, whatever their case.
+    pub fn choice<T: Copy>(&self, choices: &[(&str, T)]) -> Option<T> {
+        self.value()?;
+        let word = self.scalar().map_or("", |(text, _)| text);
+        let found = choices.iter().find(|(name, _)| name.eq_ignore_ascii_case(word));
+        found.map(|&(_, choice)| choice).or_else(|| {
+            let names: Vec<&str> = choices.iter().map(|&(name, _)| name).collect();
+            let hint = self.problems.hint(word, &names);
+            self.report_with(&format!("must be one of {}", names.join(", ")), hint)
+        })
+    }
+
+    /// The name of something that the file defines elsewhere, found by `find` among `names`.
+    pub fn reference<T>(
+        &self,
+        what: &str,
+        names: &[&str],
+        find: impl FnOnce(&str) -> Option<T>,
+    ) -> Option<T> {
+        let name = self.text()?;
+        find(name).or_else(|| {
+            let hint = self.problems.hint(name, names);
+            self.report_with(&one_of(what, names), hint)
+        })
+    }
+
+    /// Reports this field's value, or its absence. Always `None`, to be returned at once.
+    pub fn report<T>(&self, allowed: &str) -> Option<T> {
+        self.report_with(allowed, None)
+    }
+
+    /// The same with a remedy.
+    pub fn report_with<T>(&self, allowed: &str, hint: Option<String>) -> Option<T> {
+        match self.value() {
+            Some(node) => self.add(self.shown(node), allowed.to_owned(), hint),
+            None => {
+                let allowed = allowed.strip_prefix("must be ").unwrap_or(allowed);
+                self.add(None, format!("must be given: {allowed}"), hint);
+            }
+        }
+        None
+    }
+
+    /// Reports the key itself, or that this value is not what `allowed` says of it beside the others.
+    pub fn report_key(&self, allowed: &str) {
+        self.add(None, allowed.to_owned(), None);
+    }
+
+    /// Reports a key that had to be the name of something.
+    pub fn report_unknown_key(&self, what: &str, name: &str, known: &[&str]) {
+        let hint = self.problems.hint(name, known);
+        self.add(None, one_of(what, known), hint);
+    }
+
+    /// Reports a value that the program worked out itself, from this field or for want of it.
+    pub fn report_value(&self, value: &str, allowed: String) {
+        self.add(Some(shown(value)), allowed, None);
+    }
+
+    /// Whether something was said about exactly this field already.
+    pub fn was_reported(&self) -> bool {
+        self.problems.concern(&[&self.path])
+    }
+
+    fn add(&self, value: Option<String>, allowed: String, hint: Option<String>) {
+        let place = Place::Line(self.line);
+        self.problems.report(Problem { place, key: self.path.clone(), value, allowed, hint });
+    }
+
+    /// The value as a message may repeat it. What may be a secret, or hold one, it may not.
+    fn shown(&self, node: &Node) -> Option<String> {
+        if self.path == "security" || self.path.starts_with("security.hmac_secret") {
+            return None;
+        }
+        Some(match &node.content {
+            Content::Scalar { text, plain: true } => shown(text),
+            Content::Scalar { text, .. } => format!("\"{}\"", shown(text)),
+            Content::List(_) => "a list".to_owned(),
+            Content::Map(_) => "a mapping".to_owned(),
+        })
+    }
+}
+
+/// What a name may be. A thousand topics would bury the message, so that a long list is left out.
+fn one_of(what: &str, names: &[&str]) -> String {
+    match names.len() {
+        0 => format!("must be {what}, and there is none"),
+        1..=16 => format!("must be {what}: {}", names.join(", ")),
+        _ => format!("must be {what}"),
+    }
+}
+
+/// A whole number that is not negative.
+fn parse_whole(text: &str) -> Option<u64> {
+    let digits = text.strip_prefix('+').unwrap_or(text);
+    // 010 is ten in YAML 1.2 and eight in YAML 1.1: neither reading is safe.
+    if digits.starts_with('0') && digits.as_bytes().get(1).is_some_and(u8::is_ascii_digit) {
+        return None;
+    }
+    digits.parse().ok().or_else(|| {
+        // Beyond 2^53 (9.007e15) a float no longer knows the units digit.
+        let number = parse_decimal(digits)?;
+        (number.fract() == 0.0 && (0.0..=9.0e15).contains(&number)).then_some(number as u64)
+    })
+}
+
+/// A finite number in decimal notation; no `.nan`, `.inf`, `0x10` or `1_000`.
+fn parse_decimal(text: &str) -> Option<f64> {
+    let is_number = text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'+' | b'-' | b'.' | b'e' | b'E'));
+    let number = if is_number { text.parse::<f64>().ok() } else { None };
+    number.filter(|number| number.is_finite())
+}

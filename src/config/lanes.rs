@@ -1,0 +1,164 @@
+//! Lanes: who is on which network, at what rate, scheduled how.
+
+use super::environment::Environment;
+use super::field::Field;
+use super::qos::{PartialQos, Profiles};
+use super::rates::{self, MAX_QUEUE, RoutingPolicy};
+use super::settings::{DdsNetwork, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
+use crate::model::{LaneName, TrafficClass};
+
+/// Each lane is a process with a DDS participant of its own; a domain has room for 120 participants on a host.
+const MAX_LANES: usize = 32;
+
+/// The largest sample, in bytes.
+pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
+
+const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
+    ("other", SchedulingPolicy::Other),
+    ("fifo", SchedulingPolicy::Fifo),
+    ("rr", SchedulingPolicy::RoundRobin),
+];
+
+/// A lane, and the QoS that its outputs have unless they say otherwise.
+pub(super) struct LaneDraft {
+    pub lane: Lane,
+    pub qos: PartialQos,
+}
+
+/// All lanes, without outputs: `critical`, `noncritical`, then the user's in the order of the file.
+pub(super) fn read(
+    root: &Field<'_>,
+    profiles: &Profiles<'_>,
+    input: &DdsNetwork,
+    environment: &Environment,
+    max_noncritical_queue: u64,
+) -> Vec<LaneDraft> {
+    let section = root.section("lanes");
+    let policy = RoutingPolicy::read(root, max_noncritical_queue);
+    let mut lanes: Vec<(LaneName, Field<'_>)> = [LaneName::critical(), LaneName::noncritical()]
+        .into_iter()
+        .map(|name| (name.clone(), section.section(name.as_str())))
+        .collect();
+    for (name, field) in section.entries() {
+        if name == LaneName::critical().as_str() || name == LaneName::noncritical().as_str() {
+            continue;
+        }
+        match LaneName::try_from(name) {
+            // `topics[].qos_overrides.input` is the reader's side.
+            Ok(_) if name == "input" => {
+                field.report_key("must be a lane name other than input, which means the publisher's side");
+            }
+            Ok(name) => lanes.push((name, field)),
+            Err(error) => {
+                field.report_key(&format!("must be a lane name: {}", error.allowed));
+            }
+        }
+    }
+    if lanes.len() > MAX_LANES {
+        section.report_key(&format!("must be at most {MAX_LANES} lanes, each of which is a process"));
+        lanes.truncate(MAX_LANES);
+    }
+    let reader = LaneReader { profiles, input, environment, policy };
+    lanes.into_iter().map(|(name, field)| reader.read(name, &field)).collect()
+}
+
+struct LaneReader<'a> {
+    profiles: &'a Profiles<'a>,
+    input: &'a DdsNetwork,
+    environment: &'a Environment,
+    policy: RoutingPolicy,
+}
+
+impl LaneReader<'_> {
+    fn read(&self, name: LaneName, field: &Field<'_>) -> LaneDraft {
+        field.entries();
+        let class = match name == LaneName::critical() {
+            true => TrafficClass::Critical,
+            false => TrafficClass::Noncritical,
+        };
+        let queue_depth = match class {
+            TrafficClass::Critical => 64,
+            TrafficClass::Noncritical => 4,
+        };
+        let qos = field.get("qos");
+        let lane = Lane {
+            name,
+            class,
+            network: network(field, self.input, self.environment),
+            outputs: Vec::new(),
+            queue_depth: field.get("queue_depth").count(1..=MAX_QUEUE).unwrap_or(queue_depth),
+            max_borrowed: field.get("max_borrowed").count(1..=MAX_QUEUE).unwrap_or(8),
+            by_reference_min_bytes: field
+                .get("by_reference_min_bytes")
+                .count(0..=MAX_SAMPLE_BYTES)
+                .unwrap_or(65_536),
+            window_samples: field.get("window_samples").count(1..=100_000).unwrap_or(256),
+            rates: match class {
+                TrafficClass::Critical => rates::refuse(field),
+                TrafficClass::Noncritical => self.policy.lane_rates(field),
+            },
+            scheduling: scheduling(&field.section("scheduling")),
+        };
+        let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };
+        LaneDraft { lane, qos }
+    }
+
+    fn named_qos(&self, field: &Field<'_>) -> PartialQos {
+        self.profiles.named(field).unwrap_or_default()
+    }
+}
+
+/// `domain_id` and `networks` of a section; what it does not say is that of `base`.
+pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {
+    let domain = section.get("domain_id").whole(0..=232).and_then(|id| u16::try_from(id).ok());
+    let interfaces = section.get("networks").items().map(|items| {
+        let selectors = items.iter().filter_map(|item| {
+            item.parsed("the name of a network interface or an IPv4 address", network_selector)
+        });
+        selectors.collect()
+    });
+    let interfaces = interfaces.unwrap_or_else(|| base.interfaces.clone());
+    DdsNetwork {
+        domain_id: domain.unwrap_or(base.domain_id),
+        interfaces: if interfaces.is_empty() { environment.default_interfaces() } else { interfaces },
+    }
+}
+
+/// An interface name as Linux allows it (15 bytes, no `/`, no space), or an IPv4 address.
+fn network_selector(text: &str) -> Option<NetworkSelector> {
+    if let Ok(address) = text.parse() {
+        return Some(NetworkSelector::Address(address));
+    }
+    // 300.1.1.1 would do as a name, but is meant as an address; so is anything with a colon, of IPv6.
+    let meant_as_address = text.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+    let is_name = (1..=15).contains(&text.len())
+        && text.bytes().all(|byte| byte.is_ascii_graphic() && !matches!(byte, b'/' | b':'));
+    (is_name && !meant_as_address).then(|| NetworkSelector::Name(text.to_owned()))
+}
+
+/// A `scheduling` section.
+pub(super) fn scheduling(section: &Field<'_>) -> Scheduling {
+    let policy = section.get("policy");
+    let priority = section.get("priority");
+    let kind = policy.choice(SCHEDULING_POLICIES);
+    let priority = match kind.unwrap_or_default() {
+        // Where the policy itself is wrong, nothing is known of what the priority may be.
+        SchedulingPolicy::Other if policy.was_reported() => 0,
+        SchedulingPolicy::Other => priority
+            .whole_where("must be 0 unless policy is fifo or rr", |priority| priority == 0)
+            .unwrap_or(0),
+        SchedulingPolicy::Fifo | SchedulingPolicy::RoundRobin => {
+            if !priority.is_given() {
+                priority.report::<()>("must be a whole number from 1 to 99, because policy is fifo or rr");
+            }
+            priority.whole(1..=99).unwrap_or(1)
+        }
+    };
+    let cpus = section.get("cpus").items().unwrap_or_default();
+    Scheduling {
+        policy: kind.unwrap_or_default(),
+        priority: u8::try_from(priority).unwrap_or(0),
+        cpus: cpus.iter().filter_map(|cpu| cpu.count(0..=1023)).collect(),
+        lock_memory: section.get("lock_memory").flag().unwrap_or(false),
+    }
+}

@@ -1,0 +1,161 @@
+//! Finds, reads and checks a configuration file.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use super::environment::Environment;
+use super::field::Field;
+use super::lanes::MAX_SAMPLE_BYTES;
+use super::problem::{ConfigError, Place, Problem, Problems};
+use super::qos::Profiles;
+use super::settings::{Settings, SharedMemory};
+use super::{control, keys, lanes, routes, yaml};
+use crate::model::InstanceName;
+
+/// The environment variable that names the file where the command line does not.
+pub const PATH_VARIABLE: &str = "ADAPTIVE_BRIDGE_CONFIG";
+
+/// The file that is read where neither the command line nor the environment names one.
+pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
+
+/// Reads the settings from a file: from `path`, else from the one that `$ADAPTIVE_BRIDGE_CONFIG` names, else from
+/// `/etc/adaptive-bridge/config.yaml`. `env` looks up environment variables.
+///
+/// # Errors
+/// Every problem of the file and of the environment at once; one problem when there is no file or it cannot be
+/// read.
+pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<Settings, ConfigError> {
+    let path = find(path, env, Path::new(DEFAULT_PATH))?;
+    let name = path.display().to_string();
+    let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
+    parse(bytes, &name, env)
+}
+
+fn find(
+    path: Option<&Path>,
+    env: &dyn Fn(&str) -> Option<String>,
+    default: &Path,
+) -> Result<PathBuf, ConfigError> {
+    if let Some(path) = path {
+        return Ok(path.to_owned());
+    }
+    if let Some(path) = env(PATH_VARIABLE).filter(|path| !path.is_empty()) {
+        return Ok(path.into());
+    }
+    if default.exists() {
+        return Ok(default.to_owned());
+    }
+    let name = default.display().to_string();
+    let what = format!(
+        "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with the minimal \
+         one of config/README.md: `topics: [{{id: scan, input_topic: /scan}}]`"
+    );
+    Err(failure(&name, Place::File, what))
+}
+
+/// The content of a regular file. Of a pipe or a device nobody knows whether it ever ends.
+fn read(path: &Path) -> Result<Vec<u8>, String> {
+    let cannot = |error: std::io::Error| format!("cannot be read: {error}");
+    let metadata = std::fs::metadata(path).map_err(cannot)?;
+    if !metadata.is_file() {
+        return Err("must be a regular file".to_owned());
+    }
+    let mut bytes = Vec::new();
+    // One byte more than allowed tells a file that is too long from one that just fits.
+    let limit = yaml::MAX_BYTES as u64 + 1;
+    File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes)).map_err(cannot)?;
+    Ok(bytes)
+}
+
+fn failure(file: &str, place: Place, allowed: String) -> ConfigError {
+    let problem = Problem { place, key: String::new(), value: None, allowed, hint: None };
+    ConfigError::new(file, vec![problem])
+}
+
+/// Reads the settings from the content of a file; `file_name` is for messages. Pure, but for what `env` does.
+///
+/// # Errors
+/// Every problem of the content and of the environment at once; one problem when the content is not YAML.
+pub fn parse(
+    text: impl AsRef<[u8]>,
+    file_name: &str,
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Settings, ConfigError> {
+    let document = yaml::parse(text.as_ref())
+        .map_err(|error| failure(file_name, error.line.map_or(Place::File, Place::Line), error.message))?;
+    let problems = Problems::default();
+    let document = document.as_deref();
+    let root = Field::root(document, &problems);
+    if !root.is_given() {
+        let what = "the file is empty: at least `topics` must be given, such as \
+                    `topics: [{id: scan, input_topic: /scan}]`";
+        return Err(failure(file_name, Place::File, what.to_owned()));
+    }
+    if !root.is_map() {
+        let line = document.map_or(1, |node| node.line);
+        let what = "must be a mapping at its top level, of keys such as `topics:`";
+        return Err(failure(file_name, Place::Line(line), what.to_owned()));
+    }
+    if let Some(node) = document {
+        keys::check(node, &problems);
+    }
+    let settings = settings(&root, &Environment::read(env, &problems));
+    let problems = problems.into_inner();
+    if problems.is_empty() { Ok(settings) } else { Err(ConfigError::new(file_name, problems)) }
+}
+
+/// The settings, of which nothing is worth anything where problems were reported.
+fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
+    let instance =
+        root.get("instance").parsed(InstanceName::ALLOWED, |text| InstanceName::try_from(text).ok());
+    // `default` is an instance name.
+    #[allow(clippy::expect_used)]
+    let instance = instance.unwrap_or_else(|| InstanceName::try_from("default").expect("an instance name"));
+
+    let profiles = Profiles::read(root);
+    let input = routes::input_network(root, environment);
+    let safety = control::safety(root);
+    let drafts = lanes::read(root, &profiles, &input, environment, safety.max_noncritical_queue as u64);
+
+    let memory = root.section("shared_memory");
+    let max_sample_bytes = memory.get("max_sample_bytes").count(1..=MAX_SAMPLE_BYTES).unwrap_or(1 << 20);
+    let shared_memory = SharedMemory {
+        root_path: memory.get("root_path").parsed("an absolute path", control::absolute_path),
+        max_taps: memory.get("max_taps").count(0..=64).unwrap_or(2),
+    };
+    let (routes, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
+
+    let processes = root.section("processes");
+    let process = |name: &str| lanes::scheduling(&processes.section(name).section("scheduling"));
+    let security = control::security(root);
+    let policy_hold_s = root.get("policy_hold_s").decimal(0.0..=3_600.0).unwrap_or(5.0);
+    Settings {
+        instance,
+        input,
+        graph_gid_bytes: gid_bytes(root, environment),
+        routes,
+        shared_memory,
+        policy_hold_ms: (policy_hold_s * 1_000.0).round() as u64,
+        ingress_scheduling: process("ingress"),
+        control_scheduling: process("control"),
+        classifier: control::classifier(root),
+        probes: control::probes(root, security.max_probe_rate_hz),
+        safety,
+        security,
+        diagnostics: control::diagnostics(root),
+        overrides: control::overrides(root),
+        subscribers: control::subscribers(root, &lanes),
+        lanes,
+    }
+}
+
+fn gid_bytes(root: &Field<'_>, environment: &Environment) -> usize {
+    let bytes =
+        root.get("ros").get("graph_gid_bytes").whole_where("must be 16 or 24", |n| matches!(n, 16 | 24));
+    match bytes {
+        Some(24) => 24,
+        Some(_) => 16,
+        None => environment.graph_gid_bytes,
+    }
+}

@@ -1,0 +1,214 @@
+//! What is wrong with a configuration: all of it at once, each with its place, value and remedy.
+
+use std::cell::RefCell;
+use std::collections::HashSet;
+use std::fmt;
+
+/// Where a problem is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Place {
+    /// An environment variable; the problem's key is its name.
+    Environment,
+    /// The file as a whole.
+    File,
+    /// This line of the file, counted from 1.
+    Line(usize),
+}
+
+/// One thing that is wrong with a configuration.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// Where.
+    pub place: Place,
+    /// The key path, such as `topics[0].input_topic`; empty when the problem is the file's or its syntax'.
+    pub key: String,
+    /// What the file says, cut to a readable length; `None` when a key is missing or unknown, and where the
+    /// value is secret.
+    pub value: Option<String>,
+    /// What is allowed, as a phrase that begins with "must be" or says what else is wrong.
+    pub allowed: String,
+    /// A remedy, such as "did you mean `depth`?".
+    pub hint: Option<String>,
+}
+
+/// Every problem of a configuration.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ConfigError {
+    file: String,
+    problems: Vec<Problem>,
+}
+
+impl ConfigError {
+    /// An error of at least one problem. They are sorted by their place, and what two readers of the same value
+    /// said in the same words is said once.
+    pub(super) fn new(file: &str, mut problems: Vec<Problem>) -> Self {
+        let mut seen = HashSet::new();
+        problems.retain(|problem| seen.insert((problem.place, problem.key.clone(), problem.allowed.clone())));
+        problems.sort_by_key(|problem| problem.place);
+        Self { file: file.to_owned(), problems }
+    }
+
+    /// The file, as it was named to the loader.
+    pub fn file(&self) -> &str {
+        &self.file
+    }
+
+    /// The problems, in the order of the file; those of the environment come first.
+    pub fn problems(&self) -> &[Problem] {
+        &self.problems
+    }
+}
+
+/// One line for each problem: `FILE:LINE: key.path = value: must be … (did you mean …?)`.
+impl fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, problem) in self.problems.iter().enumerate() {
+            if index > 0 {
+                f.write_str("\n")?;
+            }
+            match problem.place {
+                Place::Environment => f.write_str("environment: ")?,
+                Place::File => write!(f, "{}: ", self.file)?,
+                Place::Line(line) => write!(f, "{}:{line}: ", self.file)?,
+            }
+            write!(f, "{problem}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for ConfigError {}
+
+/// The problem without its place.
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.key)?;
+        if let Some(value) = &self.value {
+            write!(f, " = {value}")?;
+        }
+        if !self.key.is_empty() {
+            f.write_str(": ")?;
+        }
+        f.write_str(&self.allowed)?;
+        match &self.hint {
+            Some(hint) => write!(f, " ({hint})"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Where readers of the file report to. Shared by all of them at once, hence the cell.
+#[derive(Debug, Default)]
+pub(super) struct Problems(RefCell<Vec<Problem>>);
+
+impl Problems {
+    /// Adds one.
+    pub fn report(&self, problem: Problem) {
+        self.0.borrow_mut().push(problem);
+    }
+
+    /// Whether something was already said about exactly one of these keys, so that a check across several of
+    /// them would only repeat it.
+    pub fn concern(&self, keys: &[&str]) -> bool {
+        self.0.borrow().iter().any(|problem| keys.contains(&problem.key.as_str()))
+    }
+
+    /// The usual hint at the name that `word` was meant to be, if one is near.
+    pub fn hint(&self, word: &str, names: &[&str]) -> Option<String> {
+        // Comparing is the one costly thing here; a file this wrong is not put right by hints.
+        if self.0.borrow().len() >= MAX_HINTS {
+            return None;
+        }
+        nearest(word, names).map(did_you_mean)
+    }
+
+    /// All of them.
+    pub fn into_inner(self) -> Vec<Problem> {
+        self.0.into_inner()
+    }
+}
+
+/// The longest piece of the user's text that a message repeats, in characters.
+const SHOWN_CHARS: usize = 60;
+
+/// Bounds of the search for the nearest name: its time grows with the product of all four, 0.3 s at the worst.
+const MAX_HINTS: usize = 128;
+const MAX_COMPARED_NAMES: usize = 512;
+const MAX_COMPARED_BYTES: usize = 64;
+
+/// The user's text made fit to print: no control characters, no more than a line.
+pub(super) fn shown(text: &str) -> String {
+    let mut shown: String = text.chars().take(SHOWN_CHARS).flat_map(char::escape_debug).collect();
+    if text.chars().nth(SHOWN_CHARS).is_some() {
+        shown.push('…');
+    }
+    shown
+}
+
+/// The name that `word` was probably meant to be: at most a third of its letters away, whatever the case.
+fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
+    if word.len() > MAX_COMPARED_BYTES {
+        return None;
+    }
+    let word = word.to_ascii_lowercase();
+    let limit = (word.chars().count() / 3).max(1);
+    names
+        .iter()
+        .take(MAX_COMPARED_NAMES)
+        .filter(|name| name.len() <= MAX_COMPARED_BYTES)
+        .map(|name| (strsim::osa_distance(&word, &name.to_ascii_lowercase()), *name))
+        .filter(|&(distance, _)| distance <= limit)
+        .min()
+        .map(|(_, name)| name)
+}
+
+/// The usual wording of a hint.
+pub(super) fn did_you_mean(name: &str) -> String {
+    format!("did you mean `{name}`?")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_prints_one_line_for_each_problem_in_the_order_of_the_file() {
+        let problem = |place, key: &str, value: Option<&str>, hint: Option<&str>| Problem {
+            place,
+            key: key.to_owned(),
+            value: value.map(str::to_owned),
+            allowed: "must be right".to_owned(),
+            hint: hint.map(str::to_owned),
+        };
+        let error = ConfigError::new(
+            "a.yaml",
+            vec![
+                problem(Place::Line(7), "b.c", Some("5"), Some("did you mean `6`?")),
+                problem(Place::Line(2), "a", None, None),
+                problem(Place::File, "", None, None),
+                problem(Place::Environment, "ROS_DOMAIN_ID", Some("x"), None),
+            ],
+        );
+        assert_eq!(
+            error.to_string(),
+            "environment: ROS_DOMAIN_ID = x: must be right\n\
+             a.yaml: must be right\n\
+             a.yaml:2: a: must be right\n\
+             a.yaml:7: b.c = 5: must be right (did you mean `6`?)"
+        );
+    }
+
+    #[test]
+    fn the_nearest_word_is_near() {
+        assert_eq!(nearest("reliabilty", &["reliability", "durability"]), Some("reliability"));
+        assert_eq!(nearest("RELIABEL", &["RELIABLE", "BEST_EFFORT"]), Some("RELIABLE"));
+        assert_eq!(nearest("colour", &["depth", "history"]), None);
+        assert_eq!(nearest(&"a".repeat(100_000), &["a"]), None);
+    }
+
+    #[test]
+    fn shown_text_is_short_and_cannot_control_a_terminal() {
+        assert_eq!(shown("\u{1b}[31mred\n"), "\\u{1b}[31mred\\n");
+        assert_eq!(shown(&"x".repeat(1000)).chars().count(), SHOWN_CHARS + 1);
+    }
+}

@@ -1,0 +1,126 @@
+//! QoS policies as the file gives them: each may be missing, and what is missing comes from what lies below.
+
+use std::collections::BTreeMap;
+
+use super::field::Field;
+use super::settings::InputQos;
+use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
+
+/// The deepest HISTORY and the most samples that may be retained. DDS itself allows 2^31; at 10,000 a route of
+/// 1 KiB samples takes 10 MiB on each lane.
+pub(super) const MAX_DEPTH: u64 = 10_000;
+
+/// The longest LIFESPAN, DEADLINE or age: a day.
+pub(super) const DAY_MS: u64 = 86_400_000;
+
+/// KEEP_LAST without a depth: that of ROS 2's default profile.
+const DEFAULT_DEPTH: u32 = 10;
+
+const RELIABILITIES: &[(&str, Reliability)] =
+    &[("RELIABLE", Reliability::Reliable), ("BEST_EFFORT", Reliability::BestEffort)];
+const DURABILITIES: &[(&str, Durability)] =
+    &[("VOLATILE", Durability::Volatile), ("TRANSIENT_LOCAL", Durability::TransientLocal)];
+const HISTORIES: &[(&str, HistoryKind)] =
+    &[("KEEP_LAST", HistoryKind::KeepLast), ("KEEP_ALL", HistoryKind::KeepAll)];
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum HistoryKind {
+    KeepLast,
+    KeepAll,
+}
+
+/// Some of the policies.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct PartialQos {
+    reliability: Option<Reliability>,
+    history: Option<HistoryKind>,
+    depth: Option<u32>,
+    durability: Option<Durability>,
+    lifespan_ms: Option<u64>,
+    deadline_ms: Option<u64>,
+}
+
+impl PartialQos {
+    /// Reads a mapping of policies; nothing of it is required.
+    pub fn read(field: &Field<'_>) -> Self {
+        field.entries();
+        Self {
+            reliability: field.get("reliability").choice(RELIABILITIES),
+            history: field.get("history").choice(HISTORIES),
+            depth: field.get("depth").whole(1..=MAX_DEPTH).and_then(|depth| u32::try_from(depth).ok()),
+            durability: field.get("durability").choice(DURABILITIES),
+            lifespan_ms: field.get("lifespan_ms").whole(1..=DAY_MS),
+            deadline_ms: field.get("deadline_ms").whole(1..=DAY_MS),
+        }
+    }
+
+    /// These policies, and those of `base` where these say nothing.
+    pub fn over(self, base: Self) -> Self {
+        Self {
+            reliability: self.reliability.or(base.reliability),
+            history: self.history.or(base.history),
+            depth: self.depth.or(base.depth),
+            durability: self.durability.or(base.durability),
+            lifespan_ms: self.lifespan_ms.or(base.lifespan_ms),
+            deadline_ms: self.deadline_ms.or(base.deadline_ms),
+        }
+    }
+
+    /// The whole profile of a writer: what is still missing is the paper's for the lane's class.
+    pub fn complete(self, class: TrafficClass) -> QosProfile {
+        let default = match class {
+            TrafficClass::Critical => QosProfile::CRITICAL,
+            TrafficClass::Noncritical => QosProfile::NONCRITICAL,
+        };
+        QosProfile {
+            reliability: self.reliability.unwrap_or(default.reliability),
+            history: match self.history {
+                Some(HistoryKind::KeepAll) => History::KeepAll,
+                _ => match self.depth {
+                    Some(depth) => History::KeepLast { depth },
+                    None => default.history,
+                },
+            },
+            durability: self.durability.unwrap_or(default.durability),
+            lifespan_ms: self.lifespan_ms,
+            deadline_ms: self.deadline_ms,
+        }
+    }
+
+    /// What ingress asks of the publisher: what is missing stays open.
+    pub fn input(self) -> InputQos {
+        let history = match (self.history, self.depth) {
+            (Some(HistoryKind::KeepAll), _) => Some(History::KeepAll),
+            (Some(HistoryKind::KeepLast), depth) => {
+                Some(History::KeepLast { depth: depth.unwrap_or(DEFAULT_DEPTH) })
+            }
+            (None, depth) => depth.map(|depth| History::KeepLast { depth }),
+        };
+        InputQos {
+            reliability: self.reliability,
+            durability: self.durability,
+            history,
+            deadline_ms: self.deadline_ms,
+        }
+    }
+}
+
+/// `qos_profiles`, by name.
+pub(super) struct Profiles<'a>(BTreeMap<&'a str, PartialQos>);
+
+impl<'a> Profiles<'a> {
+    /// Reads them all, used or not.
+    pub fn read(root: &Field<'a>) -> Self {
+        let entries = root.get("qos_profiles").entries();
+        Self(entries.into_iter().map(|(name, field)| (name, PartialQos::read(&field))).collect())
+    }
+
+    /// The profile that a field names; `None` where it names none.
+    pub fn named(&self, field: &Field<'_>) -> Option<PartialQos> {
+        if !field.is_given() {
+            return None;
+        }
+        let names: Vec<&str> = self.0.keys().copied().collect();
+        field.reference("the name of a profile in qos_profiles", &names, |name| self.0.get(name).copied())
+    }
+}

@@ -1,0 +1,167 @@
+//! Rates, ages and queues of noncritical lanes: `routing_policy`, and what a lane says for itself.
+
+use super::field::Field;
+use super::qos::DAY_MS;
+use super::settings::{DropPolicy, LaneRates, RatePolicy};
+
+/// The most samples that may wait in a queue or be borrowed: each of them occupies `max_sample_bytes`.
+pub(super) const MAX_QUEUE: u64 = 4_096;
+
+/// The fastest rate, in samples per second.
+const MAX_RATE_HZ: f64 = 100_000.0;
+
+/// The most bytes per second: 1 TB/s, beyond any memory.
+const MAX_BYTES_PER_S: u64 = 1_000_000_000_000;
+
+/// The paper's rates and age (section III-D).
+const NORMAL_RATE_HZ: f64 = 10.0;
+const DEGRADED_RATE_HZ: f64 = 3.0;
+const STALE_THRESHOLD_MS: u64 = 200;
+
+/// Samples that wait in a noncritical lane: the depth of the paper's writer, and fewer in DEGRADED.
+const NORMAL_DEPTH: u64 = 5;
+const DEGRADED_DEPTH: u64 = 2;
+
+const DROP_POLICIES: &[(&str, DropPolicy)] = &[
+    ("drop_oldest", DropPolicy::DropOldest),
+    ("drop_latest", DropPolicy::DropLatest),
+    ("drop_stale", DropPolicy::DropStale),
+];
+
+const MODES: &[&str] = &["normal", "degraded", "disabled", "emergency", "failure"];
+
+/// The keys that a critical lane cannot have.
+const RATE_KEYS: &[&str] = &[
+    "max_rate_hz",
+    "degraded_rate_hz",
+    "max_bytes_per_s",
+    "degraded_max_bytes_per_s",
+    "stale_threshold_ms",
+    "degraded_stale_threshold_ms",
+    "drop_policy",
+    "queue_samples",
+];
+
+/// The rates of a critical lane, which has none: it forwards every sample, and a rate that somebody wrote down
+/// for it would be a promise not kept.
+pub(super) fn refuse(lane: &Field<'_>) -> LaneRates {
+    for key in RATE_KEYS {
+        let rate = lane.get(key);
+        if rate.is_given() {
+            rate.report::<()>("must not be given: the critical lane forwards every sample");
+        }
+    }
+    let unlimited = RatePolicy {
+        max_rate_hz: f64::INFINITY,
+        max_bytes_per_s: None,
+        stale_threshold_ms: 0,
+        drop_policy: DropPolicy::DropOldest,
+        queue_samples: 1,
+    };
+    LaneRates { normal: unlimited, degraded: unlimited }
+}
+
+/// `routing_policy`: what holds for every noncritical lane that says nothing else.
+pub(super) struct RoutingPolicy {
+    enabled: bool,
+    normal_rate_hz: f64,
+    degraded_rate_hz: Option<f64>,
+    normal_stale_ms: u64,
+    degraded_stale_ms: Option<u64>,
+    normal_queue: Queue,
+    degraded_queue: Queue,
+}
+
+/// What waits for a token, and what gives way.
+struct Queue {
+    drop_policy: DropPolicy,
+    samples: usize,
+}
+
+impl RoutingPolicy {
+    /// Reads the section. `max_noncritical_queue` bounds the queue where a mode does not.
+    pub fn read(root: &Field<'_>, max_noncritical_queue: u64) -> Self {
+        let section = root.section("routing_policy");
+        let forward = section.get("critical_always_forward");
+        if forward.flag() == Some(false) {
+            forward.report::<()>("must be true: a critical lane forwards in every mode but emergency");
+        }
+        let rate_hz = section.get("noncritical_max_rate_hz").decimal(0.0..=MAX_RATE_HZ);
+        let stale_ms = section.get("stale_threshold_ms").whole(0..=DAY_MS);
+        let drop_policy = section.get("noncritical_drop_policy").choice(DROP_POLICIES);
+        let drop_policy = drop_policy.unwrap_or(DropPolicy::DropOldest);
+
+        let modes = section.section("modes");
+        for (name, mode) in modes.entries() {
+            match name {
+                "normal" | "degraded" => {}
+                _ if MODES.contains(&name) => check_silent_mode(&mode),
+                _ => mode.report_unknown_key("a mode", name, MODES),
+            }
+        }
+        let queue = |mode: &Field<'_>, default: u64| {
+            let cap = mode.get("max_noncritical_queue").whole(0..=MAX_QUEUE).unwrap_or(max_noncritical_queue);
+            let depth = mode.get("noncritical_depth").whole(0..=MAX_QUEUE).unwrap_or(default);
+            Queue {
+                drop_policy: mode.get("noncritical_drop_policy").choice(DROP_POLICIES).unwrap_or(drop_policy),
+                // One sample always waits: the one that the next token is for.
+                samples: usize::try_from(depth.min(cap).max(1)).unwrap_or(1),
+            }
+        };
+        let (normal, degraded) = (modes.section("normal"), modes.section("degraded"));
+        let mode_rate_hz = |mode: &Field<'_>| mode.get("noncritical_max_rate_hz").decimal(0.0..=MAX_RATE_HZ);
+        let mode_stale_ms = |mode: &Field<'_>| mode.get("stale_threshold_ms").whole(0..=DAY_MS);
+        Self {
+            enabled: section.get("noncritical_enabled").flag().unwrap_or(true),
+            normal_rate_hz: mode_rate_hz(&normal).or(rate_hz).unwrap_or(NORMAL_RATE_HZ),
+            degraded_rate_hz: mode_rate_hz(&degraded),
+            normal_stale_ms: mode_stale_ms(&normal).or(stale_ms).unwrap_or(STALE_THRESHOLD_MS),
+            degraded_stale_ms: mode_stale_ms(&degraded),
+            normal_queue: queue(&normal, NORMAL_DEPTH),
+            degraded_queue: queue(&degraded, DEGRADED_DEPTH),
+        }
+    }
+
+    /// The rates of one noncritical lane: its own, else those of the mode.
+    pub fn lane_rates(&self, lane: &Field<'_>) -> LaneRates {
+        let rate_hz = |key: &str| lane.get(key).decimal(0.0..=MAX_RATE_HZ);
+        let bytes_per_s = |key: &str| lane.get(key).whole(1..=MAX_BYTES_PER_S);
+        let stale_ms = |key: &str| lane.get(key).whole(0..=DAY_MS);
+
+        let normal_rate_hz = rate_hz("max_rate_hz").unwrap_or(self.normal_rate_hz);
+        // A lane that is slower than 3 Hz by choice does not speed up because it is degraded.
+        let degraded_rate_hz = rate_hz("degraded_rate_hz")
+            .or(self.degraded_rate_hz)
+            .unwrap_or_else(|| DEGRADED_RATE_HZ.min(normal_rate_hz));
+        let normal_stale_ms = stale_ms("stale_threshold_ms").unwrap_or(self.normal_stale_ms);
+        let degraded_stale_ms =
+            stale_ms("degraded_stale_threshold_ms").or(self.degraded_stale_ms).unwrap_or(normal_stale_ms);
+        let normal_bytes_per_s = bytes_per_s("max_bytes_per_s");
+        let degraded_bytes_per_s = bytes_per_s("degraded_max_bytes_per_s").or(normal_bytes_per_s);
+
+        let drop_policy = lane.get("drop_policy").choice(DROP_POLICIES);
+        let queue_samples = lane.get("queue_samples").count(1..=MAX_QUEUE);
+        let policy = |queue: &Queue, max_rate_hz, max_bytes_per_s, stale_threshold_ms| RatePolicy {
+            max_rate_hz: if self.enabled { max_rate_hz } else { 0.0 },
+            max_bytes_per_s,
+            stale_threshold_ms,
+            drop_policy: drop_policy.unwrap_or(queue.drop_policy),
+            queue_samples: queue_samples.unwrap_or(queue.samples),
+        };
+        LaneRates {
+            normal: policy(&self.normal_queue, normal_rate_hz, normal_bytes_per_s, normal_stale_ms),
+            degraded: policy(&self.degraded_queue, degraded_rate_hz, degraded_bytes_per_s, degraded_stale_ms),
+        }
+    }
+}
+
+/// The modes in which noncritical lanes forward nothing. Their other values are checked and have no effect.
+fn check_silent_mode(mode: &Field<'_>) {
+    mode.entries();
+    let rate = mode.get("noncritical_max_rate_hz");
+    rate.whole_where("must be 0: noncritical lanes forward nothing in this mode", |rate| rate == 0);
+    mode.get("noncritical_depth").whole(0..=MAX_QUEUE);
+    mode.get("noncritical_drop_policy").choice(DROP_POLICIES);
+    mode.get("stale_threshold_ms").whole(0..=DAY_MS);
+    mode.get("max_noncritical_queue").whole(0..=MAX_QUEUE);
+}

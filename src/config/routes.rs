@@ -1,0 +1,285 @@
+//! Routes and their outputs, and the checks across all of them.
+
+use std::collections::{HashMap, HashSet};
+
+use super::environment::Environment;
+use super::field::Field;
+use super::lanes::{self, LaneDraft, MAX_SAMPLE_BYTES};
+use super::qos::{MAX_DEPTH, PartialQos, Profiles};
+use super::settings::{DdsNetwork, Lane, Output, Route};
+use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
+
+/// The most routes: each has a pool of shared memory, a reader, and a writer on each of its lanes.
+const MAX_ROUTES: usize = 1_024;
+
+/// Samples retained for a lane that comes back, where no output asks for more.
+const RETAINED_SAMPLES: usize = 8;
+
+/// Where the publishers are.
+pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
+    let base = DdsNetwork { domain_id: environment.domain_id, interfaces: Vec::new() };
+    lanes::network(&root.section("ros"), &base, environment)
+}
+
+/// Reads `topics` and `topic_qos_profiles`: the routes, and the lanes with their outputs.
+pub(super) fn read(
+    root: &Field<'_>,
+    profiles: &Profiles<'_>,
+    input: &DdsNetwork,
+    drafts: Vec<LaneDraft>,
+    max_sample_bytes: usize,
+) -> (Vec<Route>, Vec<Lane>) {
+    let topics = root.get("topics");
+    let mut items = topics.items().unwrap_or_default();
+    if items.is_empty() && !topics.was_reported() {
+        topics
+            .report::<()>("must be a list of at least one topic, such as `- {id: scan, input_topic: /scan}`");
+    }
+    if items.len() > MAX_ROUTES {
+        topics.report_key(&format!("must be at most {MAX_ROUTES} topics"));
+        items.truncate(MAX_ROUTES);
+    }
+    let topic_qos = root.section("topic_qos_profiles");
+    let reader = RouteReader { profiles, lanes: &drafts, topic_qos: &topic_qos, max_sample_bytes };
+    let read: Vec<RouteDraft<'_>> = items.iter().map(|item| reader.read(item)).collect();
+    reader.check_topic_qos(&read);
+    check_topics(&read, input, &drafts);
+
+    // With problems the settings are thrown away, so that a route without a topic need not be kept.
+    let mut routes = Vec::new();
+    let mut lanes: Vec<Lane> = drafts.into_iter().map(|draft| draft.lane).collect();
+    for draft in read {
+        let Some(route) = draft.route else { continue };
+        for OutputDraft { lane, topic, qos, .. } in draft.outputs {
+            lanes[lane].outputs.push(Output { route: routes.len(), topic, qos });
+        }
+        routes.push(route);
+    }
+    (routes, lanes)
+}
+
+/// One entry of `topics` as far as it could be read.
+struct RouteDraft<'a> {
+    field: Field<'a>,
+    id: Option<RouteId>,
+    input: Option<(TopicName, Field<'a>)>,
+    route: Option<Route>,
+    outputs: Vec<OutputDraft<'a>>,
+}
+
+struct OutputDraft<'a> {
+    /// Index of the lane.
+    lane: usize,
+    topic: TopicName,
+    /// Where the topic is given, or would be.
+    field: Field<'a>,
+    qos: QosProfile,
+}
+
+struct RouteReader<'a, 'f> {
+    profiles: &'a Profiles<'f>,
+    lanes: &'a [LaneDraft],
+    topic_qos: &'a Field<'f>,
+    max_sample_bytes: usize,
+}
+
+impl<'f> RouteReader<'_, 'f> {
+    fn read(&self, field: &Field<'f>) -> RouteDraft<'f> {
+        field.entries();
+        let id = required(&field.get("id"), RouteId::ALLOWED, |text| RouteId::try_from(text).ok());
+        let input = field.get("input_topic");
+        let input_topic = required(&input, TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+        let message_type =
+            field.get("message_type").parsed(TypeName::ALLOWED, |text| TypeName::try_from(text).ok());
+        let max_sample_bytes = field.get("max_sample_bytes").count(1..=MAX_SAMPLE_BYTES);
+        let retained_samples = field.get("retained_samples").count(1..=MAX_DEPTH);
+
+        let overrides = field.section("qos_overrides");
+        self.check_lane_keys(&overrides, &["input"]);
+        let input_qos = PartialQos::read(&overrides.get("input")).input();
+        let outputs = self.outputs(field, id.as_ref(), input_topic.as_ref(), &overrides);
+
+        let route = match (&id, &input_topic) {
+            (Some(id), Some(input_topic)) => Some(Route {
+                id: id.clone(),
+                input_topic: input_topic.clone(),
+                message_type,
+                input_qos,
+                max_sample_bytes: max_sample_bytes.unwrap_or(self.max_sample_bytes),
+                retained_samples: retained_samples.unwrap_or_else(|| self.retained_samples(&outputs)),
+            }),
+            _ => None,
+        };
+        let input = input_topic.map(|topic| (topic, input));
+        RouteDraft { field: field.clone(), id, input, route, outputs }
+    }
+
+    /// One output for each lane that serves the route.
+    fn outputs(
+        &self,
+        field: &Field<'f>,
+        id: Option<&RouteId>,
+        input: Option<&TopicName>,
+        overrides: &Field<'f>,
+    ) -> Vec<OutputDraft<'f>> {
+        let section = field.section("outputs");
+        self.check_lane_keys(&section, &[]);
+        let serving = self.serving_lanes(field);
+        let topic_qos = id.map(|id| self.topic_qos.section(id.as_str()));
+        let mut outputs = Vec::new();
+        for (index, LaneDraft { lane, qos: lane_qos }) in self.lanes.iter().enumerate() {
+            let name = lane.name.as_str();
+            let mut given = section.get(name);
+            if matches!(name, "critical" | "noncritical") {
+                let short = field.get(&format!("{name}_output"));
+                if short.is_given() && given.is_given() {
+                    given.report::<()>(&format!("must not be given beside {}", short.path));
+                } else if short.is_given() {
+                    given = short;
+                }
+            }
+            // Every value is checked, also on lanes that do not serve the route.
+            let topic = given.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+            let override_qos = PartialQos::read(&overrides.get(name));
+            let profile = topic_qos.as_ref().and_then(|section| self.profiles.named(&section.get(name)));
+            if !serving[index] {
+                continue;
+            }
+            let topic = match (topic, input) {
+                (Some(topic), _) => topic,
+                (None, Some(input)) if !given.is_given() => {
+                    let default = format!("/adaptive_bridge/{name}{input}");
+                    let Ok(topic) = TopicName::try_from(default.as_str()) else {
+                        given.report_value(&default, format!("must be {}", TopicName::ALLOWED));
+                        continue;
+                    };
+                    topic
+                }
+                _ => continue,
+            };
+            let qos = override_qos.over(profile.unwrap_or(*lane_qos)).complete(lane.class);
+            outputs.push(OutputDraft { lane: index, topic, field: given, qos });
+        }
+        outputs
+    }
+
+    /// For each lane, whether it serves the route.
+    fn serving_lanes(&self, field: &Field<'_>) -> Vec<bool> {
+        let lanes = field.get("lanes");
+        let Some(items) = lanes.items() else { return vec![true; self.lanes.len()] };
+        if items.is_empty() {
+            lanes.report::<()>("must be a list of at least one lane");
+        }
+        let names = self.lane_names();
+        let mut serving = vec![false; self.lanes.len()];
+        for item in &items {
+            let index =
+                item.reference("a lane", &names, |name| names.iter().position(|known| *known == name));
+            if let Some(index) = index {
+                serving[index] = true;
+            }
+        }
+        serving
+    }
+
+    /// What a lane that was restarted must find again: the history that its TRANSIENT_LOCAL writers offer.
+    fn retained_samples(&self, outputs: &[OutputDraft<'_>]) -> usize {
+        let durable = outputs.iter().filter(|output| output.qos.durability == Durability::TransientLocal);
+        let depths = durable.map(|output| match output.qos.depth() {
+            Some(depth) => depth as usize,
+            // KEEP_ALL keeps what the writer has room for.
+            None => self.lanes[output.lane].lane.window_samples,
+        });
+        depths.max().unwrap_or(RETAINED_SAMPLES)
+    }
+
+    fn lane_names(&self) -> Vec<&str> {
+        self.lanes.iter().map(|draft| draft.lane.name.as_str()).collect()
+    }
+
+    /// Checks that the keys of a mapping are lanes, or one of `others`.
+    fn check_lane_keys(&self, section: &Field<'_>, others: &[&str]) {
+        let mut known = others.to_vec();
+        known.extend(self.lane_names());
+        for (name, field) in section.entries() {
+            if !known.contains(&name) {
+                field.report_unknown_key("a lane", name, &known);
+            }
+        }
+    }
+
+    /// Checks that the keys of `topic_qos_profiles` are routes and lanes.
+    fn check_topic_qos(&self, routes: &[RouteDraft<'_>]) {
+        let known: Vec<&str> =
+            routes.iter().filter_map(|route| route.id.as_ref().map(RouteId::as_str)).collect();
+        let unique: HashSet<&str> = known.iter().copied().collect();
+        for (id, section) in self.topic_qos.entries() {
+            if unique.contains(id) {
+                self.check_lane_keys(&section, &[]);
+            } else {
+                section.report_unknown_key("the id of a topic", id, &known);
+            }
+        }
+    }
+}
+
+/// A text that must be there and right.
+fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Option<T>) -> Option<T> {
+    if !field.is_given() {
+        return field.report(&format!("must be {allowed}"));
+    }
+    field.parsed(allowed, parse)
+}
+
+/// Ids are unique; no topic is read or written twice in a domain, and none is both: that would be a loop.
+fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraft]) {
+    let mut ids: HashMap<&str, &Field<'_>> = HashMap::new();
+    let mut inputs: HashMap<&str, &Field<'_>> = HashMap::new();
+    for route in routes {
+        if let Some(id) = &route.id {
+            match ids.get(id.as_str()) {
+                Some(first) => {
+                    let first = first.get("id");
+                    route.field.get("id").report::<()>(&format!("must be unique; {} has it too", at(&first)));
+                }
+                None => {
+                    ids.insert(id.as_str(), &route.field);
+                }
+            }
+        }
+        if let Some((topic, field)) = &route.input {
+            match inputs.get(topic.as_str()) {
+                Some(first) => {
+                    field.report::<()>(&format!("must be listed once; {} is the same topic", at(first)));
+                }
+                None => {
+                    inputs.insert(topic.as_str(), field);
+                }
+            }
+        }
+    }
+    let mut outputs: HashMap<(u16, &str), &Field<'_>> = HashMap::new();
+    for output in routes.iter().flat_map(|route| &route.outputs) {
+        let domain_id = lanes[output.lane].lane.network.domain_id;
+        let topic = output.topic.as_str();
+        let loops = if domain_id == input.domain_id { inputs.get(topic) } else { None };
+        if let Some(field) = loops {
+            let allowed = format!("must not be an input topic in the same domain ({}): a loop", at(field));
+            output.field.report_value(topic, allowed);
+        }
+        match outputs.get(&(domain_id, topic)) {
+            Some(first) => {
+                let allowed = format!("must not be another output in the same domain ({})", at(first));
+                output.field.report_value(topic, allowed);
+            }
+            None => {
+                outputs.insert((domain_id, topic), &output.field);
+            }
+        }
+    }
+}
+
+/// A field as a message refers to it.
+fn at(field: &Field<'_>) -> String {
+    format!("{}, line {}", field.path, field.line)
+}
