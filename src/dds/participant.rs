@@ -31,11 +31,12 @@ pub struct ParticipantOptions<'a> {
 
 /// A DDS participant with its node's entry in the ROS 2 graph.
 pub struct Participant {
-    participant: DomainParticipant,
+    /// First, because fields are dropped in this order and the library wants its writers gone first.
+    graph: RawWriter,
+    listener: DomainParticipantStatusListener,
     publisher: Publisher,
     subscriber: Subscriber,
-    listener: DomainParticipantStatusListener,
-    graph: RawWriter,
+    participant: DomainParticipant,
     namespace: String,
     node_name: String,
     graph_gid_bytes: usize,

@@ -1,6 +1,7 @@
 //! A DDS writer of raw payloads that never waits.
 
 use std::fmt;
+use std::time::Duration;
 
 use bytes::Bytes;
 
@@ -90,6 +91,12 @@ impl RawWriter {
         timestamp: SourceTimestamp,
     ) -> Result<(), WriteError> {
         self.write_with(payload, encapsulation, timestamp, Some(reader))
+    }
+
+    /// Waits until every matched RELIABLE reader has acknowledged everything written, for `patience` at most;
+    /// whether they have.
+    pub fn wait_acknowledged(&self, patience: Duration) -> bool {
+        self.inner.wait_for_acknowledgments(patience).unwrap_or(false)
     }
 
     fn write_with(

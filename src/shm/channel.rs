@@ -24,8 +24,8 @@ use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
 use super::node::{NodeShared, Service, ShmNode, failed};
 use super::root::RoleLock;
-use crate::config::Settings;
-use crate::model::{RouteId, SampleHeader};
+use crate::config::{Lane, Settings};
+use crate::model::{RouteId, SampleHeader, TrafficClass};
 
 /// Slots that ingress may hold at once while it copies and has not published yet: the one that it fills, and one
 /// of a caller that keeps a slot while it looks at the next sample.
@@ -45,6 +45,20 @@ pub struct LaneQueue {
     pub queue_depth: usize,
     /// Samples that the lane holds while DDS sends them.
     pub max_borrowed: usize,
+}
+
+impl LaneQueue {
+    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the sample
+    /// it takes next and the one that it sends.
+    pub fn of(lane: &Lane) -> Self {
+        let waiting = match lane.class {
+            TrafficClass::Critical => 0,
+            TrafficClass::Noncritical => {
+                lane.rates.normal.queue_samples.max(lane.rates.degraded.queue_samples) + 2
+            }
+        };
+        Self { queue_depth: lane.queue_depth, max_borrowed: lane.max_borrowed.max(waiting) }
+    }
 }
 
 /// The fixed parameters of the samples of one route. All processes of an instance must agree on them.
@@ -79,16 +93,12 @@ impl RouteChannel {
     /// # Panics
     /// When there is no route of that number.
     pub fn of(settings: &Settings, route: usize) -> Self {
-        let serves = |lane: &&crate::config::Lane| lane.outputs.iter().any(|output| output.route == route);
-        let queue = |lane: &crate::config::Lane| LaneQueue {
-            queue_depth: lane.queue_depth,
-            max_borrowed: lane.max_borrowed,
-        };
+        let serves = |lane: &&Lane| lane.outputs.iter().any(|output| output.route == route);
         let configured = &settings.routes[route];
         Self {
             route: configured.id.clone(),
             max_sample_bytes: configured.max_sample_bytes,
-            lanes: settings.lanes.iter().filter(serves).map(queue).collect(),
+            lanes: settings.lanes.iter().filter(serves).map(LaneQueue::of).collect(),
             max_taps: settings.shared_memory.max_taps,
             retained_samples: configured.retained_samples,
         }

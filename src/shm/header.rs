@@ -4,7 +4,7 @@ use std::fmt;
 
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::model::{Encapsulation, MonotonicNs, SampleHeader, SourceTimestamp, WriterGuid};
+use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
 
 /// The size of a [`SampleHeader`] in shared memory.
 pub const HEADER_BYTES: usize = size_of::<SampleHeader>();
@@ -44,7 +44,7 @@ pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
         word.copy_from_slice(&bytes[at..at + 8]);
         u64::from_ne_bytes(word)
     };
-    let mut writer_guid = WriterGuid::default();
+    let mut writer_guid = Guid::default();
     writer_guid.0.copy_from_slice(&bytes[40..56]);
     let header = SampleHeader {
         sequence: word(0),
@@ -95,7 +95,7 @@ impl Default for WireHeader {
             taken_at: MonotonicNs(0),
             published_at: MonotonicNs(0),
             writer_sequence: 0,
-            writer_guid: WriterGuid::default(),
+            writer_guid: Guid::default(),
             encapsulation: Encapsulation([0; 4]),
             reserved: 0,
         })
@@ -119,7 +119,7 @@ mod tests {
         wire.0.taken_at = MonotonicNs(3);
         wire.0.published_at = MonotonicNs(4);
         wire.0.writer_sequence = -1;
-        wire.0.writer_guid = WriterGuid([7; 16]);
+        wire.0.writer_guid = Guid([7; 16]);
         wire.0.encapsulation = Encapsulation([1, 2, 3, 4]);
         assert_eq!(decode_header(&bytes_of(wire)), Ok(wire.0));
     }

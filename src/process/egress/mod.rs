@@ -1,0 +1,237 @@
+//! Egress: one lane. Takes the samples of its routes out of shared memory and hands them to DDS writers of its
+//! own.
+//!
+//! The role runs once for each lane, critical or not; that the processes are separate is what isolates them, not
+//! that the code is. How a lane chooses what to send and when is [`critical`] and [`noncritical`]; how a sample
+//! is handed over and accounted for is [`output`].
+
+mod critical;
+mod late_joiners;
+mod noncritical;
+mod output;
+
+use std::time::Duration;
+
+use tracing::{info, warn};
+
+use super::HOUSEKEEPING_MS;
+use super::arena::CopyArena;
+use super::role::{Role, RoleError, lane_index, namespace};
+use super::stop::Stop;
+use crate::clock;
+use crate::config::{Lane, Settings};
+use crate::dds::{Participant, ParticipantOptions};
+use crate::model::{LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
+use crate::policy::effective_mode;
+use crate::shm::{Boards, LaneSleeper, ProcessRole};
+use critical::Critical;
+use noncritical::Noncritical;
+use output::Output;
+
+/// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping it
+/// stays well within the second that a role has to end.
+const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
+
+/// What a turn of a lane came to.
+enum Turn {
+    /// There was something to do; there may be more.
+    Busy,
+    /// Nothing there: sleep until a sample arrives, or at most until then.
+    UntilWoken(MonotonicNs),
+    /// Nothing may be sent before then, whatever arrives.
+    Until(MonotonicNs),
+}
+
+/// Runs the egress of the lane called `name` until `stop` is requested.
+///
+/// # Errors
+/// There is no such lane, it is served already, or shared memory or DDS cannot be had.
+pub fn egress(settings: &Settings, name: &str, stop: &Stop) -> Result<(), RoleError> {
+    let index = lane_index(settings, name)?;
+    let mut egress = Egress::open(settings, index)?;
+    let lane = &settings.lanes[index];
+    info!(
+        lane = name,
+        class = lane.class.label(),
+        routes = lane.outputs.len(),
+        domain_id = lane.network.domain_id,
+        "egress is up"
+    );
+    while !stop.is_requested() {
+        let turn = egress.turn();
+        egress.sleep(&turn);
+    }
+    egress.shut_down();
+    info!(lane = name, "egress is done");
+    Ok(())
+}
+
+struct Egress {
+    /// Before the participant: the DDS library wants its readers and writers gone first.
+    outputs: Vec<Output>,
+    participant: Participant,
+    role: Role,
+    forwarder: Forwarder,
+    arena: CopyArena,
+    sleeper: LaneSleeper,
+    policy: PolicyWatch,
+    housekeeping_at: MonotonicNs,
+    /// Whether the last sleep was one without a wake.
+    asleep_for_token: bool,
+}
+
+/// How the lane chooses what to send.
+enum Forwarder {
+    Critical(Critical),
+    Noncritical(Noncritical),
+}
+
+impl Egress {
+    fn open(settings: &Settings, index: usize) -> Result<Self, RoleError> {
+        let lane = &settings.lanes[index];
+        let role_name = format!("egress-{}", lane.name);
+        let role = Role::open(settings, ProcessRole::Egress(index), &role_name, &lane.scheduling)?;
+        let mut participant = Participant::open(&ParticipantOptions {
+            network: &lane.network,
+            namespace: namespace(settings),
+            node_name: format!("egress_{}", lane.name),
+            graph_gid_bytes: settings.graph_gid_bytes,
+        })?;
+        let mut outputs = Vec::with_capacity(lane.outputs.len());
+        for output in &lane.outputs {
+            outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
+        }
+        let now = clock::monotonic();
+        let forwarder = match lane.class {
+            TrafficClass::Critical => Forwarder::Critical(Critical::new()),
+            TrafficClass::Noncritical => Forwarder::Noncritical(Noncritical::new(lane, now)),
+        };
+        let sleeper = role.boards.sleeper(index);
+        let mut egress = Self {
+            policy: PolicyWatch::new(settings, lane, index),
+            role,
+            participant,
+            outputs,
+            forwarder,
+            arena: CopyArena::new(),
+            sleeper,
+            housekeeping_at: now,
+            asleep_for_token: false,
+        };
+        egress.keep_house(now);
+        Ok(egress)
+    }
+
+    fn turn(&mut self) -> Turn {
+        let now = clock::monotonic();
+        if now >= self.housekeeping_at {
+            self.keep_house(now);
+        }
+        let mode = self.policy.look(&self.role.boards, now);
+        match &mut self.forwarder {
+            Forwarder::Critical(critical) => {
+                critical.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
+            }
+            Forwarder::Noncritical(lane) => {
+                lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
+            }
+        }
+    }
+
+    fn sleep(&mut self, turn: &Turn) {
+        let (until, woken) = match *turn {
+            Turn::Busy => return,
+            Turn::UntilWoken(until) => (until, true),
+            Turn::Until(until) => (until, false),
+        };
+        let until = MonotonicNs(until.0.min(self.housekeeping_at.0));
+        let wait_ns = until.since(clock::monotonic());
+        if wait_ns == 0 {
+            return;
+        }
+        if woken {
+            self.sleeper.sleep(Duration::from_nanos(wait_ns));
+        } else {
+            std::thread::sleep(Duration::from_nanos(wait_ns));
+        }
+        self.asleep_for_token = !woken;
+    }
+
+    fn keep_house(&mut self, now: MonotonicNs) {
+        // Nothing in the lane needs to know who else is there; the list must be emptied all the same.
+        while self.participant.poll_discovery().is_some() {}
+        for output in &mut self.outputs {
+            output.keep_house(&mut self.participant, &self.role.boards, now);
+        }
+        self.role.turned(self.policy.mode as u8, self.policy.epoch);
+        self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
+    }
+
+    /// Forwards what still waits, as far as the lane's mode allows, and accounts for the rest.
+    fn shut_down(&mut self) {
+        let mode = self.policy.look(&self.role.boards, clock::monotonic());
+        if let Forwarder::Critical(critical) = &mut self.forwarder {
+            while let Turn::Busy =
+                critical.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
+            {}
+        }
+        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
+            lane.shut_down(&mut self.outputs);
+        }
+        let give_up_at = clock::monotonic().plus_ms(LAST_ACKNOWLEDGEMENTS_MS);
+        for output in &mut self.outputs {
+            let patience_ns = give_up_at.since(clock::monotonic());
+            if !output.wait_acknowledged(Duration::from_nanos(patience_ns)) {
+                warn!(
+                    route = output.id(),
+                    "a reader had not acknowledged the last samples when the lane shut down"
+                );
+            }
+        }
+    }
+}
+
+/// What the policy board says to this lane.
+struct PolicyWatch {
+    lane: usize,
+    name: LaneName,
+    class: TrafficClass,
+    policy_hold_ms: u64,
+    policy: LanePolicy,
+    mode: LaneMode,
+    epoch: u64,
+}
+
+impl PolicyWatch {
+    fn new(settings: &Settings, lane: &Lane, index: usize) -> Self {
+        Self {
+            lane: index,
+            name: lane.name.clone(),
+            class: lane.class,
+            policy_hold_ms: settings.policy_hold_ms,
+            policy: LanePolicy::default(),
+            mode: LaneMode::Normal,
+            epoch: 0,
+        }
+    }
+
+    /// The mode that applies now. A policy that cannot be read at this instant is that of the last look.
+    fn look(&mut self, boards: &Boards, now: MonotonicNs) -> LaneMode {
+        if let Some(policy) = boards.policy(self.lane) {
+            self.policy = policy;
+            self.epoch = policy.epoch;
+        }
+        let mode = effective_mode(&self.policy, self.class, now, self.policy_hold_ms);
+        if mode != self.mode {
+            info!(
+                lane = self.name.as_str(),
+                from = self.mode.label(),
+                to = mode.label(),
+                by_hand = self.policy.by_hand != 0,
+                "mode changed"
+            );
+            self.mode = mode;
+        }
+        mode
+    }
+}

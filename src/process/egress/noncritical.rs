@@ -1,0 +1,127 @@
+//! How a noncritical lane chooses: as many samples as its tokens allow, by the lane's drop policy.
+
+use super::super::arena::CopyArena;
+use super::Turn;
+use super::output::Output;
+use crate::clock;
+use crate::config::{DropPolicy, Lane, LaneRates};
+use crate::dds::Participant;
+use crate::model::{DropReason, Durability, LaneMode, MonotonicNs};
+use crate::policy::{ByteBudget, Decision, RouteShaper, Stamps, TurnOrder};
+use crate::shm::ShmSample;
+
+/// A noncritical lane.
+pub(super) struct Noncritical {
+    rates: LaneRates,
+    mode: LaneMode,
+    budget: ByteBudget,
+    turn_order: TurnOrder,
+    /// One for each output.
+    shapers: Vec<RouteShaper<ShmSample>>,
+}
+
+impl Noncritical {
+    pub fn new(lane: &Lane, now: MonotonicNs) -> Self {
+        let shapers = lane
+            .outputs
+            .iter()
+            .map(|output| RouteShaper::new(rates_of(lane.rates, output.qos.durability), now))
+            .collect();
+        Self {
+            rates: lane.rates,
+            mode: LaneMode::Normal,
+            budget: ByteBudget::new(lane.rates.normal.max_bytes_per_s, now),
+            turn_order: TurnOrder::default(),
+            shapers,
+        }
+    }
+
+    /// Takes in what is there and forwards what the tokens allow.
+    pub fn step(
+        &mut self,
+        outputs: &mut [Output],
+        participant: &mut Participant,
+        arena: &mut CopyArena,
+        mode: LaneMode,
+    ) -> Turn {
+        let now = clock::monotonic();
+        if mode != self.mode {
+            self.mode = mode;
+            self.budget.set_mode(&self.rates, mode, now);
+            for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
+                shaper.set_mode(mode, now, |sample, _, reason| output.drop_sample(&sample, reason));
+            }
+        }
+        for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
+            take_in(shaper, output);
+        }
+        let now = clock::monotonic();
+        let now_wall = clock::wall();
+        let mut token_at = MonotonicNs(u64::MAX);
+        let mut waits_for_sample = false;
+        let mut sent = false;
+        for index in self.turn_order.order(outputs.len()) {
+            let (shaper, output) = (&mut self.shapers[index], &mut outputs[index]);
+            loop {
+                let decision = shaper.poll(&mut self.budget, now, now_wall, |sample, _, reason| {
+                    output.drop_sample(&sample, reason);
+                });
+                match decision {
+                    Decision::Send(sample, _) => {
+                        output.send(sample, participant, arena);
+                        self.turn_order.sent(index);
+                        sent = true;
+                    }
+                    Decision::SleepUntil(at) => {
+                        token_at = MonotonicNs(token_at.0.min(at.0));
+                        break;
+                    }
+                    Decision::WaitForSample => {
+                        waits_for_sample = true;
+                        break;
+                    }
+                    Decision::Closed => break,
+                }
+            }
+            output.set_waiting(shaper.waiting());
+        }
+        if sent {
+            // More may have come meanwhile, for a token that is there.
+            Turn::Busy
+        } else if waits_for_sample {
+            Turn::UntilWoken(token_at)
+        } else {
+            Turn::Until(token_at)
+        }
+    }
+
+    /// Accounts for what still waits.
+    pub fn shut_down(&mut self, outputs: &mut [Output]) {
+        for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
+            take_in(shaper, output);
+            shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
+            output.set_waiting(0);
+        }
+    }
+}
+
+/// Moves what waits in shared memory into the lane's own queue.
+fn take_in(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
+    while let Some(sample) = output.take() {
+        let stamps = Stamps::new(sample.header(), sample.payload().len() as u64);
+        shaper.offer(sample, stamps, |dropped, _, reason| output.drop_sample(&dropped, reason));
+    }
+}
+
+/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms), of which no sample
+/// is too old to matter and none replaces another: it is sent in order, at the lane's rate.
+fn rates_of(lane: LaneRates, durability: Durability) -> LaneRates {
+    let mut rates = lane;
+    if durability == Durability::TransientLocal {
+        for rate in [&mut rates.normal, &mut rates.degraded] {
+            rate.stale_threshold_ms = 0;
+            rate.drop_policy = DropPolicy::DropStale;
+        }
+    }
+    rates
+}

@@ -1,0 +1,376 @@
+//! One route in ingress: its reader, its pool, its counters.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Wake, Waker};
+use std::thread::Thread;
+
+use tracing::{error, info, warn};
+
+use super::super::role::{Role, RoleError};
+use super::super::watch::DropWatch;
+use super::source::{Source, Wanted, label, still_suits};
+use crate::clock;
+use crate::config::{Route, Settings};
+use crate::dds::{Endpoint, Participant, RawReader, ReaderEvent, ReaderQos, SampleOrigin, Take};
+use crate::model::{
+    DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, RouteInfo, SampleHeader,
+};
+use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Slot, Stage};
+
+/// Writers whose sequence is followed on one route; more than publish one topic on any robot we know. With
+/// more, the one followed longest is forgotten, and its gaps are not counted.
+const WRITERS_FOLLOWED: usize = 32;
+
+/// How often a route without a publisher says so.
+const REMIND_MS: u64 = 30_000;
+
+/// Rung by the DDS library's thread when a sample arrives; wakes the thread of ingress.
+struct Bell {
+    rung: AtomicBool,
+    thread: Thread,
+}
+
+impl Wake for Bell {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        self.rung.store(true, Ordering::Release);
+        self.thread.unpark();
+    }
+}
+
+/// One route in ingress.
+pub(super) struct Input {
+    id: String,
+    dds_topic: String,
+    configured_type: Option<String>,
+    route: Route,
+    source: Source,
+    connection: Option<Connection>,
+    publisher: SamplePublisher,
+    counters: BoardWriter<IngressCounters>,
+    info: BoardWriter<RouteInfo>,
+    dds_in: HistogramWriter,
+    followed: Followed,
+    bell: Arc<Bell>,
+    waker: Waker,
+    watch: DropWatch,
+    remind_at: MonotonicNs,
+    conflict: Option<(String, String)>,
+}
+
+struct Connection {
+    reader: RawReader,
+    dds_type: String,
+    qos: ReaderQos,
+}
+
+impl Input {
+    pub fn open(role: &Role, settings: &Settings, index: usize) -> Result<Self, RoleError> {
+        let route = settings.routes[index].clone();
+        let counters = role.boards.ingress_writer(index);
+        let bell = Arc::new(Bell { rung: AtomicBool::new(true), thread: std::thread::current() });
+        Ok(Self {
+            id: route.id.to_string(),
+            dds_topic: route.input_topic.to_dds(),
+            configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
+            source: Source::default(),
+            connection: None,
+            publisher: SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?,
+            watch: DropWatch::new(counters.get().drops),
+            counters,
+            info: role.boards.route_info_writer(index),
+            dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
+            followed: Followed::default(),
+            waker: Waker::from(Arc::clone(&bell)),
+            bell,
+            remind_at: MonotonicNs(0),
+            conflict: None,
+            route,
+        })
+    }
+
+    /// Whether a publisher was found and is read.
+    pub fn is_connected(&self) -> bool {
+        self.connection.is_some()
+    }
+
+    /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes.
+    pub fn step(&mut self, wake: impl FnOnce()) -> bool {
+        let Some(connection) = &self.connection else {
+            return false;
+        };
+        if !self.bell.rung.load(Ordering::Acquire) {
+            return false;
+        }
+        let publisher = &self.publisher;
+        let mut lent: Option<(Result<Slot, LoanError>, Encapsulation, usize)> = None;
+        let mut lend = |payload: &[u8], encapsulation: Encapsulation| {
+            lent = Some((publisher.copy_in(payload), encapsulation, payload.len()));
+        };
+        let mut take = connection.reader.take(&mut lend);
+        if take == Take::Empty {
+            // Nothing there, so ask to be rung, and look again in case something came in between.
+            self.bell.rung.store(false, Ordering::Release);
+            connection.reader.arm(&self.waker);
+            take = connection.reader.take(&mut lend);
+        }
+        match take {
+            Take::Empty => return false,
+            Take::Sample(origin) => match lent {
+                Some((slot, encapsulation, bytes)) => {
+                    self.bell.rung.store(true, Ordering::Release);
+                    self.publish(slot, encapsulation, bytes, origin, wake);
+                }
+                // The library says that there was a sample and lent none; it has no such path today.
+                None => self.count_malformed(),
+            },
+            Take::Malformed => self.count_malformed(),
+        }
+        true
+    }
+
+    fn publish(
+        &mut self,
+        slot: Result<Slot, LoanError>,
+        encapsulation: Encapsulation,
+        bytes: usize,
+        origin: SampleOrigin,
+        wake: impl FnOnce(),
+    ) {
+        let taken_at = clock::monotonic();
+        let lost_upstream = self.followed.missing_before(origin.writer, origin.sequence);
+        let dropped = match slot {
+            Ok(_) => None,
+            Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
+            Err(_) => Some(DropReason::PoolExhausted),
+        };
+        // Counted before it is published: a process that dies in between leaves a hole in the sequence, which
+        // the lanes count, and not two samples of one number.
+        let sequence = self.counters.update(|counters| {
+            counters.received += 1;
+            counters.received_bytes += bytes as u64;
+            counters.lost_upstream += lost_upstream;
+            counters.last_received_at = taken_at;
+            match dropped {
+                Some(reason) => counters.drops.add(reason, 1),
+                None => counters.published += 1,
+            }
+            counters.published
+        });
+        if let Ok(slot) = slot {
+            let header = SampleHeader {
+                sequence,
+                source_timestamp: origin.source_timestamp,
+                taken_at,
+                published_at: clock::monotonic(),
+                writer_sequence: origin.sequence,
+                writer_guid: origin.writer,
+                encapsulation,
+                reserved: 0,
+            };
+            let published = slot.publish(header);
+            wake();
+            if let Err(error) = published {
+                error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
+            }
+        }
+        if let Some(written) = origin.source_timestamp.to_wall() {
+            self.dds_in.record(clock::wall().since(written));
+        }
+    }
+
+    fn count_malformed(&mut self) {
+        self.bell.rung.store(true, Ordering::Release);
+        self.counters.update(|counters| {
+            counters.received += 1;
+            counters.drops.add(DropReason::Malformed, 1);
+        });
+    }
+
+    /// Discovery knows a writer; whatever its topic.
+    pub fn writer_found(&mut self, writer: &Endpoint) {
+        if writer.topic == self.dds_topic && self.source.found(writer) {
+            info!(
+                route = self.id,
+                topic = self.dds_topic,
+                dds_type = writer.dds_type,
+                offers = label(writer.reliability, writer.durability),
+                "publisher found"
+            );
+        }
+    }
+
+    /// A writer is gone; whatever its topic.
+    pub fn writer_gone(&mut self, guid: Guid) {
+        self.source.gone(guid);
+    }
+
+    /// Connects to the publisher, attends to lanes that came, logs.
+    pub fn keep_house(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
+        self.connect(participant, now)?;
+        if let Some(connection) = &self.connection {
+            while let Some(event) = connection.reader.poll_event() {
+                match event {
+                    ReaderEvent::Matched { writers } => {
+                        self.counters.update(|counters| counters.writers = writers);
+                    }
+                    ReaderEvent::Incompatible { writer } => {
+                        warn!(
+                            route = self.id,
+                            ?writer,
+                            asked = label(connection.qos.reliability, connection.qos.durability),
+                            "a publisher offers less than the reader asks for: leave qos_overrides.input open"
+                        );
+                    }
+                }
+            }
+        }
+        self.publisher.attend();
+        self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[], now);
+        Ok(())
+    }
+
+    fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
+        let configured_type = self.configured_type.as_deref();
+        // Once a type is read it stays, whoever else claims the topic.
+        let settled = self.connection.as_ref().map(|connection| connection.dds_type.as_str());
+        if let Some(dds_type) = settled.or(configured_type)
+            && let Some(other) = self.source.of_other_type(dds_type)
+        {
+            let conflict = (dds_type.to_owned(), other.dds_type.clone());
+            self.report_conflict(conflict);
+        }
+        let settled = self.connection.as_ref().map(|connection| connection.dds_type.clone());
+        let wanted = self.source.wanted(
+            settled.as_deref().or(self.configured_type.as_deref()),
+            &self.route.input_qos,
+            self.route.max_sample_bytes,
+        );
+        match wanted {
+            Wanted::Reader { dds_type, qos } => {
+                if self.connection.as_ref().is_some_and(|current| still_suits(&current.qos, &qos)) {
+                    return Ok(());
+                }
+                self.read(participant, dds_type, qos)
+            }
+            Wanted::TypeConflict(one, other) => {
+                self.report_conflict((one, other));
+                Ok(())
+            }
+            Wanted::Unknown => {
+                if self.connection.is_none() && now >= self.remind_at {
+                    info!(
+                        route = self.id,
+                        topic = self.dds_topic,
+                        message_type = self.configured_type.as_deref().unwrap_or("any"),
+                        "waiting for a publisher"
+                    );
+                    self.remind_at = now.plus_ms(REMIND_MS);
+                }
+                Ok(())
+            }
+        }
+    }
+
+    fn read(
+        &mut self,
+        participant: &mut Participant,
+        dds_type: String,
+        qos: ReaderQos,
+    ) -> Result<(), RoleError> {
+        if let Some(former) = self.connection.take() {
+            info!(
+                route = self.id,
+                from = label(former.qos.reliability, former.qos.durability),
+                to = label(qos.reliability, qos.durability),
+                "the reader follows what the publishers offer"
+            );
+            let guid = former.reader.guid();
+            drop(former);
+            participant.forget(guid);
+        }
+        // Before the reader: a lane must be able to make its writer before the first sample reaches it.
+        self.info.update(|info| info.dds_type = FixedText::new(&dds_type));
+        let reader = participant.create_reader(&self.dds_topic, &dds_type, &qos)?;
+        info!(
+            route = self.id,
+            topic = self.dds_topic,
+            dds_type,
+            qos = label(qos.reliability, qos.durability),
+            depth = qos.depth,
+            "reading"
+        );
+        self.bell.rung.store(true, Ordering::Release);
+        self.connection = Some(Connection { reader, dds_type, qos });
+        Ok(())
+    }
+
+    fn report_conflict(&mut self, conflict: (String, String)) {
+        if self.conflict.as_ref() != Some(&conflict) {
+            error!(
+                route = self.id,
+                topic = self.dds_topic,
+                one = conflict.0,
+                other = conflict.1,
+                "two types claim the topic: set message_type of the route, or stop one of the publishers"
+            );
+            self.conflict = Some(conflict);
+        }
+    }
+}
+
+/// The last sequence number of each writer, to know what never reached us.
+#[derive(Default)]
+struct Followed {
+    writers: Vec<(Guid, i64)>,
+    oldest: usize,
+}
+
+impl Followed {
+    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began to
+    /// follow is not missing.
+    fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
+        if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == writer) {
+            let missing = sequence.saturating_sub(*last).saturating_sub(1).max(0);
+            *last = sequence.max(*last);
+            return missing.unsigned_abs();
+        }
+        if self.writers.len() < WRITERS_FOLLOWED {
+            self.writers.push((writer, sequence));
+        } else {
+            self.writers[self.oldest] = (writer, sequence);
+            self.oldest = (self.oldest + 1) % WRITERS_FOLLOWED;
+        }
+        0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaps_are_counted_for_each_writer_by_itself() {
+        let mut followed = Followed::default();
+        assert_eq!(followed.missing_before(Guid([1; 16]), 10), 0);
+        assert_eq!(followed.missing_before(Guid([2; 16]), 500), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 11), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 15), 3);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 12), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 16), 0);
+        assert_eq!(followed.missing_before(Guid([2; 16]), i64::MAX), (i64::MAX - 501) as u64);
+    }
+
+    #[test]
+    fn many_writers_take_bounded_memory() {
+        let mut followed = Followed::default();
+        for writer in 0..=255 {
+            followed.missing_before(Guid([writer; 16]), 1);
+        }
+        assert_eq!(followed.writers.len(), WRITERS_FOLLOWED);
+    }
+}

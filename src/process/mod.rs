@@ -1,0 +1,25 @@
+//! The roles: what each process of a bridge does from its start to its end. The only place where the edges
+//! meet policy.
+//!
+//! A role is a loop of turns. A turn handles what is there and then sleeps until it is woken, or until the next
+//! housekeeping, which is all that need not happen for each sample: discovery, matching, logs, health.
+
+mod arena;
+mod egress;
+mod ingress;
+mod manual;
+mod role;
+mod scheduling;
+mod stop;
+mod supervisor;
+mod watch;
+
+pub use egress::egress;
+pub use ingress::ingress;
+pub use manual::set_mode;
+pub use role::RoleError;
+pub use stop::Stop;
+pub use supervisor::{SupervisorError, end_with_supervisor, up};
+
+/// How often a role keeps house. A signal to stop is seen within it, so that a role ends within a second.
+const HOUSEKEEPING_MS: u64 = 100;

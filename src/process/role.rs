@@ -1,0 +1,154 @@
+//! What every role begins with and ends by.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use tracing::info;
+
+use super::scheduling;
+use crate::clock;
+use crate::config::{Scheduling, Settings};
+use crate::dds::DdsError;
+use crate::model::ProcessHealth;
+use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
+
+/// Why a role could not start, or had to end.
+#[derive(Debug)]
+pub enum RoleError {
+    /// The configuration has no lane of that name.
+    NoSuchLane {
+        /// The name.
+        name: String,
+        /// The lanes there are.
+        lanes: Vec<String>,
+    },
+    /// No process serves the lane.
+    NotRunning {
+        /// The bridge.
+        instance: String,
+        /// The lane.
+        lane: String,
+    },
+    /// Shared memory.
+    Shm(ShmError),
+    /// DDS.
+    Dds(DdsError),
+    /// The operating system refused something else.
+    Os(std::io::Error),
+}
+
+impl fmt::Display for RoleError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoSuchLane { name, lanes } => {
+                write!(f, "there is no lane {name}; the configuration has: {}", lanes.join(", "))
+            }
+            Self::NotRunning { instance, lane } => write!(
+                f,
+                "no process serves lane {lane} of instance {instance}; start it with \
+                 `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
+            ),
+            Self::Shm(error) => error.fmt(f),
+            Self::Dds(error) => error.fmt(f),
+            Self::Os(error) => error.fmt(f),
+        }
+    }
+}
+
+impl std::error::Error for RoleError {}
+
+impl From<ShmError> for RoleError {
+    fn from(error: ShmError) -> Self {
+        Self::Shm(error)
+    }
+}
+
+impl From<DdsError> for RoleError {
+    fn from(error: DdsError) -> Self {
+        Self::Dds(error)
+    }
+}
+
+impl From<std::io::Error> for RoleError {
+    fn from(error: std::io::Error) -> Self {
+        Self::Os(error)
+    }
+}
+
+/// The number of the lane called `name`.
+pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleError> {
+    settings.lanes.iter().position(|lane| lane.name.as_str() == name).ok_or_else(|| RoleError::NoSuchLane {
+        name: name.to_owned(),
+        lanes: settings.lanes.iter().map(|lane| lane.name.to_string()).collect(),
+    })
+}
+
+/// The folder of the bridge's shared files, for these settings and this environment.
+pub(super) fn root(settings: &Settings) -> PathBuf {
+    default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
+}
+
+/// A role that is up: nobody else serves it, shared memory is attached, health is shown.
+pub(super) struct Role {
+    pub node: ShmNode,
+    pub boards: Boards,
+    health: BoardWriter<ProcessHealth>,
+    /// Last, so that the role is free only when everything else is gone.
+    _lock: RoleLock,
+}
+
+impl Role {
+    /// Takes the role `name`, applies its scheduling and attaches to shared memory.
+    pub fn open(
+        settings: &Settings,
+        role: ProcessRole,
+        name: &str,
+        how: &Scheduling,
+    ) -> Result<Self, RoleError> {
+        let root = root(settings);
+        let lock = RoleLock::acquire(&root, &settings.instance, name)?;
+        scheduling::apply(how);
+        let node = ShmNode::open(&root, &settings.instance, name)?;
+        let cleaned = node.cleaned_up();
+        if cleaned.dead_processes > 0 {
+            info!(
+                dead_processes = cleaned.dead_processes,
+                not_yet = cleaned.failed,
+                "cleaned up in shared memory after processes that died"
+            );
+        }
+        let boards = node.boards(&BridgeShape::of(settings))?;
+        let mut health = boards.health_writer(role);
+        let now = clock::monotonic();
+        health.update(|health| {
+            let starts = health.starts + 1;
+            *health = ProcessHealth {
+                pid: u64::from(std::process::id()),
+                started_at: now,
+                alive_at: now,
+                starts,
+                ..ProcessHealth::default()
+            };
+        });
+        Ok(Self { node, boards, health, _lock: lock })
+    }
+
+    /// Shows that the data path turned, and what it applies.
+    pub fn turned(&mut self, mode: u8, policy_epoch: u64) {
+        let now = clock::monotonic();
+        self.health.update(|health| {
+            health.alive_at = now;
+            health.turns += 1;
+            health.mode = mode;
+            health.policy_epoch = policy_epoch;
+        });
+    }
+}
+
+/// The ROS 2 namespace of a bridge's nodes: that of the default instance is short.
+pub(super) fn namespace(settings: &Settings) -> String {
+    match settings.instance.as_str() {
+        "default" => "/adaptive_bridge".to_owned(),
+        instance => format!("/adaptive_bridge/{instance}"),
+    }
+}

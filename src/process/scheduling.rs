@@ -1,0 +1,67 @@
+//! How the operating system is to schedule this process.
+
+use nix::errno::Errno;
+use nix::libc;
+use nix::sched::{CpuSet, sched_setaffinity};
+use nix::sys::mman::{MlockAllFlags, mlockall};
+use nix::unistd::Pid;
+use tracing::{info, warn};
+
+use crate::config::{Scheduling, SchedulingPolicy};
+
+/// Applies what is configured to this process and the threads that it starts from now on. What the system
+/// refuses is a warning that says what would allow it: a bridge with the wrong priority is better than none.
+pub(super) fn apply(scheduling: &Scheduling) {
+    if !scheduling.cpus.is_empty() {
+        match set_affinity(&scheduling.cpus) {
+            Ok(()) => info!(cpus = ?scheduling.cpus, "CPUs set"),
+            Err(error) => {
+                warn!(cpus = ?scheduling.cpus, %error, "CPUs not set: use CPUs that this machine has")
+            }
+        }
+    }
+    let (policy, name) = match scheduling.policy {
+        SchedulingPolicy::Other => (None, "other"),
+        SchedulingPolicy::Fifo => (Some(libc::SCHED_FIFO), "fifo"),
+        SchedulingPolicy::RoundRobin => (Some(libc::SCHED_RR), "rr"),
+    };
+    if let Some(policy) = policy {
+        match set_policy(policy, scheduling.priority) {
+            Ok(()) => info!(policy = name, priority = scheduling.priority, "scheduling policy set"),
+            Err(error) => warn!(
+                policy = name,
+                priority = scheduling.priority,
+                %error,
+                "scheduling policy not set: the process needs CAP_SYS_NICE or an RLIMIT_RTPRIO of at least \
+                 the priority"
+            ),
+        }
+    }
+    if scheduling.lock_memory {
+        match mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE) {
+            Ok(()) => info!("memory locked"),
+            Err(error) => {
+                warn!(%error, "memory not locked: the process needs CAP_IPC_LOCK or a larger RLIMIT_MEMLOCK");
+            }
+        }
+    }
+}
+
+fn set_affinity(cpus: &[usize]) -> nix::Result<()> {
+    let mut set = CpuSet::new();
+    for &cpu in cpus {
+        set.set(cpu)?;
+    }
+    sched_setaffinity(Pid::from_raw(0), &set)
+}
+
+fn set_policy(policy: libc::c_int, priority: u8) -> nix::Result<()> {
+    // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it. nix has no
+    // wrapper for this call.
+    let outcome = unsafe {
+        let mut param: libc::sched_param = std::mem::zeroed();
+        param.sched_priority = libc::c_int::from(priority);
+        libc::sched_setscheduler(0, policy, &param)
+    };
+    Errno::result(outcome).map(drop)
+}

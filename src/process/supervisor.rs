@@ -1,0 +1,263 @@
+//! `up`: all roles of a bridge as children of one process, for a terminal or a container.
+//!
+//! On a robot systemd supervises the roles. Here a child that dies is started again, with a backoff; each line
+//! of a child's log is passed on with the child's name before it; and no child outlives this process, because
+//! each asks the kernel to be terminated when its parent dies, however that dies.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::io::{self, BufRead, BufReader, Write};
+use std::os::unix::process::ExitStatusExt;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::Duration;
+
+use nix::sys::prctl::set_pdeathsig;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::{Pid, getppid};
+use tracing::{error, info, warn};
+
+use super::stop::Stop;
+use crate::clock;
+use crate::config::Settings;
+use crate::model::MonotonicNs;
+use crate::policy::{ChildExit, GiveUpReason, RestartBackoff, RestartDecision};
+
+/// How often the children are looked at.
+const LOOK_MS: u64 = 20;
+
+/// Roles end within a second of a request; one that has not by then is killed.
+const GRACE_MS: u64 = 900;
+
+/// Set for children, to the process id of their supervisor.
+const SUPERVISOR_VARIABLE: &str = "ADAPTIVE_BRIDGE_SUPERVISOR";
+
+/// Why `up` had to end.
+#[derive(Debug)]
+pub enum SupervisorError {
+    /// A child could not be started.
+    Start {
+        /// Its name.
+        name: String,
+        /// What the operating system said.
+        error: io::Error,
+    },
+    /// No child is left that could be started again.
+    AllGaveUp,
+}
+
+impl fmt::Display for SupervisorError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Start { name, error } => write!(f, "cannot start {name}: {error}"),
+            Self::AllGaveUp => f.write_str("every process of the bridge has given up; see the log above"),
+        }
+    }
+}
+
+impl std::error::Error for SupervisorError {}
+
+/// To be called by a role before anything else: if `up` started this process, it ends with `up`.
+pub fn end_with_supervisor() {
+    let Some(supervisor) = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok()) else {
+        return;
+    };
+    if let Err(error) = set_pdeathsig(Signal::SIGTERM) {
+        warn!(%error, "this process may outlive its supervisor");
+    }
+    // The supervisor may have died before the request was made.
+    if getppid() != Pid::from_raw(supervisor) {
+        error!("the supervisor is gone already");
+        std::process::exit(1);
+    }
+}
+
+/// Runs ingress and every lane as children until `stop` is requested. `arguments` are passed on to each, after
+/// its own (the configuration file, say).
+///
+/// # Errors
+/// The first start of a child failed, or all children gave up.
+pub fn up(settings: &Settings, arguments: &[OsString], stop: &Stop) -> Result<(), SupervisorError> {
+    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments)];
+    for lane in &settings.lanes {
+        let name = format!("egress-{}", lane.name);
+        children.push(Supervised::new(&name, &["egress", "--lane", lane.name.as_str()], arguments));
+    }
+    let mut outcome = Ok(());
+    for child in &mut children {
+        if let Err(error) = child.start() {
+            outcome = Err(SupervisorError::Start { name: child.name.clone(), error });
+            break;
+        }
+    }
+    while outcome.is_ok() && !stop.is_requested() {
+        std::thread::sleep(Duration::from_millis(LOOK_MS));
+        let now = clock::monotonic();
+        for child in &mut children {
+            child.look(now);
+        }
+        if children.iter().all(|child| child.state == State::GaveUp) {
+            outcome = Err(SupervisorError::AllGaveUp);
+        }
+    }
+    end(&mut children);
+    outcome
+}
+
+/// Asks all children to end and sees to it that they do.
+fn end(children: &mut [Supervised]) {
+    for child in children.iter() {
+        child.signal(Signal::SIGTERM);
+    }
+    let deadline = clock::monotonic().plus_ms(GRACE_MS);
+    while children.iter_mut().any(|child| !child.has_ended()) {
+        if clock::monotonic() >= deadline {
+            for child in children.iter_mut().filter(|child| child.process.is_some()) {
+                warn!(child = child.name, "did not end in time; killed");
+                child.signal(Signal::SIGKILL);
+                // SIGKILL cannot be refused, so this wait is short; also for a stopped process.
+                if let Some(mut process) = child.process.take() {
+                    let _ = process.wait();
+                }
+            }
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Running,
+    RestartAt(MonotonicNs),
+    GaveUp,
+}
+
+struct Supervised {
+    name: String,
+    arguments: Vec<OsString>,
+    process: Option<Child>,
+    backoff: RestartBackoff,
+    state: State,
+}
+
+impl Supervised {
+    fn new(name: &str, own: &[&str], passed_on: &[OsString]) -> Self {
+        let mut arguments: Vec<OsString> = own.iter().map(OsString::from).collect();
+        arguments.extend_from_slice(passed_on);
+        Self {
+            name: name.to_owned(),
+            arguments,
+            process: None,
+            backoff: RestartBackoff::new(clock::monotonic()),
+            state: State::Running,
+        }
+    }
+
+    fn start(&mut self) -> io::Result<()> {
+        let mut process = Command::new(std::env::current_exe()?)
+            .args(&self.arguments)
+            .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
+            .stdin(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        if let Some(log) = process.stderr.take() {
+            let name = self.name.clone();
+            std::thread::spawn(move || pass_on(&name, log));
+        }
+        info!(child = self.name, pid = process.id(), "started");
+        self.process = Some(process);
+        self.state = State::Running;
+        Ok(())
+    }
+
+    fn look(&mut self, now: MonotonicNs) {
+        match self.state {
+            State::GaveUp => {}
+            State::RestartAt(at) => {
+                if now >= at {
+                    self.backoff.started(now);
+                    if let Err(error) = self.start() {
+                        error!(child = self.name, %error, "not started again");
+                        // The same as a child that fails at once.
+                        self.ended(ChildExit::Code(1), now);
+                    }
+                }
+            }
+            State::Running => {
+                let ended = self.process.as_mut().map(Child::try_wait);
+                match ended {
+                    Some(Ok(Some(status))) => {
+                        self.process = None;
+                        let exit = exit_of(status);
+                        warn!(child = self.name, ?exit, "ended unasked");
+                        self.ended(exit, now);
+                    }
+                    Some(Err(error)) => error!(child = self.name, %error, "cannot be waited for"),
+                    Some(Ok(None)) | None => {}
+                }
+            }
+        }
+    }
+
+    fn ended(&mut self, exit: ChildExit, now: MonotonicNs) {
+        self.state = match self.backoff.ended(exit, now) {
+            RestartDecision::RestartAt(at) => State::RestartAt(at),
+            RestartDecision::GiveUp(reason) => {
+                let why = match reason {
+                    GiveUpReason::WrongCommandLine => "its command line is wrong",
+                    GiveUpReason::BadConfiguration => "the configuration is bad",
+                };
+                error!(child = self.name, "not started again: {why}");
+                State::GaveUp
+            }
+        };
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Some(process) = &self.process
+            && let Ok(pid) = i32::try_from(process.id())
+        {
+            // A stopped child has to be continued to see any signal but SIGKILL.
+            let _ = kill(Pid::from_raw(pid), signal);
+            let _ = kill(Pid::from_raw(pid), Signal::SIGCONT);
+        }
+    }
+
+    fn has_ended(&mut self) -> bool {
+        if let Some(process) = &mut self.process
+            && !matches!(process.try_wait(), Ok(None))
+        {
+            self.process = None;
+        }
+        self.process.is_none()
+    }
+}
+
+fn exit_of(status: ExitStatus) -> ChildExit {
+    match (status.code(), status.signal()) {
+        (Some(code), _) => ChildExit::Code(code),
+        (None, Some(signal)) => ChildExit::Signal(signal),
+        (None, None) => ChildExit::Code(1),
+    }
+}
+
+/// Writes each line of a child's log to ours, with the child's name before it. One write for each line, so that
+/// lines of several children do not mix.
+fn pass_on(name: &str, log: impl io::Read) {
+    let mut lines = BufReader::new(log);
+    let mut line = Vec::with_capacity(256);
+    loop {
+        line.clear();
+        line.extend_from_slice(format!("[{name}] ").as_bytes());
+        match lines.read_until(b'\n', &mut line) {
+            Ok(0) | Err(_) => return,
+            Ok(_) => {
+                if line.last() != Some(&b'\n') {
+                    line.push(b'\n');
+                }
+                // Nobody can be told that stderr is gone.
+                let _ = io::stderr().lock().write_all(&line);
+            }
+        }
+    }
+}
