@@ -1,1 +1,7 @@
-fn main() {}
+//! The `adaptive-bridge` program: parses, dispatches, exits.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    adaptive_bridge::cli::main()
+}

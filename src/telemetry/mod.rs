@@ -1,0 +1,5 @@
+//! What the processes show: logs, and readings of the boards.
+
+mod logs;
+
+pub use logs::start_logs;
