@@ -21,8 +21,8 @@ use clap::{Args, Parser, Subcommand};
 use crate::clock;
 use crate::config::{self, ConfigError, Settings};
 use crate::process::Stop;
-use crate::shm;
-use crate::telemetry;
+use crate::shm::{self, ShmError};
+use crate::telemetry::{self, Snapshot};
 
 /// Bad configuration (`EX_CONFIG`, sysexits.h).
 const EXIT_CONFIG: u8 = 78;
@@ -107,6 +107,18 @@ pub fn main() -> ExitCode {
 fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     eprintln!("adaptive-bridge: {error}");
     ExitCode::FAILURE
+}
+
+/// A reading; other settings than those of the running bridge are named as what they are.
+fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, String> {
+    Snapshot::take(root, settings).map_err(|error| match error {
+        ShmError::Incompatible { .. } => format!(
+            "the bridge that runs as instance {} has other lanes or routes than this configuration, or is of \
+             another version; name the configuration that it was started with (--config)",
+            settings.instance
+        ),
+        other => other.to_string(),
+    })
 }
 
 /// Prints that there is no bridge to look at, and gives the exit code.

@@ -6,10 +6,9 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, pause, root};
+use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
 use crate::config::Settings;
 use crate::process::Stop;
-use crate::shm::ShmError;
 use crate::telemetry::{Report, Snapshot};
 
 /// What `status` is asked.
@@ -34,7 +33,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Err(code) => return code,
     };
     let root = root(&settings);
-    let first = match take(&root, &settings) {
+    let first = match read_bridge(&root, &settings) {
         Ok(Some(snapshot)) => snapshot,
         Ok(None) => return no_bridge(&settings, &root),
         Err(error) => return failed(&error),
@@ -43,7 +42,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         return watch(arguments, &root, &settings, first);
     }
     std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
-    match take(&root, &settings) {
+    match read_bridge(&root, &settings) {
         Ok(Some(second)) => match show(&second.since(&first), arguments.json) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => output_ended(&error),
@@ -62,7 +61,7 @@ fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapsho
     let in_place = !arguments.json && io::stdout().is_terminal();
     let mut last = Some(first);
     while pause(arguments.interval_ms, &stop) {
-        let next = match take(root, settings) {
+        let next = match read_bridge(root, settings) {
             Ok(next) => next,
             Err(error) => return failed(&error),
         };
@@ -85,18 +84,6 @@ fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapsho
     ExitCode::SUCCESS
 }
 
-/// A reading; other settings than those of the running bridge are named as what they are.
-fn take(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, String> {
-    Snapshot::take(root, settings).map_err(|error| match error {
-        ShmError::Incompatible { .. } => format!(
-            "the bridge that runs as instance {} has other lanes or routes than this configuration, or is of \
-             another version; name the configuration that it was started with (--config)",
-            settings.instance
-        ),
-        other => other.to_string(),
-    })
-}
-
 fn show(report: &Report, json: bool) -> io::Result<()> {
     let mut text = if json { serde_json::to_string(report)? } else { report.to_string() };
     if json {
@@ -107,20 +94,37 @@ fn show(report: &Report, json: bool) -> io::Result<()> {
     stdout.flush()
 }
 
-/// Draws over what was drawn before: from the upper left corner, each line cleared behind its text, then all
-/// that is below. Cut to the terminal, because a line that wraps or scrolls would spoil the next frame.
 fn redraw(text: &str) -> io::Result<()> {
     let (columns, lines) = match terminal_size::terminal_size() {
-        Some((terminal_size::Width(columns), terminal_size::Height(lines))) => (columns.max(1), lines.max(2)),
+        Some((terminal_size::Width(columns), terminal_size::Height(lines))) => (columns, lines),
         None => (80, 24),
     };
+    let mut stdout = io::stdout().lock();
+    stdout.write_all(frame(text, usize::from(columns), usize::from(lines)).as_bytes())?;
+    stdout.flush()
+}
+
+/// Draws over what was drawn before: from the upper left corner, each line cleared behind its text, then all
+/// that is below. Cut to the terminal, because a line that wraps or scrolls would spoil the next frame.
+fn frame(text: &str, columns: usize, lines: usize) -> String {
     let mut frame = String::from("\x1b[H");
-    for line in text.lines().take(usize::from(lines) - 1) {
-        frame.extend(line.chars().take(usize::from(columns)));
+    // The cursor needs the last line.
+    for line in text.lines().take(lines.saturating_sub(1)) {
+        frame.extend(line.chars().take(columns));
         frame.push_str("\x1b[K\n");
     }
     frame.push_str("\x1b[J");
-    let mut stdout = io::stdout().lock();
-    stdout.write_all(frame.as_bytes())?;
-    stdout.flush()
+    frame
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_fits_the_terminal_and_clears_what_was_there() {
+        assert_eq!(frame("one\ntwo µs\nthree", 5, 10), "\x1b[Hone\x1b[K\ntwo µ\x1b[K\nthree\x1b[K\n\x1b[J");
+        assert_eq!(frame("one\ntwo\nthree", 80, 3), "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J");
+        assert_eq!(frame("one", 0, 0), "\x1b[H\x1b[J");
+    }
 }

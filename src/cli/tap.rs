@@ -10,14 +10,14 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, root};
+use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge, root};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{Encapsulation, MonotonicNs};
 use crate::policy::{SequenceTracker, Sighting};
 use crate::process::Stop;
 use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError};
-use crate::telemetry::{Intervals, Snapshot};
+use crate::telemetry::Intervals;
 
 /// How often `--hz` says something.
 const REPORT_MS: u64 = 1_000;
@@ -57,7 +57,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     };
     // First of all, because joining would set up the shared memory of a bridge that does not run.
     let root = root(&settings);
-    match Snapshot::take(&root, &settings) {
+    match read_bridge(&root, &settings) {
         Ok(Some(_)) => {}
         Ok(None) => return no_bridge(&settings, &root),
         Err(error) => return failed(&error),
@@ -74,7 +74,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(subscriber) => subscriber,
         Err(error) => return failed(&error),
     };
-    let bridge_runs = || matches!(Snapshot::take(&root, &settings), Ok(Some(_)));
+    let bridge_runs = || matches!(read_bridge(&root, &settings), Ok(Some(_)));
     match Tap::new(arguments).follow(&subscriber, &stop, bridge_runs) {
         Ok(End::Done) => ExitCode::SUCCESS,
         Ok(End::BridgeGone) => failed(&"the bridge has ended"),
