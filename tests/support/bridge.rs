@@ -28,7 +28,7 @@ impl Bridge {
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let instance = format!("test-{}-{number}", std::process::id());
+        let instance = format!("test_{}_{number}", std::process::id());
         let bridge = Bridge { instance, folder: tempfile::tempdir().unwrap() };
         bridge.write_config(yaml);
         bridge
