@@ -157,7 +157,8 @@ pub struct RatePolicy {
     pub max_rate_hz: f64,
     /// Payload bytes per second over all routes of the lane; `None` is unlimited.
     pub max_bytes_per_s: Option<u64>,
-    /// A sample older than this by its source timestamp is dropped; 0 never.
+    /// A sample older than this by its source timestamp is dropped; 0 never. Does not apply to a
+    /// `TRANSIENT_LOCAL` output, whose samples are meant to be old.
     pub stale_threshold_ms: u64,
     /// What gives way when more samples wait than tokens come.
     pub drop_policy: DropPolicy,
@@ -172,7 +173,8 @@ pub enum DropPolicy {
     DropOldest,
     /// The oldest sample is sent; a new one that finds the queue full is dropped.
     DropLatest,
-    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is full.
+    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is
+    /// full.
     DropStale,
 }
 
