@@ -390,7 +390,8 @@ fn what_is_no_ordinary_file_is_refused_and_never_waited_for() {
 
 /// Pieces that YAML is made of, and pieces of configurations, with `;` between them.
 const PIECES: &str = concat!(
-    "\n;\n  ;\n    ;- ;: ;:;, ;[;];{;};\";';|\n;>-\n;&a ;*a;!!str ;!x ;#;? ;---\n;...\n;%YAML 1.2\n;<<: *a;\t;\r\n;~;",
+    "\n;\n  ;\n    ;- ;: ;:;, ;[;];{;};\";';|\n;>-\n;&a ;*a;!!str ;!x ;#;",
+    "? ;---\n;...\n;%YAML 1.2\n;<<: *a;\t;\r\n;~;",
     "null;true;yes;-1;0;1e999;.nan;.inf;18446744073709551616;/a;\0;\u{feff};\u{85};é;topics;id;input_topic;",
     "lanes;qos_profiles;noncritical;critical;qos;depth;overrides",
 );
