@@ -56,6 +56,12 @@ fn is_whole_and_quiet(status: &Value) -> bool {
     routes.peek().is_some() && routes.all(|route| route["whole"] == true && route["waiting"] == 0)
 }
 
+/// What a subscriber missed from sample `first` on. What came before, while the endpoints found each other, is
+/// nobody's loss: the writers are VOLATILE.
+fn missing_from(received: &Received, first: u64) -> Vec<(u64, u64)> {
+    received.missing.iter().copied().filter(|(_, last)| *last >= first).collect()
+}
+
 const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, max_sample_bytes: 65536}\n";
 const CRITICAL: &str = "rt/adaptive_bridge/critical/scan";
 const NONCRITICAL: &str = "rt/adaptive_bridge/noncritical/scan";
@@ -74,7 +80,7 @@ fn every_library_reaches_every_library_through_both_lanes() {
             let scout = first.wait_match(1).start_on(bed.host("publisher"));
             critical.wait_received(1);
             noncritical.wait_received(1);
-            let scouted: Sent = scout.end();
+            let _: Sent = scout.end();
 
             let again = peer(from).publisher().topic("rt/scan").rate_hz(200.0).count(400).wait_match(1);
             let publisher = again.first_seq(10_000).start_on(bed.host("publisher"));
@@ -86,10 +92,8 @@ fn every_library_reaches_every_library_through_both_lanes() {
 
             let received: Received = critical.end();
             received.assert_sound();
-            // All of the second run, and of the first one from some sample on.
-            let from_first = scouted.last + 1 - received.first.expect("numbered");
-            assert_eq!(received.received, 400 + from_first, "{from:?} to {to:?}: {received:?}");
-            assert_eq!(received.source_timestamps_changed, 0, "{from:?} to {to:?}: {received:?} {scouted:?}");
+            assert!(missing_from(&received, 10_000).is_empty(), "{from:?} to {to:?}: {received:?}");
+            assert_eq!(received.source_timestamps_changed, 0, "{from:?} to {to:?}: {received:?}");
             let slow: Received = noncritical.end();
             slow.assert_sound();
             assert_eq!(slow.headers, received.headers.clone().into_keys().zip([slow.received]).collect());
