@@ -59,7 +59,6 @@ impl Bridge {
     /// Completes a command line such as `egress --lane critical` with `--config`.
     fn complete(&self, mut command: Command, arguments: &str) -> Command {
         command.args(arguments.split_whitespace()).arg("--config").arg(self.config());
-        command.env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "info".to_owned()));
         command.env("NO_COLOR", "1");
         command
     }
