@@ -28,7 +28,7 @@ impl Bridge {
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let instance = format!("test-{}-{number}", std::process::id());
+        let instance = format!("test_{}_{number}", std::process::id());
         let bridge = Bridge { instance, folder: tempfile::tempdir().unwrap() };
         bridge.write_config(yaml);
         bridge
@@ -59,7 +59,6 @@ impl Bridge {
     /// Completes a command line such as `egress --lane critical` with `--config`.
     fn complete(&self, mut command: Command, arguments: &str) -> Command {
         command.args(arguments.split_whitespace()).arg("--config").arg(self.config());
-        command.env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "info".to_owned()));
         command.env("NO_COLOR", "1");
         command
     }

@@ -6,6 +6,7 @@
 // Every test binary compiles this module and uses a part of it.
 #![allow(dead_code)]
 
+pub mod bed;
 pub mod bridge;
 pub mod netns;
 pub mod peer;

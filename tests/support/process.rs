@@ -194,3 +194,9 @@ impl Drop for Process {
         }
     }
 }
+
+/// Sends a signal to a process that is not a child of the test, such as a child of `up`.
+pub fn signal(pid: i32, signal: Signal) {
+    nix::sys::signal::kill(Pid::from_raw(pid), signal)
+        .unwrap_or_else(|error| panic!("{signal} to {pid}: {error}"));
+}

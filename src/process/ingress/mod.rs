@@ -84,6 +84,14 @@ impl Ingress {
 
     /// Handles what is there; whether anything was.
     fn turn(&mut self) -> bool {
+        let now = clock::monotonic();
+        // First, because it may connect a route, whose reader must be looked at before sleeping: a new reader
+        // rings nobody yet.
+        if now >= self.housekeeping_at
+            && let Err(error) = self.keep_house(now)
+        {
+            tracing::error!(%error, "housekeeping failed");
+        }
         let mut busy = false;
         for route in 0..self.inputs.len() {
             for _ in 0..SAMPLES_PER_TURN {
@@ -92,12 +100,6 @@ impl Ingress {
                 }
                 busy = true;
             }
-        }
-        let now = clock::monotonic();
-        if now >= self.housekeeping_at
-            && let Err(error) = self.keep_house(now)
-        {
-            tracing::error!(%error, "housekeeping failed");
         }
         busy
     }
