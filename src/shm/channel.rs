@@ -22,8 +22,9 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
-use super::node::{NodeShared, Service, ShmNode, failed};
+use super::node::{NodeShared, ShmNode, failed};
 use super::root::RoleLock;
+use super::service::Service;
 use crate::config::Settings;
 use crate::model::{RouteId, SampleHeader};
 

@@ -18,6 +18,7 @@ mod header;
 mod node;
 mod root;
 mod segment;
+mod service;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};

@@ -1,7 +1,8 @@
 //! The membership of one process in one bridge instance.
 
 use std::fs;
-use std::path::Path;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use iceoryx2::config::Config;
@@ -14,10 +15,8 @@ use super::board::{Boards, BridgeShape};
 use super::error::ShmError;
 use super::root::{InstanceDir, Membership};
 use super::segment::{commit_files, require_free};
+use super::service::Service;
 use crate::model::InstanceName;
-
-/// Samples are released on whatever thread DDS drops them.
-pub(super) type Service = iceoryx2::service::ipc_threadsafe::Service;
 
 /// What a service, a connection or the boards of a small bridge take beside the pool.
 const SMALL_BYTES: u64 = 512 * 1024;
@@ -72,6 +71,8 @@ impl ShmNode {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
             .map_err(|error| failed(dir, "to join the bridge", &error))?;
+        // iceoryx2 lets everybody read and write its count of nodes.
+        make_private(&dir.shm_files());
         Ok(Self { shared: Arc::new(NodeShared { node, membership }), cleaned_up })
     }
 
@@ -170,8 +171,19 @@ fn remove_monitor(dir: &InstanceDir, id: &str) -> bool {
         .all(|entry| fs::remove_file(entry.path()).is_ok())
 }
 
+/// Takes away what other users may do with files in shared memory.
+fn make_private(files: &[PathBuf]) {
+    for path in files {
+        // A file that is gone belongs to a process that ends just now.
+        if let Ok(metadata) = fs::symlink_metadata(path)
+            && metadata.permissions().mode() & 0o077 != 0
+        {
+            let _ = fs::set_permissions(path, fs::Permissions::from_mode(0o600));
+        }
+    }
+}
+
 fn private_folder(path: &Path) -> Result<(), ShmError> {
-    use std::os::unix::fs::DirBuilderExt;
     match fs::DirBuilder::new().recursive(true).mode(0o700).create(path) {
         Ok(()) => Ok(()),
         Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),
