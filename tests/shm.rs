@@ -698,6 +698,50 @@ fn processes_killed_while_they_start_leave_nothing() {
 }
 
 #[test]
+fn what_a_process_leaves_half_made_is_removed_and_holds_up_nobody() {
+    let place = Place::new();
+    let survivor = Process::start("tap", &place, "1000");
+    survivor.expect("ready");
+    // As after kill -9 between the calls that create a file, set its length, fill it and publish it.
+    let instance = place.root().join("test");
+    let services = || fs::read_dir(instance.join("services")).unwrap().flatten().map(|entry| entry.path());
+    let other = RouteChannel { route: RouteId::try_from("other").unwrap(), ..channel(100) };
+    let service = {
+        let before: Vec<_> = services().collect();
+        let node = place.node();
+        let _publisher = SamplePublisher::create(&node, &other).unwrap();
+        services().find(|path| !before.contains(path)).unwrap()
+    };
+    assert!(!service.exists(), "the service goes with its last user");
+    let count = place.shm_files().into_iter().find(|path| path.to_string_lossy().ends_with("global_mgmt"));
+    let count = count.unwrap();
+    let connection = std::path::Path::new("/dev/shm")
+        .join(format!("{}b9fc73e5c1f646968758453273c6c65cb372831b_1_2.connection", place.prefix()));
+    let node_folder = instance.join("nodes/12345678901234567890");
+    let write = |path: &std::path::Path, content: &[u8], mode| {
+        let _ = fs::remove_file(path);
+        fs::write(path, content).unwrap();
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    };
+    for content in [&[][..], &[0; 64]] {
+        write(&count, content, 0o200);
+        write(&connection, content, 0o200);
+        write(&service, content, 0o600);
+        fs::create_dir(&node_folder).unwrap();
+        fs::write(node_folder.join("x.details"), "half").unwrap();
+        let node = place.node();
+        assert_eq!(node.cleaned_up().stray_files, 4);
+        assert!(!connection.exists() && !service.exists() && !node_folder.exists());
+        let publisher = SamplePublisher::create(&node, &other).unwrap();
+        let lane = lane(&node, &other);
+        publish(&publisher, 1, 100);
+        assert_eq!(sequences(&lane), [1]);
+    }
+    survivor.finish();
+    place.assert_nothing_left();
+}
+
+#[test]
 fn counters_survive_their_writer_whole() {
     let place = Place::new();
     let node = place.node();

@@ -101,7 +101,7 @@ const READ_ATTEMPTS: usize = 1_000;
 unsafe trait Plain: Copy + Default {
     /// Its size in words.
     const WORDS: usize = {
-        assert!(size_of::<Self>() % 8 == 0);
+        assert!(size_of::<Self>().is_multiple_of(8));
         size_of::<Self>() / 8
     };
 }
@@ -123,7 +123,6 @@ const _: () = {
     assert!(size_of::<ProcessHealth>() == 7 * 8);
     assert!(size_of::<LanePolicy>() == 4 * 8);
     assert!(size_of::<RouteInfo>() == 16 * 8);
-    assert!(size_of::<LaneCounters>() % 8 == 0 && size_of::<IngressCounters>() % 8 == 0);
 };
 
 /// A value in its copies: a line for the version, then the copies, each on lines of its own.

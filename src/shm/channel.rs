@@ -22,7 +22,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
-use super::node::{NodeShared, ShmNode, failed};
+use super::node::{NodeShared, ShmNode, StartLock, failed};
 use super::root::RoleLock;
 use super::service::Service;
 use crate::config::Settings;
@@ -135,8 +135,7 @@ impl RouteChannel {
     }
 
     /// Opens the route's service, or creates it: whoever comes first.
-    fn open(&self, node: &ShmNode) -> Result<Factory, ShmError> {
-        let shared = node.shared();
+    fn open(&self, shared: &NodeShared, start: &StartLock) -> Result<Factory, ShmError> {
         let what = format!("to open route {}", self.route);
         let say = |error: &dyn fmt::Display| failed(shared.dir(), &what, error);
         let name = format!("ab1/samples/{}", self.route);
@@ -175,7 +174,7 @@ impl RouteChannel {
             };
             if attempt < OPEN_ATTEMPTS && is_passing(error) {
                 // Its creator may have died within, or the last user removes it at this moment.
-                node.clean_up();
+                shared.clean_up(start);
                 thread::sleep(OPEN_PAUSE);
                 continue;
             }
@@ -322,7 +321,8 @@ impl SamplePublisher {
         let shared = node.shared();
         let pool = channel.pool_size();
         let what = format!("the sample pool of route {} ({} slots)", channel.route, pool.slots);
-        let factory = channel.open(node)?;
+        let start = StartLock::take(shared.dir())?;
+        let factory = channel.open(shared, &start)?;
         shared.require_free(pool.bytes, &what)?;
         let create = || {
             factory
@@ -338,7 +338,7 @@ impl SamplePublisher {
         let port = match create() {
             // A dead predecessor takes the place until it is cleaned up.
             Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
-                node.clean_up();
+                shared.clean_up(&start);
                 create()
             }
             other => other,
@@ -447,7 +447,8 @@ impl SampleSubscriber {
             SubscriberRole::Lane(queue) => (queue, None),
             SubscriberRole::Tap => (TAP, Some(take_tap_place(shared, channel)?)),
         };
-        let factory = channel.open(node)?;
+        let start = StartLock::take(shared.dir())?;
+        let factory = channel.open(shared, &start)?;
         let what = format!("a queue of route {}", channel.route);
         shared.require_free(0, &what)?;
         let create = || {
@@ -460,7 +461,7 @@ impl SampleSubscriber {
         let port = match create() {
             // A dead predecessor takes the place until it is cleaned up.
             Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
-                node.clean_up();
+                shared.clean_up(&start);
                 create()
             }
             other => other,

@@ -258,7 +258,7 @@ impl FileLock {
         self.lock.relock(how)
     }
 
-    fn write_pid(&mut self) -> io::Result<()> {
+    pub(super) fn write_pid(&mut self) -> io::Result<()> {
         let mut file: &File = &self.lock;
         file.set_len(0)?;
         file.rewind()?;

@@ -170,7 +170,7 @@ impl<T: Send + Debug + Abandonable> Abandonable for RecycledArc<T> {
         if handle.shared().handles.load(Ordering::Acquire) == 1 {
             if let Ok(mut value) = handle.mutex().lock() {
                 // SAFETY: there is no other handle, and the value is not used afterwards.
-                unsafe { T::abandon_in_place(NonNull::from_mut(&mut *value)) };
+                unsafe { T::abandon_in_place(NonNull::from(&mut *value)) };
             }
         } else {
             // SAFETY: not used afterwards, as the caller promises.

@@ -45,16 +45,19 @@ impl Place {
         ShmNode::open(self.root(), &self.instance, "test").unwrap()
     }
 
-    /// The instance's files in /dev/shm. The prefix is computed by the crate; here it is found by its hash,
-    /// which no other folder has.
-    pub fn shm_files(&self) -> Vec<PathBuf> {
+    /// With what the names of the instance's files in /dev/shm begin.
+    pub fn prefix(&self) -> String {
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         let folder = fs::canonicalize(self.root()).unwrap().join(self.instance.as_str());
         for &byte in folder.as_os_str().as_encoded_bytes() {
             hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
-        let hash = (hash >> 32) as u32 ^ hash as u32;
-        let prefix = format!("ab1_{}_{hash:08x}_", self.instance);
+        format!("ab1_{}_{:08x}_", self.instance, (hash >> 32) as u32 ^ hash as u32)
+    }
+
+    /// The instance's files in /dev/shm.
+    pub fn shm_files(&self) -> Vec<PathBuf> {
+        let prefix = self.prefix();
         let mut files: Vec<_> = fs::read_dir("/dev/shm")
             .unwrap()
             .flatten()
