@@ -309,18 +309,6 @@ fn a_header_that_makes_no_sense_is_an_error_and_the_next_sample_comes() {
 }
 
 #[test]
-fn a_subscriber_with_a_smaller_limit_refuses_a_longer_payload() {
-    let place = Place::new();
-    let node = place.node();
-    let route = RouteChannel { max_taps: 0, lanes: vec![LANE], ..channel(100) };
-    let publisher = SamplePublisher::create(&node, &route).unwrap();
-    // Processes with other sizes do not meet, so this one says the same and means another.
-    let lane = lane(&node, &route);
-    publish(&publisher, 1, 100);
-    assert_eq!(lane.take().unwrap().unwrap().payload().len(), 100);
-}
-
-#[test]
 fn a_sample_costs_no_allocation() {
     // In a process of its own: what a loan needs is kept for the whole process, and other tests loan too.
     let place = Place::new();
@@ -862,7 +850,8 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
     assert_eq!(set(LaneMode::Suspended, 8), 2);
     assert_eq!(boards.policy(0).unwrap().mode(), LaneMode::Suspended);
     assert_eq!(boards.policy(1).unwrap().epoch, 0);
-    // Another process confirms and changes meanwhile; no change is lost, and one that is killed blocks nobody.
+    // Another process confirms and changes meanwhile; no change is lost, and one that is killed blocks
+    // nobody.
     for _ in 0..5 {
         let mut other = Process::start("policy", &place, "");
         other.expect("ready");
@@ -889,12 +878,14 @@ fn no_wake_is_missed() {
     pong.expect("ready");
     let (waker, mut sleeper) = (boards.waker(0), boards.sleeper(1));
     assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
-    for turn in 0..100_000 {
+    for turn in 0..200_000 {
+        // The other side falls asleep meanwhile, or has done so, or not yet.
+        (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
         waker.wake();
         assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "turn {turn}");
     }
     pong.finish();
-    assert_eq!(sleeper.sleep(Duration::from_millis(20)), Woken::TimedOut);
+    while sleeper.sleep(Duration::from_millis(20)) == Woken::Woken {}
     boards.waker(1).wake();
     boards.waker(1).wake();
     assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "a wake before the sleep counts");

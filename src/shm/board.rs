@@ -5,8 +5,9 @@
 //!
 //! A value is kept in several copies, which take turns. Its one writer fills the next one, then shows it by
 //! counting up the version. A writer that dies within an update therefore leaves the former value, whole. A
-//! reader takes the one that is shown, and once more if the writer has come round to it meanwhile: it waits for
-//! nobody and never sees half a value. The counts of a histogram are single words, and are counted in place.
+//! reader takes the one that is shown, and once more if the writer has come round to it meanwhile: it waits
+//! for nobody and never sees half a value. The counts of a histogram are single words, and are counted in
+//! place.
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -88,8 +89,8 @@ const MAGIC: u64 = 0x4142_626f_6172_6473;
 /// Words of a cache line, on which every value begins, so that two writers never share one.
 const LINE: usize = 8;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
-/// Copies of a value. A reader, which takes some 100 ns when the writer is on another CPU, starts again only if
-/// more than `COPIES - 2` updates came meanwhile.
+/// Copies of a value. A reader, which takes some 100 ns when the writer is on another CPU, starts again only
+/// if more than `COPIES - 2` updates came meanwhile.
 const COPIES: u64 = 4;
 /// Turns of a reader, so that a writer that has run wild cannot hold it.
 const READ_ATTEMPTS: usize = 1_000;
@@ -156,8 +157,9 @@ impl<T: Plain> Cell<T> {
         for _ in 0..READ_ATTEMPTS {
             let version = segment.word(self.at).load(Ordering::Acquire);
             let value = load(segment, self.copy_at(version));
-            // The writer begins to fill this copy again, as version `version + COPIES`, only after it has shown
-            // the one before that. If we have read a word of it, this fence makes us see that it was shown.
+            // The writer begins to fill this copy again, as version `version + COPIES`, only after it has
+            // shown the one before that. If we have read a word of it, this fence makes us see that it was
+            // shown.
             fence(Ordering::Acquire);
             let now = segment.word(self.at).load(Ordering::Relaxed);
             if now.wrapping_sub(version) < COPIES - 1 {
@@ -327,14 +329,14 @@ impl Boards {
         Ok(Self { segment: Arc::new(segment), layout, policy_lock: dir.path.join("policy.lock") })
     }
 
-    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster than
-    /// it can be read, which only a runaway writer does; so for all readings.
+    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster
+    /// than it can be read, which only a runaway writer does; so for all readings.
     pub fn health(&self, role: ProcessRole) -> Option<ProcessHealth> {
         self.layout.health(role).read(&self.segment)
     }
 
-    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a time:
-    /// the holder of the role's lock.
+    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a
+    /// time: the holder of the role's lock.
     pub fn health_writer(&self, role: ProcessRole) -> BoardWriter<ProcessHealth> {
         self.writer(self.layout.health(role))
     }
@@ -389,9 +391,9 @@ impl Boards {
         self.layout.policy(lane).read(&self.segment)
     }
 
-    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy and
-    /// gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns what
-    /// was written.
+    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy
+    /// and gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns
+    /// what was written.
     pub fn set_policy(
         &self,
         lane: usize,

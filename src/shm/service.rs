@@ -1,8 +1,8 @@
-//! The variant of iceoryx2's services that the bridge uses: its thread-safe inter-process one, but that loaning
-//! a sample allocates nothing.
+//! The variant of iceoryx2's services that the bridge uses: its thread-safe inter-process one, but that
+//! loaning a sample allocates nothing.
 //!
-//! iceoryx2 0.10 keeps what belongs to one loaned sample behind an `Arc` with a mutex of its own, and so calls
-//! the allocator for each sample. Here the memory of such an `Arc` is kept and used for the next one.
+//! iceoryx2 0.10 keeps what belongs to one loaned sample behind an `Arc` with a mutex of its own, and so
+//! calls the allocator for each sample. Here the memory of such an `Arc` is kept and used for the next one.
 
 use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
 use std::fmt::{self, Debug};

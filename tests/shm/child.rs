@@ -13,7 +13,7 @@ use adaptive_bridge::shm::{
 };
 
 use crate::allocations;
-use crate::support::{LANE, channel, deep_channel, header, payload, shape};
+use crate::support::{LANE, PATIENCE, channel, deep_channel, header, payload, shape};
 
 pub struct Child {
     pub root: PathBuf,
@@ -208,18 +208,25 @@ impl Child {
         }
     }
 
-    /// Answers every wake of lane 0 by one of lane 1.
+    /// Answers every wake of lane 0 by one of lane 1. It never looks by itself: a wake that is missed is not
+    /// made up for.
     fn pong(&self) {
         let node = self.node("pong");
         let boards = node.boards(&shape()).unwrap();
         let mut sleeper = boards.sleeper(0);
         let waker = boards.waker(1);
+        let (stop, last) = (self.stop.clone(), boards.waker(0));
+        std::thread::spawn(move || {
+            while !stop.load(Ordering::SeqCst) {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            last.wake();
+        });
         assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
         println!("@ ready");
         while !self.stopping() {
-            if sleeper.sleep(Duration::from_millis(100)) == Woken::Woken {
-                waker.wake();
-            }
+            assert_eq!(sleeper.sleep(PATIENCE * 2), Woken::Woken);
+            waker.wake();
         }
     }
 
