@@ -201,3 +201,23 @@ fn an_acknowledged_sample_is_let_go_of_without_waiting_for_the_cache_cleaning() 
     let held = released[..936].iter().filter(|flag| !flag.load(Ordering::Acquire)).count();
     assert_eq!(held, 0, "acknowledged samples are still held");
 }
+
+#[test]
+fn a_new_reader_of_a_topic_does_not_get_what_a_former_one_has_taken() {
+    let mut here = participant("here", 75);
+    let mut there = participant("there", 75);
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    let former = there.create_reader("rt/again", TYPE, &qos).unwrap();
+    let writer = here.create_writer("rt/again", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let write = |payload: &'static [u8]| {
+        writer.write(Bytes::from_static(payload), Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+    };
+    write(b"one.");
+    assert_eq!(take_one(&former).unwrap().0, b"one.");
+    drop(former);
+    let reader = there.create_reader("rt/again", TYPE, &qos).unwrap();
+    wait_for_reader(&writer);
+    write(b"two.");
+    assert_eq!(take_one(&reader).unwrap().0, b"two.");
+}

@@ -7,7 +7,7 @@ use super::error::DdsError;
 use super::graph;
 use super::network;
 use super::qos::{self, ReaderQos};
-use super::reader::RawReader;
+use super::reader::{RawReader, Take};
 use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, Publisher, QosPolicies,
     RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind,
@@ -128,7 +128,11 @@ impl Participant {
         let guid = Guid(inner.guid().to_bytes());
         self.readers.push(guid);
         self.announce();
-        Ok(RawReader { inner, guid })
+        let reader = RawReader { inner, guid };
+        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them: what
+        // a former reader has taken would be taken once more.
+        while reader.take(&mut |_, _| {}) != Take::Empty {}
+        Ok(reader)
     }
 
     /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has at
