@@ -9,8 +9,8 @@ pub const WINDOW_SAMPLES: usize = 10_000;
 
 /// The arrivals of the last samples.
 ///
-/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The rate
-/// counts sequence numbers, so that samples which the tap itself missed do not lower it.
+/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The
+/// rate counts sequence numbers, so that samples which the tap itself missed do not lower it.
 #[derive(Clone, Debug)]
 pub struct Intervals {
     window_samples: usize,
@@ -44,7 +44,8 @@ impl Intervals {
         Self { window_samples: window_samples.max(2), arrivals: VecDeque::new() }
     }
 
-    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins anew.
+    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins
+    /// anew.
     pub fn see(&mut self, header: &SampleHeader) {
         if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
             self.arrivals.clear();

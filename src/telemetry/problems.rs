@@ -12,8 +12,8 @@ const APPLY_MS: u64 = 1_000;
 /// Fewer samples may be on their way at the moment of the reading.
 const SILENT_LANE_SAMPLES: u64 = 5;
 
-/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing, drops,
-/// then what is only missing.
+/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing,
+/// drops, then what is only missing.
 pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
     let mut problems = Vec::new();
     for process in &now.processes {
