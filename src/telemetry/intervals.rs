@@ -68,13 +68,13 @@ impl Intervals {
                 (min_ms, max_ms) = (min_ms.min(ms), max_ms.max(ms));
             }
         }
-        let seconds = ended_at.since(began_at) as f64 / 1e9;
-        if count == 0.0 || seconds == 0.0 {
+        let span_ns = ended_at.since(began_at);
+        if count == 0.0 || span_ns == 0 {
             return None;
         }
         let mean = sum / count;
         Some(IntervalStatistics {
-            rate_hz: (last - first) as f64 / seconds,
+            rate_hz: (last - first) as f64 * 1e9 / span_ns as f64,
             min_ms,
             max_ms,
             // Rounding may take it below 0 where all intervals are alike.
