@@ -51,11 +51,22 @@ impl Bed {
         self.net.host(name)
     }
 
-    /// A subscriber on a host, matched with the bridge.
+    /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is written
+    /// before the writer knows of a reader is not for that reader.
     pub fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
+        let before = self.readers(topic);
         let subscriber = peer.subscriber().topic(topic).start_on(self.host(host));
         subscriber.wait_matched(1);
+        super::wait_until("a reader matched by the bridge", || self.readers(topic) > before);
         subscriber
+    }
+
+    /// Readers that the bridge's writer of a DDS topic is matched with.
+    fn readers(&self, topic: &str) -> u64 {
+        let status = self.bridge.status();
+        let found =
+            outputs(&status).find(|output| topic == format!("rt{}", output["topic"].as_str().unwrap_or("")));
+        found.and_then(|output| output["readers"].as_u64()).unwrap_or_else(|| panic!("{topic} in {status}"))
     }
 
     /// A publisher that begins when ingress reads it.
@@ -98,10 +109,10 @@ pub fn is_whole_and_quiet(status: &Value) -> bool {
     outputs.peek().is_some() && outputs.all(|output| output["whole"] == true && output["waiting"] == 0)
 }
 
-/// Each route of each lane in a status.
+/// Each lane of each route in a status.
 pub fn outputs(status: &Value) -> impl Iterator<Item = &Value> {
-    let lanes = status["lanes"].as_array().into_iter().flatten();
-    lanes.flat_map(|lane| lane["routes"].as_array().into_iter().flatten())
+    let routes = status["routes"].as_array().into_iter().flatten();
+    routes.flat_map(|route| route["lanes"].as_array().into_iter().flatten())
 }
 
 /// What a subscriber missed from sample `first` on.

@@ -82,7 +82,7 @@ impl Bridge {
 
     /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no host.
     pub fn try_status(&self) -> Result<Value, String> {
-        let output = self.run("status --json");
+        let output = self.run("status --json --interval-ms 50");
         let said = || String::from_utf8_lossy(&output.stderr).into_owned();
         if !output.status.success() {
             return Err(format!("{}: {}", output.status, said()));
