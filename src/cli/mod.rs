@@ -130,8 +130,8 @@ fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
     ))
 }
 
-/// The exit code after stdout could not be written to. Who reads only the beginning, as `head` does, has what it
-/// wants: that is no failure.
+/// The exit code after stdout could not be written to. Who reads only the beginning, as `head` does, has what
+/// it wants: that is no failure.
 fn output_ended(error: &io::Error) -> ExitCode {
     match error.kind() {
         ErrorKind::BrokenPipe => ExitCode::SUCCESS,

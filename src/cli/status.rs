@@ -1,15 +1,19 @@
 //! `status`: what the bridge does at present, from its boards in shared memory.
 
 use std::io::{self, IsTerminal, Write};
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::process::ExitCode;
 
-use clap::Args;
+use clap::{Args, value_parser};
 
 use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
 use crate::config::Settings;
 use crate::process::Stop;
 use crate::telemetry::{Report, Snapshot};
+
+/// From what tells a rate of 100 Hz to an hour.
+const INTERVALS_MS: RangeInclusive<u64> = 10..=3_600_000;
 
 /// What `status` is asked.
 #[derive(Args, Debug)]
@@ -21,7 +25,8 @@ pub(super) struct Arguments {
     #[arg(long, short)]
     watch: bool,
     /// The time over which rates and latencies are measured, and between two outputs
-    #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
+    #[arg(long, value_name = "N", default_value_t = 1_000)]
+    #[arg(value_parser = value_parser!(u64).range(INTERVALS_MS))]
     interval_ms: u64,
     #[command(flatten)]
     config: ConfigArguments,

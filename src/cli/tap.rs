@@ -1,7 +1,7 @@
 //! `tap`: the samples of a route, straight from shared memory.
 //!
-//! A tap is a subscriber of its own with a short queue. Nobody wakes it and nobody waits for it: it looks, and
-//! what it does not look at in time is overwritten. Ingress and the lanes do not notice it.
+//! A tap is a subscriber of its own with a short queue. Nobody wakes it and nobody waits for it: it looks,
+//! and what it does not look at in time is overwritten. Ingress and the lanes do not notice it.
 
 use std::fmt::Write as _;
 use std::io::{self, BufWriter, StdoutLock, Write};
@@ -21,8 +21,8 @@ use crate::telemetry::Intervals;
 
 /// How often `--hz` says something.
 const REPORT_MS: u64 = 1_000;
-/// How often a tap looks whether the bridge is still there. A tap that stayed would keep the shared memory of a
-/// bridge that has ended, and one with other routes could not start.
+/// How often a tap looks whether the bridge is still there. A tap that stayed would keep the shared memory of
+/// a bridge that has ended, and one with other routes could not start.
 const BRIDGE_LOOK_MS: u64 = 200;
 
 /// What `tap` is asked.

@@ -9,8 +9,8 @@ pub const WINDOW_SAMPLES: usize = 10_000;
 
 /// The arrivals of the last samples.
 ///
-/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The rate
-/// counts sequence numbers, so that samples which the tap itself missed do not lower it.
+/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The
+/// rate counts sequence numbers, so that samples which the tap itself missed do not lower it.
 #[derive(Clone, Debug)]
 pub struct Intervals {
     window_samples: usize,
@@ -44,7 +44,8 @@ impl Intervals {
         Self { window_samples: window_samples.max(2), arrivals: VecDeque::new() }
     }
 
-    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins anew.
+    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins
+    /// anew.
     pub fn see(&mut self, header: &SampleHeader) {
         if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
             self.arrivals.clear();
@@ -67,13 +68,13 @@ impl Intervals {
                 (min_ms, max_ms) = (min_ms.min(ms), max_ms.max(ms));
             }
         }
-        let seconds = ended_at.since(began_at) as f64 / 1e9;
-        if count == 0.0 || seconds == 0.0 {
+        let span_ns = ended_at.since(began_at);
+        if count == 0.0 || span_ns == 0 {
             return None;
         }
         let mean = sum / count;
         Some(IntervalStatistics {
-            rate_hz: (last - first) as f64 / seconds,
+            rate_hz: (last - first) as f64 * 1e9 / span_ns as f64,
             min_ms,
             max_ms,
             // Rounding may take it below 0 where all intervals are alike.

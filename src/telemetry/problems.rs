@@ -12,8 +12,8 @@ const APPLY_MS: u64 = 1_000;
 /// Fewer samples may be on their way at the moment of the reading.
 const SILENT_LANE_SAMPLES: u64 = 5;
 
-/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing, drops,
-/// then what is only missing.
+/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing,
+/// drops, then what is only missing.
 pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
     let mut problems = Vec::new();
     for process in &now.processes {
@@ -194,5 +194,177 @@ const fn meaning(reason: DropReason) -> &'static str {
         DropReason::Suspended => "the lane is suspended (suspended)",
         DropReason::Stopped => "forwarding is stopped (stopped)",
         DropReason::Shutdown => "still waiting when the lane shut down (shutdown)",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::snapshot::ModeReason;
+    use super::*;
+    use crate::model::{
+        IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram, MonotonicNs,
+        ProcessHealth, RouteId, TopicName, WallNs,
+    };
+
+    /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
+    fn sound() -> Snapshot {
+        let at = MonotonicNs(100_000_000_000);
+        let health = ProcessHealth { pid: 7, alive_at: at, starts: 1, ..ProcessHealth::default() };
+        let process = |name: &str, role| ProcessReading {
+            name: name.into(),
+            role,
+            health,
+            state: ProcessState::Running,
+        };
+        let lane = |name, class| LaneReading {
+            name,
+            class,
+            policy: LanePolicy::default(),
+            mode: LaneMode::Normal,
+            reason: ModeReason::Default,
+            ends_at: None,
+            health,
+        };
+        let output = |lane, topic| OutputReading {
+            lane,
+            topic: TopicName::try_from(topic).unwrap(),
+            counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
+            shm: LatencyHistogram::default(),
+            dds_out: LatencyHistogram::default(),
+            age: LatencyHistogram::default(),
+        };
+        Snapshot {
+            instance: InstanceName::try_from("default").unwrap(),
+            at,
+            at_wall: WallNs(0),
+            processes: vec![
+                process("ingress", ProcessRole::Ingress),
+                process("egress-critical", ProcessRole::Egress(0)),
+                process("egress-noncritical", ProcessRole::Egress(1)),
+            ],
+            lanes: vec![
+                lane(LaneName::critical(), TrafficClass::Critical),
+                lane(LaneName::noncritical(), TrafficClass::Noncritical),
+            ],
+            routes: vec![RouteReading {
+                id: RouteId::try_from("scan").unwrap(),
+                input_topic: TopicName::try_from("/scan").unwrap(),
+                message_type: None,
+                counters: IngressCounters {
+                    received: 100,
+                    published: 100,
+                    writers: 1,
+                    ..IngressCounters::default()
+                },
+                dds_in: LatencyHistogram::default(),
+                outputs: vec![output(0, "/c/scan"), output(1, "/n/scan")],
+            }],
+        }
+    }
+
+    /// What is said of a bridge that was sound and then changed.
+    fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
+        let before = sound();
+        let mut now = before.clone();
+        now.at = now.at.plus_ms(1_000);
+        change(&mut now);
+        of(&now, &before)
+    }
+
+    fn drop_on(now: &mut Snapshot, output: usize, reason: DropReason, count: u64) {
+        let counters = &mut now.routes[0].outputs[output].counters;
+        counters.drops.add(reason, count);
+        counters.last_sequence += count;
+    }
+
+    #[test]
+    fn of_a_sound_bridge_nothing_is_said() {
+        assert_eq!(after(|_| {}), [""; 0]);
+        assert_eq!(after(|now| drop_on(now, 1, DropReason::Superseded, 90)), [""; 0]);
+    }
+
+    #[test]
+    fn a_process_that_hangs_or_was_restarted_is_named() {
+        let said = after(|now| {
+            now.processes[0].state = ProcessState::Silent;
+            now.processes[1].health.starts = 3;
+            now.processes[2].state = ProcessState::Dead;
+        });
+        assert_eq!(
+            said,
+            [
+                "ingress (pid 7) has not turned for 1.0 s: nothing is taken in",
+                "egress-critical was restarted just now, 2 times",
+                "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing",
+            ]
+        );
+    }
+
+    #[test]
+    fn an_account_that_does_not_add_up_is_shown() {
+        let said = after(|now| {
+            now.routes[0].counters.received += 2;
+            now.routes[0].outputs[1].counters.last_sequence += 1;
+        });
+        assert_eq!(
+            said,
+            [
+                "lane noncritical, route scan: does not add up: 101 received, 100 forwarded, 0 waiting, 0 dropped",
+                "ingress, route scan: does not add up: 102 received, 100 published, 0 dropped",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_critical_lane_that_lives_and_forwards_nothing_is_named() {
+        let come = |now: &mut Snapshot| {
+            now.routes[0].counters.received += 50;
+            now.routes[0].counters.published += 50;
+        };
+        let said = after(come);
+        assert_eq!(said, ["lane critical, /c/scan: 50 samples came in just now and none was forwarded"]);
+        let said = after(|now| {
+            come(now);
+            now.lanes[0].mode = LaneMode::Stopped;
+        });
+        assert_eq!(said, [""; 0]);
+    }
+
+    #[test]
+    fn drops_that_are_no_part_of_the_work_are_named_while_they_go_on() {
+        let said = after(|now| {
+            now.routes[0].counters.received += 1;
+            now.routes[0].counters.drops.add(DropReason::TooLarge, 1);
+            now.routes[0].counters.lost_upstream += 4;
+            drop_on(now, 0, DropReason::WindowFull, 3);
+            drop_on(now, 0, DropReason::Superseded, 1);
+        });
+        assert_eq!(said.len(), 4, "{said:?}");
+        assert!(
+            said[0].starts_with("ingress, route scan: 1 samples dropped just now: larger than"),
+            "{said:?}"
+        );
+        assert!(said[1].contains("lane critical, /c/scan: 3 samples") && said[1].ends_with("(window_full)"));
+        assert!(said[2].ends_with("(superseded)"), "{said:?}");
+        assert!(said[3].contains("4 samples lost just now on their way"), "{said:?}");
+        let mut before = sound();
+        drop_on(&mut before, 0, DropReason::WindowFull, 3);
+        assert_eq!(of(&before, &before), [""; 0]);
+    }
+
+    #[test]
+    fn a_mode_that_is_not_applied_and_a_publisher_that_is_missing_are_named() {
+        let said = after(|now| {
+            now.lanes[1].policy = LanePolicy { epoch: 1, ..LanePolicy::default() };
+            now.lanes[1].mode = LaneMode::Suspended;
+            now.routes[0].counters.writers = 0;
+        });
+        assert_eq!(
+            said,
+            [
+                "lane noncritical: mode suspended was set and the lane's process has not applied it",
+                "route scan: the publisher of /scan is gone",
+            ]
+        );
     }
 }

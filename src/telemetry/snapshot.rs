@@ -19,8 +19,8 @@ use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 const WHOLE_ATTEMPTS: usize = 100;
 const WHOLE_PAUSE: Duration = Duration::from_micros(200);
 
-/// All that the processes of a bridge show of themselves, read at one instant as nearly as can be without making
-/// anybody wait.
+/// All that the processes of a bridge show of themselves, read at one instant as nearly as can be without
+/// making anybody wait.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
     /// The bridge.
@@ -132,8 +132,8 @@ pub struct OutputReading {
 }
 
 impl Snapshot {
-    /// Reads the boards of the bridge that these settings describe, below `root`. `None` when it does not run;
-    /// nothing is created then, and nothing of it is written or locked at any time.
+    /// Reads the boards of the bridge that these settings describe, below `root`. `None` when it does not
+    /// run; nothing is created then, and nothing of it is written or locked at any time.
     ///
     /// # Errors
     /// The boards are those of other settings or of another version, or may not be opened.

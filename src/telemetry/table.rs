@@ -40,7 +40,9 @@ impl fmt::Display for Report {
         }
         for lane in &self.lanes {
             let process = process(&format!("egress-{}", lane.name));
-            writeln!(f, "\nlane {}: {}{}", lane.name, mode_text(lane), lane_process_text(process))?;
+            let title = format!("lane {}: {};", lane.name, mode_text(lane));
+            let process = process.map(process_text).unwrap_or_default();
+            write!(f, "\n{}", wrapped("", "  ", [title.as_str(), &process].into_iter(), " "))?;
             f.write_str(&row(["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"]))?;
             let outputs = self.routes.iter().flat_map(|route| &route.lanes);
             for output in outputs.filter(|output| output.lane == lane.name) {
@@ -139,10 +141,6 @@ fn mode_text(lane: &LaneReport) -> String {
         Some(left_s) => format!("{} ({reason}, {left_s:.0} s left)", lane.mode),
         None => format!("{} ({reason})", lane.mode),
     }
-}
-
-fn lane_process_text(process: Option<&ProcessReport>) -> String {
-    process.map_or_else(String::new, |process| format!("; {}", process_text(process)))
 }
 
 fn process_text(process: &ProcessReport) -> String {
