@@ -1,5 +1,7 @@
 //! One DDS participant, which is one ROS 2 node.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 
 use super::discovery::{Discovery, translate};
@@ -147,7 +149,23 @@ impl Participant {
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        let policies = qos::of_writer(writer_qos, window_samples);
+        self.create_blocking_writer(topic, dds_type, writer_qos, window_samples, Duration::ZERO)
+    }
+
+    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] waits up to `max_blocking` for room
+    /// in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge itself never waits.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_blocking_writer(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        writer_qos: &QosProfile,
+        window_samples: usize,
+        max_blocking: Duration,
+    ) -> Result<RawWriter, DdsError> {
+        let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
         let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, &policies)?;
         self.writers.push(writer.guid());
         self.announce();
