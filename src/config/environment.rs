@@ -64,8 +64,8 @@ impl Environment {
             refuse(
                 "ROS_STATIC_PEERS",
                 &value,
-                "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces with \
-                 ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
+                "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces \
+                 with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
             );
         }
         // The identifier shrank from 24 to 16 bytes in Iron.

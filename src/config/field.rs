@@ -1,5 +1,5 @@
-//! A value of the file at its key path, and the ways to read it. A wrong value is reported, and then counts as
-//! not given: the reader goes on, so that one run finds every problem.
+//! A value of the file at its key path, and the ways to read it. A wrong value is reported, and then counts
+//! as not given: the reader goes on, so that one run finds every problem.
 
 use std::ops::RangeInclusive;
 
@@ -154,7 +154,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Text. A number or truth value is not, unless in quotes: `id: 010` would change on its way through YAML.
+    /// Text. A number or truth value is not, unless in quotes: other readers of the file would change `010`.
     pub fn text(&self) -> Option<&'a str> {
         self.value()?;
         match self.scalar() {

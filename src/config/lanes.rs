@@ -7,7 +7,8 @@ use super::rates::{self, MAX_QUEUE, RoutingPolicy};
 use super::settings::{DdsNetwork, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
 use crate::model::{LaneName, TrafficClass};
 
-/// Each lane is a process with a DDS participant of its own; a domain has room for 120 participants on a host.
+/// Each lane is a process with a DDS participant of its own, of which a domain has 120 on a host (RTPS 2.5
+/// clause 9.6.2.3).
 const MAX_LANES: usize = 32;
 
 /// The largest sample, in bytes.

@@ -19,12 +19,12 @@ pub const PATH_VARIABLE: &str = "ADAPTIVE_BRIDGE_CONFIG";
 /// The file that is read where neither the command line nor the environment names one.
 pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
 
-/// Reads the settings from a file: from `path`, else from the one that `$ADAPTIVE_BRIDGE_CONFIG` names, else from
-/// `/etc/adaptive-bridge/config.yaml`. `env` looks up environment variables.
+/// Reads the settings from a file: from `path`, else from the one that `$ADAPTIVE_BRIDGE_CONFIG` names, else
+/// from `/etc/adaptive-bridge/config.yaml`. `env` looks up environment variables.
 ///
 /// # Errors
-/// Every problem of the file and of the environment at once; one problem when there is no file or it cannot be
-/// read.
+/// Every problem of the file and of the environment at once; one problem when there is no file or it cannot
+/// be read.
 pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<Settings, ConfigError> {
     let path = find(path, env, Path::new(DEFAULT_PATH))?;
     let name = path.display().to_string();
@@ -48,8 +48,8 @@ fn find(
     }
     let name = default.display().to_string();
     let what = format!(
-        "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with the minimal \
-         one of config/README.md: `topics: [{{id: scan, input_topic: /scan}}]`"
+        "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with one that \
+         says `topics: [{{id: scan, input_topic: /scan}}]`"
     );
     Err(failure(&name, Place::File, what))
 }

@@ -1,8 +1,8 @@
 //! The configuration: YAML in, validated [`Settings`] out, or every problem of the file at once.
 //!
-//! `yaml` turns text into a tree of values that know their lines; `keys` has the list of all keys and finds the
-//! unknown ones; `field` reads one value, checks it and reports it; the other modules put the settings together,
-//! a file for each part.
+//! `yaml` turns text into a tree of values that know their lines; `keys` has the list of all keys and finds
+//! the unknown ones; `field` reads one value, checks it and reports it; the other modules put the settings
+//! together, a file for each part.
 
 mod control;
 mod environment;
@@ -15,6 +15,8 @@ mod qos;
 mod rates;
 mod routes;
 mod settings;
+#[cfg(test)]
+mod tests;
 mod yaml;
 
 pub use keys::KEYS;

@@ -39,8 +39,8 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
-    /// An error of at least one problem. They are sorted by their place, and what two readers of the same value
-    /// said in the same words is said once.
+    /// An error of at least one problem. They are sorted by their place, and what two readers of the same
+    /// value said in the same words is said once.
     pub(super) fn new(file: &str, mut problems: Vec<Problem>) -> Self {
         let mut seen = HashSet::new();
         problems.retain(|problem| seen.insert((problem.place, problem.key.clone(), problem.allowed.clone())));
@@ -131,7 +131,7 @@ impl Problems {
 /// The longest piece of the user's text that a message repeats, in characters.
 const SHOWN_CHARS: usize = 60;
 
-/// Bounds of the search for the nearest name: its time grows with the product of all four, 0.3 s at the worst.
+/// Bounds of the search for the nearest name: its time grows with the product of the three, the last squared.
 const MAX_HINTS: usize = 128;
 const MAX_COMPARED_NAMES: usize = 512;
 const MAX_COMPARED_BYTES: usize = 64;

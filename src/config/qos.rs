@@ -6,8 +6,8 @@ use super::field::Field;
 use super::settings::InputQos;
 use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 
-/// The deepest HISTORY and the most samples that may be retained. DDS itself allows 2^31; at 10,000 a route of
-/// 1 KiB samples takes 10 MiB on each lane.
+/// The deepest HISTORY and the most samples that may be retained. DDS itself allows 2^31; at 10,000 a route
+/// of 1 KiB samples takes 10 MiB on each lane.
 pub(super) const MAX_DEPTH: u64 = 10_000;
 
 /// The longest LIFESPAN, DEADLINE or age: a day.

@@ -42,8 +42,8 @@ const RATE_KEYS: &[&str] = &[
     "queue_samples",
 ];
 
-/// The rates of a critical lane, which has none: it forwards every sample, and a rate that somebody wrote down
-/// for it would be a promise not kept.
+/// The rates of a critical lane, which has none: it forwards every sample, and a rate that somebody wrote
+/// down for it would be a promise not kept.
 pub(super) fn refuse(lane: &Field<'_>) -> LaneRates {
     for key in RATE_KEYS {
         let rate = lane.get(key);

@@ -86,6 +86,16 @@ struct RouteReader<'a, 'f> {
 impl<'f> RouteReader<'_, 'f> {
     fn read(&self, field: &Field<'f>) -> RouteDraft<'f> {
         field.entries();
+        if field.was_reported() {
+            // Of what is no mapping it would be idle to say which keys it lacks.
+            return RouteDraft {
+                field: field.clone(),
+                id: None,
+                input: None,
+                route: None,
+                outputs: Vec::new(),
+            };
+        }
         let id = required(&field.get("id"), RouteId::ALLOWED, |text| RouteId::try_from(text).ok());
         let input = field.get("input_topic");
         let input_topic = required(&input, TopicName::ALLOWED, |text| TopicName::try_from(text).ok());

@@ -9,10 +9,10 @@ use std::rc::Rc;
 
 use granit_parser::{Event, Parser, ScalarStyle, Tag};
 
-/// The largest configuration file, in bytes. The default one, with all its comments, has about 12 KiB.
+/// The largest configuration file, in bytes. The default one has 6 KiB.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
-/// The most values that a file may have, each use of an alias counted: enough for 1,024 routes with 60 keys each.
+/// The most keys and values that a file may have, each use of an alias counted: 1,024 routes of 30 keys each.
 const MAX_NODES: usize = 65_536;
 
 /// The deepest nesting. The deepest key there is, `lanes.<lane>.scheduling.cpus[]`, is 5 deep.
@@ -25,7 +25,7 @@ pub(super) struct Node {
     pub line: usize,
     /// What it is.
     pub content: Content,
-    /// Values in it, itself and the expansion of its aliases included.
+    /// Keys and values in it, itself and the expansion of its aliases included.
     size: usize,
 }
 
@@ -157,7 +157,7 @@ impl Builder {
             }
             Event::SequenceEnd | Event::MappingEnd => self.end(line)?,
             Event::Alias(anchor) => {
-                // An anchor is known once its value is complete, so one that is not is an alias of what it is in.
+                // An anchor is known once its value is complete: an alias inside it finds nothing.
                 let node = self.anchors.get(&anchor).cloned();
                 let node =
                     node.ok_or_else(|| SyntaxError::at(line, "this alias refers to what it is part of"))?;
@@ -199,7 +199,7 @@ impl Builder {
         };
         parent.size = parent.size.saturating_add(node.size);
         if parent.size.max(self.nodes) > MAX_NODES {
-            let message = format!("must have at most {MAX_NODES} values, those of aliases included");
+            let message = format!("must have at most {MAX_NODES} keys and values, those of aliases included");
             return Err(SyntaxError::at(line, message));
         }
         match &mut parent.collection {
@@ -225,8 +225,8 @@ fn is_text_tag(tag: Option<Cow<'_, Tag>>, line: usize) -> Result<bool, SyntaxErr
     }
 }
 
-/// The entries with each merge key (`<<: *alias`) replaced by what it names, unless the mapping says otherwise.
-/// A `<<` of anything but mappings stays, and is reported as the unknown key that it then is.
+/// The entries with each merge key (`<<: *alias`) replaced by what it names, unless the mapping says
+/// otherwise. A `<<` of anything but mappings stays, and is reported as the unknown key that it then is.
 fn merged(entries: Vec<Entry>) -> Vec<Entry> {
     if !entries.iter().any(|entry| entry.key == "<<") {
         return entries;

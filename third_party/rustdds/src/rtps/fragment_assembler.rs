@@ -28,6 +28,9 @@ struct AssemblyBuffer {
   fragment_count: usize,
   received_bitmap: BitVec,
 
+  // Of whichever fragment came with one first.
+  source_timestamp: Option<Timestamp>,
+
   #[allow(dead_code)] // TODO: Purpose is to use this later for e.g.
   // garbage collection, in case some buffer is not completed within reasonable time.
   created_time: Timestamp,
@@ -37,6 +40,10 @@ struct AssemblyBuffer {
 impl AssemblyBuffer {
   pub fn new(datafrag: &DataFrag) -> Option<Self> {
     let data_size: usize = datafrag.data_size.try_into().ok()?;
+    if data_size > MAX_ASSEMBLED_SIZE {
+      debug!("DATAFRAG of a sample of {data_size} bytes, more than {MAX_ASSEMBLED_SIZE}");
+      return None;
+    }
     let fragment_size: u16 = datafrag.fragment_size;
     debug!("new AssemblyBuffer data_size={data_size} frag_size={fragment_size}");
 
@@ -45,8 +52,9 @@ impl AssemblyBuffer {
       return None;
     }
 
-    let mut buffer_bytes = BytesMut::with_capacity(data_size);
-    buffer_bytes.resize(data_size, 0);
+    // The size is what the sender claims. Zeroed memory costs nothing until it
+    // is written to.
+    let buffer_bytes = BytesMut::zeroed(data_size);
 
     let fragment_count = usize::from(datafrag.total_number_of_fragments());
     if fragment_count == 0 {
@@ -60,6 +68,7 @@ impl AssemblyBuffer {
       buffer_bytes,
       fragment_count,
       received_bitmap: BitVec::from_elem(fragment_count, false),
+      source_timestamp: None,
       created_time: now,
       modified_time: now,
     })
@@ -185,6 +194,9 @@ impl AssemblyBuffer {
 // under best effort is lost anyway and under reliable will be re-requested.
 const MAX_ASSEMBLY_BUFFERS: usize = 128;
 
+// The largest sample that is assembled. A single datagram can claim up to 4 GiB.
+const MAX_ASSEMBLED_SIZE: usize = 64 * 1024 * 1024 + 4;
+
 // Assembles fragments from a single (remote) Writer
 // So there is only one sequence of SNs
 pub(crate) struct FragmentAssembler {
@@ -213,12 +225,15 @@ impl FragmentAssembler {
     }
   }
 
-  // Returns completed DDSData, when complete, and disposes the assembly buffer.
+  // Returns completed DDSData and its source timestamp, when complete, and
+  // disposes the assembly buffer. A writer need not repeat the timestamp with
+  // each fragment, and Cyclone DDS does not when it repairs.
   pub fn new_datafrag(
     &mut self,
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
-  ) -> Option<DDSData> {
+    source_timestamp: Option<Timestamp>,
+  ) -> Option<(DDSData, Option<Timestamp>)> {
     let writer_sn = datafrag.writer_sn;
     let frag_size = self.fragment_size;
 
@@ -244,10 +259,13 @@ impl FragmentAssembler {
       return None;
     }
 
+    assembly_buffer.source_timestamp = assembly_buffer.source_timestamp.or(source_timestamp);
+
     if assembly_buffer.is_complete() {
       debug!("new_datafrag: COMPLETED FRAGMENT");
       if let Some(assembly_buffer) = self.assembly_buffers.remove(&writer_sn) {
         // Return what we have assembled.
+        let source_timestamp = assembly_buffer.source_timestamp;
         let serialized_data_or_key =
           SerializedPayload::from_bytes(&assembly_buffer.buffer_bytes.freeze()).map_or_else(
             |e| {
@@ -262,7 +280,7 @@ impl FragmentAssembler {
           // it is data
           DDSData::new(serialized_data_or_key)
         };
-        Some(dds_data) // completed data from fragments
+        Some((dds_data, source_timestamp)) // completed data from fragments
       } else {
         error!("Assembly buffer mysteriously lost");
         None
@@ -423,7 +441,7 @@ mod tests {
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
     let mut fa = FragmentAssembler::new(frag_size, true);
     assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty())
+      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None)
       .is_none());
   }
 }

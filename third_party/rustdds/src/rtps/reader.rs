@@ -593,6 +593,17 @@ impl Reader {
     let receive_timestamp = Timestamp::now();
     //trace!("DATAFRAG received topic={:?}", self.topic_name);
 
+    // Assemble only what will be delivered: not what a writer that we do not know
+    // sends, and not a second time what was received already.
+    if !self.like_stateless {
+      match self.matched_writer(writer_guid) {
+        Some(writer_proxy) if !writer_proxy.should_ignore_change(seq_num) => {}
+        Some(_) => return,
+        None if writer_guid.entity_id.entity_kind.is_user_defined() => return,
+        None => {}
+      }
+    }
+
     // check if this submessage is expired already
     // TODO: Maybe this check is in the wrong place altogether? It should be
     // done when Datareader fetches data for the application.
@@ -612,10 +623,6 @@ impl Reader {
     // parse write_options out of the message
     // TODO: This is almost duplicate code from DATA processing
     let mut write_options_b = WriteOptionsBuilder::new();
-    // Check if we have a source timestamp
-    if let Some(source_timestamp) = mr_state.source_timestamp {
-      write_options_b = write_options_b.source_timestamp(source_timestamp);
-    }
     // Check if the message specifies a related_sample_identity
     let representation_identifier = DATAFRAG_Flags::cdr_representation_identifier(datafrag_flags);
     if let Some(related_sample_identity) =
@@ -637,12 +644,13 @@ impl Reader {
     let writer_seq_num = datafrag.writer_sn; // for borrow checker
     let completed_dds_data = self
       .fragment_assembler_mutable(writer_guid, datafrag.fragment_size)
-      .new_datafrag(datafrag, datafrag_flags);
+      .new_datafrag(datafrag, datafrag_flags, mr_state.source_timestamp);
 
     // ... and continue processing, if data was completed.
-    if let Some(dds_data) = completed_dds_data {
-      // Source timestamp (if any) will be the timestamp of the last fragment (that
-      // completes the sample).
+    if let Some((dds_data, source_timestamp)) = completed_dds_data {
+      if let Some(source_timestamp) = source_timestamp {
+        write_options_b = write_options_b.source_timestamp(source_timestamp);
+      }
       self.process_received_data(
         dds_data,
         receive_timestamp,

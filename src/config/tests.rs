@@ -1,0 +1,451 @@
+//! What the loader makes of single keys: each value that it accepts, each message that it gives. Pure.
+
+use std::fmt::Write;
+
+use super::*;
+use crate::model::{Durability, History, LaneName, QosProfile, Reliability, SubscriberState};
+
+/// One topic, in line 1.
+const TOPIC: &str = "topics: [{id: scan, input_topic: /scan}]\n";
+
+fn no_env(_: &str) -> Option<String> {
+    None
+}
+
+fn settings(text: &str) -> Settings {
+    parse(text, "f.yaml", &no_env).unwrap_or_else(|error| panic!("{text}\n{error}"))
+}
+
+/// The settings of [`TOPIC`] and `text`.
+fn with(text: &str) -> Settings {
+    settings(&format!("{TOPIC}{text}"))
+}
+
+fn messages(text: &str) -> Vec<String> {
+    messages_in(text, &no_env)
+}
+
+fn messages_in(text: &str, env: &dyn Fn(&str) -> Option<String>) -> Vec<String> {
+    match parse(text, "f.yaml", env) {
+        Ok(settings) => panic!("accepted: {text}\n{settings:?}"),
+        Err(error) => error.to_string().lines().map(str::to_owned).collect(),
+    }
+}
+
+fn lane<'a>(settings: &'a Settings, name: &str) -> &'a Lane {
+    settings.lane(&LaneName::try_from(name).unwrap()).unwrap()
+}
+
+#[test]
+fn a_file_with_one_topic_has_the_papers_defaults() {
+    let settings = settings(TOPIC);
+    let [critical, noncritical] = settings.lanes.as_slice() else { panic!("{:?}", settings.lanes) };
+    assert_eq!((critical.name.as_str(), critical.queue_depth), ("critical", 64));
+    assert_eq!((noncritical.name.as_str(), noncritical.queue_depth), ("noncritical", 4));
+    assert_eq!(critical.outputs[0].topic.as_str(), "/adaptive_bridge/critical/scan");
+    assert_eq!(critical.outputs[0].qos, QosProfile::CRITICAL);
+    assert_eq!(noncritical.outputs[0].topic.as_str(), "/adaptive_bridge/noncritical/scan");
+    assert_eq!(noncritical.outputs[0].qos, QosProfile::NONCRITICAL);
+    let normal = RatePolicy {
+        max_rate_hz: 10.0,
+        max_bytes_per_s: None,
+        stale_threshold_ms: 200,
+        drop_policy: DropPolicy::DropOldest,
+        queue_samples: 5,
+    };
+    let degraded = RatePolicy { max_rate_hz: 3.0, queue_samples: 2, ..normal };
+    assert_eq!(noncritical.rates, LaneRates { normal, degraded });
+    assert_eq!(critical.rates.normal.max_rate_hz, f64::INFINITY);
+    assert_eq!(settings.routes[0].max_sample_bytes, 1 << 20);
+    assert_eq!(settings.routes[0].retained_samples, 8);
+    assert_eq!(settings.routes[0].input_qos, InputQos::default());
+    assert_eq!((settings.policy_hold_ms, settings.graph_gid_bytes), (5000, 16));
+    assert_eq!(settings.instance.as_str(), "default");
+}
+
+#[test]
+fn null_is_the_same_as_leaving_a_key_out() {
+    let nulls = "instance: ~\nlanes: {critical: null, noncritical: {max_rate_hz: }}\nprobes:\n";
+    assert_eq!(with(nulls), settings(TOPIC));
+}
+
+#[test]
+fn qos_comes_from_override_then_profile_then_lane_then_class() {
+    let settings = settings(
+        "topics:\n\
+         - {id: a, input_topic: /a}\n\
+         - {id: b, input_topic: /b}\n\
+         - {id: c, input_topic: /c, qos_overrides: {rviz: {depth: 7, deadline_ms: 9}}}\n\
+         qos_profiles: {map: {durability: transient_local, depth: 1}, all: {history: KEEP_ALL}}\n\
+         lanes: {rviz: {qos: map}, fleet: {qos: {reliability: RELIABLE, lifespan_ms: 50}}}\n\
+         topic_qos_profiles: {b: {rviz: all}, c: {rviz: map}}\n",
+    );
+    let rviz = |route: usize| lane(&settings, "rviz").outputs[route].qos;
+    let map = QosProfile {
+        durability: Durability::TransientLocal,
+        history: History::KeepLast { depth: 1 },
+        ..QosProfile::NONCRITICAL
+    };
+    assert_eq!(rviz(0), map);
+    assert_eq!(rviz(1), QosProfile { history: History::KeepAll, ..QosProfile::NONCRITICAL });
+    let deadline_ms = Some(9);
+    assert_eq!(rviz(2), QosProfile { history: History::KeepLast { depth: 7 }, deadline_ms, ..map });
+    let fleet = lane(&settings, "fleet").outputs[0].qos;
+    let reliability = Reliability::Reliable;
+    assert_eq!(fleet, QosProfile { reliability, lifespan_ms: Some(50), ..QosProfile::NONCRITICAL });
+    // The deepest TRANSIENT_LOCAL output of each route, else 8.
+    assert_eq!(settings.routes.iter().map(|route| route.retained_samples).collect::<Vec<_>>(), [1, 8, 7]);
+}
+
+#[test]
+fn a_keep_all_transient_local_output_retains_its_lanes_window() {
+    let text =
+        "lanes: {noncritical: {window_samples: 30, qos: {history: KEEP_ALL, durability: TRANSIENT_LOCAL}}}\n";
+    assert_eq!(with(text).routes[0].retained_samples, 30);
+}
+
+#[test]
+fn what_the_input_does_not_say_follows_the_publisher() {
+    let input = |text: &str| {
+        let text = format!("topics: [{{id: a, input_topic: /a, qos_overrides: {{input: {text}}}}}]");
+        settings(&text).routes[0].input_qos
+    };
+    assert_eq!(input("{}"), InputQos::default());
+    let depth = |depth| Some(History::KeepLast { depth });
+    assert_eq!(input("{depth: 3}"), InputQos { history: depth(3), ..InputQos::default() });
+    assert_eq!(input("{history: KEEP_LAST}"), InputQos { history: depth(10), ..InputQos::default() });
+    let all = InputQos {
+        reliability: Some(Reliability::BestEffort),
+        durability: Some(Durability::Volatile),
+        history: Some(History::KeepAll),
+        deadline_ms: Some(5),
+    };
+    assert_eq!(
+        input(
+            "{reliability: best_effort, durability: VOLATILE, history: KEEP_ALL, depth: 4, deadline_ms: 5}"
+        ),
+        all
+    );
+}
+
+#[test]
+fn a_route_is_on_the_lanes_that_it_names() {
+    let settings = settings(
+        "topics:\n\
+         - {id: a, input_topic: /a, lanes: [rviz, critical], outputs: {rviz: /rviz/a, critical: /c/a}}\n\
+         - {id: b, input_topic: /b, noncritical_output: /n/b}\n\
+         lanes: {rviz: {}}\n",
+    );
+    let outputs = |name: &str| -> Vec<(usize, String)> {
+        let outputs = lane(&settings, name).outputs.iter();
+        outputs.map(|output| (output.route, output.topic.to_string())).collect()
+    };
+    assert_eq!(outputs("critical"), [(0, "/c/a".into()), (1, "/adaptive_bridge/critical/b".into())]);
+    assert_eq!(outputs("noncritical"), [(1, "/n/b".into())]);
+    assert_eq!(outputs("rviz"), [(0, "/rviz/a".into()), (1, "/adaptive_bridge/rviz/b".into())]);
+}
+
+#[test]
+fn rates_come_from_lane_then_mode_then_routing_policy() {
+    let settings = with(
+        "routing_policy:\n\
+         \x20 noncritical_max_rate_hz: 20\n\
+         \x20 noncritical_drop_policy: drop_latest\n\
+         \x20 stale_threshold_ms: 900\n\
+         \x20 modes:\n\
+         \x20   normal: {noncritical_depth: 30, max_noncritical_queue: 12}\n\
+         \x20   degraded: {stale_threshold_ms: 100, noncritical_depth: 0, \
+         noncritical_drop_policy: drop_stale}\n\
+         safety: {max_noncritical_queue: 6}\n\
+         lanes:\n\
+         \x20 slow: {max_rate_hz: 2, stale_threshold_ms: 0, max_bytes_per_s: 1000, queue_samples: 9}\n\
+         \x20 fast: {degraded_rate_hz: 15, degraded_stale_threshold_ms: 3, degraded_max_bytes_per_s: 10, \
+         drop_policy: drop_oldest}\n",
+    );
+    let policy = |max_rate_hz, max_bytes_per_s, stale_threshold_ms, drop_policy, queue_samples| RatePolicy {
+        max_rate_hz,
+        max_bytes_per_s,
+        stale_threshold_ms,
+        drop_policy,
+        queue_samples,
+    };
+    let rates = |name: &str| lane(&settings, name).rates;
+    assert_eq!(rates("noncritical").normal, policy(20.0, None, 900, DropPolicy::DropLatest, 12));
+    assert_eq!(rates("noncritical").degraded, policy(3.0, None, 100, DropPolicy::DropStale, 1));
+    assert_eq!(rates("slow").normal, policy(2.0, Some(1000), 0, DropPolicy::DropLatest, 9));
+    assert_eq!(rates("slow").degraded, policy(2.0, Some(1000), 100, DropPolicy::DropStale, 9));
+    assert_eq!(rates("fast").normal, policy(20.0, None, 900, DropPolicy::DropOldest, 12));
+    assert_eq!(rates("fast").degraded, policy(15.0, Some(10), 3, DropPolicy::DropOldest, 1));
+}
+
+#[test]
+fn a_queue_is_capped_where_the_mode_has_no_cap_of_its_own() {
+    let text =
+        "safety: {max_noncritical_queue: 6}\nrouting_policy: {modes: {normal: {noncritical_depth: 30}}}\n";
+    assert_eq!(with(text).lanes[1].rates.normal.queue_samples, 6);
+}
+
+#[test]
+fn noncritical_lanes_that_are_not_enabled_forward_nothing() {
+    let settings = with("routing_policy: {noncritical_enabled: false}\nlanes: {rviz: {max_rate_hz: 5}}\n");
+    for name in ["noncritical", "rviz"] {
+        let rates = lane(&settings, name).rates;
+        assert_eq!((rates.normal.max_rate_hz, rates.degraded.max_rate_hz), (0.0, 0.0));
+    }
+    assert_eq!(settings.lanes[0].rates.normal.max_rate_hz, f64::INFINITY);
+}
+
+#[test]
+fn lanes_have_networks_and_scheduling_of_their_own() {
+    let settings = with(
+        "ros: {domain_id: 4, networks: [eth0, 10.0.0.7]}\n\
+         lanes:\n\
+         \x20 critical: {scheduling: {policy: fifo, priority: 80, cpus: [2, 3], lock_memory: true}}\n\
+         \x20 noncritical: {domain_id: 9, networks: [wlan0]}\n\
+         \x20 fleet: {networks: []}\n\
+         processes: {ingress: {scheduling: {policy: rr, priority: 1}}}\n",
+    );
+    let name = |name: &str| NetworkSelector::Name(name.to_owned());
+    let address = NetworkSelector::Address([10, 0, 0, 7].into());
+    let input = DdsNetwork { domain_id: 4, interfaces: vec![name("eth0"), address] };
+    assert_eq!(settings.input, input);
+    assert_eq!(lane(&settings, "critical").network, input);
+    assert_eq!(
+        lane(&settings, "noncritical").network,
+        DdsNetwork { domain_id: 9, interfaces: vec![name("wlan0")] }
+    );
+    assert_eq!(lane(&settings, "fleet").network, DdsNetwork { domain_id: 4, interfaces: vec![] });
+    let fifo =
+        Scheduling { policy: SchedulingPolicy::Fifo, priority: 80, cpus: vec![2, 3], lock_memory: true };
+    assert_eq!(lane(&settings, "critical").scheduling, fifo);
+    let rr = Scheduling { policy: SchedulingPolicy::RoundRobin, priority: 1, ..Scheduling::default() };
+    assert_eq!(settings.ingress_scheduling, rr);
+    assert_eq!(settings.control_scheduling, Scheduling::default());
+}
+
+#[test]
+fn subscribers_and_overrides_are_known_by_their_ids() {
+    let settings = with(
+        "lanes: {rviz: {}}\n\
+         subscribers: {laptop: rviz, tablet: {lane: noncritical}, gone: {lane: null}}\n\
+         overrides: {laptop: critical, 7: NONCRITICAL, other: null}\n",
+    );
+    let lanes: Vec<_> = settings.subscribers.iter().map(|(id, lane)| (id.as_str(), lane.as_str())).collect();
+    assert_eq!(lanes, [("laptop", "rviz"), ("tablet", "noncritical")]);
+    let states: Vec<_> = settings.overrides.iter().map(|(id, &state)| (id.as_str(), state)).collect();
+    assert_eq!(states, [("7", SubscriberState::Noncritical), ("laptop", SubscriberState::Critical)]);
+}
+
+#[test]
+fn a_secret_is_known_by_its_source_only() {
+    let secret = |text: &str| with(&format!("security: {{{text}}}\n")).security.secret;
+    assert_eq!(secret("hmac_secret: ''"), None);
+    assert_eq!(secret("hmac_secret: swordfish"), Some(SecretSource::ConfigFile));
+    assert_eq!(secret("hmac_secret_file: /etc/secret"), Some(SecretSource::File("/etc/secret".into())));
+    assert_eq!(secret("hmac_secret_env: SECRET"), Some(SecretSource::Environment("SECRET".into())));
+    assert!(!format!("{:?}", with("security: {hmac_secret: swordfish}\n")).contains("swordfish"));
+}
+
+#[test]
+fn no_message_ever_repeats_a_secret() {
+    for text in [
+        "security: swordfish",
+        "security: [swordfish]",
+        "security: {hmac_secret: [swordfish]}",
+        "security: {hmac_secret: {swordfish: 1}}",
+        "security: {hmac_secret:swordfish}",
+        "security: {hmac_secrt: swordfish}",
+        "security: {hmac_secret: swordfish, hmac_secret: swordfish}",
+        "security: {hmac_secret: swordfish, hmac_secret_file: /swordfish}",
+        "security: {hmac_secret_file: swordfish}",
+        "security: {hmac_secret_env: sword-swordfish}",
+        "security: {hmac_secret: *swordfish}",
+        "security: {hmac_secret: !swordfish x}",
+        "security: {hmac_secret: swordfish",
+        "security:\n  hmac_secret: 'swordfish\n",
+    ] {
+        let text = format!("{TOPIC}{text}\n");
+        let error = parse(&text, "f.yaml", &no_env).expect_err(&text);
+        assert!(!format!("{error}{error:?}").contains("swordfish"), "{text}{error}");
+    }
+}
+
+#[test]
+fn aliases_and_merge_keys_are_written_out() {
+    let settings = settings(
+        "topics: [{id: a, input_topic: /a}]\n\
+         qos_profiles:\n\
+         \x20 base: &base {reliability: RELIABLE, depth: 3}\n\
+         \x20 derived: {<<: *base, depth: 4}\n\
+         topic_qos_profiles: {a: {critical: base, noncritical: derived}}\n",
+    );
+    let qos = |lane: usize| settings.lanes[lane].outputs[0].qos;
+    assert_eq!(qos(0).depth(), Some(3));
+    assert_eq!((qos(1).depth(), qos(1).reliability), (Some(4), Reliability::Reliable));
+}
+
+#[test]
+fn a_topic_may_have_the_name_of_its_input_in_another_domain() {
+    let settings = settings(
+        "topics: [{id: a, input_topic: /a, noncritical_output: /a}]\nlanes: {noncritical: {domain_id: 1}}\n",
+    );
+    assert_eq!(settings.lanes[1].outputs[0].topic.as_str(), "/a");
+}
+
+#[test]
+fn a_default_output_that_is_too_long_is_named() {
+    let input = format!("/{}", "a".repeat(240));
+    let found = messages(&format!("topics: [{{id: a, input_topic: {input}}}]"));
+    assert_eq!(found.len(), 2);
+    assert!(
+        found[0].starts_with("f.yaml:1: topics[0].outputs.critical = /adaptive_bridge/critical/aaa"),
+        "{found:?}"
+    );
+    assert!(found[0].contains("at most 246 characters"), "{found:?}");
+}
+
+#[test]
+fn each_mistake_is_named_with_its_line_value_and_what_is_allowed() {
+    let cases = include_str!("../../tests/fixtures/config/messages.txt").split("\n\n").skip(1);
+    let mut count = 0;
+    for case in cases {
+        let (text, expected): (Vec<&str>, Vec<&str>) =
+            case.lines().partition(|line| !line.starts_with("=> "));
+        let text = text.join("\n");
+        let text = if text.starts_with("topics") { text } else { format!("{TOPIC}{text}") };
+        let expected: Vec<String> = expected.iter().map(|line| line.replacen("=> ", "f.yaml:", 1)).collect();
+        assert_eq!(messages(&text), expected, "{text}");
+        count += 1;
+    }
+    assert!(count > 90, "{count} cases");
+}
+
+#[test]
+fn a_file_without_topics_says_so() {
+    let found = messages("instance: a");
+    assert_eq!(found.len(), 1);
+    assert!(
+        found[0].starts_with("f.yaml:1: topics: must be given: a list of at least one topic"),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn what_is_not_a_configuration_at_all_is_said_so() {
+    for text in ["", "\n\n", "# nothing\n", "---\n", "~", "---\n...\n", "\u{feff}"] {
+        let found = messages(text);
+        assert_eq!(found.len(), 1, "{text:?}");
+        assert!(found[0].starts_with("f.yaml: the file is empty: at least `topics` must"), "{found:?}");
+    }
+    for (text, message) in [
+        ("5", "f.yaml:1: must be a mapping at its top level, of keys such as `topics:`"),
+        ("\n- a\n- b", "f.yaml:2: must be a mapping at its top level, of keys such as `topics:`"),
+        ("topics: [", "f.yaml:1: not YAML: "),
+        ("a: b\n c: d", "f.yaml:2: not YAML: "),
+        ("a: b\n\tc: d", "f.yaml:1: not YAML: "),
+        ("a: 1\n---\nb: 2\n", "f.yaml:2: must be one YAML document; a second one begins here"),
+        ("a: 1\n? [b]\n: 2\n", "f.yaml:2: a key must be text, not a list or a mapping"),
+        ("a: *b\n", "f.yaml:1: not YAML: "),
+        ("a: &a\n  b: *a\n", "f.yaml:2: this alias refers to what it is part of"),
+        ("a: !include b\n", "f.yaml:1: must be without YAML tags (`!name`)"),
+    ] {
+        let found = messages(text);
+        assert_eq!(found.len(), 1, "{text}");
+        assert!(found[0].starts_with(message), "{text}: {found:?}");
+    }
+    let error = parse(b"a: b\nc: \xff\n", "f.yaml", &no_env).unwrap_err();
+    assert_eq!(error.to_string(), "f.yaml:2: must be text in UTF-8");
+}
+
+#[test]
+fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
+    let mut bomb = String::from("a0: &a0 [x, x, x, x, x, x, x, x, x]\n");
+    for level in 1..40 {
+        let aliases = vec![format!("*a{}", level - 1); 9].join(", ");
+        writeln!(bomb, "a{level}: &a{level} [{aliases}]").unwrap();
+    }
+    let mebibyte = 1 << 20;
+    let many = "must have at most 65536 keys and values, those of aliases included";
+    let deep = "not YAML: recursion limit exceeded";
+    for (text, message) in [
+        (bomb, format!("f.yaml:5: {many}")),
+        ("[".repeat(mebibyte), format!("f.yaml:1: {deep}")),
+        ("{a: ".repeat(mebibyte / 4), format!("f.yaml:1: {deep}")),
+        ("- ".repeat(mebibyte / 2), format!("f.yaml:1: {deep}")),
+        ("? ".repeat(mebibyte / 2), format!("f.yaml:1: {deep}")),
+        (format!("[{}]", "a,".repeat(mebibyte / 2 - 1)), format!("f.yaml:1: {many}")),
+        (" ".repeat(mebibyte + 1), "f.yaml: must be at most 1048576 bytes long".to_owned()),
+    ] {
+        assert_eq!(messages(&text), [message]);
+    }
+    // Mixed nesting stays below both limits of the parser, and is counted here.
+    let mixed = messages(&"- [\n".repeat(40));
+    assert!(mixed[0].starts_with("f.yaml:"), "{mixed:?}");
+}
+
+#[test]
+fn too_many_lanes_or_topics_are_refused() {
+    let mut lanes = String::from("lanes:\n");
+    for index in 0..31 {
+        writeln!(lanes, "  l{index}: {{}}").unwrap();
+    }
+    assert_eq!(
+        messages(&format!("{TOPIC}{lanes}")),
+        ["f.yaml:2: lanes: must be at most 32 lanes, each of which is a process"]
+    );
+    let mut topics = String::from("topics:\n");
+    for index in 0..1025 {
+        writeln!(topics, "- {{id: t{index}, input_topic: /t{index}}}").unwrap();
+    }
+    assert_eq!(messages(&topics), ["f.yaml:1: topics: must be at most 1024 topics"]);
+}
+
+#[test]
+fn environment_variables_stand_in_where_the_file_is_silent() {
+    let parse_in = |text: &str, name: &'static str, value: &'static str| {
+        let text = format!("{TOPIC}{text}");
+        parse(&text, "f.yaml", &|asked: &str| (asked == name).then(|| value.to_owned())).unwrap()
+    };
+    let loopback = [NetworkSelector::Address([127, 0, 0, 1].into())];
+    assert_eq!(parse_in("", "ROS_DOMAIN_ID", "42").input.domain_id, 42);
+    assert_eq!(parse_in("", "ROS_DOMAIN_ID", "42").lanes[1].network.domain_id, 42);
+    assert_eq!(parse_in("", "ROS_DOMAIN_ID", "").input.domain_id, 0);
+    assert_eq!(parse_in("ros: {domain_id: 7}", "ROS_DOMAIN_ID", "42").input.domain_id, 7);
+    assert_eq!(parse_in("", "ROS_LOCALHOST_ONLY", "1").input.interfaces, loopback);
+    assert!(parse_in("", "ROS_LOCALHOST_ONLY", "0").input.interfaces.is_empty());
+    let range = "ROS_AUTOMATIC_DISCOVERY_RANGE";
+    assert_eq!(parse_in("", range, "LOCALHOST").lanes[0].network.interfaces, loopback);
+    assert!(parse_in("", range, "SUBNET").input.interfaces.is_empty());
+    assert!(parse_in("", range, "SYSTEM_DEFAULT").input.interfaces.is_empty());
+    let named = parse_in("ros: {networks: [eth0]}\nlanes: {a: {networks: []}}", range, "LOCALHOST");
+    assert_eq!(named.input.interfaces, [NetworkSelector::Name("eth0".to_owned())]);
+    assert_eq!(lane(&named, "a").network.interfaces, loopback);
+    for (distro, bytes) in [("humble", 24), ("galactic", 24), ("foxy", 24), ("iron", 16), ("jazzy", 16)] {
+        assert_eq!(parse_in("", "ROS_DISTRO", distro).graph_gid_bytes, bytes, "{distro}");
+    }
+    assert_eq!(parse_in("ros: {graph_gid_bytes: 16}", "ROS_DISTRO", "humble").graph_gid_bytes, 16);
+}
+
+#[test]
+fn a_wrong_environment_variable_is_named() {
+    for (name, value, message) in [
+        ("ROS_DOMAIN_ID", "233", "must be a whole number from 0 to 232"),
+        ("ROS_DOMAIN_ID", "-1", "must be a whole number from 0 to 232"),
+        ("ROS_LOCALHOST_ONLY", "true", "must be 0 or 1"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "subnet", "must be one of SUBNET, LOCALHOST, SYSTEM_DEFAULT"),
+        (
+            "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            "OFF",
+            "must not be OFF: a bridge without discovery finds neither publishers nor subscribers",
+        ),
+        (
+            "ROS_STATIC_PEERS",
+            "10.0.0.1",
+            "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces \
+             with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
+        ),
+    ] {
+        let found = messages_in(TOPIC, &|asked: &str| (asked == name).then(|| value.to_owned()));
+        assert_eq!(found, [format!("environment: {name} = {value}: {message}")]);
+    }
+}

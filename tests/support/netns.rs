@@ -1,0 +1,211 @@
+//! Hosts on one Ethernet switch, as network namespaces: each has its own addresses, ports and multicast.
+
+use std::cell::Cell;
+use std::fs;
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::process::Command;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use super::{Exclusive, exclusive};
+
+/// Namespaces are called `ab-PID-NUMBER-HOST`: PID is the test program's.
+const PREFIX: &str = "ab-";
+const NAMESPACES: &str = "/run/netns";
+
+/// Why network namespaces can't be made on this machine; `None` when they can.
+pub fn requires_root() -> Option<String> {
+    static REASON: OnceLock<Option<String>> = OnceLock::new();
+    REASON
+        .get_or_init(|| {
+            if !nix::unistd::geteuid().is_root() {
+                return Some("network namespaces need root".to_owned());
+            }
+            let name = format!("{PREFIX}{}-probe", std::process::id());
+            let made = try_run("ip", &["netns", "add", &name]);
+            let _ = try_run("ip", &["netns", "del", &name]);
+            made.err().map(|error| format!("network namespaces can't be made: {error}"))
+        })
+        .clone()
+}
+
+/// Runs a program to its end; an error is what it said.
+fn try_run(program: &str, arguments: &[&str]) -> Result<String, String> {
+    let output =
+        Command::new(program).args(arguments).output().map_err(|error| format!("{program}: {error}"))?;
+    if output.status.success() {
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    } else {
+        let said = String::from_utf8_lossy(&output.stderr);
+        Err(format!("{program} {}: {} {}", arguments.join(" "), output.status, said.trim()))
+    }
+}
+
+fn run(program: &str, arguments: &[&str]) {
+    try_run(program, arguments).unwrap_or_else(|error| panic!("{error}"));
+}
+
+/// Runs `ip` with arguments that have no blanks in them.
+fn ip(arguments: &str) {
+    run("ip", &arguments.split_whitespace().collect::<Vec<_>>());
+}
+
+/// Kills what runs in a namespace and removes it. What has gone meanwhile is as good as removed.
+fn remove(namespace: &str) {
+    let pids = try_run("ip", &["netns", "pids", namespace]).unwrap_or_default();
+    for pid in pids.split_whitespace().filter_map(|pid| pid.parse().ok()) {
+        let _ = kill(Pid::from_raw(pid), Signal::SIGKILL);
+    }
+    let _ = try_run("ip", &["netns", "del", namespace]);
+}
+
+/// Removes the namespaces that test programs which are gone have left.
+fn remove_stale() {
+    let Ok(entries) = fs::read_dir(NAMESPACES) else { return };
+    for name in entries.flatten().filter_map(|entry| entry.file_name().into_string().ok()) {
+        let pid = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').next()?.parse::<u32>().ok());
+        if pid.is_some_and(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
+            remove(&name);
+        }
+    }
+}
+
+thread_local! {
+    /// A second [`Net`] in one test would wait for the first for ever.
+    static HAS_NET: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Hosts on one switch. Only one exists at a time on a machine's source tree (see [`exclusive`]); dropping it
+/// kills whatever still runs in its hosts and removes them.
+pub struct Net {
+    id: String,
+    hosts: Vec<Host>,
+    _exclusive: Exclusive,
+}
+
+impl Net {
+    /// Makes the hosts, each connected to the switch at once. Panics where [`requires_root`] has a reason.
+    pub fn new(hosts: &[&str]) -> Net {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        assert!(!HAS_NET.replace(true), "a test has one Net: drop the first before making another");
+        let exclusive = exclusive();
+        remove_stale();
+
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let pid = std::process::id();
+        let id = format!("{PREFIX}{pid}-{number}");
+        let mut net = Net { id, hosts: Vec::new(), _exclusive: exclusive };
+        let switch = net.switch();
+        ip(&format!("netns add {switch}"));
+        ip(&format!("-n {switch} link add br0 type bridge mcast_snooping 0"));
+        ip(&format!("-n {switch} link set br0 up"));
+        // Else the machine's firewall sees, and reassembles, what passes the switch.
+        let no_netfilter = "f=/proc/sys/net/bridge/bridge-nf-call-iptables; test ! -e $f || echo 0 > $f";
+        run("nsenter", &[&format!("--net={NAMESPACES}/{switch}"), "sh", "-c", no_netfilter]);
+
+        for (index, name) in hosts.iter().enumerate() {
+            let namespace = format!("{}-{name}", net.id);
+            let port = format!("p{index}");
+            // Another subnet for each Net, so that no peer takes an address for one it knew before.
+            let address = Ipv4Addr::new(10, 64 + (pid % 128) as u8, (number % 256) as u8, index as u8 + 1);
+            ip(&format!("netns add {namespace}"));
+            let host = Host { name: (*name).to_owned(), namespace, address, switch: switch.clone(), port };
+            let (namespace, port) = (&host.namespace, &host.port);
+            ip(&format!("link add {port} netns {switch} type veth peer name eth0 netns {namespace}"));
+            ip(&format!("-n {switch} link set {port} master br0 up"));
+            ip(&format!("-n {namespace} link set lo up"));
+            ip(&format!("-n {namespace} addr add {address}/24 dev eth0"));
+            ip(&format!("-n {namespace} link set eth0 up"));
+            ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"));
+            net.hosts.push(host);
+        }
+        net
+    }
+
+    fn switch(&self) -> String {
+        format!("{}-switch", self.id)
+    }
+
+    /// The host of that name.
+    pub fn host(&self, name: &str) -> &Host {
+        self.hosts.iter().find(|host| host.name == name).unwrap_or_else(|| panic!("no host '{name}'"))
+    }
+}
+
+impl Drop for Net {
+    fn drop(&mut self) {
+        // By name and not by `hosts`, so that a Net that could not be made whole is removed too.
+        let prefix = format!("{}-", self.id);
+        for entry in fs::read_dir(NAMESPACES).into_iter().flatten().flatten() {
+            if let Some(name) = entry.file_name().to_str().filter(|name| name.starts_with(&prefix)) {
+                remove(name);
+            }
+        }
+        HAS_NET.set(false);
+    }
+}
+
+/// One host of a [`Net`].
+#[derive(Clone, Debug)]
+pub struct Host {
+    name: String,
+    namespace: String,
+    address: Ipv4Addr,
+    switch: String,
+    port: String,
+}
+
+impl Host {
+    /// Its name in the [`Net`].
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Its address on `eth0`.
+    pub fn address(&self) -> Ipv4Addr {
+        self.address
+    }
+
+    /// The name of its network namespace, as `ip netns list` shows it.
+    pub fn namespace(&self) -> &str {
+        &self.namespace
+    }
+
+    /// A command that will run on this host. It is the program itself that runs under the child's pid, and it
+    /// shares all but the network with the test: files, `/dev/shm`, process ids.
+    pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
+        let mut command = Command::new("nsenter");
+        command.arg(format!("--net={NAMESPACES}/{}", self.namespace)).arg(program);
+        command
+    }
+
+    /// Runs a program on this host to its end; yields its output.
+    pub fn run(&self, program: &str, arguments: &[&str]) -> String {
+        let network = format!("--net={NAMESPACES}/{}", self.namespace);
+        let mut all = vec![network.as_str(), program];
+        all.extend_from_slice(arguments);
+        try_run("nsenter", &all).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// Connects the host to the switch, or pulls its cable at the switch's end.
+    pub fn set_link(&self, up: bool) {
+        let state = if up { "up" } else { "down" };
+        ip(&format!("-n {} link set {} {state}", self.switch, self.port));
+    }
+
+    /// From now on loses datagrams that arrive, each with that probability (0 to 1; 0 ends it). The kernel's
+    /// random numbers are not seeded.
+    pub fn lose_incoming(&self, probability: f64) {
+        self.run("iptables", &["-F", "INPUT"]);
+        if probability > 0.0 {
+            let probability = probability.to_string();
+            let rule = ["-A", "INPUT", "-i", "eth0", "-m", "statistic", "--mode", "random"];
+            let rule = [rule.as_slice(), &["--probability", &probability, "-j", "DROP"]].concat();
+            self.run("iptables", &rule);
+        }
+    }
+}

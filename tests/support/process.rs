@@ -1,0 +1,196 @@
+//! A child process whose output is kept, which can be stopped and killed, and which never outlives its test.
+
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::CommandExt;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Instant;
+
+use nix::sys::signal::{Signal, kill, killpg};
+use nix::unistd::Pid;
+
+use super::patience;
+
+/// How much of an output is shown when a test fails.
+const TAIL_LINES: usize = 20;
+
+/// The lines of one output stream, so far.
+#[derive(Default)]
+struct Lines {
+    state: Mutex<LinesState>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct LinesState {
+    lines: Vec<String>,
+    ended: bool,
+}
+
+impl Lines {
+    fn read_from(stream: impl Read + Send + 'static) -> Arc<Lines> {
+        let lines = Arc::new(Lines::default());
+        let sink = Arc::clone(&lines);
+        std::thread::spawn(move || {
+            // Bytes that are no UTF-8 are shown as such: a log is never the reason for a test to fail.
+            let mut stream = BufReader::new(stream);
+            let mut line = Vec::new();
+            while matches!(stream.read_until(b'\n', &mut line), Ok(count) if count > 0) {
+                let text = String::from_utf8_lossy(&line).trim_end().to_owned();
+                sink.state.lock().unwrap().lines.push(text);
+                sink.changed.notify_all();
+                line.clear();
+            }
+            sink.state.lock().unwrap().ended = true;
+            sink.changed.notify_all();
+        });
+        lines
+    }
+}
+
+/// A running child, the leader of a process group of its own.
+///
+/// Dropping it kills the whole group; so does the death of the test's thread or process. When the test is
+/// failing, its log and the end of its output are printed.
+pub struct Process {
+    name: String,
+    child: Child,
+    stdout: Arc<Lines>,
+    stderr: Arc<Lines>,
+}
+
+impl Process {
+    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started it
+    /// ends.
+    pub fn spawn(name: &str, mut command: Command) -> Process {
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
+        // SAFETY: between fork and exec the closure makes one system call (prctl), which is
+        // async-signal-safe; it neither allocates nor takes a lock.
+        unsafe {
+            command
+                .pre_exec(|| nix::sys::prctl::set_pdeathsig(Signal::SIGKILL).map_err(std::io::Error::from));
+        }
+        let mut child =
+            command.spawn().unwrap_or_else(|error| panic!("{name}: {command:?} can't be started: {error}"));
+        let stdout = Lines::read_from(child.stdout.take().unwrap());
+        let stderr = Lines::read_from(child.stderr.take().unwrap());
+        Process { name: name.to_owned(), child, stdout, stderr }
+    }
+
+    /// The process id.
+    pub fn pid(&self) -> Pid {
+        Pid::from_raw(self.child.id() as i32)
+    }
+
+    /// Sends a signal to the process itself, not to its children.
+    pub fn signal(&self, signal: Signal) {
+        kill(self.pid(), signal).unwrap_or_else(|error| panic!("{signal} to {}: {error}", self.name));
+    }
+
+    /// Sends a signal to the process and to those of its children that have stayed in its group.
+    pub fn signal_group(&self, signal: Signal) {
+        killpg(self.pid(), signal).unwrap_or_else(|error| panic!("{signal} to {}: {error}", self.name));
+    }
+
+    /// Freezes it (SIGSTOP).
+    pub fn stop(&self) {
+        self.signal(Signal::SIGSTOP);
+    }
+
+    /// Lets it go on (SIGCONT).
+    pub fn cont(&self) {
+        self.signal(Signal::SIGCONT);
+    }
+
+    /// Kills it (SIGKILL) and takes its exit status, so that its pid is free.
+    pub fn kill9(&mut self) -> ExitStatus {
+        self.signal(Signal::SIGKILL);
+        self.wait()
+    }
+
+    /// Asks it to end (SIGTERM) and waits until it has.
+    pub fn terminate(&mut self) -> ExitStatus {
+        if self.is_running() {
+            self.signal(Signal::SIGTERM);
+        }
+        self.wait()
+    }
+
+    /// Whether it has not ended yet; a stopped process is running.
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// Waits until it has ended, and until all that it wrote has been read.
+    pub fn wait(&mut self) -> ExitStatus {
+        let what = format!("the end of {}", self.name);
+        let status = super::wait_for(&what, || self.child.try_wait().unwrap());
+        // A grandchild may hold the pipe open; then what has come so far is all there is to wait for.
+        let deadline = Instant::now() + std::time::Duration::from_secs(1);
+        for lines in [&self.stdout, &self.stderr] {
+            let mut state = lines.state.lock().unwrap();
+            while !state.ended && Instant::now() < deadline {
+                let left = deadline.saturating_duration_since(Instant::now());
+                state = lines.changed.wait_timeout(state, left).unwrap().0;
+            }
+        }
+        status
+    }
+
+    /// What it wrote to stdout so far.
+    pub fn stdout_lines(&self) -> Vec<String> {
+        self.stdout.state.lock().unwrap().lines.clone()
+    }
+
+    /// What it wrote to stderr so far.
+    pub fn log(&self) -> String {
+        self.stderr.state.lock().unwrap().lines.join("\n")
+    }
+
+    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number of
+    /// the line after it. Panics with the last lines when patience or the output ends.
+    pub fn wait_for_line<T>(
+        &self,
+        what: &str,
+        from: usize,
+        mut find: impl FnMut(&str) -> Option<T>,
+    ) -> (T, usize) {
+        let deadline = Instant::now() + patience();
+        let mut at = from;
+        let mut state = self.stdout.state.lock().unwrap();
+        loop {
+            while at < state.lines.len() {
+                at += 1;
+                if let Some(value) = find(&state.lines[at - 1]) {
+                    return (value, at);
+                }
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if state.ended || left.is_zero() {
+                let why = if state.ended { "its output ended" } else { "patience ended" };
+                let tail = state.lines[state.lines.len().saturating_sub(TAIL_LINES)..].join("\n");
+                drop(state);
+                panic!("{}: {why} while waiting for: {what}; its last lines:\n{tail}", self.name);
+            }
+            state = self.stdout.changed.wait_timeout(state, left).unwrap().0;
+        }
+    }
+
+    /// Waits until a line of its log contains `text`.
+    pub fn wait_for_log(&self, text: &str) {
+        super::wait_until(&format!("'{text}' in the log of {}", self.name), || self.log().contains(text));
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // The group may be gone already; a group that is not can be killed by the one who started it.
+        let _ = killpg(self.pid(), Signal::SIGKILL);
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            let lines = self.stdout_lines();
+            let tail = lines[lines.len().saturating_sub(TAIL_LINES)..].join("\n");
+            eprintln!("--- {}, end of its output:\n{tail}\n--- its log:\n{}\n---", self.name, self.log());
+        }
+    }
+}
