@@ -201,3 +201,25 @@ fn an_acknowledged_sample_is_let_go_of_without_waiting_for_the_cache_cleaning() 
     let held = released[..936].iter().filter(|flag| !flag.load(Ordering::Acquire)).count();
     assert_eq!(held, 0, "acknowledged samples are still held");
 }
+
+#[test]
+fn a_process_that_was_stopped_and_continued_goes_on_receiving() {
+    let mut here = participant("here", 75);
+    let mut there = participant("there", 75);
+    let reader = there
+        .create_reader("rt/stopped", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/stopped", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    // Somebody has to continue this process; a shell does it from outside.
+    let stopped_and_continued = std::process::Command::new("sh")
+        .args(["-c", "kill -STOP $0; sleep 0.2; kill -CONT $0", &std::process::id().to_string()])
+        .status()
+        .unwrap();
+    assert!(stopped_and_continued.success());
+    for number in 0..10 {
+        let payload = Bytes::from(vec![number; 100]);
+        writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+        assert_eq!(take_one(&reader).expect("nothing arrived").0, vec![number; 100]);
+    }
+}

@@ -733,6 +733,8 @@ impl Discovery {
       );
       match self.poll.poll(&mut events, Some(poll_timeout)) {
         Ok(_) => (),
+        // As in the other event loop: a process that was stopped and continued.
+        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => events.clear(),
         Err(e) => {
           error!("Failed in waiting of poll in discovery. {e:?}");
           return;

@@ -305,6 +305,9 @@ impl DPEventLoop {
       let poll_timeout = timeout_until(ev_wrapper.shared_timer.borrow().next_deadline(), idle_cap);
       match ev_wrapper.poll.poll(&mut events, Some(poll_timeout)) {
         Ok(_) => {}
+        // SIGSTOP with SIGCONT, or a debugger that attaches, interrupts epoll_wait
+        // even where no signal is handled (signal(7)). Nothing is amiss.
+        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => events.clear(),
         Err(e) => {
           error!("dp_event_loop poll failed: {e:?}");
           break;
