@@ -152,6 +152,17 @@ struct Bridge {
     folder: PathBuf,
 }
 
+impl Bridge {
+    fn check(&mut self) -> Result<(), String> {
+        for process in &mut self.processes {
+            if let Ok(Some(status)) = process.try_wait() {
+                return Err(format!("a process of the bridge ended unasked: {status}"));
+            }
+        }
+        Ok(())
+    }
+}
+
 impl Drop for Bridge {
     fn drop(&mut self) {
         for process in &mut self.processes {
@@ -238,6 +249,9 @@ impl Bed {
 
     pub fn measure(&mut self, case: &Case) -> Result<Run, String> {
         let route = Route::ALL.iter().position(|route| *route == case.route).unwrap_or(0);
+        if let Some(bridge) = &mut self.bridge {
+            bridge.check()?;
+        }
         let before = self.bridge.as_ref().map(|bridge| Counted::read(&bridge.boards, route));
         self.subscriber.order("begin")?;
         std::thread::sleep(Duration::from_millis(150));
