@@ -221,3 +221,25 @@ fn a_new_reader_of_a_topic_does_not_get_what_a_former_one_has_taken() {
     write(b"two.");
     assert_eq!(take_one(&reader).unwrap().0, b"two.");
 }
+
+#[test]
+fn a_process_that_was_stopped_and_continued_goes_on_receiving() {
+    let mut here = participant("here", 76);
+    let mut there = participant("there", 76);
+    let reader = there
+        .create_reader("rt/stopped", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/stopped", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    // Somebody has to continue this process; a shell does it from outside.
+    let stopped_and_continued = std::process::Command::new("sh")
+        .args(["-c", "kill -STOP $0; sleep 0.2; kill -CONT $0", &std::process::id().to_string()])
+        .status()
+        .unwrap();
+    assert!(stopped_and_continued.success());
+    for number in 0..10 {
+        let payload = Bytes::from(vec![number; 100]);
+        writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+        assert_eq!(take_one(&reader).expect("nothing arrived").0, vec![number; 100]);
+    }
+}

@@ -307,7 +307,7 @@ impl DPEventLoop {
         Ok(_) => {}
         // A process that was stopped and goes on (SIGSTOP and SIGCONT, a debugger, a suspended machine) has its
         // epoll_wait interrupted, although no signal handler ran (signal(7)). There are no events then.
-        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => events.clear(),
         Err(e) => {
           error!("dp_event_loop poll failed: {e:?}");
           break;
