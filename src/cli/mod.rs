@@ -4,6 +4,7 @@
 //! sysexits.h). Logs go to stderr; what a program may want to read goes to stdout, and nothing else does.
 
 mod check;
+mod demo;
 mod mode;
 mod roles;
 
@@ -39,6 +40,12 @@ enum Command {
     Up(ConfigArguments),
     /// Set the mode of a lane by hand
     Mode(mode::Arguments),
+    /// Show what the bridge is for: publisher, subscribers and bridge on this machine, without ROS 2
+    Demo(demo::Arguments),
+    #[command(hide = true)]
+    DemoPublisher(demo::PublisherArguments),
+    #[command(hide = true)]
+    DemoSubscriber(demo::SubscriberArguments),
 }
 
 /// Which configuration.
@@ -74,6 +81,9 @@ pub fn main() -> ExitCode {
         Command::Egress(arguments) => roles::egress(&arguments),
         Command::Up(arguments) => roles::up(&arguments),
         Command::Mode(arguments) => mode::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::DemoPublisher(arguments) => demo::publisher(&arguments),
+        Command::DemoSubscriber(arguments) => demo::subscriber(&arguments),
     }
 }
 
