@@ -17,7 +17,7 @@ missing=""
 lacking=""
 need() {
     check=$1 packages=$2 purpose=$3
-    if eval "$check"; then return; fi
+    if eval "$check"; then return 0; fi
     missing="$missing $packages"
     lacking="$lacking
   $packages: $purpose"
@@ -41,21 +41,21 @@ check_all() {
 # The first of 'a|b' that the package lists know.
 existing() {
     for package in $(echo "$1" | tr '|' ' '); do
-        if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; return; fi
+        if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; return 0; fi
     done
 }
 
 install_missing() {
     if ! has apt-get; then
         say "this is not Debian or Ubuntu; these have to be installed by hand:$lacking"
-        return
+        return 0
     fi
     as_root=""
     if [ "$(id -u)" -ne 0 ]; then
         if has sudo && { sudo -n true 2>/dev/null || [ -t 0 ]; }; then
             as_root="sudo"
         else
-            return
+            return 0
         fi
     fi
     say "missing:$lacking"
@@ -66,7 +66,7 @@ install_missing() {
         package=$(existing "$names")
         if [ -n "$package" ]; then packages="$packages $package"; fi
     done
-    if [ -z "$packages" ]; then return; fi
+    if [ -z "$packages" ]; then return 0; fi
     say "apt-get install$packages"
     # The list is words.
     # shellcheck disable=SC2086
