@@ -78,8 +78,8 @@ impl RawWriter {
         self.write_with(payload, encapsulation, timestamp, None)
     }
 
-    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, whom
-    /// the DDS protocol has no way to give the history.
+    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer,
+    /// whom the DDS protocol has no way to give the history.
     ///
     /// # Errors
     /// As for [`write`](Self::write).
