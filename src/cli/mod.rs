@@ -5,6 +5,7 @@
 
 mod check;
 mod completions;
+mod demo;
 mod man;
 mod mode;
 mod roles;
@@ -57,6 +58,12 @@ enum Command {
     /// Write the manual pages to a folder
     #[command(hide = true)]
     Man(man::Arguments),
+    /// Show what the bridge is for: publisher, subscribers and bridge on this machine, without ROS 2
+    Demo(demo::Arguments),
+    #[command(hide = true)]
+    DemoPublisher(demo::PublisherArguments),
+    #[command(hide = true)]
+    DemoSubscriber(demo::SubscriberArguments),
 }
 
 /// Which configuration.
@@ -100,6 +107,9 @@ pub fn main() -> ExitCode {
         Command::Mode(arguments) => mode::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => man::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::DemoPublisher(arguments) => demo::publisher(&arguments),
+        Command::DemoSubscriber(arguments) => demo::subscriber(&arguments),
     }
 }
 

@@ -2,8 +2,8 @@
 //! bridge.
 //!
 //! - [`ShmNode`]: the membership of one process in one bridge instance; cleans up after dead processes.
-//! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of fixed
-//!   size (iceoryx2 publish-subscribe).
+//! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of
+//!   fixed size (iceoryx2 publish-subscribe).
 //! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
 //! - [`RoleLock`]: at most one process for each role.
@@ -18,6 +18,7 @@ mod header;
 mod node;
 mod root;
 mod segment;
+mod service;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
