@@ -1,6 +1,6 @@
 //! The demo, as a user runs it: the shipped binary with its own processes, real DDS, real shared memory, real
-//! signals. What a phase must show follows from its mechanism and from how long the demo says that it stopped the
-//! remote subscriber; no test depends on how fast this machine is.
+//! signals. What a phase must show follows from its mechanism and from how long the demo says that it stopped
+//! the remote subscriber; no test depends on how fast this machine is.
 
 use std::fs;
 use std::io::Read;
@@ -133,8 +133,8 @@ fn assert_shows_what_the_bridge_is_for(stdout: &str) {
         assert_eq!(at("/remote/stalls"), 1.0);
     }
 
-    // While the remote subscriber is stopped the writer takes 50 scans, its history, and no more. Two more are on
-    // the edges of the stall.
+    // While the remote subscriber is stopped the writer takes 50 scans, its history, and no more. Two more
+    // are on the edges of the stall.
     let without = |key: &str| number(&result, &format!("/without_bridge{key}"));
     let stalled_s = without("/remote/stalled_s");
     assert!(stalled_s > 2.0, "stopped for {stalled_s} s only");

@@ -35,8 +35,8 @@ pub(super) use peers::{PublisherArguments, SubscriberArguments, publisher, subsc
 
 /// Scans per second.
 const RATE_HZ: u64 = 30;
-/// Scans that the publisher's writer keeps while they are unacknowledged. So few that a stall of 3 s, 90 scans,
-/// fills it; with 200 it would take 7 s.
+/// Scans that the publisher's writer keeps while they are unacknowledged. So few that a stall of 3 s, 90
+/// scans, fills it; with 200 it would take 7 s.
 const HISTORY_SCANS: usize = 50;
 /// How long a publish call waits for room: the default of ROS 2's publishers (DDS 1.4 clause 2.2.3.14).
 const MAX_BLOCKING_MS: u64 = 100;

@@ -23,8 +23,8 @@ pub struct Bridge {
 }
 
 impl Bridge {
-    /// A bridge of its own, not started yet. In `yaml`, `{instance}` becomes a name that no other bridge has, and
-    /// `{folder}` the folder of the file, which is removed with the bridge.
+    /// A bridge of its own, not started yet. In `yaml`, `{instance}` becomes a name that no other bridge has,
+    /// and `{folder}` the folder of the file, which is removed with the bridge.
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -80,7 +80,8 @@ impl Bridge {
         self.complete(Command::new(program()), arguments).output().unwrap()
     }
 
-    /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no host.
+    /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no
+    /// host.
     pub fn try_status(&self) -> Result<Value, String> {
         let output = self.run("status --json --interval-ms 50");
         let said = || String::from_utf8_lossy(&output.stderr).into_owned();

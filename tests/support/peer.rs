@@ -38,8 +38,8 @@ impl Library {
     }
 }
 
-/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948 bytes
-/// at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
+/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948
+/// bytes at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
 #[derive(Clone, Debug)]
 #[must_use]
 pub struct Peer {

@@ -93,11 +93,12 @@ impl<'a> Children<'a> {
         for variable in FOREIGN_VARIABLES {
             command.env_remove(variable);
         }
-        // A process group of its own: Ctrl-C in the terminal is for the demo alone, which then ends the others.
+        // A process group of its own: Ctrl-C in the terminal is for the demo alone, which then ends the
+        // others.
         command.process_group(0);
         // SAFETY: between fork and exec only async-signal-safe functions may be called and no memory may be
-        // allocated. This makes the system calls prctl and getppid, and `Errno` becomes an `io::Error` without
-        // an allocation.
+        // allocated. This makes the system calls prctl and getppid, and `Errno` becomes an `io::Error`
+        // without an allocation.
         unsafe {
             command.pre_exec(move || {
                 set_pdeathsig(at_our_death)?;

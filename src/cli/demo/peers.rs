@@ -1,5 +1,5 @@
-//! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own, which know nothing of
-//! the bridge.
+//! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own, which know nothing
+//! of the bridge.
 
 use std::io::{self, Write};
 use std::net::Ipv4Addr;
@@ -111,7 +111,8 @@ pub(in crate::cli) fn subscriber(arguments: &SubscriberArguments) -> ExitCode {
     exit(&error)
 }
 
-/// A timer as rclcpp's: a publish call that takes longer than a period costs the scans that are due meanwhile.
+/// A timer as rclcpp's: a publish call that takes longer than a period costs the scans that are due
+/// meanwhile.
 fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, PeerError> {
     let mut participant = join(arguments.domain, "publisher")?;
     let writer = participant.create_blocking_writer(
@@ -133,7 +134,8 @@ fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, P
         let returned_at = clock::monotonic();
         report(Report::Published { number, call_ns: returned_at.since(taken_at), written })?;
         number += 1;
-        // A scan that was due before the call is late because this process was not scheduled; it is not skipped.
+        // A scan that was due before the call is late because this process was not scheduled; it is not
+        // skipped.
         if due_at(began_at, number) >= taken_at {
             number = first_due_after(began_at, returned_at).max(number);
         }

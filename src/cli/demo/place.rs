@@ -20,8 +20,8 @@ const fn discovery_port(domain: u16) -> u16 {
     7400 + 250 * domain
 }
 
-/// Between the two multicast ports of a domain (offsets 0 and 1) and the unicast ones (10 and above) are ports
-/// that no DDS program uses. Whoever has bound this one has the domain.
+/// Between the two multicast ports of a domain (offsets 0 and 1) and the unicast ones (10 and above) are
+/// ports that no DDS program uses. Whoever has bound this one has the domain.
 const fn claim_port(domain: u16) -> u16 {
     discovery_port(domain) + 5
 }

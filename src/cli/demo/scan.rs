@@ -1,4 +1,5 @@
-//! The demo's message: a `sensor_msgs/msg/LaserScan` of 360 beams with intensities, in plain little-endian CDR.
+//! The demo's message: a `sensor_msgs/msg/LaserScan` of 360 beams with intensities, in plain little-endian
+//! CDR.
 
 use crate::model::MonotonicNs;
 

@@ -77,7 +77,8 @@ impl Screen {
             Style::InPlace => {
                 let view = View::of(tally, window, stalls, stalled_since, now);
                 let lines = view.table(way, tally, window, now);
-                // Up to where the table begins; without wrapping, so that a line stays one on a narrow terminal.
+                // Up to where the table begins; without wrapping, so that a line stays one on a narrow
+                // terminal.
                 let mut text = String::from("\x1b[?7l");
                 if self.table_lines > 0 {
                     text.push_str(&format!("\x1b[{}A", self.table_lines));
