@@ -53,7 +53,8 @@ const INPUT_TOPIC: &str = "/scan";
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Seconds of each of the two phases
-    #[arg(long, value_name = "N", default_value_t = 18, value_parser = clap::value_parser!(u64).range(6..=600))]
+    #[arg(long, value_name = "N", default_value_t = 18)]
+    #[arg(value_parser = clap::value_parser!(u64).range(6..=600))]
     seconds: u64,
     /// Print the result as JSON, and nothing else
     #[arg(long)]
@@ -118,8 +119,8 @@ impl fmt::Display for DemoError {
             Self::Ended { who, status } => write!(f, "the {who} ended unasked ({status})"),
             Self::NothingArrives { who, patience_ms } => write!(
                 f,
-                "nothing comes from or to the {who} for {} s; if no log above says why: DDS discovery needs UDP \
-                 multicast on the loopback interface, which a firewall may block",
+                "nothing comes from or to the {who} for {} s; if no log above says why: DDS discovery needs \
+                 UDP multicast on the loopback interface, which a firewall may block",
                 patience_ms / 1_000
             ),
             Self::Config(what) => write!(f, "the demo's configuration: {what}"),
@@ -189,16 +190,16 @@ fn show(arguments: &Arguments, screen: &mut Screen) -> Result<Outcome, DemoError
 
 fn introduction(seconds: u64, domain: u16) -> String {
     let what = format!(
-        "A laser publishes {RATE_HZ} scans a second to two subscribers: a critical one on the robot, and a remote \
-         one whose link dies for {} s in every {}. For that its process is stopped (SIGSTOP): to the publisher's \
-         DDS writer that is a dead Wi-Fi link, no acknowledgements.",
+        "A laser publishes {RATE_HZ} scans a second to two subscribers: a critical one on the robot, and a \
+         remote one whose link dies for {} s in every {}. For that its process is stopped (SIGSTOP): to the \
+         publisher's DDS writer that is a dead Wi-Fi link, no acknowledgements.",
         STALL_MS / 1_000,
         STALL_EVERY_MS / 1_000,
     );
     let how = format!(
-        "The publisher is an ordinary one: RELIABLE, a history of {HISTORY_SCANS} unacknowledged scans (so small \
-         that {} s fill it; 200 would take {:.0} s), and a publish call waits {MAX_BLOCKING_MS} ms for room at \
-         most. Each of the two phases takes {seconds} s, on loopback, in DDS domain {domain}.",
+        "The publisher is an ordinary one: RELIABLE, a history of {HISTORY_SCANS} unacknowledged scans (so \
+         small that {} s fill it; 200 would take {:.0} s), and a publish call waits {MAX_BLOCKING_MS} ms for \
+         room at most. Each of the two phases takes {seconds} s, on loopback, in DDS domain {domain}.",
         STALL_MS / 1_000,
         200.0 / RATE_HZ as f64,
     );

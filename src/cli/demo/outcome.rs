@@ -10,8 +10,8 @@ use super::{HISTORY_SCANS, MAX_BLOCKING_MS, RATE_HZ, STALL_EVERY_MS, STALL_MS};
 use crate::model::DropReason;
 
 /// The remote lane's work, so that nobody takes it for a fault.
-const SUPERSEDED: &str = "Superseded: when the remote lane was due to send, 10 times a second, there was a fresher \
-                          scan, and it sent that one.";
+const SUPERSEDED: &str = "Superseded: when the remote lane was due to send, 10 times a second, there was a \
+                          fresher scan, and it sent that one.";
 
 /// What the demo found.
 #[derive(Debug, Serialize)]
@@ -107,8 +107,8 @@ fn hurt(figures: &Figures) -> bool {
 fn summary(without: &Figures, with: &Figures) -> String {
     let silence_s = |figures: &Figures| figures.critical.silence_max_ms / 1e3;
     let bridge = format!(
-        "the publisher wrote {:.1} Hz, no publish call took longer than {}, and the critical subscriber got {} of \
-         {} scans",
+        "the publisher wrote {:.1} Hz, no publish call took longer than {}, and the critical subscriber got \
+         {} of {} scans",
         with.publisher.rate_hz,
         latency(with.publisher.call_max_ms),
         with.critical.received,
@@ -116,10 +116,10 @@ fn summary(without: &Figures, with: &Figures) -> String {
     );
     match (hurt(without), hurt(with)) {
         (true, false) => format!(
-            "Shown: the remote subscriber's dead link filled the writer that both share, so that publish calls \
-             waited up to {} and the publisher fell to {:.1} Hz; the critical subscriber, whose own link was fine, \
-             missed {} of {} scans and once heard nothing for {:.1} s. Through the bridge, under the same stalls, \
-             {bridge}.",
+            "Shown: the remote subscriber's dead link filled the writer that both share, so that publish \
+             calls waited up to {} and the publisher fell to {:.1} Hz; the critical subscriber, whose own \
+             link was fine, missed {} of {} scans and once heard nothing for {:.1} s. Through the bridge, \
+             under the same stalls, {bridge}.",
             latency(without.publisher.call_max_ms),
             without.publisher.rate_hz,
             without.critical.lost,
@@ -127,17 +127,17 @@ fn summary(without: &Figures, with: &Figures) -> String {
             silence_s(without),
         ),
         (true, true) => format!(
-            "Not shown: the critical subscriber missed {} scans without the bridge, and {} with it. The bridge \
-             should lose none: this machine may be too busy for 30 scans a second.",
+            "Not shown: the critical subscriber missed {} scans without the bridge, and {} with it. The \
+             bridge should lose none: this machine may be too busy for 30 scans a second.",
             without.critical.lost, with.critical.lost,
         ),
         (false, false) => format!(
-            "Not shown: in this run the stalls did not fill the writer that both subscribers share, so there was \
-             nothing to protect the critical one from. Through the bridge {bridge}."
+            "Not shown: in this run the stalls did not fill the writer that both subscribers share, so there \
+             was nothing to protect the critical one from. Through the bridge {bridge}."
         ),
         (false, true) => format!(
-            "Not shown: the critical subscriber missed {} scans through the bridge, and {} without it. This machine \
-             may be too busy for 30 scans a second.",
+            "Not shown: the critical subscriber missed {} scans through the bridge, and {} without it. This \
+             machine may be too busy for 30 scans a second.",
             with.critical.lost, without.critical.lost,
         ),
     }
