@@ -5,6 +5,7 @@ use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use adaptive_bridge::shm::default_root;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -17,6 +18,9 @@ pub fn program() -> &'static Path {
 }
 
 /// One bridge: an instance name, and a folder with its configuration file.
+///
+/// Declare it before its processes: they are killed when they are dropped and leave their shared memory
+/// behind, which is removed with the bridge.
 pub struct Bridge {
     instance: String,
     folder: TempDir,
@@ -109,5 +113,19 @@ impl Bridge {
             assert!(Instant::now() < deadline, "waited in vain for: {what}; the last status: {status:?}");
             std::thread::sleep(Duration::from_millis(50));
         }
+    }
+}
+
+impl Drop for Bridge {
+    fn drop(&mut self) {
+        let prefix = format!("ab1_{}_", self.instance);
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+        // Where the configuration names no root below the bridge's own folder.
+        let root = default_root(None, |name| std::env::var_os(name));
+        let _ = std::fs::remove_dir_all(root.join(&self.instance));
     }
 }
