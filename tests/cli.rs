@@ -29,12 +29,11 @@ const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 const ENCAPSULATIONS: [[u8; 4]; 4] = [[0, 1, 0, 0], [0, 0, 0, 3], [0, 7, 0, 2], [0, 0x0b, 0, 1]];
 
 /// A bridge of one route, `/scan`, in a domain and with an instance of its own.
-fn bridge(domain_id: u16, more: &str) -> Bridge {
+fn bridge(domain_id: u16) -> Bridge {
     Bridge::new(&format!(
-        "instance: cli_{}_{domain_id}\nros: {{domain_id: {domain_id}}}\n\
+        "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
          topics:\n  - {{id: front_laser, input_topic: /scan, max_sample_bytes: 8192}}\n\
-         shared_memory: {{root_path: {{folder}}/root, max_taps: 1}}\n{more}",
-        std::process::id()
+         shared_memory: {{root_path: {{folder}}/root, max_taps: 1}}"
     ))
 }
 
@@ -165,18 +164,18 @@ fn problems(status: &Value) -> String {
 
 #[test]
 fn without_a_bridge_status_and_tap_say_so_and_create_nothing() {
-    let bridge = bridge(100, "");
+    let bridge = bridge(100);
     for arguments in ["status", "status --json", "status --watch", "tap /scan", "tap front_laser --hz"] {
         let output = bridge.run(arguments);
         assert_eq!(output.status.code(), Some(1), "{arguments}");
         assert_eq!(text(&output.stdout), "", "{arguments}");
         let said = text(&output.stderr);
-        for part in ["no bridge runs as instance cli_", "/root)", "`adaptive-bridge up`"] {
+        for part in ["no bridge runs as instance test_", "/root)", "`adaptive-bridge up`"] {
             assert!(said.contains(part), "{arguments}: {part} is not in: {said}");
         }
         assert!(!bridge.folder().join("root").exists(), "{arguments} created the root folder");
     }
-    let mark = format!("_cli_{}_100_", std::process::id());
+    let mark = format!("_{}_", bridge.instance());
     for entry in fs::read_dir("/dev/shm").unwrap() {
         let name = entry.unwrap().file_name().to_string_lossy().into_owned();
         assert!(!name.contains(&mark), "{name} was created");
@@ -186,7 +185,7 @@ fn without_a_bridge_status_and_tap_say_so_and_create_nothing() {
 #[test]
 fn status_accounts_for_every_sample() {
     const SAMPLES: u32 = 300;
-    let bridge = bridge(101, "");
+    let bridge = bridge(101);
     let mut up = up(&bridge);
     let waiting = status(&bridge);
     assert!(problems(&waiting).contains("front_laser: waits for a publisher of /scan"), "{waiting}");
@@ -267,7 +266,7 @@ fn keys(value: &Value, path: &str, found: &mut BTreeSet<String>) {
 
 #[test]
 fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
-    let bridge = bridge(102, "");
+    let bridge = bridge(102);
     let _up = up(&bridge);
     let mut found = BTreeSet::new();
     keys(&status(&bridge), "", &mut found);
@@ -286,7 +285,7 @@ fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
 
 #[test]
 fn status_says_in_words_what_is_wrong() {
-    let bridge = bridge(103, "");
+    let bridge = bridge(103);
     let ingress = bridge.start("ingress");
     let mut critical = bridge.start("egress --lane critical");
     wait_status(&bridge, "two processes", |status| {
@@ -327,7 +326,7 @@ fn status_says_in_words_what_is_wrong() {
 
 #[test]
 fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
-    let bridge = bridge(104, "");
+    let bridge = bridge(104);
     let _up = up(&bridge);
     let _publisher = Publisher::new(104).run();
     let before = status(&bridge);
@@ -350,7 +349,7 @@ fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
 
 #[test]
 fn watch_shows_line_after_line_and_ends_well_on_a_signal_or_when_nobody_reads() {
-    let bridge = bridge(105, "");
+    let bridge = bridge(105);
     let mut running = up(&bridge);
     let mut json = bridge.start("status --watch --json --interval-ms 50");
     let mut text_watch = bridge.start("status --watch --interval-ms 50");
@@ -361,7 +360,7 @@ fn watch_shows_line_after_line_and_ends_well_on_a_signal_or_when_nobody_reads() 
         assert!(report["window_ms"].as_f64().unwrap() >= 50.0, "{report}");
         at = next;
     }
-    text_watch.wait_for_line("a table", 0, |line| line.starts_with("bridge cli_").then_some(()));
+    text_watch.wait_for_line("a table", 0, |line| line.starts_with("bridge test_").then_some(()));
 
     // A bridge that ends is waited for.
     running.terminate();
@@ -412,7 +411,7 @@ fn frames(mut bytes: &[u8]) -> Vec<(Encapsulation, Vec<u8>)> {
 
 #[test]
 fn a_tap_sees_the_payloads_bit_for_bit_and_disturbs_nobody() {
-    let bridge = bridge(106, "");
+    let bridge = bridge(106);
     let _up = up(&bridge);
     let _publisher = Publisher::new(106).run();
     let output = bridge.run("tap scan --raw --count 200");
@@ -462,7 +461,7 @@ fn a_tap_sees_the_payloads_bit_for_bit_and_disturbs_nobody() {
 
 #[test]
 fn a_tap_that_cannot_be_says_why() {
-    let bridge = bridge(107, "");
+    let bridge = bridge(107);
     let mut running = up(&bridge);
     let _publisher = Publisher::new(107).run();
     let unknown = bridge.run("tap /imu");
@@ -493,12 +492,12 @@ fn a_tap_that_cannot_be_says_why() {
     assert_eq!(running.terminate().code(), Some(0));
     assert_eq!(last.wait().code(), Some(1));
     assert!(last.log().contains("the bridge has ended"), "{}", last.log());
-    assert!(!bridge.folder().join("root").join(format!("cli_{}_107", std::process::id())).exists());
+    assert!(!bridge.folder().join("root").join(bridge.instance()).exists());
 }
 
 #[test]
 fn a_configuration_that_the_bridge_does_not_run_with_is_named_as_such() {
-    let bridge = bridge(108, "");
+    let bridge = bridge(108);
     let _up = up(&bridge);
     let other = fs::read_to_string(bridge.config()).unwrap().replace("front_laser", "rear_laser");
     let path = bridge.folder().join("other.yaml");
@@ -513,7 +512,7 @@ fn a_configuration_that_the_bridge_does_not_run_with_is_named_as_such() {
 
 #[test]
 fn exit_codes_tell_what_was_wrong() {
-    let bridge = bridge(109, "");
+    let bridge = bridge(109);
     assert_eq!(bridge.run("check").status.code(), Some(0));
     assert_eq!(run(&["--version"]).status.code(), Some(0));
     for wrong in
@@ -547,7 +546,7 @@ fn exit_codes_tell_what_was_wrong() {
 
 #[test]
 fn check_prints_json_of_good_and_of_bad_configurations() {
-    let bridge = bridge(109, "");
+    let bridge = bridge(109);
     let output = bridge.run("check --json");
     assert_eq!(output.status.code(), Some(0));
     let good: Value = serde_json::from_slice(&output.stdout).unwrap();

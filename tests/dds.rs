@@ -135,8 +135,8 @@ fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
         assert!(Instant::now() < give_up);
         std::thread::sleep(Duration::from_millis(5));
     };
-    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT writer
-    // when that is over, so the reader's end is asked.
+    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT
+    // writer when that is over, so the reader's end is asked.
     while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
         assert!(Instant::now() < give_up);
         std::thread::sleep(Duration::from_millis(5));
@@ -196,8 +196,8 @@ fn an_acknowledged_sample_is_let_go_of_without_waiting_for_the_cache_cleaning() 
         }
         assert!(take_one(&reader).is_some());
     }
-    // All but the last 64, the window, are acknowledged. The cleaning that comes every 6 s would have released
-    // none of them yet, or some on a machine so slow that this took longer.
+    // All but the last 64, the window, are acknowledged. The cleaning that comes every 6 s would have
+    // released none of them yet, or some on a machine so slow that this took longer.
     let held = released[..936].iter().filter(|flag| !flag.load(Ordering::Acquire)).count();
     assert_eq!(held, 0, "acknowledged samples are still held");
 }

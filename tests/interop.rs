@@ -1,5 +1,5 @@
-//! The bridge between DDS libraries: Cyclone DDS and Fast DDS programs as publishers and subscribers on hosts of
-//! their own (network namespaces), the bridge on a third one. Every payload is compared by hash.
+//! The bridge between DDS libraries: Cyclone DDS and Fast DDS programs as publishers and subscribers on hosts
+//! of their own (network namespaces), the bridge on a third one. Every payload is compared by hash.
 
 mod support;
 
@@ -50,8 +50,8 @@ fn best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably() {
         critical.wait_received(200);
         critical.end::<Received>().assert_all_of(&sent);
 
-        // One that comes later and offers more is matched by the reader that is there; once the former is gone,
-        // one that asks for repair of what is lost is read reliably again.
+        // One that comes later and offers more is matched by the reader that is there; once the former is
+        // gone, one that asks for repair of what is lost is read reliably again.
         let critical = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
         bed.host("bridge").lose_incoming(0.05);
         let strong = bed.publish(
@@ -88,7 +88,8 @@ fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
     for from in LIBRARIES {
         for to in LIBRARIES {
             let mut first = 0;
-            // Nothing; one LaserScan of 360 beams; one PointCloud2 of 2 MB; the largest allowed, header included.
+            // Nothing; one LaserScan of 360 beams; one PointCloud2 of 2 MB; the largest allowed, header
+            // included.
             for (sizes, count, rate_hz) in [(&[0][..], 10, 50.0), (&[2948, 2_000_000, (4 << 20) - 4], 9, 3.0)]
             {
                 let subscribe = |host, topic| bed.subscribe(host, cloud(to).sizes(sizes), topic);

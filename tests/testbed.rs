@@ -30,8 +30,8 @@ fn go_when_matched(publisher: &RunningPeer, subscriber: &RunningPeer) {
     publisher.go();
 }
 
-/// Runs a publisher and a subscriber until the subscriber has received `expected` samples. The publisher stays
-/// until then: lost fragments are repaired at the heartbeats.
+/// Runs a publisher and a subscriber until the subscriber has received `expected` samples. The publisher
+/// stays until then: lost fragments are repaired at the heartbeats.
 fn transfer(publisher: (Peer, &Host), subscriber: (Peer, &Host), expected: u64) -> (Sent, Received) {
     let subscriber = subscriber.0.subscriber().start_on(subscriber.1);
     let peer = publisher.0.publisher().hold().prime().heartbeat_ms(200).linger_s(600.0);

@@ -235,7 +235,8 @@ impl Bed {
         self.kind.label()
     }
 
-    /// Sends until everything arrives: the writers in the middle are matched a little later than the first one.
+    /// Sends until everything arrives: the writers in the middle are matched a little later than the first
+    /// one.
     fn warm_up(&mut self, route: Route) -> Result<(), String> {
         let case = Case { name: "warm-up", route, rate_hz: 50, bytes: 2_948, samples: 25 };
         for _ in 0..20 {

@@ -1,5 +1,5 @@
-//! The programs around and beside the bridge: publisher, subscriber, relay. Each is this binary, started with a
-//! hidden argument, takes its orders line by line on stdin and answers on stdout.
+//! The programs around and beside the bridge: publisher, subscriber, relay. Each is this binary, started with
+//! a hidden argument, takes its orders line by line on stdin and answers on stdout.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead, Write};
@@ -83,7 +83,8 @@ pub const OUTPUT: &str = "/bench/out/";
 /// What may be unacknowledged, on every RELIABLE writer of the bench and in the bridge (its default).
 const WINDOW_SAMPLES: usize = 256;
 
-/// What a payload begins with: its number, when it was due, when it was written; its number is at the end too.
+/// What a payload begins with: its number, when it was due, when it was written; its number is at the end
+/// too.
 const STAMPS: usize = 24;
 
 /// What the subscriber records of one sample. Instants of CLOCK_MONOTONIC in nanoseconds; 0 is unknown.
@@ -273,8 +274,8 @@ impl Inlet {
     }
 }
 
-/// Records when told: `begin`, then `end SAMPLES PATIENCE_MS`, which waits for so many, or until none has come
-/// for so long, and is answered by `samples N DAMAGED` and a line for each.
+/// Records when told: `begin`, then `end SAMPLES PATIENCE_MS`, which waits for so many, or until none has
+/// come for so long, and is answered by `samples N DAMAGED` and a line for each.
 fn subscriber(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "subscriber")?;
     let boards = match arguments.get(3) {
@@ -359,8 +360,8 @@ fn read_stamps(payload: &[u8], record: &mut Record) -> bool {
     payload.len() >= STAMPS + 8 && word(payload.len() - 8) == Some(number)
 }
 
-/// The stages of the sample that just came, if the boards still speak of it: after its arrival was stamped, so
-/// this costs nothing that is measured.
+/// The stages of the sample that just came, if the boards still speak of it: after its arrival was stamped,
+/// so this costs nothing that is measured.
 fn look_at_boards(boards: &Boards, route: usize, record: &mut Record) {
     let between = |at: u64| if at > record.written_at && at < record.arrived_at { at } else { 0 };
     record.taken_at = boards.ingress(route).map_or(0, |ingress| between(ingress.last_received_at.0));
@@ -396,8 +397,9 @@ fn orders() -> Receiver<String> {
 }
 
 /// Reads and writes with the DDS library in one process, without shared memory: what the bridge's hop is
-/// measured against. Written as the bridge's roles are: a bell, a drain loop, a copy into an arena (the library
-/// lends what it received and keeps what it sends, so one copy there must be), no allocation for each sample.
+/// measured against. Written as the bridge's roles are: a bell, a drain loop, a copy into an arena (the
+/// library lends what it received and keeps what it sends, so one copy there must be), no allocation for each
+/// sample.
 fn relay(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "relay")?;
     let mut lines = Vec::new();

@@ -1,15 +1,15 @@
 //! How fast the bridge is, beside what it is measured against, all in one run.
 //!
-//! - **wake-up**: an eventfd between two threads on the two CPUs, the least that a hand-over between processes
-//!   costs on this machine at this rate;
+//! - **wake-up**: an eventfd between two threads on the two CPUs, the least that a hand-over between
+//!   processes costs on this machine at this rate;
 //! - **direct**: a publisher process to a subscriber process, with the bridge's own DDS library;
 //! - **relay**: one process between them that reads and writes with that library, without shared memory;
 //! - **bridge**: the shipped binary, ingress and the critical egress.
 //!
 //! All programs stay up for the whole run; only the publisher of one of them sends at a time, in the order
-//! wake-up, direct, relay, bridge, again and again. Sending is open loop: sample k is due at `start + k / rate`
-//! whatever became of the one before it, and both the latency from the moment of the write and the one from the
-//! moment it was due are recorded.
+//! wake-up, direct, relay, bridge, again and again. Sending is open loop: sample k is due at `start + k /
+//! rate` whatever became of the one before it, and both the latency from the moment of the write and the one
+//! from the moment it was due are recorded.
 //!
 //! `cargo bench` takes about six minutes, `cargo bench -- --quick` one. Other arguments: [`Options`].
 

@@ -203,7 +203,8 @@ impl Results {
         for (index, case) in self.cases.iter().enumerate() {
             let _ = writeln!(
                 text,
-                "\n{} ({} samples a repetition; medians of the repetitions, µs)\n{:<9} {:>9} {:>9} {:>9} {:>9} {:>13} {:>8}",
+                "\n{} ({} samples a repetition; medians of the repetitions, µs)\n\
+                 {:<9} {:>9} {:>9} {:>9} {:>9} {:>13} {:>8}",
                 case.name, case.samples, "", "p50", "p99", "hop p50", "hop p99", "from due p99", "missing"
             );
             let _ = writeln!(
@@ -266,8 +267,8 @@ impl Results {
         text
     }
 
-    /// Copies of a payload in user space from the receive buffer to the DDS writer: one into shared memory, and
-    /// another where the lane did not hand it on by reference.
+    /// Copies of a payload in user space from the receive buffer to the DDS writer: one into shared memory,
+    /// and another where the lane did not hand it on by reference.
     fn copies_of(&self, case: usize) -> f64 {
         let (forwarded, by_reference) = self.copies.get(&case).copied().unwrap_or_default();
         2.0 - by_reference as f64 / forwarded.max(1) as f64

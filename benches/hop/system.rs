@@ -14,8 +14,8 @@ use super::Options;
 /// Which CPU each stage of a sample's way has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Placement {
-    /// Each stage on the other CPU than the one before, so that every hand-over crosses CPUs, as the eventfd's
-    /// does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
+    /// Each stage on the other CPU than the one before, so that every hand-over crosses CPUs, as the
+    /// eventfd's does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
     Alternating,
     /// Publisher and subscriber on CPU 0, relay or bridge on CPU 1: what the bridge does is all on one CPU.
     Split,

@@ -9,8 +9,8 @@ use super::system::{self, Place};
 use super::{Case, Options};
 use adaptive_bridge::clock;
 
-/// Latencies in nanoseconds of as many wake-ups as the case has samples, at its rate: from before the write to
-/// after the read.
+/// Latencies in nanoseconds of as many wake-ups as the case has samples, at its rate: from before the write
+/// to after the read.
 pub fn eventfd(case: &Case, options: &Options) -> Result<Vec<u64>, String> {
     let say = |error: nix::errno::Errno| format!("eventfd: {error}");
     let event = Arc::new(EventFd::from_flags(EfdFlags::EFD_SEMAPHORE).map_err(say)?);

@@ -131,14 +131,14 @@ impl Participant {
         self.readers.push(guid);
         self.announce();
         let reader = RawReader { inner, guid };
-        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them: what
-        // a former reader has taken would be taken once more.
+        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them:
+        // what a former reader has taken would be taken once more.
         while reader.take(&mut |_, _| {}) != Take::Empty {}
         Ok(reader)
     }
 
-    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has at
-    /// most `window_samples` unacknowledged samples.
+    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has
+    /// at most `window_samples` unacknowledged samples.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -152,8 +152,8 @@ impl Participant {
         self.create_blocking_writer(topic, dds_type, writer_qos, window_samples, Duration::ZERO)
     }
 
-    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] waits up to `max_blocking` for room
-    /// in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge itself never waits.
+    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] waits up to `max_blocking` for
+    /// room in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge itself never waits.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -197,7 +197,8 @@ impl Participant {
             &self.writers,
             self.graph_gid_bytes,
         );
-        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one does.
+        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one
+        // does.
         if let Err(error) = self.graph.write(Bytes::from(entry), graph::ENCAPSULATION, SourceTimestamp::NONE)
         {
             tracing::warn!(node = self.node_name, %error, "ROS 2 graph entry not published");

@@ -24,6 +24,7 @@ use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
 use super::node::{NodeShared, ShmNode, StartLock, failed};
 use super::root::RoleLock;
+use super::sample_error::{LoanError, PublishError, TakeError};
 use super::service::Service;
 use crate::config::{Lane, Settings};
 use crate::model::{RouteId, SampleHeader, TrafficClass};
@@ -49,8 +50,8 @@ pub struct LaneQueue {
 }
 
 impl LaneQueue {
-    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the sample
-    /// it takes next and the one that it sends.
+    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the
+    /// sample it takes next and the one that it sends.
     pub fn of(lane: &Lane) -> Self {
         let waiting = match lane.class {
             TrafficClass::Critical => 0,
@@ -250,71 +251,6 @@ fn is_passing(error: OpenOrCreateError) -> bool {
 }
 
 type Factory = PortFactory<Service, [u8], WireHeader>;
-
-/// Why a sample could not be copied into shared memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LoanError {
-    /// The payload is larger than the route allows.
-    TooLarge {
-        /// Its bytes.
-        len: usize,
-        /// Bytes allowed.
-        max: usize,
-    },
-    /// No slot is free: someone holds more than its share.
-    PoolExhausted,
-    /// iceoryx2 failed.
-    Failed(&'static str),
-}
-
-/// Why a sample could not be published.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PublishError {
-    /// iceoryx2 failed; the sample reached some subscribers at most.
-    Failed(&'static str),
-}
-
-/// Why no sample could be taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TakeError {
-    /// The subscriber holds as many samples as it may. Nothing is lost: drop one and take again.
-    BorrowLimit,
-    /// The header or the length of a sample makes no sense; the sample is gone.
-    Malformed(HeaderError),
-    /// iceoryx2 failed.
-    Failed(&'static str),
-}
-
-impl fmt::Display for LoanError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::TooLarge { len, max } => write!(f, "a sample of {len} bytes, at most {max} are allowed"),
-            Self::PoolExhausted => f.write_str("no free slot in the route's pool"),
-            Self::Failed(reason) => write!(f, "no slot: {reason}"),
-        }
-    }
-}
-
-impl fmt::Display for PublishError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self::Failed(reason) = self;
-        write!(f, "not published to everybody: {reason}")
-    }
-}
-
-impl fmt::Display for TakeError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::BorrowLimit => f.write_str("as many samples are held as may be"),
-            Self::Malformed(error) => write!(f, "{error}"),
-            Self::Failed(reason) => write!(f, "nothing taken: {reason}"),
-        }
-    }
-}
-
-impl std::error::Error for LoanError {}
-impl std::error::Error for PublishError {}
-impl std::error::Error for TakeError {}
 
 /// The one publisher of a route: ingress.
 #[derive(Debug)]

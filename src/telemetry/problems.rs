@@ -309,7 +309,8 @@ mod tests {
         assert_eq!(
             said,
             [
-                "lane noncritical, route scan: does not add up: 101 received, 100 forwarded, 0 waiting, 0 dropped",
+                "lane noncritical, route scan: does not add up: 101 received, 100 forwarded, 0 waiting, \
+             0 dropped",
                 "ingress, route scan: does not add up: 102 received, 100 published, 0 dropped",
             ]
         );

@@ -7,7 +7,8 @@ use super::netns::{Host, Net};
 use super::peer::{Peer, Received, RunningPeer};
 use super::process::Process;
 
-/// The configuration of one LaserScan route, whose type is given, so that every writer is there from the start.
+/// The configuration of one LaserScan route, whose type is given, so that every writer is there from the
+/// start.
 pub const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
                         max_sample_bytes: 65536}\n";
 /// The DDS type of it.
@@ -25,8 +26,8 @@ pub struct Bed {
 }
 
 impl Bed {
-    /// Starts a bridge with this configuration, but for its instance name; records that `test` is skipped where
-    /// the machine can't.
+    /// Starts a bridge with this configuration, but for its instance name; records that `test` is skipped
+    /// where the machine can't.
     pub fn start(test: &str, yaml: &str) -> Option<Self> {
         if let Some(reason) = super::testbed_missing() {
             super::skip(test, &reason);
@@ -51,8 +52,8 @@ impl Bed {
         self.net.host(name)
     }
 
-    /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is written
-    /// before the writer knows of a reader is not for that reader.
+    /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is
+    /// written before the writer knows of a reader is not for that reader.
     pub fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
         let before = self.readers(topic);
         let subscriber = peer.subscriber().topic(topic).start_on(self.host(host));

@@ -39,8 +39,8 @@ impl Library {
     }
 }
 
-/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948 bytes
-/// at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
+/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948
+/// bytes at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
 #[derive(Clone, Debug)]
 #[must_use]
 pub struct Peer {
@@ -197,15 +197,15 @@ impl Peer {
         self.option("--wait-match", subscribers)
     }
 
-    /// A publisher begins at [`RunningPeer::go`]. That the writer knows the reader does not mean that the reader
-    /// knows the writer yet, and a VOLATILE reader gets nothing from before.
+    /// A publisher begins at [`RunningPeer::go`]. That the writer knows the reader does not mean that the
+    /// reader knows the writer yet, and a VOLATILE reader gets nothing from before.
     pub fn hold(mut self) -> Peer {
         self.arguments.push("--hold".to_owned());
         self
     }
 
-    /// A publisher first sends a sample that does not count and waits for its acknowledgement: a VOLATILE reader of
-    /// Cyclone DDS loses samples that are on their way when it sees the writer's first heartbeat.
+    /// A publisher first sends a sample that does not count and waits for its acknowledgement: a VOLATILE
+    /// reader of Cyclone DDS loses samples that are on their way when it sees the writer's first heartbeat.
     pub fn prime(mut self) -> Peer {
         self.arguments.push("--prime".to_owned());
         self

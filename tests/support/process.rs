@@ -60,8 +60,8 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started it
-    /// ends.
+    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started
+    /// it ends.
     pub fn spawn(name: &str, mut command: Command) -> Process {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
         // SAFETY: between fork and exec the closure makes one system call (prctl), which is
@@ -147,8 +147,8 @@ impl Process {
         self.stderr.state.lock().unwrap().lines.join("\n")
     }
 
-    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number of
-    /// the line after it. Panics with the last lines when patience or the output ends.
+    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number
+    /// of the line after it. Panics with the last lines when patience or the output ends.
     pub fn wait_for_line<T>(
         &self,
         what: &str,

@@ -49,6 +49,8 @@ pub struct Rust {
     pub tokens: Vec<Token>,
     /// Comments, without nesting, with the line on which they begin.
     pub comments: Vec<Token>,
+    /// The first and the last line of each string.
+    pub strings: Vec<(usize, usize)>,
 }
 
 impl Rust {
@@ -84,7 +86,11 @@ impl Rust {
                 Kind::String | Kind::Code => rust.tokens.push(Token { line, text }),
                 Kind::Space => {}
             }
+            let first = line;
             line += chars[start..at].iter().filter(|&&c| c == '\n').count();
+            if matches!(kind, Kind::String) {
+                rust.strings.push((first, line));
+            }
         }
         rust
     }

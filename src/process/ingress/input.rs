@@ -258,7 +258,8 @@ impl Input {
                 Ok(())
             }
             Wanted::Unknown => {
-                // The last publisher is gone. The next one may offer more, and nothing is lost by asking anew.
+                // The last publisher is gone. The next one may offer more, and nothing is lost by asking
+                // anew.
                 self.disconnect(participant);
                 if now >= self.remind_at {
                     info!(
@@ -329,8 +330,8 @@ struct Followed {
 }
 
 impl Followed {
-    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began to
-    /// follow is not missing.
+    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began
+    /// to follow is not missing.
     fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
         if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == writer) {
             let missing = sequence.saturating_sub(*last).saturating_sub(1).max(0);

@@ -106,8 +106,8 @@ impl Ingress {
 
     /// Sleeps until a sample arrives or housekeeping is due.
     fn sleep(&mut self) {
-        // An arrival after the last look rings the bell of its route, and a bell that was rung keeps `park` from
-        // sleeping; so nothing is slept through.
+        // An arrival after the last look rings the bell of its route, and a bell that was rung keeps `park`
+        // from sleeping; so nothing is slept through.
         let wait_ns = self.housekeeping_at.since(clock::monotonic());
         if wait_ns > 0 {
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
