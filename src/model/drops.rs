@@ -40,7 +40,7 @@ drop_reasons! {
     IngressDied = "ingress_died",
     /// Lane: overwritten in the lane's shared-memory queue before the lane took it.
     QueueOverflow = "queue_overflow",
-    /// Lane: published while no process served the lane.
+    /// Lane: published while no process served the lane, or held by one that was killed.
     LaneDown = "lane_down",
     /// Lane: the message type of the route is not known yet, so that there is no writer.
     NoWriter = "no_writer",

@@ -95,6 +95,8 @@ pub struct ProcessHealth {
     pub reserved: [u8; 7],
     /// The epoch of the policy that the process applies.
     pub policy_epoch: u64,
+    /// The process' DDS participant, for its successor to say goodbye for it should it be killed.
+    pub participant: Guid,
 }
 
 /// What the policy board says to one lane.

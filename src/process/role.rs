@@ -8,8 +8,8 @@ use tracing::info;
 use super::scheduling;
 use crate::clock;
 use crate::config::{Scheduling, Settings};
-use crate::dds::DdsError;
-use crate::model::ProcessHealth;
+use crate::dds::{DdsError, Participant, ParticipantOptions};
+use crate::model::{Guid, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
 
 /// Why a role could not start, or had to end.
@@ -93,6 +93,8 @@ pub(super) struct Role {
     pub node: ShmNode,
     pub boards: Boards,
     health: BoardWriter<ProcessHealth>,
+    /// The participant of the process that served the role before; all zero for none.
+    former_participant: Guid,
     /// Last, so that the role is free only when everything else is gone.
     _lock: RoleLock,
 }
@@ -120,6 +122,7 @@ impl Role {
         let boards = node.boards(&BridgeShape::of(settings))?;
         let mut health = boards.health_writer(role);
         let now = clock::monotonic();
+        let former_participant = health.get().participant;
         health.update(|health| {
             let starts = health.starts + 1;
             *health = ProcessHealth {
@@ -130,7 +133,17 @@ impl Role {
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self { node, boards, health, _lock: lock })
+        Ok(Self { node, boards, health, former_participant, _lock: lock })
+    }
+
+    /// Opens the role's DDS participant. If the process that served the role before was killed, the others are
+    /// told that its participant is gone.
+    pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
+        let participant = Participant::open(options)?;
+        participant.say_goodbye_for(self.former_participant);
+        let guid = participant.guid();
+        self.health.update(|health| health.participant = guid);
+        Ok(participant)
     }
 
     /// Shows that the data path turned, and what it applies.

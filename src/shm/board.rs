@@ -121,7 +121,7 @@ unsafe impl Plain for RouteInfo {}
 unsafe impl Plain for LatencyHistogram {}
 
 const _: () = {
-    assert!(size_of::<ProcessHealth>() == 7 * 8);
+    assert!(size_of::<ProcessHealth>() == 9 * 8);
     assert!(size_of::<LanePolicy>() == 4 * 8);
     assert!(size_of::<RouteInfo>() == 16 * 8);
 };

@@ -90,8 +90,8 @@ impl Egress {
     fn open(settings: &Settings, index: usize) -> Result<Self, RoleError> {
         let lane = &settings.lanes[index];
         let role_name = format!("egress-{}", lane.name);
-        let role = Role::open(settings, ProcessRole::Egress(index), &role_name, &lane.scheduling)?;
-        let mut participant = Participant::open(&ParticipantOptions {
+        let mut role = Role::open(settings, ProcessRole::Egress(index), &role_name, &lane.scheduling)?;
+        let mut participant = role.join(&ParticipantOptions {
             network: &lane.network,
             namespace: namespace(settings),
             node_name: format!("egress_{}", lane.name),

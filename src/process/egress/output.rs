@@ -64,6 +64,9 @@ impl Output {
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
         counters.update(|counters| {
+            // What waited in a process that was killed died with it.
+            let accounted = counters.forwarded + counters.drops.total();
+            counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
             counters.waiting = 0;
             counters.readers = 0;
         });
@@ -334,7 +337,12 @@ impl Output {
         } else {
             self.gap_reason
         };
-        self.counters.update(|counters| counters.drops.add(reason, missing));
+        self.counters.update(|counters| {
+            counters.first_sequence = self.tracker.first();
+            // The missing ones are accounted for with this; the one after them is not yet.
+            counters.last_sequence = next.sequence - 1;
+            counters.drops.add(reason, missing);
+        });
     }
 
     /// Writes what was forwarded before a restart once more, for late joiners.

@@ -72,7 +72,8 @@ struct Connection {
 impl Input {
     pub fn open(role: &Role, settings: &Settings, index: usize) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
-        let counters = role.boards.ingress_writer(index);
+        let mut counters = role.boards.ingress_writer(index);
+        counters.update(|counters| counters.writers = 0);
         let bell = Arc::new(Bell { rung: AtomicBool::new(true), thread: std::thread::current() });
         Ok(Self {
             id: route.id.to_string(),

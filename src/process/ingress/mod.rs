@@ -57,7 +57,7 @@ struct Ingress {
 
 impl Ingress {
     fn open(settings: &Settings) -> Result<Self, RoleError> {
-        let role = Role::open(settings, ProcessRole::Ingress, "ingress", &settings.ingress_scheduling)?;
+        let mut role = Role::open(settings, ProcessRole::Ingress, "ingress", &settings.ingress_scheduling)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
             inputs.push(Input::open(&role, settings, route)?);
@@ -71,7 +71,7 @@ impl Ingress {
                 wakers.push((role.boards.waker(index), serves));
             }
         }
-        let participant = Participant::open(&ParticipantOptions {
+        let participant = role.join(&ParticipantOptions {
             network: &settings.input,
             namespace: namespace(settings),
             node_name: "ingress".to_owned(),

@@ -618,6 +618,13 @@ impl DomainParticipant {
     self.dpi.lock()?.assert_liveliness()
   }
 
+  /// Says goodbye on behalf of another participant, one that died and cannot:
+  /// remote participants forget it and its endpoints at once, instead of when
+  /// its lease ends.
+  pub fn dispose_participant(&self, guid: GUID) -> WriteResult<(), ()> {
+    self.dpi.lock()?.dispose_participant(guid)
+  }
+
   /// Get a `DomainDomainParticipantStatusListener` that can be used
   /// to get `DomainParticipantStatusEvent`s for this DomainParticipant.
   pub fn status_listener(&self) -> DomainParticipantStatusListener {
@@ -1102,6 +1109,13 @@ impl DomainParticipantDisc {
       .discovery_command_sender
       .send(DiscoveryCommand::ManualAssertLiveliness)
       // TODO: Are there more severe reasons than channel full? Is WouldBlock correct?
+      .map_err(|_e| WriteError::WouldBlock { data: () })
+  }
+
+  pub(crate) fn dispose_participant(&self, guid: GUID) -> WriteResult<(), ()> {
+    self
+      .discovery_command_sender
+      .send(DiscoveryCommand::DisposeParticipant { guid })
       .map_err(|_e| WriteError::WouldBlock { data: () })
   }
 

@@ -95,6 +95,9 @@ pub enum DiscoveryCommand {
     guid: GUID,
   },
   ManualAssertLiveliness,
+  DisposeParticipant {
+    guid: GUID,
+  },
   AssertTopicLiveliness {
     writer_guid: GUID,
     manual_assertion: bool,
@@ -301,7 +304,9 @@ pub(crate) struct Discovery {
 impl Discovery {
   const PARTICIPANT_CLEANUP_PERIOD: StdDuration = StdDuration::from_secs(2);
   const TOPIC_CLEANUP_PERIOD: StdDuration = StdDuration::from_secs(60); // timer for cleaning up inactive topics
-  const SPDP_PUBLISH_PERIOD: StdDuration = StdDuration::from_secs(10);
+  // As Fast DDS announces by default. The lease is five times this: how long
+  // others wait for the acknowledgements of a participant that was killed.
+  const SPDP_PUBLISH_PERIOD: StdDuration = StdDuration::from_secs(3);
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -788,6 +793,13 @@ impl Discovery {
                   }
                   self.send_endpoint_dispose_message(guid);
                   discovery_db_write(&self.discovery_db).remove_local_topic_reader(guid);
+                }
+                DiscoveryCommand::DisposeParticipant { guid } => {
+                  self
+                    .dcps_participant
+                    .writer
+                    .dispose(&Participant_GUID(guid), None)
+                    .unwrap_or_else(|e| error!("Disposing participant {guid:?}: {e:?}"));
                 }
                 DiscoveryCommand::ManualAssertLiveliness => {
                   self
