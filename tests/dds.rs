@@ -135,8 +135,8 @@ fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
         assert!(Instant::now() < give_up);
         std::thread::sleep(Duration::from_millis(5));
     };
-    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT writer
-    // when that is over, so the reader's end is asked.
+    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT
+    // writer when that is over, so the reader's end is asked.
     while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
         assert!(Instant::now() < give_up);
         std::thread::sleep(Duration::from_millis(5));
@@ -196,8 +196,50 @@ fn an_acknowledged_sample_is_let_go_of_without_waiting_for_the_cache_cleaning() 
         }
         assert!(take_one(&reader).is_some());
     }
-    // All but the last 64, the window, are acknowledged. The cleaning that comes every 6 s would have released
-    // none of them yet, or some on a machine so slow that this took longer.
+    // All but the last 64, the window, are acknowledged. The cleaning that comes every 6 s would have
+    // released none of them yet, or some on a machine so slow that this took longer.
     let held = released[..936].iter().filter(|flag| !flag.load(Ordering::Acquire)).count();
     assert_eq!(held, 0, "acknowledged samples are still held");
+}
+
+#[test]
+fn a_new_reader_of_a_topic_does_not_get_what_a_former_one_has_taken() {
+    let mut here = participant("here", 75);
+    let mut there = participant("there", 75);
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    let former = there.create_reader("rt/again", TYPE, &qos).unwrap();
+    let writer = here.create_writer("rt/again", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let write = |payload: &'static [u8]| {
+        writer.write(Bytes::from_static(payload), Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+    };
+    write(b"one.");
+    assert_eq!(take_one(&former).unwrap().0, b"one.");
+    drop(former);
+    let reader = there.create_reader("rt/again", TYPE, &qos).unwrap();
+    wait_for_reader(&writer);
+    write(b"two.");
+    assert_eq!(take_one(&reader).unwrap().0, b"two.");
+}
+
+#[test]
+fn a_process_that_was_stopped_and_continued_goes_on_receiving() {
+    let mut here = participant("here", 76);
+    let mut there = participant("there", 76);
+    let reader = there
+        .create_reader("rt/stopped", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/stopped", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    // Somebody has to continue this process; a shell does it from outside.
+    let stopped_and_continued = std::process::Command::new("sh")
+        .args(["-c", "kill -STOP $0; sleep 0.2; kill -CONT $0", &std::process::id().to_string()])
+        .status()
+        .unwrap();
+    assert!(stopped_and_continued.success());
+    for number in 0..10 {
+        let payload = Bytes::from(vec![number; 100]);
+        writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+        assert_eq!(take_one(&reader).expect("nothing arrived").0, vec![number; 100]);
+    }
 }

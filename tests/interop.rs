@@ -1,100 +1,279 @@
-//! The bridge between DDS libraries: Cyclone DDS and Fast DDS programs as publishers and subscribers on hosts of
-//! their own (network namespaces), the bridge on a third one. Every payload is compared by hash.
+//! The bridge between DDS libraries: Cyclone DDS and Fast DDS programs as publishers and subscribers on hosts
+//! of their own (network namespaces), the bridge on a third one. Every payload is compared by hash.
 
 mod support;
 
-use serde_json::Value;
-use support::bridge::Bridge;
-use support::netns::{Host, Net};
-use support::peer::{Library, Peer, Received, RunningPeer, Sent};
-use support::process::Process;
+use std::collections::BTreeMap;
+
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, missing_from};
+use support::peer::{Graph, Library, Peer, Received, Sent};
 
 const LIBRARIES: [Library; 2] = [Library::Cyclone, Library::Fast];
 
-/// A bridge that runs on the host `bridge`, and the hosts around it.
-struct Bed {
-    // Dropped in this order: the processes before the hosts they run on.
-    up: Process,
-    bridge: Bridge,
-    net: Net,
-}
-
-impl Bed {
-    /// Starts a bridge with these `topics` and further keys, or records that the machine can't.
-    fn start(test: &str, yaml: &str) -> Option<Self> {
-        if let Some(reason) = support::testbed_missing() {
-            support::skip(test, &reason);
-            return None;
-        }
-        let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
-        let bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
-        let up = bridge.start_on(net.host("bridge"), "up");
-        up.wait_for_log("ingress is up");
-        Some(Self { up, bridge, net })
-    }
-
-    fn host(&self, name: &str) -> &Host {
-        self.net.host(name)
-    }
-
-    /// A subscriber on a lane's output of a topic, matched with the bridge's writer when the publisher is.
-    fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
-        peer.subscriber().topic(topic).start_on(self.host(host))
-    }
-
-    /// Asks the bridge to end, and checks that it does so as it should.
-    fn end(mut self) {
-        let status = self.up.terminate();
-        assert!(status.success(), "up ended with {status}\n{}", self.up.log());
-    }
-}
-
-/// Whether every lane and route accounts for every sample, and none waits.
-fn is_whole_and_quiet(status: &Value) -> bool {
-    let lanes = status["lanes"].as_array().into_iter().flatten();
-    let mut routes = lanes.flat_map(|lane| lane["routes"].as_array().into_iter().flatten()).peekable();
-    routes.peek().is_some() && routes.all(|route| route["whole"] == true && route["waiting"] == 0)
-}
-
-const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, max_sample_bytes: 65536}\n";
-const CRITICAL: &str = "rt/adaptive_bridge/critical/scan";
-const NONCRITICAL: &str = "rt/adaptive_bridge/noncritical/scan";
-
 #[test]
 fn every_library_reaches_every_library_through_both_lanes() {
-    let test = "every_library_reaches_every_library_through_both_lanes";
+    let Some(bed) = Bed::start("every_library_reaches_every_library_through_both_lanes", SCAN) else {
+        return;
+    };
     for from in LIBRARIES {
         for to in LIBRARIES {
-            let Some(bed) = Bed::start(test, SCAN) else { return };
             let peer = |library| Peer::on(library).keep_all().seed(11).size(2948);
             let critical = bed.subscribe("critical", peer(to), CRITICAL);
             let noncritical = bed.subscribe("slow", peer(to).best_effort(), NONCRITICAL);
-            // A sample now and then until both lanes are through, because the type is found by discovery.
-            let first = peer(from).publisher().topic("rt/scan").rate_hz(20.0).count(4_000);
-            let scout = first.wait_match(1).start_on(bed.host("publisher"));
-            critical.wait_received(1);
-            noncritical.wait_received(1);
-            let scouted: Sent = scout.end();
-
-            let again = peer(from).publisher().topic("rt/scan").rate_hz(200.0).count(400).wait_match(1);
-            let publisher = again.first_seq(10_000).start_on(bed.host("publisher"));
+            let publisher = bed.publish(peer(from).rate_hz(200.0).count(400), INPUT);
             let sent: Sent = publisher.finish();
             assert_eq!((sent.ok, sent.failed), (400, 0), "{from:?} to {to:?}");
-            let critical_last = critical.wait_for("the last sample", |event| event["last"] == 10_399);
-            assert!(critical_last["received"].as_u64() > Some(400), "{critical_last}");
-            // bed.bridge.wait_status("every lane whole and quiet", is_whole_and_quiet);
-
+            critical.wait_received(400);
+            noncritical.wait_for("a late sample", |event| event["last"].as_u64() > Some(380));
             let received: Received = critical.end();
-            received.assert_sound();
-            // All of the second run, and of the first one from some sample on.
-            let from_first = scouted.last + 1 - received.first.expect("numbered");
-            assert_eq!(received.received, 400 + from_first, "{from:?} to {to:?}: {received:?}");
-            assert_eq!(received.source_timestamps_changed, 0, "{from:?} to {to:?}: {received:?} {scouted:?}");
+            received.assert_all_of(&sent);
+            assert_eq!(received.source_timestamps_kept, 400, "{from:?} to {to:?}: {received:?}");
             let slow: Received = noncritical.end();
             slow.assert_sound();
-            assert_eq!(slow.headers, received.headers.clone().into_keys().zip([slow.received]).collect());
-            assert_eq!(slow.source_timestamps_changed, 0);
-            bed.end();
+            assert!(slow.received < 40, "10 Hz for 2 s, and two tokens to begin with: {slow:?}");
+            assert_eq!(slow.headers.keys().collect::<Vec<_>>(), received.headers.keys().collect::<Vec<_>>());
+            assert_eq!(slow.source_timestamps_changed, 0, "{from:?} to {to:?}");
         }
+    }
+    bed.wait_whole();
+    bed.end();
+}
+
+#[test]
+fn best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably() {
+    let test = "best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    for from in LIBRARIES {
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let weak = bed.publish(Peer::on(from).best_effort().rate_hz(200.0).count(200), INPUT);
+        let sent: Sent = weak.finish();
+        critical.wait_received(200);
+        critical.end::<Received>().assert_all_of(&sent);
+
+        // One that comes later and offers more is matched by the reader that is there; once the former is
+        // gone, one that asks for repair of what is lost is read reliably again.
+        let critical = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+        bed.host("bridge").lose_incoming(0.05);
+        let strong = bed.publish(
+            Peer::on(from)
+                .keep_all()
+                .option("--max-blocking-ms", 5000)
+                .rate_hz(200.0)
+                .count(400)
+                .linger_s(20.0),
+            INPUT,
+        );
+        critical.wait_received(400);
+        bed.host("bridge").lose_incoming(0.0);
+        critical.end::<Received>().assert_all_of(&strong.end());
+    }
+    bed.end();
+}
+
+/// A route of any size up to 4 MiB whose samples are all wanted on both lanes.
+const LARGE: &str = "topics:\n  - {id: cloud, input_topic: /cloud, message_type: sensor_msgs/msg/PointCloud2, \
+                     max_sample_bytes: 4194304, retained_samples: 1}\n\
+                     lanes:\n  critical: {queue_depth: 8}\n  \
+                     noncritical: {max_rate_hz: 1000, stale_threshold_ms: 0, qos: {reliability: RELIABLE, \
+                     history: KEEP_LAST, depth: 10}, queue_samples: 8, drop_policy: drop_latest, queue_depth: 8}\n";
+
+#[test]
+fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
+    let test = "every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes";
+    let Some(bed) = Bed::start(test, LARGE) else { return };
+    let cloud =
+        |library| Peer::on(library).keep_all().seed(12).type_name("sensor_msgs::msg::dds_::PointCloud2_");
+    let critical_topic = "rt/adaptive_bridge/critical/cloud";
+    let noncritical_topic = "rt/adaptive_bridge/noncritical/cloud";
+    for from in LIBRARIES {
+        for to in LIBRARIES {
+            let mut first = 0;
+            // Nothing; one LaserScan of 360 beams; one PointCloud2 of 2 MB; the largest allowed, header
+            // included.
+            for (sizes, count, rate_hz) in [(&[0][..], 10, 50.0), (&[2948, 2_000_000, (4 << 20) - 4], 9, 3.0)]
+            {
+                let subscribe = |host, topic| bed.subscribe(host, cloud(to).sizes(sizes), topic);
+                let critical = subscribe("critical", critical_topic);
+                let noncritical = subscribe("slow", noncritical_topic);
+                let publisher = cloud(from).sizes(sizes).count(count).rate_hz(rate_hz).first_seq(first);
+                let sent: Sent = bed.publish(publisher, "rt/cloud").finish();
+                assert_eq!(sent.ok, count, "{from:?} to {to:?}");
+                for subscriber in [critical, noncritical] {
+                    subscriber.wait_received(count);
+                    subscriber.end::<Received>().assert_all_of(&sent);
+                }
+                first += count;
+            }
+        }
+    }
+    let status = bed.wait_whole();
+    if status.is_null() {
+        return;
+    }
+    let critical = support::bed::outputs(&status).next().unwrap();
+    assert!(critical["by_reference"].as_u64() > Some(0), "large samples go by reference: {critical}");
+    bed.end();
+}
+
+#[test]
+fn encapsulation_kind_and_padding_bits_arrive_as_they_were_sent() {
+    let test = "encapsulation_kind_and_padding_bits_arrive_as_they_were_sent";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    // CDR_BE with two bytes of padding announced, PL_CDR_LE, CDR2_LE with one (XTypes 1.3, table 60).
+    for header in ["00000002", "00030000", "00070001"] {
+        let critical = bed.subscribe("critical", Peer::fast().keep_all().size(100), CRITICAL);
+        let noncritical = bed.subscribe("slow", Peer::fast().best_effort().size(100), NONCRITICAL);
+        let publisher = Peer::fast().keep_all().size(100).encapsulation(header).count(40).rate_hz(20.0);
+        let sent: Sent = bed.publish(publisher, INPUT).finish();
+        critical.wait_received(40);
+        noncritical.wait_received(1);
+        let received: Received = critical.end();
+        received.assert_all_of(&sent);
+        assert_eq!(received.headers, BTreeMap::from([(header.to_owned(), 40)]));
+        let slow: Received = noncritical.end();
+        slow.assert_sound();
+        assert_eq!(slow.headers.keys().collect::<Vec<_>>(), [header]);
+    }
+    bed.end();
+}
+
+#[test]
+fn a_type_is_found_by_discovery_and_two_types_on_one_topic_are_an_error_that_names_both() {
+    let test = "a_type_is_found_by_discovery_and_two_types_on_one_topic_are_an_error_that_names_both";
+    let yaml = "topics:\n  - {id: any, input_topic: /any, max_sample_bytes: 65536}\n";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    bed.up.wait_for_log("waiting for a publisher");
+    let peer = || Peer::cyclone().keep_all().type_name("robot_msgs::msg::dds_::Strange_");
+    let critical =
+        peer().subscriber().topic("rt/adaptive_bridge/critical/any").start_on(bed.host("critical"));
+    let publisher = bed.publish(peer().rate_hz(100.0), "rt/any");
+    critical.wait_received(50);
+
+    let other = Peer::fast().type_name("other_msgs::msg::dds_::Stranger_").topic("rt/any").publisher();
+    let other = other.start_on(bed.host("slow"));
+    bed.up.wait_for_log("two types claim the topic");
+    let log = bed.up.log();
+    let line = log.lines().find(|line| line.contains("two types claim")).unwrap();
+    assert!(line.contains("robot_msgs::msg::dds_::Strange_"), "{line}");
+    assert!(line.contains("other_msgs::msg::dds_::Stranger_"), "{line}");
+    let before = critical.received();
+    critical.wait_received(before + 50);
+    let _: Sent = other.end();
+    let _: Sent = publisher.end();
+    critical.end::<Received>().assert_sound();
+    bed.end();
+}
+
+/// A latched route: a map on both lanes, RELIABLE on the critical one, BEST_EFFORT on the noncritical one.
+const MAP: &str = "topics:\n  - id: map\n    input_topic: /map\n    message_type: nav_msgs/msg/OccupancyGrid\n    \
+                   max_sample_bytes: 65536\n    qos_overrides:\n      \
+                   critical: {durability: TRANSIENT_LOCAL, depth: 1}\n      \
+                   noncritical: {durability: TRANSIENT_LOCAL, depth: 1}\n";
+
+#[test]
+fn a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_restarted() {
+    let test = "a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_restarted";
+    let Some(bed) = Bed::start(test, MAP) else { return };
+    let map = |library| {
+        Peer::on(library)
+            .transient_local()
+            .keep_last(1)
+            .type_name("nav_msgs::msg::dds_::OccupancyGrid_")
+            .size(4000)
+    };
+    // Published once, long ago: its age does not matter.
+    let publisher = map(Library::Cyclone).count(1).linger_s(600.0).source_age_ms(60_000);
+    let publisher = bed.publish(publisher, "rt/map");
+    publisher.wait_sent();
+    for round in 0..2 {
+        for to in LIBRARIES {
+            let late =
+                |host, peer: Peer, topic: &str| peer.subscriber().topic(topic).start_on(bed.host(host));
+            let critical = late("critical", map(to), "rt/adaptive_bridge/critical/map");
+            let noncritical = late("slow", map(to).best_effort(), "rt/adaptive_bridge/noncritical/map");
+            for subscriber in [critical, noncritical] {
+                subscriber.wait_received(1);
+                let received: Received = subscriber.end();
+                assert_eq!((received.received, received.bad), (1, 0), "round {round}, {to:?}: {received:?}");
+                assert_eq!(received.source_timestamps_changed, 0);
+            }
+        }
+        if round == 0 {
+            for child in ["egress-critical", "egress-noncritical"] {
+                support::process::signal(bed.pid(child), nix::sys::signal::Signal::SIGKILL);
+                support::wait_until("a restart", || bed.pids(child).len() == 2);
+            }
+        }
+    }
+    let _: Sent = publisher.end();
+    bed.end();
+}
+
+#[test]
+fn several_routes_and_a_lane_of_the_users_own_in_another_domain() {
+    let test = "several_routes_and_a_lane_of_the_users_own_in_another_domain";
+    let yaml = "topics:\n  \
+                - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, max_sample_bytes: 8192}\n  \
+                - {id: odom, input_topic: /odom, message_type: nav_msgs/msg/Odometry, max_sample_bytes: 8192, \
+                   outputs: {rviz: /operator/odom}}\n\
+                lanes:\n  rviz: {domain_id: 42, max_rate_hz: 20, networks: [eth0]}\n";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    bed.up.wait_for_log("egress is up lane=\"rviz\"");
+    let scan = || Peer::cyclone().keep_all().seed(1);
+    let odom = || Peer::fast().keep_all().seed(2).type_name("nav_msgs::msg::dds_::Odometry_");
+    let critical_scan = bed.subscribe("critical", scan(), CRITICAL);
+    let critical_odom = bed.subscribe("critical", odom(), "rt/adaptive_bridge/critical/odom");
+    let rviz_scan = bed.subscribe("slow", scan().best_effort().domain(42), "rt/adaptive_bridge/rviz/scan");
+    let rviz_odom = bed.subscribe("slow", odom().best_effort().domain(42), "rt/operator/odom");
+    let scans = bed.publish(scan().rate_hz(100.0).count(300), INPUT);
+    let odoms = bed.publish(odom().rate_hz(150.0).count(450), "rt/odom");
+    let (scans, odoms): (Sent, Sent) = (scans.finish(), odoms.finish());
+    critical_scan.wait_received(300);
+    critical_odom.wait_received(450);
+    critical_scan.end::<Received>().assert_all_of(&scans);
+    critical_odom.end::<Received>().assert_all_of(&odoms);
+    for subscriber in [rviz_scan, rviz_odom] {
+        let received: Received = subscriber.end();
+        received.assert_sound();
+        // 20 Hz for 3 s, with the burst of a bucket at each end.
+        assert!((50..=66).contains(&received.received), "{received:?}");
+        assert!(missing_from(&received, 0).len() > 10);
+    }
+    bed.wait_whole();
+    bed.end();
+}
+
+#[test]
+fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
+    let test = "the_ros_graph_shows_each_process_as_a_node_with_its_endpoints";
+    for gid_bytes in [16, 24] {
+        let yaml = format!("{SCAN}ros: {{graph_gid_bytes: {gid_bytes}}}\n");
+        let Some(bed) = Bed::start(test, &yaml) else { return };
+        let publisher = bed.publish(Peer::fast().rate_hz(10.0), INPUT);
+        let viewer = Peer::cyclone().graph(gid_bytes).start_on(bed.host("slow"));
+        let node_of = |graph: &Graph, name: &str| {
+            graph.nodes.values().flatten().find(|node| node.name == name).cloned()
+        };
+        for (name, kind, topic) in [
+            ("ingress", "reader", INPUT),
+            ("egress_critical", "writer", CRITICAL),
+            ("egress_noncritical", "writer", NONCRITICAL),
+        ] {
+            support::wait_until(&format!("{name} with its {kind} of {topic}"), || {
+                let graph = viewer.graph();
+                let Some(node) = node_of(&graph, name) else { return false };
+                let gids = if kind == "reader" { &node.reader_gids } else { &node.writer_gids };
+                node.namespace.starts_with("/adaptive_bridge")
+                    && gids.len() == 1
+                    && graph.endpoints.values().any(|endpoint| {
+                        endpoint.kind == kind
+                            && endpoint.topic == topic
+                            && endpoint.type_name == support::bed::SCAN_TYPE
+                            && gids[0].starts_with(&endpoint.guid)
+                    })
+            });
+        }
+        let _: Sent = publisher.end();
+        bed.end();
     }
 }

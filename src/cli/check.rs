@@ -1,57 +1,147 @@
 //! `check`: is this configuration good, and what does it take?
 
+use std::fmt;
+use std::io::{self, Write};
 use std::process::ExitCode;
 
 use clap::Args;
+use serde::Serialize;
+use serde_json::json;
 
-use super::ConfigArguments;
-use crate::config::Settings;
+use super::{ConfigArguments, EXIT_CONFIG, output_ended};
+use crate::config::{ConfigError, Place, Settings};
 use crate::shm::RouteChannel;
 
 /// What `check` is asked.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
+    /// Print JSON, the problems too
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     config: ConfigArguments,
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    match arguments.config.load() {
-        Ok(settings) => {
-            print(&settings);
-            ExitCode::SUCCESS
+    let (text, code) = if arguments.json {
+        match arguments.config.try_load() {
+            Ok(settings) => (json!(Summary::of(&settings)).to_string() + "\n", ExitCode::SUCCESS),
+            Err(error) => (problems(&error).to_string() + "\n", ExitCode::from(EXIT_CONFIG)),
         }
-        Err(code) => code,
+    } else {
+        match arguments.config.load() {
+            Ok(settings) => (Summary::of(&settings).to_string(), ExitCode::SUCCESS),
+            Err(code) => return code,
+        }
+    };
+    match io::stdout().write_all(text.as_bytes()) {
+        Ok(()) => code,
+        Err(error) => output_ended(&error),
     }
 }
 
-fn print(settings: &Settings) {
-    println!(
-        "instance {}: {} routes, {} lanes",
-        settings.instance,
-        settings.routes.len(),
-        settings.lanes.len()
-    );
-    let mut total = 0;
-    for (index, route) in settings.routes.iter().enumerate() {
-        let pool = RouteChannel::of(settings, index).pool_size();
-        total += pool.bytes;
-        let message_type =
-            route.message_type.as_ref().map_or("type found by discovery".to_owned(), ToString::to_string);
-        println!("\nroute {}: {} ({message_type})", route.id, route.input_topic);
-        for lane in &settings.lanes {
-            for output in lane.outputs.iter().filter(|output| output.route == index) {
-                println!("  {} -> {}", lane.name, output.topic);
-            }
+/// What a good configuration comes to.
+#[derive(Serialize)]
+struct Summary {
+    instance: String,
+    lanes: Vec<String>,
+    routes: Vec<RouteSummary>,
+    shared_memory_bytes: u64,
+}
+
+#[derive(Serialize)]
+struct RouteSummary {
+    id: String,
+    input_topic: String,
+    message_type: Option<String>,
+    outputs: Vec<OutputSummary>,
+    max_sample_bytes: u64,
+    slots: usize,
+    shared_memory_bytes: u64,
+}
+
+#[derive(Serialize)]
+struct OutputSummary {
+    lane: String,
+    topic: String,
+}
+
+impl Summary {
+    fn of(settings: &Settings) -> Self {
+        let routes: Vec<RouteSummary> = settings
+            .routes
+            .iter()
+            .enumerate()
+            .map(|(index, route)| {
+                let pool = RouteChannel::of(settings, index).pool_size();
+                let outputs = settings.lanes.iter().flat_map(|lane| {
+                    lane.outputs.iter().filter(|output| output.route == index).map(|output| OutputSummary {
+                        lane: lane.name.to_string(),
+                        topic: output.topic.to_string(),
+                    })
+                });
+                RouteSummary {
+                    id: route.id.to_string(),
+                    input_topic: route.input_topic.to_string(),
+                    message_type: route.message_type.as_ref().map(ToString::to_string),
+                    outputs: outputs.collect(),
+                    max_sample_bytes: route.max_sample_bytes as u64,
+                    slots: pool.slots,
+                    shared_memory_bytes: pool.bytes,
+                }
+            })
+            .collect();
+        Self {
+            instance: settings.instance.to_string(),
+            lanes: settings.lanes.iter().map(|lane| lane.name.to_string()).collect(),
+            shared_memory_bytes: routes.iter().map(|route| route.shared_memory_bytes).sum(),
+            routes,
         }
-        println!(
-            "  shared memory: {} slots for samples of up to {}: {}",
-            pool.slots,
-            bytes(route.max_sample_bytes as u64),
-            bytes(pool.bytes)
-        );
     }
-    println!("\nshared memory in all: {}", bytes(total));
+}
+
+impl fmt::Display for Summary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "instance {}: {} routes, {} lanes", self.instance, self.routes.len(), self.lanes.len())?;
+        for route in &self.routes {
+            let message_type = route.message_type.as_deref().unwrap_or("type found by discovery");
+            writeln!(f, "\nroute {}: {} ({message_type})", route.id, route.input_topic)?;
+            for output in &route.outputs {
+                writeln!(f, "  {} -> {}", output.lane, output.topic)?;
+            }
+            writeln!(
+                f,
+                "  shared memory: {} slots for samples of up to {}: {}",
+                route.slots,
+                bytes(route.max_sample_bytes),
+                bytes(route.shared_memory_bytes)
+            )?;
+        }
+        writeln!(f, "\nshared memory in all: {}", bytes(self.shared_memory_bytes))
+    }
+}
+
+fn problems(error: &ConfigError) -> serde_json::Value {
+    let problems: Vec<_> = error
+        .problems()
+        .iter()
+        .map(|problem| {
+            let (place, line) = match problem.place {
+                Place::Environment => ("environment", None),
+                Place::File => ("file", None),
+                Place::Line(line) => ("file", Some(line)),
+            };
+            json!({
+                "place": place,
+                "line": line,
+                "key": problem.key,
+                "value": problem.value,
+                "allowed": problem.allowed,
+                "hint": problem.hint,
+            })
+        })
+        .collect();
+    json!({ "file": error.file(), "problems": problems })
 }
 
 /// A size as people read it.

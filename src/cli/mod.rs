@@ -4,16 +4,26 @@
 //! sysexits.h). Logs go to stderr; what a program may want to read goes to stdout, and nothing else does.
 
 mod check;
+mod completions;
+mod demo;
+mod man;
 mod mode;
 mod roles;
+mod status;
+mod tap;
 
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::config::{self, Settings};
-use crate::telemetry;
+use crate::clock;
+use crate::config::{self, ConfigError, Settings};
+use crate::process::Stop;
+use crate::shm::{self, ShmError};
+use crate::telemetry::{self, Snapshot};
 
 /// Bad configuration (`EX_CONFIG`, sysexits.h).
 const EXIT_CONFIG: u8 = 78;
@@ -37,8 +47,23 @@ enum Command {
     Egress(roles::EgressArguments),
     /// Run the whole bridge, all processes as children of this one
     Up(ConfigArguments),
+    /// Show what the running bridge does: processes, rates, drops, latencies, and what is wrong
+    Status(status::Arguments),
+    /// Read the samples of a route straight from shared memory
+    Tap(tap::Arguments),
     /// Set the mode of a lane by hand
     Mode(mode::Arguments),
+    /// Print what a shell needs to complete command lines
+    Completions(completions::Arguments),
+    /// Write the manual pages to a folder
+    #[command(hide = true)]
+    Man(man::Arguments),
+    /// Show what the bridge is for: publisher, subscribers and bridge on this machine, without ROS 2
+    Demo(demo::Arguments),
+    #[command(hide = true)]
+    DemoPublisher(demo::PublisherArguments),
+    #[command(hide = true)]
+    DemoSubscriber(demo::SubscriberArguments),
 }
 
 /// Which configuration.
@@ -56,10 +81,14 @@ impl ConfigArguments {
 
     /// The settings, or the exit code after the problems were printed.
     fn load(&self) -> Result<Settings, ExitCode> {
-        config::load(self.path(), &|name| std::env::var(name).ok()).map_err(|error| {
+        self.try_load().map_err(|error| {
             eprintln!("{error}");
             ExitCode::from(EXIT_CONFIG)
         })
+    }
+
+    fn try_load(&self) -> Result<Settings, ConfigError> {
+        config::load(self.path(), &|name| std::env::var(name).ok())
     }
 }
 
@@ -73,7 +102,14 @@ pub fn main() -> ExitCode {
         Command::Ingress(arguments) => roles::ingress(&arguments),
         Command::Egress(arguments) => roles::egress(&arguments),
         Command::Up(arguments) => roles::up(&arguments),
+        Command::Status(arguments) => status::run(&arguments),
+        Command::Tap(arguments) => tap::run(&arguments),
         Command::Mode(arguments) => mode::run(&arguments),
+        Command::Completions(arguments) => completions::run(&arguments),
+        Command::Man(arguments) => man::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::DemoPublisher(arguments) => demo::publisher(&arguments),
+        Command::DemoSubscriber(arguments) => demo::subscriber(&arguments),
     }
 }
 
@@ -81,4 +117,52 @@ pub fn main() -> ExitCode {
 fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     eprintln!("adaptive-bridge: {error}");
     ExitCode::FAILURE
+}
+
+/// A reading; other settings than those of the running bridge are named as what they are.
+fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, String> {
+    Snapshot::take(root, settings).map_err(|error| match error {
+        ShmError::Incompatible { .. } => format!(
+            "the bridge that runs as instance {} has other lanes or routes than this configuration, or is of \
+             another version; name the configuration that it was started with (--config)",
+            settings.instance
+        ),
+        other => other.to_string(),
+    })
+}
+
+/// Prints that there is no bridge to look at, and gives the exit code.
+fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
+    failed(&format!(
+        "no bridge runs as instance {} (root {}); start it with `adaptive-bridge up`",
+        settings.instance,
+        root.display()
+    ))
+}
+
+/// The exit code after stdout could not be written to. Who reads only the beginning, as `head` does, has what
+/// it wants: that is no failure.
+fn output_ended(error: &io::Error) -> ExitCode {
+    match error.kind() {
+        ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        _ => failed(&format!("stdout: {error}")),
+    }
+}
+
+/// The folder of the bridge's shared files, for these settings and this environment.
+fn root(settings: &Settings) -> PathBuf {
+    shm::default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
+}
+
+/// Waits; `false` as soon as the process is asked to stop.
+fn pause(ms: u64, stop: &Stop) -> bool {
+    const LOOK_MS: u64 = 20;
+    let end = clock::monotonic().plus_ms(ms);
+    loop {
+        let left_ns = end.since(clock::monotonic());
+        if left_ns == 0 || stop.is_requested() {
+            return !stop.is_requested();
+        }
+        std::thread::sleep(Duration::from_nanos(left_ns.min(LOOK_MS * 1_000_000)));
+    }
 }

@@ -43,7 +43,8 @@ pub enum Discovery {
 pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery> {
     use DomainParticipantStatusEvent as Event;
     match event {
-        // DDS 1.4 table in clause 2.2.3: RELIABILITY defaults to RELIABLE for writers, BEST_EFFORT for readers.
+        // DDS 1.4 table in clause 2.2.3: RELIABILITY defaults to RELIABLE for writers, BEST_EFFORT for
+        // readers.
         Event::WriterDetected { writer } => Some(Discovery::Writer(endpoint(writer, Reliability::Reliable))),
         Event::ReaderDetected { reader } => {
             Some(Discovery::Reader(endpoint(reader, Reliability::BestEffort)))

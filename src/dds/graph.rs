@@ -14,8 +14,8 @@ pub(super) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInf
 /// The entry of a participant with one node, in plain little-endian CDR (RTPS 2.5 clause 10, without the
 /// encapsulation header).
 ///
-/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron. A GUID fills the
-/// first 16; the rest is zero.
+/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron. A GUID fills
+/// the first 16; the rest is zero.
 pub fn encode_graph(
     participant: Guid,
     namespace: &str,

@@ -1,8 +1,8 @@
 //! The RTPS edge: a participant, a raw reader, a raw writer and discovery, on RustDDS.
 //!
 //! Payloads pass as the bytes that were on the wire, with their encapsulation header, and are never decoded;
-//! that is why any message type will do. No RustDDS type leaves this module, so that another DDS library could
-//! stand behind it.
+//! that is why any message type will do. No RustDDS type leaves this module, so that another DDS library
+//! could stand behind it.
 
 mod discovery;
 mod error;

@@ -1,5 +1,7 @@
 //! One DDS participant, which is one ROS 2 node.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 
 use super::discovery::{Discovery, translate};
@@ -7,7 +9,7 @@ use super::error::DdsError;
 use super::graph;
 use super::network;
 use super::qos::{self, ReaderQos};
-use super::reader::RawReader;
+use super::reader::{RawReader, Take};
 use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, Publisher, QosPolicies,
     RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind,
@@ -128,11 +130,15 @@ impl Participant {
         let guid = Guid(inner.guid().to_bytes());
         self.readers.push(guid);
         self.announce();
-        Ok(RawReader { inner, guid })
+        let reader = RawReader { inner, guid };
+        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them:
+        // what a former reader has taken would be taken once more.
+        while reader.take(&mut |_, _| {}) != Take::Empty {}
+        Ok(reader)
     }
 
-    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has at
-    /// most `window_samples` unacknowledged samples.
+    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has
+    /// at most `window_samples` unacknowledged samples.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -143,7 +149,23 @@ impl Participant {
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        let policies = qos::of_writer(writer_qos, window_samples);
+        self.create_blocking_writer(topic, dds_type, writer_qos, window_samples, Duration::ZERO)
+    }
+
+    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] waits up to `max_blocking` for
+    /// room in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge itself never waits.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_blocking_writer(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        writer_qos: &QosProfile,
+        window_samples: usize,
+        max_blocking: Duration,
+    ) -> Result<RawWriter, DdsError> {
+        let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
         let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, &policies)?;
         self.writers.push(writer.guid());
         self.announce();
@@ -175,7 +197,8 @@ impl Participant {
             &self.writers,
             self.graph_gid_bytes,
         );
-        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one does.
+        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one
+        // does.
         if let Err(error) = self.graph.write(Bytes::from(entry), graph::ENCAPSULATION, SourceTimestamp::NONE)
         {
             tracing::warn!(node = self.node_name, %error, "ROS 2 graph entry not published");

@@ -42,6 +42,15 @@ pub(super) fn of_reader(qos: &ReaderQos) -> QosPolicies {
 /// A writer's policies. `window_samples` bounds what may be unacknowledged, and a full window is reported at
 /// once (`max_blocking_time` zero) instead of waited for.
 pub(super) fn of_writer(qos: &QosProfile, window_samples: usize) -> QosPolicies {
+    of_blocking_writer(qos, window_samples, std::time::Duration::ZERO)
+}
+
+/// Like [`of_writer`], but a full window is waited for (`max_blocking_time`, DDS 1.4 clause 2.2.3.14).
+pub(super) fn of_blocking_writer(
+    qos: &QosProfile,
+    window_samples: usize,
+    max_blocking: std::time::Duration,
+) -> QosPolicies {
     let window = i32::try_from(window_samples).unwrap_or(i32::MAX);
     let mut builder = QosPolicyBuilder::new()
         .durability(durability(qos.durability))
@@ -60,7 +69,7 @@ pub(super) fn of_writer(qos: &QosProfile, window_samples: usize) -> QosPolicies 
     }
     match qos.reliability {
         Reliability::BestEffort => builder.best_effort(),
-        Reliability::Reliable => builder.reliable(Duration::ZERO),
+        Reliability::Reliable => builder.reliable(Duration::from_std(max_blocking)),
     }
     .build()
 }

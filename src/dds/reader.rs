@@ -66,8 +66,8 @@ impl RawReader {
 
     /// Takes the next sample, lending its payload and encapsulation to `lend` exactly once if there is one.
     ///
-    /// Samples of one RELIABLE writer come in order and without repetition. The library's lock on the topic is
-    /// held while `lend` runs: it must copy and return.
+    /// Samples of one RELIABLE writer come in order and without repetition. The library's lock on the topic
+    /// is held while `lend` runs: it must copy and return.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
         let lend = RefCell::new(lend);
         match self.inner.try_take_one_with(Lend(&lend)) {

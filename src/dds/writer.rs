@@ -1,4 +1,4 @@
-//! A DDS writer of raw payloads that never waits.
+//! A DDS writer of raw payloads that never waits, unless it was made to.
 
 use std::fmt;
 use std::time::Duration;
@@ -64,8 +64,9 @@ impl RawWriter {
         self.guid
     }
 
-    /// Hands a sample to the DDS library and returns at once. The library keeps `payload` until every matched
-    /// RELIABLE reader has acknowledged it, and lets go of it some time after that.
+    /// Hands a sample to the DDS library and returns at once, or, of a writer that was made to wait, within
+    /// its blocking time. The library keeps `payload` until every matched RELIABLE reader has acknowledged
+    /// it, and lets go of it some time after that.
     ///
     /// # Errors
     /// The sample was not taken and `payload` is let go of.
@@ -78,8 +79,8 @@ impl RawWriter {
         self.write_with(payload, encapsulation, timestamp, None)
     }
 
-    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, whom
-    /// the DDS protocol has no way to give the history.
+    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer,
+    /// whom the DDS protocol has no way to give the history.
     ///
     /// # Errors
     /// As for [`write`](Self::write).

@@ -14,7 +14,8 @@ pub struct IngressCounters {
     pub received: u64,
     /// Payload bytes of those.
     pub received_bytes: u64,
-    /// Samples published to the lanes; also the sequence of the last one, because ingress numbers without gaps.
+    /// Samples published to the lanes; also the sequence of the last one, because ingress numbers without
+    /// gaps.
     pub published: u64,
     /// Samples received and not published.
     pub drops: DropCounts,
@@ -28,8 +29,8 @@ pub struct IngressCounters {
 
 /// What one lane has done on one route.
 ///
-/// `last_sequence - first_sequence = forwarded + drops` whenever no sample waits in the lane; while some wait,
-/// the difference is `waiting`.
+/// `last_sequence - first_sequence = forwarded + drops` whenever no sample waits in the lane; while some
+/// wait, the difference is `waiting`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct LaneCounters {
@@ -53,7 +54,8 @@ pub struct LaneCounters {
     pub last_forwarded_sequence: u64,
     /// When that was.
     pub last_forwarded_at: MonotonicNs,
-    /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes from.
+    /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes
+    /// from.
     pub last_writer_guid: Guid,
     /// See `last_writer_guid`.
     pub last_writer_sequence: i64,
@@ -161,7 +163,8 @@ pub struct RouteInfo {
     pub dds_type: FixedText,
 }
 
-/// Sub-buckets of each octave; the relative width of a bucket is 1/16, so that a quantile is at most 6.3 % off.
+/// Sub-buckets of each octave; the relative width of a bucket is 1/16, so that a quantile is at most 6.3 %
+/// off.
 const SUB_BUCKETS: usize = 16;
 /// Octaves from 2^10 ns (1 µs) up to 2^37 ns (137 s).
 const OCTAVES: usize = 27;
@@ -213,7 +216,8 @@ impl LatencyHistogram {
         Some(self.max_ns)
     }
 
-    /// What was counted since `earlier`, a former reading of the same histogram. The maximum stays that of all.
+    /// What was counted since `earlier`, a former reading of the same histogram. The maximum stays that of
+    /// all.
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
         for (count, before) in difference.counts.iter_mut().zip(earlier.counts.iter()) {

@@ -62,7 +62,9 @@ checked_name! {
 
 checked_name! {
     /// One bridge among several on a host; the namespace of its shared memory.
-    InstanceName, "instance name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", is_short_name
+    InstanceName, "instance name",
+    "1 to 24 characters of a-z, 0-9 and _, beginning with a letter",
+    is_short_name
 }
 
 checked_name! {
@@ -73,7 +75,8 @@ checked_name! {
 checked_name! {
     /// A fully qualified ROS 2 topic name.
     TopicName, "topic name",
-    "an absolute ROS 2 topic name of at most 246 characters: /tokens of A-Z, a-z, 0-9 and _, none beginning with a digit",
+    "an absolute ROS 2 topic name of at most 246 characters: /tokens of A-Z, a-z, 0-9 and _, none beginning \
+     with a digit",
     is_topic_name
 }
 

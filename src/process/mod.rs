@@ -1,8 +1,8 @@
 //! The roles: what each process of a bridge does from its start to its end. The only place where the edges
 //! meet policy.
 //!
-//! A role is a loop of turns. A turn handles what is there and then sleeps until it is woken, or until the next
-//! housekeeping, which is all that need not happen for each sample: discovery, matching, logs, health.
+//! A role is a loop of turns. A turn handles what is there and then sleeps until it is woken, or until the
+//! next housekeeping, which is all that need not happen for each sample: discovery, matching, logs, health.
 
 mod arena;
 mod egress;

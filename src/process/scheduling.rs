@@ -56,8 +56,8 @@ fn set_affinity(cpus: &[usize]) -> nix::Result<()> {
 }
 
 fn set_policy(policy: libc::c_int, priority: u8) -> nix::Result<()> {
-    // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it. nix has no
-    // wrapper for this call.
+    // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it. nix has
+    // no wrapper for this call.
     let outcome = unsafe {
         let mut param: libc::sched_param = std::mem::zeroed();
         param.sched_priority = libc::c_int::from(priority);

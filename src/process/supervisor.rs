@@ -1,8 +1,8 @@
 //! `up`: all roles of a bridge as children of one process, for a terminal or a container.
 //!
-//! On a robot systemd supervises the roles. Here a child that dies is started again, with a backoff; each line
-//! of a child's log is passed on with the child's name before it; and no child outlives this process, because
-//! each asks the kernel to be terminated when its parent dies, however that dies.
+//! On a robot systemd supervises the roles. Here a child that dies is started again, with a backoff; each
+//! line of a child's log is passed on with the child's name before it; and no child outlives this process,
+//! because each asks the kernel to be terminated when its parent dies, however that dies.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -71,8 +71,8 @@ pub fn end_with_supervisor() {
     }
 }
 
-/// Runs ingress and every lane as children until `stop` is requested. `arguments` are passed on to each, after
-/// its own (the configuration file, say).
+/// Runs ingress and every lane as children until `stop` is requested. `arguments` are passed on to each,
+/// after its own (the configuration file, say).
 ///
 /// # Errors
 /// The first start of a child failed, or all children gave up.
@@ -241,8 +241,8 @@ fn exit_of(status: ExitStatus) -> ChildExit {
     }
 }
 
-/// Writes each line of a child's log to ours, with the child's name before it. One write for each line, so that
-/// lines of several children do not mix.
+/// Writes each line of a child's log to ours, with the child's name before it. One write for each line, so
+/// that lines of several children do not mix.
 fn pass_on(name: &str, log: impl io::Read) {
     let mut lines = BufReader::new(log);
     let mut line = Vec::with_capacity(256);

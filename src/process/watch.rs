@@ -56,7 +56,8 @@ const fn advice(reason: DropReason) -> &'static str {
         DropReason::LaneDown => "samples lost: published while no process served the lane",
         DropReason::NoWriter => "samples dropped: the message type is not known yet",
         DropReason::WindowFull => {
-            "samples dropped: a reader does not acknowledge and the window is full; see `status` for the readers"
+            "samples dropped: a reader does not acknowledge and the window is full; see `status` for the \
+             readers"
         }
         DropReason::WriteFailed => "samples dropped: the DDS library refused them",
         DropReason::Stale => "samples dropped: older than stale_threshold_ms; are the clocks in step?",

@@ -3,10 +3,11 @@
 //! All boards of an instance are one segment, which the first process creates and which belongs to none: it
 //! stays until the last process of the instance has left, so a process that died finds its counters again.
 //!
-//! A value is kept twice. Its one writer fills the copy that is not shown, then shows it by counting up the
-//! version. A writer that dies within an update therefore leaves the former value, whole. A reader copies the
-//! shown one, and again if the version has moved meanwhile: it waits for nobody and never sees half a value.
-//! The counts of a histogram are single words, and are counted in place.
+//! A value is kept in several copies, which take turns. Its one writer fills the next one, then shows it by
+//! counting up the version. A writer that dies within an update therefore leaves the former value, whole. A
+//! reader takes the one that is shown, and once more if the writer has come round to it meanwhile: it waits
+//! for nobody and never sees half a value. The counts of a histogram are single words, and are counted in
+//! place.
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -88,7 +89,10 @@ const MAGIC: u64 = 0x4142_626f_6172_6473;
 /// Words of a cache line, on which every value begins, so that two writers never share one.
 const LINE: usize = 8;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
-/// Retries of a reader. A writer would have to finish an update within the nanoseconds of each single copy.
+/// Copies of a value. A reader, which takes some 100 ns when the writer is on another CPU, starts again only
+/// if more than `COPIES - 2` updates came meanwhile.
+const COPIES: u64 = 4;
+/// Turns of a reader, so that a writer that has run wild cannot hold it.
 const READ_ATTEMPTS: usize = 1_000;
 
 /// A type that may be copied through shared memory word by word.
@@ -98,7 +102,7 @@ const READ_ATTEMPTS: usize = 1_000;
 unsafe trait Plain: Copy + Default {
     /// Its size in words.
     const WORDS: usize = {
-        assert!(size_of::<Self>() % 8 == 0);
+        assert!(size_of::<Self>().is_multiple_of(8));
         size_of::<Self>() / 8
     };
 }
@@ -120,10 +124,9 @@ const _: () = {
     assert!(size_of::<ProcessHealth>() == 7 * 8);
     assert!(size_of::<LanePolicy>() == 4 * 8);
     assert!(size_of::<RouteInfo>() == 16 * 8);
-    assert!(size_of::<LaneCounters>() % 8 == 0 && size_of::<IngressCounters>() % 8 == 0);
 };
 
-/// A value that is kept twice: a line for its version, then the two copies, each on lines of its own.
+/// A value in its copies: a line for the version, then the copies, each on lines of its own.
 #[derive(Debug)]
 struct Cell<T> {
     at: usize,
@@ -139,7 +142,7 @@ impl<T> Clone for Cell<T> {
 impl<T> Copy for Cell<T> {}
 
 impl<T: Plain> Cell<T> {
-    const WORDS: usize = LINE + 2 * Self::COPY_WORDS;
+    const WORDS: usize = LINE + COPIES as usize * Self::COPY_WORDS;
     const COPY_WORDS: usize = T::WORDS.next_multiple_of(LINE);
 
     fn at(at: usize) -> Self {
@@ -147,17 +150,19 @@ impl<T: Plain> Cell<T> {
     }
 
     fn copy_at(self, version: u64) -> usize {
-        self.at + LINE + (version % 2) as usize * Self::COPY_WORDS
+        self.at + LINE + (version % COPIES) as usize * Self::COPY_WORDS
     }
 
     fn read(self, segment: &Segment) -> Option<T> {
         for _ in 0..READ_ATTEMPTS {
             let version = segment.word(self.at).load(Ordering::Acquire);
             let value = load(segment, self.copy_at(version));
-            // The writer begins to fill this copy again only after it has counted the version up. If we have
-            // read a word of that, this fence makes us see the new version.
+            // The writer begins to fill this copy again, as version `version + COPIES`, only after it has
+            // shown the one before that. If we have read a word of it, this fence makes us see that it was
+            // shown.
             fence(Ordering::Acquire);
-            if segment.word(self.at).load(Ordering::Relaxed) == version {
+            let now = segment.word(self.at).load(Ordering::Relaxed);
+            if now.wrapping_sub(version) < COPIES - 1 {
                 return Some(value);
             }
         }
@@ -324,14 +329,14 @@ impl Boards {
         Ok(Self { segment: Arc::new(segment), layout, policy_lock: dir.path.join("policy.lock") })
     }
 
-    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster than
-    /// it can be read, which only a runaway writer does; so for all readings.
+    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster
+    /// than it can be read, which only a runaway writer does; so for all readings.
     pub fn health(&self, role: ProcessRole) -> Option<ProcessHealth> {
         self.layout.health(role).read(&self.segment)
     }
 
-    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a time:
-    /// the holder of the role's lock.
+    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a
+    /// time: the holder of the role's lock.
     pub fn health_writer(&self, role: ProcessRole) -> BoardWriter<ProcessHealth> {
         self.writer(self.layout.health(role))
     }
@@ -386,9 +391,9 @@ impl Boards {
         self.layout.policy(lane).read(&self.segment)
     }
 
-    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy and
-    /// gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns what
-    /// was written.
+    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy
+    /// and gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns
+    /// what was written.
     pub fn set_policy(
         &self,
         lane: usize,

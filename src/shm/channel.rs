@@ -22,13 +22,15 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
-use super::node::{NodeShared, Service, ShmNode, failed};
+use super::node::{NodeShared, ShmNode, StartLock, failed};
 use super::root::RoleLock;
+use super::sample_error::{LoanError, PublishError, TakeError};
+use super::service::Service;
 use crate::config::{Lane, Settings};
 use crate::model::{RouteId, SampleHeader, TrafficClass};
 
-/// Slots that ingress may hold at once while it copies and has not published yet: the one that it fills, and one
-/// of a caller that keeps a slot while it looks at the next sample.
+/// Slots that ingress may hold at once while it copies and has not published yet: the one that it fills, and
+/// one of a caller that keeps a slot while it looks at the next sample.
 const LOANED_SLOTS: usize = 2;
 /// The share of one tap.
 const TAP: LaneQueue = LaneQueue { queue_depth: 4, max_borrowed: 2 };
@@ -48,8 +50,8 @@ pub struct LaneQueue {
 }
 
 impl LaneQueue {
-    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the sample
-    /// it takes next and the one that it sends.
+    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the
+    /// sample it takes next and the one that it sends.
     pub fn of(lane: &Lane) -> Self {
         let waiting = match lane.class {
             TrafficClass::Critical => 0,
@@ -106,8 +108,8 @@ impl RouteChannel {
 
     /// What the pool takes; ingress allocates it at its start, all of it.
     ///
-    /// Every slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress; so as many
-    /// as all of those together suffice, whatever the lanes do.
+    /// Every slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress; so as
+    /// many as all of those together suffice, whatever the lanes do.
     pub fn pool_size(&self) -> PoolSize {
         let share = |queue: LaneQueue| self.depth(queue) + queue.max_borrowed.max(1);
         let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
@@ -144,8 +146,7 @@ impl RouteChannel {
     }
 
     /// Opens the route's service, or creates it: whoever comes first.
-    fn open(&self, node: &ShmNode) -> Result<Factory, ShmError> {
-        let shared = node.shared();
+    fn open(&self, shared: &NodeShared, start: &StartLock) -> Result<Factory, ShmError> {
         let what = format!("to open route {}", self.route);
         let say = |error: &dyn fmt::Display| failed(shared.dir(), &what, error);
         let name = format!("ab1/samples/{}", self.route);
@@ -184,7 +185,7 @@ impl RouteChannel {
             };
             if attempt < OPEN_ATTEMPTS && is_passing(error) {
                 // Its creator may have died within, or the last user removes it at this moment.
-                node.clean_up();
+                shared.clean_up(start);
                 thread::sleep(OPEN_PAUSE);
                 continue;
             }
@@ -251,71 +252,6 @@ fn is_passing(error: OpenOrCreateError) -> bool {
 
 type Factory = PortFactory<Service, [u8], WireHeader>;
 
-/// Why a sample could not be copied into shared memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LoanError {
-    /// The payload is larger than the route allows.
-    TooLarge {
-        /// Its bytes.
-        len: usize,
-        /// Bytes allowed.
-        max: usize,
-    },
-    /// No slot is free: someone holds more than its share.
-    PoolExhausted,
-    /// iceoryx2 failed.
-    Failed(&'static str),
-}
-
-/// Why a sample could not be published.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PublishError {
-    /// iceoryx2 failed; the sample reached some subscribers at most.
-    Failed(&'static str),
-}
-
-/// Why no sample could be taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TakeError {
-    /// The subscriber holds as many samples as it may. Nothing is lost: drop one and take again.
-    BorrowLimit,
-    /// The header or the length of a sample makes no sense; the sample is gone.
-    Malformed(HeaderError),
-    /// iceoryx2 failed.
-    Failed(&'static str),
-}
-
-impl fmt::Display for LoanError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::TooLarge { len, max } => write!(f, "a sample of {len} bytes, at most {max} are allowed"),
-            Self::PoolExhausted => f.write_str("no free slot in the route's pool"),
-            Self::Failed(reason) => write!(f, "no slot: {reason}"),
-        }
-    }
-}
-
-impl fmt::Display for PublishError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self::Failed(reason) = self;
-        write!(f, "not published to everybody: {reason}")
-    }
-}
-
-impl fmt::Display for TakeError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::BorrowLimit => f.write_str("as many samples are held as may be"),
-            Self::Malformed(error) => write!(f, "{error}"),
-            Self::Failed(reason) => write!(f, "nothing taken: {reason}"),
-        }
-    }
-}
-
-impl std::error::Error for LoanError {}
-impl std::error::Error for PublishError {}
-impl std::error::Error for TakeError {}
-
 /// The one publisher of a route: ingress.
 #[derive(Debug)]
 pub struct SamplePublisher {
@@ -331,7 +267,8 @@ impl SamplePublisher {
         let shared = node.shared();
         let pool = channel.pool_size();
         let what = format!("the sample pool of route {} ({} slots)", channel.route, pool.slots);
-        let factory = channel.open(node)?;
+        let start = StartLock::take(shared.dir())?;
+        let factory = channel.open(shared, &start)?;
         shared.require_free(pool.bytes, &what)?;
         let create = || {
             factory
@@ -347,7 +284,7 @@ impl SamplePublisher {
         let port = match create() {
             // A dead predecessor takes the place until it is cleaned up.
             Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
-                node.clean_up();
+                shared.clean_up(&start);
                 create()
             }
             other => other,
@@ -382,9 +319,9 @@ impl SamplePublisher {
         }
     }
 
-    /// Connects to subscribers that came since, gives them what is retained, and takes back the slots of those
-    /// that are gone. Publishing does so too; where nothing is published for long, call it now and then (10
-    /// times a second, say). Cheap when nothing has changed.
+    /// Connects to subscribers that came since, gives them what is retained, and takes back the slots of
+    /// those that are gone. Publishing does so too; where nothing is published for long, call it now and then
+    /// (10 times a second, say). Cheap when nothing has changed.
     pub fn attend(&self) {
         // A subscriber that cannot be reached is logged by iceoryx2; the others are connected all the same.
         let _ = self.port.update_connections();
@@ -456,7 +393,8 @@ impl SampleSubscriber {
             SubscriberRole::Lane(queue) => (queue, None),
             SubscriberRole::Tap => (TAP, Some(take_tap_place(shared, channel)?)),
         };
-        let factory = channel.open(node)?;
+        let start = StartLock::take(shared.dir())?;
+        let factory = channel.open(shared, &start)?;
         let what = format!("a queue of route {}", channel.route);
         shared.require_free(0, &what)?;
         let create = || {
@@ -469,7 +407,7 @@ impl SampleSubscriber {
         let port = match create() {
             // A dead predecessor takes the place until it is cleaned up.
             Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
-                node.clean_up();
+                shared.clean_up(&start);
                 create()
             }
             other => other,
@@ -519,7 +457,8 @@ impl SampleSubscriber {
     }
 }
 
-/// Lanes have their places by their role; taps have to share a fixed number, so that none takes a lane's place.
+/// Lanes have their places by their role; taps have to share a fixed number, so that none takes a lane's
+/// place.
 fn take_tap_place(shared: &NodeShared, channel: &RouteChannel) -> Result<RoleLock, ShmError> {
     for place in 0..channel.max_taps {
         let name = format!("tap-{}-{place}", channel.route);
@@ -544,16 +483,16 @@ pub struct ShmSample {
 }
 
 // SAFETY: a shared reference gives access to the header, which is a copy, and to the bytes of the payload,
-// which nobody writes while they are borrowed. `_slot`, which is what is not `Sync`, is reached by nobody until
-// it is dropped, and may be dropped on any thread: `Sample` of a thread-safe service is `Send`. The bytes are
-// in a mapping that `_slot` keeps, not in memory of a thread.
+// which nobody writes while they are borrowed. `_slot`, which is what is not `Sync`, is reached by nobody
+// until it is dropped, and may be dropped on any thread: `Sample` of a thread-safe service is `Send`. The
+// bytes are in a mapping that `_slot` keeps, not in memory of a thread.
 unsafe impl Sync for ShmSample {}
 // SAFETY: as above; the pointer is the one field that is not `Send` by itself.
 unsafe impl Send for ShmSample {}
 
 impl ShmSample {
-    /// Checks what another process wrote, and remembers where the payload is, so that looking at it later takes
-    /// no lock and reads no length that might have changed.
+    /// Checks what another process wrote, and remembers where the payload is, so that looking at it later
+    /// takes no lock and reads no length that might have changed.
     fn new(
         slot: Sample<Service, [u8], WireHeader>,
         max_bytes: usize,
@@ -580,8 +519,8 @@ impl ShmSample {
 
     /// The payload.
     pub fn payload(&self) -> &[u8] {
-        // SAFETY: `length` bytes of the slot, which is mapped as long as `_slot` lives, and which ingress does
-        // not write before it is given back.
+        // SAFETY: `length` bytes of the slot, which is mapped as long as `_slot` lives, and which ingress
+        // does not write before it is given back.
         unsafe { std::slice::from_raw_parts(self.payload.as_ptr(), self.length) }
     }
 }
@@ -589,5 +528,41 @@ impl ShmSample {
 impl AsRef<[u8]> for ShmSample {
     fn as_ref(&self) -> &[u8] {
         self.payload()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::InstanceName;
+
+    #[test]
+    fn a_payload_longer_than_its_route_allows_is_refused() {
+        let root = tempfile::tempdir().unwrap();
+        let instance = InstanceName::try_from("unit").unwrap();
+        let node = ShmNode::open(root.path(), &instance, "test").unwrap();
+        let lane = LaneQueue { queue_depth: 4, max_borrowed: 2 };
+        let route = RouteId::try_from("scan").unwrap();
+        let channel = RouteChannel {
+            route,
+            max_sample_bytes: 100,
+            lanes: vec![lane],
+            max_taps: 0,
+            retained_samples: 0,
+        };
+        let publisher = SamplePublisher::create(&node, &channel).unwrap();
+        let mut subscriber =
+            SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(lane), false).unwrap();
+        // Processes that say different sizes do not meet; one that lies does.
+        subscriber.max_sample_bytes = 50;
+        let mut header = WireHeader::default().0;
+        header.sequence = 1;
+        for length in [51, 50] {
+            publisher.copy_in(&vec![7; length]).unwrap().publish(header).unwrap();
+        }
+        let refused = subscriber.take().unwrap_err();
+        assert_eq!(refused, TakeError::Malformed(HeaderError::PayloadTooLong));
+        assert_eq!(subscriber.borrowed(), 0);
+        assert_eq!(subscriber.take().unwrap().unwrap().payload(), [7; 50]);
     }
 }

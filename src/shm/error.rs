@@ -104,7 +104,8 @@ impl fmt::Display for ShmError {
             ),
             Self::PathTooLong { path, length, max } => write!(
                 f,
-                "the path {} has {length} bytes, at most {max} work; choose a shorter shared_memory.root_path",
+                "the path {} has {length} bytes, at most {max} work; choose a shorter \
+                 shared_memory.root_path",
                 path.display()
             ),
             Self::AlreadyServed { role, pid } => {

@@ -78,9 +78,9 @@ pub(super) struct WireHeader(pub(super) SampleHeader);
 /// No byte of the header is padding, so that none is left unwritten.
 const _: () = assert!(HEADER_BYTES == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 && align_of::<SampleHeader>() == 8);
 
-// SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle of
-// a process, no destructor, every bit pattern valid. The name stands for exactly this layout, and the service's
-// name carries the version.
+// SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle
+// of a process, no destructor, every bit pattern valid. The name stands for exactly this layout, and the
+// service's name carries the version.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "ab1::SampleHeader"

@@ -2,8 +2,8 @@
 //! bridge.
 //!
 //! - [`ShmNode`]: the membership of one process in one bridge instance; cleans up after dead processes.
-//! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of fixed
-//!   size (iceoryx2 publish-subscribe).
+//! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of
+//!   fixed size (iceoryx2 publish-subscribe).
 //! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
 //! - [`RoleLock`]: at most one process for each role.
@@ -17,16 +17,18 @@ mod error;
 mod header;
 mod node;
 mod root;
+mod sample_error;
 mod segment;
+mod service;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
 pub use channel::{
-    LaneQueue, LoanError, PoolSize, PublishError, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample,
-    Slot, SubscriberRole, TakeError,
+    LaneQueue, PoolSize, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, Slot, SubscriberRole,
 };
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
 pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
+pub use sample_error::{LoanError, PublishError, TakeError};
 pub use wake::{LaneSleeper, LaneWaker, Woken};

@@ -1,7 +1,9 @@
 //! The membership of one process in one bridge instance.
 
+use std::collections::HashSet;
 use std::fs;
-use std::path::Path;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use iceoryx2::config::Config;
@@ -9,15 +11,14 @@ use iceoryx2::node::{Node, NodeBuilder, NodeState, NodeView};
 use iceoryx2::prelude::{
     CallbackProgression, FileName, LogLevel, SemanticString, SignalHandlingMode, set_log_level,
 };
+use nix::fcntl::FlockArg;
 
 use super::board::{Boards, BridgeShape};
 use super::error::ShmError;
-use super::root::{InstanceDir, Membership};
+use super::root::{FileLock, InstanceDir, Membership};
 use super::segment::{commit_files, require_free};
+use super::service::Service;
 use crate::model::InstanceName;
-
-/// Samples are released on whatever thread DDS drops them.
-pub(super) type Service = iceoryx2::service::ipc_threadsafe::Service;
 
 /// What a service, a connection or the boards of a small bridge take beside the pool.
 const SMALL_BYTES: u64 = 512 * 1024;
@@ -29,7 +30,7 @@ pub struct CleanUp {
     pub dead_processes: usize,
     /// Dead processes that could not be cleaned up now; the next clean-up tries again.
     pub failed: usize,
-    /// Stray files that were removed because no process of the instance was alive.
+    /// Files removed that belonged to nobody: half made ones, and all of them when no process was alive.
     pub stray_files: usize,
 }
 
@@ -40,8 +41,8 @@ pub struct ShmNode {
     cleaned_up: CleanUp,
 }
 
-/// What every port and every sample keeps alive. The fields are dropped in this order: the node's own files go
-/// first, then the membership.
+/// What every port and every sample keeps alive. The fields are dropped in this order: the node's own files
+/// go first, then the membership.
 #[derive(Debug)]
 pub(super) struct NodeShared {
     node: Node<Service>,
@@ -51,20 +52,21 @@ pub(super) struct NodeShared {
 impl ShmNode {
     /// Joins the instance in `root`, and first cleans up what dead processes of the instance left behind.
     ///
-    /// Nothing but the arguments configures iceoryx2: no `iceoryx2.toml` of the working folder, of the user or
-    /// of the system is read. It installs no signal handler.
+    /// Nothing but the arguments configures iceoryx2: no `iceoryx2.toml` of the working folder, of the user
+    /// or of the system is read. It installs no signal handler.
     pub fn open(root: &Path, instance: &InstanceName, process: &str) -> Result<Self, ShmError> {
         quieten();
         let (membership, stray_files) = Membership::join(root, instance)?;
         let dir = membership.dir();
         require_free(SMALL_BYTES, "joining the bridge")?;
+        let start = StartLock::take(dir)?;
         for folder in ["nodes", "services"] {
             // iceoryx2 would create them with mode 0755.
             private_folder(&dir.path.join(folder))?;
         }
         let config = config_of(dir)?;
-        let mut cleaned_up = clean_up_dead(dir, &config);
-        cleaned_up.stray_files = stray_files;
+        let mut cleaned_up = clean_up_dead(dir, &config, &start);
+        cleaned_up.stray_files += stray_files;
         let name = process.try_into().map_err(|error| failed(dir, "to name the process", &error))?;
         let node = NodeBuilder::new()
             .name(&name)
@@ -72,6 +74,9 @@ impl ShmNode {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
             .map_err(|error| failed(dir, "to join the bridge", &error))?;
+        // iceoryx2 lets everybody read and write its count of nodes.
+        make_private(&dir.shm_files());
+        drop(start);
         Ok(Self { shared: Arc::new(NodeShared { node, membership }), cleaned_up })
     }
 
@@ -80,13 +85,19 @@ impl ShmNode {
         self.cleaned_up
     }
 
-    /// Cleans up after processes that died since; for processes that run for long, once a second, say.
+    /// Cleans up after processes that died since; for processes that run for long, once a second, say. Never
+    /// waits: while another process starts or cleans up it does nothing. It reads folders, which takes some
+    /// 0.5 ms, so it is not for the thread that handles samples.
     pub fn clean_up(&self) -> CleanUp {
-        clean_up_dead(self.shared.dir(), self.shared.node.config())
+        match StartLock::try_take(self.shared.dir()) {
+            Some(start) => self.shared.clean_up(&start),
+            None => CleanUp::default(),
+        }
     }
 
     /// The boards of the instance; the first process creates them, the others find them.
     pub fn boards(&self, shape: &BridgeShape) -> Result<Boards, ShmError> {
+        let _start = StartLock::take(self.shared.dir())?;
         Boards::open_or_create(self.shared.dir(), shape)
     }
 
@@ -98,6 +109,10 @@ impl ShmNode {
 impl NodeShared {
     pub(super) fn dir(&self) -> &InstanceDir {
         self.membership.dir()
+    }
+
+    pub(super) fn clean_up(&self, start: &StartLock) -> CleanUp {
+        clean_up_dead(self.dir(), self.node.config(), start)
     }
 
     pub(super) fn node(&self) -> &Node<Service> {
@@ -137,41 +152,115 @@ fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
     Ok(config)
 }
 
-/// Removes what dead processes left: their ports with queues and pools, and services that nobody uses any more.
+/// Held by whoever sets something up in shared memory: one process at a time.
 ///
-/// This is done here and not by iceoryx2 itself because, for a process that died after its details were removed
-/// or before they were written, iceoryx2 falls back to the configuration file of the working folder.
-fn clean_up_dead(dir: &InstanceDir, config: &Config) -> CleanUp {
+/// iceoryx2 0.10 waits for ever for a segment whose creator was killed before it set its length, and refuses
+/// for ever a service whose creator was killed before it wrote its description. Nobody but the holder of this
+/// lock creates either, so that whatever its holder finds half made belongs to a process that is dead.
+/// Nothing on the way of a sample takes it.
+pub(super) struct StartLock {
+    _lock: FileLock,
+}
+
+impl StartLock {
+    fn path(dir: &InstanceDir) -> PathBuf {
+        dir.path.join("start.lock")
+    }
+
+    pub(super) fn take(dir: &InstanceDir) -> Result<Self, ShmError> {
+        let mut lock = FileLock::take_soon(&Self::path(dir), FlockArg::LockExclusiveNonblock)?;
+        // For the message of those who wait in vain; not worth failing for.
+        let _ = lock.write_pid();
+        Ok(Self { _lock: lock })
+    }
+
+    fn try_take(dir: &InstanceDir) -> Option<Self> {
+        let lock = FileLock::take(&Self::path(dir), FlockArg::LockExclusiveNonblock).ok()??;
+        Some(Self { _lock: lock })
+    }
+}
+
+/// Removes what dead processes left: their ports with queues and pools, and services that nobody uses any
+/// more.
+///
+/// This is done here and not by iceoryx2 itself because, for a process that died after its details were
+/// removed or before they were written, iceoryx2 falls back to the configuration file of the working folder.
+fn clean_up_dead(dir: &InstanceDir, config: &Config, _start: &StartLock) -> CleanUp {
     let mut result = CleanUp::default();
+    result.stray_files += remove_half_made(dir);
+    let mut known = HashSet::new();
     let listed = Node::<Service>::list(config, |state| {
-        if let NodeState::Dead(dead) = state {
-            let cleaned = if dead.details().is_some() {
-                dead.try_remove_stale_resources().is_ok()
-            } else {
-                remove_monitor(dir, &dead.id().value().to_string())
-            };
-            result.dead_processes += usize::from(cleaned);
-            result.failed += usize::from(!cleaned);
+        let id = state.node_id().value().to_string();
+        match state {
+            NodeState::Dead(dead) if dead.details().is_some() => {
+                let cleaned = dead.try_remove_stale_resources().is_ok();
+                result.dead_processes += usize::from(cleaned);
+                result.failed += usize::from(!cleaned);
+                known.insert(id);
+            }
+            NodeState::Dead(_) => {}
+            _ => {
+                known.insert(id);
+            }
         }
         CallbackProgression::Continue
     });
-    if listed.is_err() {
-        result.failed += 1;
+    match listed {
+        Ok(()) => result.stray_files += remove_unknown_nodes(dir, &known),
+        Err(_) => result.failed += 1,
     }
     result
 }
 
-/// Removes the rest of a dead process whose details are gone. They go last, after all its ports.
-fn remove_monitor(dir: &InstanceDir, id: &str) -> bool {
-    let start = format!("{}{id}.", dir.prefix);
+/// Removes what its creator, dead now, did not finish.
+fn remove_half_made(dir: &InstanceDir) -> usize {
+    let segment = |metadata: &fs::Metadata| metadata.len() == 0 || metadata.mode() & 0o400 == 0;
+    // iceoryx2 takes away the right to write when the description is complete.
+    let description = |metadata: &fs::Metadata| metadata.mode() & 0o200 != 0;
+    let services = fs::read_dir(dir.path.join("services")).into_iter().flatten().flatten();
+    let segments = dir.shm_files().into_iter().map(|path| (path, segment as fn(&_) -> _));
+    let files = segments.chain(services.map(|entry| (entry.path(), description as fn(&_) -> _)));
+    files
+        .filter(|(path, is_half_made)| {
+            let half_made = fs::symlink_metadata(path).is_ok_and(|metadata| is_half_made(&metadata));
+            half_made && fs::remove_file(path).is_ok()
+        })
+        .count()
+}
+
+/// Removes the files of processes that died while they joined, or while they were cleaned up after: those
+/// that iceoryx2 does not know as alive or dead. All their ports are gone by then, or were never there.
+fn remove_unknown_nodes(dir: &InstanceDir, known: &HashSet<String>) -> usize {
     let entries = fs::read_dir(dir.path.join("nodes")).into_iter().flatten().flatten();
     entries
-        .filter(|entry| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes()))
-        .all(|entry| fs::remove_file(entry.path()).is_ok())
+        .filter(|entry| {
+            let name = entry.file_name();
+            let Some(name) = name.to_str() else { return false };
+            let name = name.strip_prefix(&dir.prefix).unwrap_or(name);
+            let id = name.split('.').next().unwrap_or(name);
+            let is_id = !id.is_empty() && id.bytes().all(|byte| byte.is_ascii_digit());
+            if !is_id || known.contains(id) {
+                return false;
+            }
+            let path = entry.path();
+            if path.is_dir() { fs::remove_dir_all(path).is_ok() } else { fs::remove_file(path).is_ok() }
+        })
+        .count()
+}
+
+/// Takes away what other users may do with files in shared memory.
+fn make_private(files: &[PathBuf]) {
+    for path in files {
+        // A file that is gone belongs to a process that ends just now.
+        if let Ok(metadata) = fs::symlink_metadata(path)
+            && metadata.permissions().mode() & 0o077 != 0
+        {
+            let _ = fs::set_permissions(path, fs::Permissions::from_mode(0o600));
+        }
+    }
 }
 
 fn private_folder(path: &Path) -> Result<(), ShmError> {
-    use std::os::unix::fs::DirBuilderExt;
     match fs::DirBuilder::new().recursive(true).mode(0o700).create(path) {
         Ok(()) => Ok(()),
         Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),

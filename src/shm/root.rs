@@ -57,8 +57,8 @@ pub fn default_root(configured: Option<&Path>, env: impl Fn(&str) -> Option<OsSt
 #[derive(Clone, Debug)]
 pub(super) struct InstanceDir {
     pub(super) path: PathBuf,
-    /// With what the names of this instance's files begin, in [`SHM_DIR`] above all, which all instances of all
-    /// users share: the version of what is in them, the instance, and a hash of the folder.
+    /// With what the names of this instance's files begin, in [`SHM_DIR`] above all, which all instances of
+    /// all users share: the version of what is in them, the instance, and a hash of the folder.
     pub(super) prefix: String,
 }
 
@@ -122,8 +122,8 @@ impl InstanceDir {
             .collect()
     }
 
-    /// Removes every file of the instance but locks that are held, and says how many. Only while the instance's
-    /// lock is held exclusively: then no process of the instance is alive.
+    /// Removes every file of the instance but locks that are held, and says how many. Only while the
+    /// instance's lock is held exclusively: then no process of the instance is alive.
     pub(super) fn sweep(&self) -> usize {
         let mut removed = 0;
         for file in self.shm_files() {
@@ -258,7 +258,7 @@ impl FileLock {
         self.lock.relock(how)
     }
 
-    fn write_pid(&mut self) -> io::Result<()> {
+    pub(super) fn write_pid(&mut self) -> io::Result<()> {
         let mut file: &File = &self.lock;
         file.set_len(0)?;
         file.rewind()?;
@@ -361,8 +361,8 @@ impl Drop for Membership {
     }
 }
 
-/// The right to serve a role of an instance: `ingress`, `egress-critical`, … Held until dropped; the operating
-/// system releases it when the process dies, however it dies.
+/// The right to serve a role of an instance: `ingress`, `egress-critical`, … Held until dropped; the
+/// operating system releases it when the process dies, however it dies.
 #[derive(Debug)]
 pub struct RoleLock {
     lock: Option<FileLock>,

@@ -98,7 +98,8 @@ impl Segment {
         Ok(Self { start: start.cast(), words })
     }
 
-    /// The word at that place. The places are computed from the layout, once; one outside is a defect of ours.
+    /// The word at that place. The places are computed from the layout, once; one outside is a defect of
+    /// ours.
     pub(super) fn word(&self, at: usize) -> &AtomicU64 {
         assert!(at < self.words, "word {at} of {}", self.words);
         // SAFETY: within the mapping, which lives as long as `self`; mappings are aligned to a page, so each
@@ -133,7 +134,8 @@ pub(super) fn free_bytes() -> u64 {
     statvfs(SHM_DIR).map_or(0, |stat| stat.blocks_available() * stat.fragment_size())
 }
 
-/// Says so when shared memory has not that many bytes free: what finds none at its first touch dies of SIGBUS.
+/// Says so when shared memory has not that many bytes free: what finds none at its first touch dies of
+/// SIGBUS.
 pub(super) fn require_free(needed_bytes: u64, what: &str) -> Result<(), ShmError> {
     let free_bytes = free_bytes();
     if free_bytes < needed_bytes {
@@ -164,8 +166,8 @@ fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
     }
 }
 
-/// Gives files in shared memory all their pages now. iceoryx2 only sets the length of its segments; a page that
-/// is first touched when the file system is full is a SIGBUS in the middle of a sample.
+/// Gives files in shared memory all their pages now. iceoryx2 only sets the length of its segments; a page
+/// that is first touched when the file system is full is a SIGBUS in the middle of a sample.
 pub(super) fn commit_files(files: &[std::path::PathBuf], what: &str) -> Result<(), ShmError> {
     for path in files {
         // A file that is gone or not readable yet belongs to a process that starts or ends just now.

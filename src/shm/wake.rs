@@ -1,9 +1,9 @@
 //! How ingress wakes a lane: a futex in the boards' memory.
 //!
-//! A count of wakes, and a flag that says whether the lane sleeps. A wake counts, and calls the kernel only if
-//! the flag is up; a lane puts the flag up, looks at the count once more, and sleeps only if nothing came. Both
-//! sides write before they read, sequentially consistent, so one of them sees the other: no wake is lost. No
-//! descriptor and no buffer is involved that could fill up while a lane is stopped.
+//! A count of wakes, and a flag that says whether the lane sleeps. A wake counts, and calls the kernel only
+//! if the flag is up; a lane puts the flag up, looks at the count once more, and sleeps only if nothing came.
+//! Both sides write before they read, sequentially consistent, so one of them sees the other: no wake is
+//! lost. No descriptor and no buffer is involved that could fill up while a lane is stopped.
 //! `docs/decisions/0004-shared-memory.md` has the measurements.
 
 use std::sync::Arc;

@@ -4,11 +4,12 @@ use std::io::IsTerminal;
 
 use tracing_subscriber::EnvFilter;
 
-/// Without `RUST_LOG`: ourselves in full; of the libraries what is an error. A RELIABLE writer of RustDDS warns of
-/// each sample that its full window refuses; those are counted and named here.
+/// Without `RUST_LOG`: ourselves in full; of the libraries what is an error. A RELIABLE writer of RustDDS
+/// warns of each sample that its full window refuses; those are counted and named here.
 const DEFAULT_FILTER: &str = "info,rustdds=error,ros2_client=error,iceoryx2=error";
 
-/// Starts logging to stderr, filtered by `RUST_LOG`. What the libraries log through the `log` crate comes too.
+/// Starts logging to stderr, filtered by `RUST_LOG`. What the libraries log through the `log` crate comes
+/// too.
 pub fn start_logs() {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
     let outcome = tracing_subscriber::fmt()

@@ -11,6 +11,7 @@
 #include <mutex>
 
 volatile std::sig_atomic_t stop_requested = 0;
+volatile std::sig_atomic_t go_requested = 0;
 
 namespace {
 
@@ -140,7 +141,7 @@ std::string distribution(std::vector<int64_t> ns) {
          ",\"max\":" + microseconds(ns.back()) + "}";
 }
 
-void on_signal(int) { stop_requested = 1; }
+void on_signal(int signal) { (signal == SIGUSR1 ? go_requested : stop_requested) = 1; }
 
 int64_t clock_ns(clockid_t clock) {
   timespec now{};
@@ -156,6 +157,8 @@ Options parse_options(int argc, char** argv) {
     const std::string name = argv[at];
     if (name == "--summary") { options.summary = true; continue; }
     if (name == "--opaque") { options.opaque = true; continue; }
+    if (name == "--hold") { options.hold = true; continue; }
+    if (name == "--prime") { options.prime = true; continue; }
     if (name == "--shm") { options.shared_memory = true; continue; }
     if (at + 1 == argc) usage(name + ": unknown, or its value is missing");
     const std::string value = argv[++at];
@@ -181,6 +184,7 @@ Options parse_options(int argc, char** argv) {
     else if (name == "--payload-file") options.payload_file = value;
     else if (name == "--source-age-ms") options.source_age_s = number(name, value, 1e9) / 1e3;
     else if (name == "--wait-match") options.wait_match = static_cast<int32_t>(number(name, value, 1e6));
+    else if (name == "--heartbeat-ms") options.heartbeat_s = number(name, value, 1e6) / 1e3;
     else if (name == "--linger") options.linger_s = number(name, value, 1e6);
     else if (name == "--stall-every") options.stall_every_s = number(name, value, 1e6);
     else if (name == "--stall-for") options.stall_for_s = number(name, value, 1e6);
@@ -194,11 +198,12 @@ Options parse_options(int argc, char** argv) {
   return options;
 }
 
-void stop_on_signals() {
+void handle_signals() {
   struct sigaction action {};
   action.sa_handler = on_signal;  // no SA_RESTART: a sleep is to end
   sigaction(SIGINT, &action, nullptr);
   sigaction(SIGTERM, &action, nullptr);
+  sigaction(SIGUSR1, &action, nullptr);
 }
 
 int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
@@ -305,6 +310,14 @@ bool Publisher::next() {
   return true;
 }
 
+void Publisher::make_priming_sample() {
+  source_ns_ = realtime_ns();
+  const size_t header = options_.encapsulation.size();
+  bytes_.assign(header + 24, 0);
+  std::copy(options_.encapsulation.begin(), options_.encapsulation.end(), bytes_.begin());
+  std::memcpy(bytes_.data() + header, &priming_seq, 8);
+}
+
 void Publisher::record(bool ok, int64_t call_ns) {
   ++attempted_;
   ++(ok ? ok_ : failed_);
@@ -364,6 +377,11 @@ bool Subscriber::check(const uint8_t* payload, size_t count, uint64_t seq) {
 
 void Subscriber::take(const uint8_t* bytes, size_t count, int64_t source_ns) {
   const int64_t now_ns = monotonic_ns();
+  uint64_t seq = 0;
+  if (!options_.opaque && count >= header_bytes + 8) {
+    std::memcpy(&seq, bytes + header_bytes, 8);
+    if (seq == priming_seq) return;
+  }
   if (last_arrival_ns_ != 0) max_gap_ns_ = std::max(max_gap_ns_, now_ns - last_arrival_ns_);
   last_arrival_ns_ = now_ns;
 
@@ -378,9 +396,7 @@ void Subscriber::take(const uint8_t* bytes, size_t count, int64_t source_ns) {
 
   const bool numbered = !options_.opaque && size >= 8;
   bool good = true;
-  uint64_t seq = 0;
   if (numbered) {
-    std::memcpy(&seq, payload, 8);
     good = check(payload, size, seq);
     if (!good) ++bad_;
     if (seen_.insert(seq).second) {

@@ -33,6 +33,9 @@ struct Options {
   std::string payload_file;
   double source_age_s = 0;     // the source timestamp is so much older than the sample
   int32_t wait_match = 0;
+  bool hold = false;           // a publisher begins at SIGUSR1
+  bool prime = false;
+  double heartbeat_s = 0;      // 0 is the library's default
   double linger_s = 0;
 
   bool opaque = false;         // the payload is not a peer's: no sequence, no check
@@ -47,7 +50,9 @@ Options parse_options(int argc, char** argv);
 
 // Set by SIGINT and SIGTERM.
 extern volatile std::sig_atomic_t stop_requested;
-void stop_on_signals();
+// Set by SIGUSR1.
+extern volatile std::sig_atomic_t go_requested;
+void handle_signals();
 
 int64_t monotonic_ns();
 int64_t realtime_ns();
@@ -60,6 +65,9 @@ void emit_error(const std::string& message);
 std::string json_string(const std::string& text);
 std::string hex(const uint8_t* bytes, size_t count);
 
+// The sequence number of a sample that only opens the way for others.
+constexpr uint64_t priming_seq = UINT64_MAX;
+
 // A serialized sample: its encapsulation header and what follows. In memory both are one block, as on the wire.
 using Bytes = std::vector<uint8_t>;
 
@@ -69,6 +77,19 @@ using Bytes = std::vector<uint8_t>;
 class Publisher {
  public:
   explicit Publisher(const Options& options);
+
+  // To be called before `run`: waits for the signal of --hold; with --prime sends a sample that does not count and
+  // waits until `acknowledged(timeout_ns)`. A VOLATILE reader of Cyclone DDS takes all up to the last sample of
+  // the first heartbeat that it sees for history, and drops what of it is still on its way.
+  template <typename Write, typename Acknowledged>
+  void begin(Write write, Acknowledged acknowledged) {
+    while (options_.hold && !go_requested && !stop_requested) sleep_until(monotonic_ns() + 10'000'000);
+    if (!options_.prime) return;
+    make_priming_sample();
+    write(bytes_, source_ns_);
+    while (!stop_requested && !acknowledged(int64_t{100'000'000})) {
+    }
+  }
 
   // Hands out the samples at the rate of the options; `write(bytes, source_ns)` returns whether it succeeded.
   // Returns when all are sent or a signal came.
@@ -97,6 +118,7 @@ class Publisher {
 
  private:
   bool next();
+  void make_priming_sample();
   void record(bool ok, int64_t call_ns);
   void finish_sending();
 

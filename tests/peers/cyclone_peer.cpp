@@ -217,10 +217,13 @@ int publish(const Options& options, dds_entity_t participant) {
     sleep_until(monotonic_ns() + 10'000'000);
   }
   Publisher publisher(options);
-  publisher.run([&](const Bytes& bytes, int64_t source_ns) {
+  const auto write = [&](const Bytes& bytes, int64_t source_ns) {
     return dds_write_ts(writer, &bytes, source_ns) == DDS_RETCODE_OK;
-  });
-  publisher.linger([&](int64_t timeout_ns) { return dds_wait_for_acks(writer, timeout_ns) == DDS_RETCODE_OK; });
+  };
+  const auto acknowledged = [&](int64_t timeout_ns) { return dds_wait_for_acks(writer, timeout_ns) == DDS_RETCODE_OK; };
+  publisher.begin(write, acknowledged);
+  publisher.run(write);
+  publisher.linger(acknowledged);
   publisher.print_summary();
   return 0;
 }
@@ -464,7 +467,7 @@ std::string configuration(const Options& options) {
 
 int main(int argc, char** argv) {
   const Options options = parse_options(argc, argv);
-  stop_on_signals();
+  handle_signals();
   setenv("CYCLONEDDS_URI", configuration(options).c_str(), 0);
   const dds_entity_t participant = check("participant", dds_create_participant(options.domain, nullptr, nullptr));
   int code = 0;

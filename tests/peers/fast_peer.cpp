@@ -124,6 +124,9 @@ void set_qos(Qos& qos, const Options& options) {
 int publish(const Options& options, fast::DomainParticipant* participant, fast::Topic* topic, Events& events) {
   fast::DataWriterQos qos = fast::DATAWRITER_QOS_DEFAULT;
   set_qos(qos, options);
+  if (options.heartbeat_s > 0) {
+    qos.reliable_writer_qos().times.heartbeatPeriod = Duration_t(static_cast<long double>(options.heartbeat_s));
+  }
   fast::Publisher* parent = participant->create_publisher(fast::PUBLISHER_QOS_DEFAULT);
   fast::DataWriter* writer = parent == nullptr ? nullptr : parent->create_datawriter(topic, qos, &events);
   if (writer == nullptr) {
@@ -133,18 +136,21 @@ int publish(const Options& options, fast::DomainParticipant* participant, fast::
   emit("{\"event\":\"ready\"}");
   while (!stop_requested && events.matched < options.wait_match) sleep_until(monotonic_ns() + 10'000'000);
   Publisher publisher(options);
-  publisher.run([&](const Bytes& bytes, int64_t source_ns) {
+  const auto write = [&](const Bytes& bytes, int64_t source_ns) {
     rtps::WriteParams params;
     rtps::Time_t source_time;
     source_time.from_ns(source_ns);
     params.source_timestamp(source_time);
     return writer->write(const_cast<Bytes*>(&bytes), params);
-  });
-  publisher.linger([&](int64_t timeout_ns) {
+  };
+  const auto acknowledged = [&](int64_t timeout_ns) {
     const Duration_t timeout(static_cast<int32_t>(timeout_ns / 1'000'000'000),
                                   static_cast<uint32_t>(timeout_ns % 1'000'000'000));
     return writer->wait_for_acknowledgments(timeout) == ReturnCode_t::RETCODE_OK;
-  });
+  };
+  publisher.begin(write, acknowledged);
+  publisher.run(write);
+  publisher.linger(acknowledged);
   publisher.print_summary();
   return 0;
 }
@@ -179,7 +185,7 @@ int subscribe(const Options& options, fast::DomainParticipant* participant, fast
 
 int main(int argc, char** argv) {
   const Options options = parse_options(argc, argv);
-  stop_on_signals();
+  handle_signals();
   if (options.role == "graph") {
     emit_error("fast_peer has no role graph; cyclone_peer has");
     return 2;

@@ -5,6 +5,7 @@ use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use adaptive_bridge::shm::default_root;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -17,14 +18,17 @@ pub fn program() -> &'static Path {
 }
 
 /// One bridge: an instance name, and a folder with its configuration file.
+///
+/// Declare it before its processes: they are killed when they are dropped and leave their shared memory
+/// behind, which is removed with the bridge.
 pub struct Bridge {
     instance: String,
     folder: TempDir,
 }
 
 impl Bridge {
-    /// A bridge of its own, not started yet. In `yaml`, `{instance}` becomes a name that no other bridge has, and
-    /// `{folder}` the folder of the file, which is removed with the bridge.
+    /// A bridge of its own, not started yet. In `yaml`, `{instance}` becomes a name that no other bridge has,
+    /// and `{folder}` the folder of the file, which is removed with the bridge.
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -59,7 +63,6 @@ impl Bridge {
     /// Completes a command line such as `egress --lane critical` with `--config`.
     fn complete(&self, mut command: Command, arguments: &str) -> Command {
         command.args(arguments.split_whitespace()).arg("--config").arg(self.config());
-        command.env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "info".to_owned()));
         command.env("NO_COLOR", "1");
         command
     }
@@ -81,9 +84,10 @@ impl Bridge {
         self.complete(Command::new(program()), arguments).output().unwrap()
     }
 
-    /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no host.
+    /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no
+    /// host.
     pub fn try_status(&self) -> Result<Value, String> {
-        let output = self.run("status --json");
+        let output = self.run("status --json --interval-ms 50");
         let said = || String::from_utf8_lossy(&output.stderr).into_owned();
         if !output.status.success() {
             return Err(format!("{}: {}", output.status, said()));
@@ -109,5 +113,19 @@ impl Bridge {
             assert!(Instant::now() < deadline, "waited in vain for: {what}; the last status: {status:?}");
             std::thread::sleep(Duration::from_millis(50));
         }
+    }
+}
+
+impl Drop for Bridge {
+    fn drop(&mut self) {
+        let prefix = format!("ab1_{}_", self.instance);
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+        // Where the configuration names no root below the bridge's own folder.
+        let root = default_root(None, |name| std::env::var_os(name));
+        let _ = std::fs::remove_dir_all(root.join(&self.instance));
     }
 }

@@ -6,6 +6,7 @@
 // Every test binary compiles this module and uses a part of it.
 #![allow(dead_code)]
 
+pub mod bed;
 pub mod bridge;
 pub mod netns;
 pub mod peer;
@@ -65,7 +66,8 @@ pub fn skip_into(list: &Path, ci: bool, test: &str, reason: &str) {
     writeln!(file, "{test}: {reason}").unwrap();
 }
 
-/// Why tests between hosts can't run on this machine: no right to make network namespaces, or a peer not built.
+/// Why tests between hosts can't run on this machine: no right to make network namespaces, or a peer not
+/// built.
 pub fn testbed_missing() -> Option<String> {
     netns::requires_root().or_else(peer::missing)
 }
@@ -73,10 +75,11 @@ pub fn testbed_missing() -> Option<String> {
 /// Held by one test at a time over all test programs of this source tree.
 pub struct Exclusive(#[allow(dead_code)] Flock<File>);
 
-/// Waits until no other test holds it. [`netns::Net`] has it built in; a test takes it once, else it waits for
-/// itself for ever.
+/// Waits until no other test holds it. [`netns::Net`] has it built in; a test takes it once, else it waits
+/// for itself for ever.
 ///
-/// It makes tests that load the machine run one after another under any runner, whatever its number of threads.
+/// It makes tests that load the machine run one after another under any runner, whatever its number of
+/// threads.
 pub fn exclusive() -> Exclusive {
     fs::create_dir_all(target_dir()).unwrap();
     let file = File::create(target_dir().join("testbed.lock")).unwrap();

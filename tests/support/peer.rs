@@ -5,6 +5,7 @@ use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use nix::sys::signal::Signal;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -38,8 +39,8 @@ impl Library {
     }
 }
 
-/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948 bytes
-/// at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
+/// The command line of a peer: domain 0, topic `rt/scan`, LaserScan, RELIABLE, VOLATILE, KEEP_LAST 10, 2,948
+/// bytes at 100 Hz, and only a summary, unless told otherwise. `tests/peers/README.md` has all of it.
 #[derive(Clone, Debug)]
 #[must_use]
 pub struct Peer {
@@ -196,6 +197,25 @@ impl Peer {
         self.option("--wait-match", subscribers)
     }
 
+    /// A publisher begins at [`RunningPeer::go`]. That the writer knows the reader does not mean that the
+    /// reader knows the writer yet, and a VOLATILE reader gets nothing from before.
+    pub fn hold(mut self) -> Peer {
+        self.arguments.push("--hold".to_owned());
+        self
+    }
+
+    /// A publisher first sends a sample that does not count and waits for its acknowledgement: a VOLATILE
+    /// reader of Cyclone DDS loses samples that are on their way when it sees the writer's first heartbeat.
+    pub fn prime(mut self) -> Peer {
+        self.arguments.push("--prime".to_owned());
+        self
+    }
+
+    /// The period of a RELIABLE writer's heartbeats in Fast DDS; its default is 3 s.
+    pub fn heartbeat_ms(self, period_ms: u64) -> Peer {
+        self.option("--heartbeat-ms", period_ms)
+    }
+
     /// A publisher stays for so many seconds after its last sample was acknowledged.
     pub fn linger_s(self, seconds: f64) -> Peer {
         self.option("--linger", seconds)
@@ -290,6 +310,11 @@ impl RunningPeer {
     /// Waits until so many endpoints match it.
     pub fn wait_matched(&self, endpoints: u64) {
         super::wait_until(&format!("{endpoints} matched endpoints"), || self.matched() == endpoints);
+    }
+
+    /// Lets a publisher begin that was held back by [`Peer::hold`].
+    pub fn go(&self) {
+        self.process.signal(Signal::SIGUSR1);
     }
 
     /// What a subscriber has received so far, without duplicates; up to 100 ms late.

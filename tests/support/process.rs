@@ -60,8 +60,8 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started it
-    /// ends.
+    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started
+    /// it ends.
     pub fn spawn(name: &str, mut command: Command) -> Process {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
         // SAFETY: between fork and exec the closure makes one system call (prctl), which is
@@ -147,8 +147,8 @@ impl Process {
         self.stderr.state.lock().unwrap().lines.join("\n")
     }
 
-    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number of
-    /// the line after it. Panics with the last lines when patience or the output ends.
+    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number
+    /// of the line after it. Panics with the last lines when patience or the output ends.
     pub fn wait_for_line<T>(
         &self,
         what: &str,
@@ -193,4 +193,10 @@ impl Drop for Process {
             eprintln!("--- {}, end of its output:\n{tail}\n--- its log:\n{}\n---", self.name, self.log());
         }
     }
+}
+
+/// Sends a signal to a process that is not a child of the test, such as a child of `up`.
+pub fn signal(pid: i32, signal: Signal) {
+    nix::sys::signal::kill(Pid::from_raw(pid), signal)
+        .unwrap_or_else(|error| panic!("{signal} to {pid}: {error}"));
 }

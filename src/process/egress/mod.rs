@@ -1,9 +1,9 @@
-//! Egress: one lane. Takes the samples of its routes out of shared memory and hands them to DDS writers of its
-//! own.
+//! Egress: one lane. Takes the samples of its routes out of shared memory and hands them to DDS writers of
+//! its own.
 //!
-//! The role runs once for each lane, critical or not; that the processes are separate is what isolates them, not
-//! that the code is. How a lane chooses what to send and when is [`critical`] and [`noncritical`]; how a sample
-//! is handed over and accounted for is [`output`].
+//! The role runs once for each lane, critical or not; that the processes are separate is what isolates them,
+//! not that the code is. How a lane chooses what to send and when is [`critical`] and [`noncritical`]; how a
+//! sample is handed over and accounted for is [`output`].
 
 mod critical;
 mod late_joiners;
@@ -28,8 +28,8 @@ use critical::Critical;
 use noncritical::Noncritical;
 use output::Output;
 
-/// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping it
-/// stays well within the second that a role has to end.
+/// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping
+/// it stays well within the second that a role has to end.
 const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 
 /// What a turn of a lane came to.

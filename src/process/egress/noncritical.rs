@@ -113,8 +113,8 @@ fn take_in(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
     }
 }
 
-/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms), of which no sample
-/// is too old to matter and none replaces another: it is sent in order, at the lane's rate.
+/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms), of which no
+/// sample is too old to matter and none replaces another: it is sent in order, at the lane's rate.
 fn rates_of(lane: LaneRates, durability: Durability) -> LaneRates {
     let mut rates = lane;
     if durability == Durability::TransientLocal {

@@ -113,8 +113,8 @@ impl Output {
     }
 
     /// The next sample that is not accounted for yet. What is missing before it is counted here; what was
-    /// forwarded before a restart is not returned, but for a TRANSIENT_LOCAL output it is written again, because
-    /// the new writer has to have it for late joiners.
+    /// forwarded before a restart is not returned, but for a TRANSIENT_LOCAL output it is written again,
+    /// because the new writer has to have it for late joiners.
     pub fn take(&mut self) -> Option<ShmSample> {
         loop {
             let sample = match self.subscriber.take() {
@@ -262,8 +262,8 @@ impl Output {
                         lane = self.lane,
                         topic = self.dds_topic,
                         ?reader,
-                        "a reader asks for more than this lane offers and gets nothing: change its QoS or the \
-                         lane's"
+                        "a reader asks for more than this lane offers and gets nothing: change its QoS or \
+                         the lane's"
                     );
                 }
             }
@@ -279,7 +279,13 @@ impl Output {
                 let written =
                     writer.write_to(reader, kept.payload.clone(), kept.encapsulation, kept.timestamp);
                 if let Err(failure) = written {
-                    warn!(route = self.id, lane = self.lane, ?reader, %failure, "history not sent to a late joiner");
+                    warn!(
+                        route = self.id,
+                        lane = self.lane,
+                        ?reader,
+                        %failure,
+                        "history not sent to a late joiner"
+                    );
                 }
             }
         }
@@ -355,8 +361,8 @@ fn account(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.last_sequence = tracker.last();
 }
 
-/// A critical lane that misses samples was too slow. A noncritical one sleeps until it has a token, and what is
-/// overwritten meanwhile gave way as its drop policy has it.
+/// A critical lane that misses samples was too slow. A noncritical one sleeps until it has a token, and what
+/// is overwritten meanwhile gave way as its drop policy has it.
 const fn gap_reason(class: TrafficClass, policy: DropPolicy) -> DropReason {
     match (class, policy) {
         (TrafficClass::Critical, _) => DropReason::QueueOverflow,

@@ -50,6 +50,8 @@ pub(super) struct Input {
     route: Route,
     source: Source,
     connection: Option<Connection>,
+    /// The type that the lanes have writers for: once read, it stays.
+    settled_type: Option<String>,
     publisher: SamplePublisher,
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
@@ -64,7 +66,6 @@ pub(super) struct Input {
 
 struct Connection {
     reader: RawReader,
-    dds_type: String,
     qos: ReaderQos,
 }
 
@@ -79,6 +80,7 @@ impl Input {
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
             connection: None,
+            settled_type: None,
             publisher: SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?,
             watch: DropWatch::new(counters.get().drops),
             counters,
@@ -235,21 +237,15 @@ impl Input {
     }
 
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
-        let configured_type = self.configured_type.as_deref();
-        // Once a type is read it stays, whoever else claims the topic.
-        let settled = self.connection.as_ref().map(|connection| connection.dds_type.as_str());
-        if let Some(dds_type) = settled.or(configured_type)
+        let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
+        if let Some(dds_type) = known_type
             && let Some(other) = self.source.of_other_type(dds_type)
         {
             let conflict = (dds_type.to_owned(), other.dds_type.clone());
             self.report_conflict(conflict);
         }
-        let settled = self.connection.as_ref().map(|connection| connection.dds_type.clone());
-        let wanted = self.source.wanted(
-            settled.as_deref().or(self.configured_type.as_deref()),
-            &self.route.input_qos,
-            self.route.max_sample_bytes,
-        );
+        let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
+        let wanted = self.source.wanted(known_type, &self.route.input_qos, self.route.max_sample_bytes);
         match wanted {
             Wanted::Reader { dds_type, qos } => {
                 if self.connection.as_ref().is_some_and(|current| still_suits(&current.qos, &qos)) {
@@ -262,7 +258,10 @@ impl Input {
                 Ok(())
             }
             Wanted::Unknown => {
-                if self.connection.is_none() && now >= self.remind_at {
+                // The last publisher is gone. The next one may offer more, and nothing is lost by asking
+                // anew.
+                self.disconnect(participant);
+                if now >= self.remind_at {
                     info!(
                         route = self.id,
                         topic = self.dds_topic,
@@ -282,17 +281,7 @@ impl Input {
         dds_type: String,
         qos: ReaderQos,
     ) -> Result<(), RoleError> {
-        if let Some(former) = self.connection.take() {
-            info!(
-                route = self.id,
-                from = label(former.qos.reliability, former.qos.durability),
-                to = label(qos.reliability, qos.durability),
-                "the reader follows what the publishers offer"
-            );
-            let guid = former.reader.guid();
-            drop(former);
-            participant.forget(guid);
-        }
+        self.disconnect(participant);
         // Before the reader: a lane must be able to make its writer before the first sample reaches it.
         self.info.update(|info| info.dds_type = FixedText::new(&dds_type));
         let reader = participant.create_reader(&self.dds_topic, &dds_type, &qos)?;
@@ -305,8 +294,18 @@ impl Input {
             "reading"
         );
         self.bell.rung.store(true, Ordering::Release);
-        self.connection = Some(Connection { reader, dds_type, qos });
+        self.settled_type = Some(dds_type);
+        self.connection = Some(Connection { reader, qos });
         Ok(())
+    }
+
+    fn disconnect(&mut self, participant: &mut Participant) {
+        if let Some(former) = self.connection.take() {
+            let guid = former.reader.guid();
+            drop(former);
+            participant.forget(guid);
+            self.counters.update(|counters| counters.writers = 0);
+        }
     }
 
     fn report_conflict(&mut self, conflict: (String, String)) {
@@ -331,8 +330,8 @@ struct Followed {
 }
 
 impl Followed {
-    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began to
-    /// follow is not missing.
+    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began
+    /// to follow is not missing.
     fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
         if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == writer) {
             let missing = sequence.saturating_sub(*last).saturating_sub(1).max(0);

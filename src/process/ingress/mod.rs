@@ -84,6 +84,14 @@ impl Ingress {
 
     /// Handles what is there; whether anything was.
     fn turn(&mut self) -> bool {
+        let now = clock::monotonic();
+        // First, because it may connect a route, whose reader must be looked at before sleeping: a new reader
+        // rings nobody yet.
+        if now >= self.housekeeping_at
+            && let Err(error) = self.keep_house(now)
+        {
+            tracing::error!(%error, "housekeeping failed");
+        }
         let mut busy = false;
         for route in 0..self.inputs.len() {
             for _ in 0..SAMPLES_PER_TURN {
@@ -93,19 +101,13 @@ impl Ingress {
                 busy = true;
             }
         }
-        let now = clock::monotonic();
-        if now >= self.housekeeping_at
-            && let Err(error) = self.keep_house(now)
-        {
-            tracing::error!(%error, "housekeeping failed");
-        }
         busy
     }
 
     /// Sleeps until a sample arrives or housekeeping is due.
     fn sleep(&mut self) {
-        // An arrival after the last look rings the bell of its route, and a bell that was rung keeps `park` from
-        // sleeping; so nothing is slept through.
+        // An arrival after the last look rings the bell of its route, and a bell that was rung keeps `park`
+        // from sleeping; so nothing is slept through.
         let wait_ns = self.housekeeping_at.since(clock::monotonic());
         if wait_ns > 0 {
             std::thread::park_timeout(Duration::from_nanos(wait_ns));

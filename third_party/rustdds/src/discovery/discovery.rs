@@ -733,6 +733,8 @@ impl Discovery {
       );
       match self.poll.poll(&mut events, Some(poll_timeout)) {
         Ok(_) => (),
+        // See dp_event_loop: the process was stopped and goes on.
+        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => events.clear(),
         Err(e) => {
           error!("Failed in waiting of poll in discovery. {e:?}");
           return;

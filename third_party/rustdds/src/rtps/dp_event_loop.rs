@@ -305,6 +305,9 @@ impl DPEventLoop {
       let poll_timeout = timeout_until(ev_wrapper.shared_timer.borrow().next_deadline(), idle_cap);
       match ev_wrapper.poll.poll(&mut events, Some(poll_timeout)) {
         Ok(_) => {}
+        // A process that was stopped and goes on (SIGSTOP and SIGCONT, a debugger, a suspended machine) has its
+        // epoll_wait interrupted, although no signal handler ran (signal(7)). There are no events then.
+        Err(e) if e.kind() == std::io::ErrorKind::Interrupted => events.clear(),
         Err(e) => {
           error!("dp_event_loop poll failed: {e:?}");
           break;

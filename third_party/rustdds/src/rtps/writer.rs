@@ -1805,6 +1805,15 @@ impl Writer {
 
     let mut blocked: BTreeSet<SocketId> = BTreeSet::new();
 
+    // User data goes to each reader by unicast. Multicast over Wi-Fi is sent at
+    // the lowest rate and never repeated by the link layer, and it loads every
+    // host on the network.
+    let preferred_mode = if self.my_guid.entity_id.kind().is_built_in() {
+      preferred_mode
+    } else {
+      DeliveryMode::Unicast
+    };
+
     #[cfg(feature = "security")]
     let encoded = self.security_encode(message, &readers);
     #[cfg(not(feature = "security"))]

@@ -1,0 +1,37 @@
+# The commands of this project; `make test` is what must pass.
+FUZZ_SECONDS ?= 20
+
+build:
+	cargo build --locked --release
+
+setup:
+	scripts/setup.sh
+
+# The DDS peers of the integration tests.
+peers:
+	$(MAKE) --no-print-directory -C tests/peers
+
+# Sets up, builds and runs everything: lints, unit, property and integration tests, and a bounded fuzz run.
+test:
+	FUZZ_SECONDS=$(FUZZ_SECONDS) scripts/test.sh
+
+lint:
+	cargo fmt --check
+	cargo clippy --locked --all-targets --all-features -- -D warnings
+	RUSTDOCFLAGS='-D warnings' cargo doc --locked --no-deps --all-features
+
+# A publisher, a critical and a slow subscriber, first without and then with the bridge. No ROS 2, no root.
+demo: build
+	target/release/adaptive-bridge demo
+
+bench:
+	cargo bench --locked
+
+fuzz:
+	scripts/fuzz.sh $(FUZZ_SECONDS)
+
+clean:
+	cargo clean
+	$(MAKE) --no-print-directory -C tests/peers clean
+
+.PHONY: build setup peers test lint demo bench fuzz clean

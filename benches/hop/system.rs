@@ -1,0 +1,182 @@
+//! Where and how the programs run, and what machine it is.
+
+use std::fs;
+use std::process::Command;
+
+use nix::errno::Errno;
+use nix::libc;
+use nix::sched::{CpuSet, sched_setaffinity};
+use nix::time::{ClockId, ClockNanosleepFlags, clock_nanosleep};
+use nix::unistd::Pid;
+
+use super::Options;
+
+/// Which CPU each stage of a sample's way has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Placement {
+    /// Each stage on the other CPU than the one before, so that every hand-over crosses CPUs, as the
+    /// eventfd's does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
+    Alternating,
+    /// Publisher and subscriber on CPU 0, relay or bridge on CPU 1: what the bridge does is all on one CPU.
+    Split,
+    /// Wherever the kernel puts them.
+    Free,
+}
+
+impl Placement {
+    pub fn parse(text: &str) -> Result<Self, String> {
+        match text {
+            "alternating" => Ok(Self::Alternating),
+            "split" => Ok(Self::Split),
+            "free" => Ok(Self::Free),
+            other => Err(format!("{other} is no placement: alternating, split or free")),
+        }
+    }
+
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Alternating => "alternating",
+            Self::Split => "split",
+            Self::Free => "free",
+        }
+    }
+
+    /// The CPU of the publisher (stage 0), of the stages between, and of the subscriber (the last stage).
+    pub fn cpu(self, stage: usize, stages: usize) -> Option<usize> {
+        match self {
+            Self::Alternating => Some(stage % 2),
+            Self::Split => Some(usize::from(stage > 0 && stage + 1 < stages)),
+            Self::Free => None,
+        }
+    }
+}
+
+/// How the programs are scheduled; the same for all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scheduling {
+    Other,
+    /// SCHED_FIFO with priority 50: what other programs do on the machine no longer shows.
+    Fifo,
+}
+
+impl Scheduling {
+    pub fn parse(text: &str) -> Result<Self, String> {
+        match text {
+            "other" => Ok(Self::Other),
+            "fifo" => Ok(Self::Fifo),
+            other => Err(format!("{other} is no scheduling: other or fifo")),
+        }
+    }
+
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Other => "other",
+            Self::Fifo => "fifo",
+        }
+    }
+}
+
+pub const FIFO_PRIORITY: i32 = 50;
+
+/// A CPU and a scheduling policy for one program, as it crosses the command line.
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    pub cpu: Option<usize>,
+    pub scheduling: Scheduling,
+}
+
+impl Place {
+    /// For one end of the eventfd: always the two CPUs, unless nothing is pinned.
+    pub fn of(options: &Options, end: usize) -> Self {
+        let cpu = (options.placement != Placement::Free).then_some(end);
+        Self { cpu, scheduling: options.scheduling }
+    }
+
+    pub fn to_argument(self) -> String {
+        let cpu = self.cpu.map_or("any".to_owned(), |cpu| cpu.to_string());
+        format!("{cpu}:{}", self.scheduling.label())
+    }
+
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let (cpu, scheduling) = text.split_once(':').ok_or("a place is CPU:SCHEDULING")?;
+        Ok(Self { cpu: cpu.parse().ok(), scheduling: Scheduling::parse(scheduling)? })
+    }
+
+    /// Applies to this thread and those that it starts. What is refused is said: the figures would mean
+    /// something else.
+    pub fn apply(self) {
+        if let Some(cpu) = self.cpu {
+            let mut set = CpuSet::new();
+            let outcome = set.set(cpu).and_then(|()| sched_setaffinity(Pid::from_raw(0), &set));
+            if let Err(error) = outcome {
+                eprintln!("bench: not pinned to CPU {cpu}: {error}");
+            }
+        }
+        if self.scheduling == Scheduling::Fifo {
+            // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
+            let outcome = unsafe {
+                let mut param: libc::sched_param = std::mem::zeroed();
+                param.sched_priority = FIFO_PRIORITY;
+                libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param)
+            };
+            if let Err(error) = Errno::result(outcome) {
+                eprintln!("bench: no SCHED_FIFO: {error}");
+            }
+        }
+        let _ = nix::sys::prctl::set_timerslack(1);
+    }
+}
+
+/// Sleeps until that instant of CLOCK_MONOTONIC.
+pub fn sleep_until(instant_ns: u64) {
+    let until = libc::timespec {
+        tv_sec: (instant_ns / 1_000_000_000) as i64,
+        tv_nsec: (instant_ns % 1_000_000_000) as i64,
+    };
+    while let Err(Errno::EINTR) =
+        clock_nanosleep(ClockId::CLOCK_MONOTONIC, ClockNanosleepFlags::TIMER_ABSTIME, &until.into())
+    {}
+}
+
+/// What the figures depend on.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Machine {
+    pub cpu: String,
+    pub cpus: usize,
+    pub kernel: String,
+    pub commit: String,
+    pub command: String,
+    pub load_average: String,
+    pub rmem_max: String,
+}
+
+impl Machine {
+    pub fn look() -> Self {
+        let read =
+            |path: &str| fs::read_to_string(path).map(|text| text.trim().to_owned()).unwrap_or_default();
+        let cpu = read("/proc/cpuinfo")
+            .lines()
+            .find_map(|line| {
+                line.strip_prefix("model name")?.split(':').nth(1).map(|name| name.trim().to_owned())
+            })
+            .unwrap_or_default();
+        let git = |arguments: &[&str]| {
+            let output =
+                Command::new("git").args(arguments).output().ok().filter(|output| output.status.success());
+            output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned()).unwrap_or_default()
+        };
+        let changed = !git(&["status", "--porcelain", "--untracked-files=no"]).is_empty();
+        Self {
+            cpu,
+            cpus: std::thread::available_parallelism().map_or(0, usize::from),
+            kernel: read("/proc/sys/kernel/osrelease"),
+            commit: git(&["rev-parse", "--short=12", "HEAD"]) + if changed { " with changes" } else { "" },
+            command: std::iter::once("cargo bench --".to_owned())
+                .chain(std::env::args().skip(1).filter(|argument| argument != "--bench"))
+                .collect::<Vec<_>>()
+                .join(" "),
+            load_average: read("/proc/loadavg"),
+            rmem_max: read("/proc/sys/net/core/rmem_max"),
+        }
+    }
+}

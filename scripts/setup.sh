@@ -1,0 +1,110 @@
+#!/bin/sh
+# Installs what building and testing need and this machine lacks (Debian and Ubuntu). Safe to run again.
+#
+# It asks for root by sudo only when a package is missing. Without root it says what will not run, and goes on.
+set -eu
+
+say() { echo "setup: $*"; }
+has() { command -v "$1" >/dev/null 2>&1; }
+
+# Where Debian keeps ip and iptables, which is not in every user's path, and where rustup keeps cargo.
+PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin:${CARGO_HOME:-$HOME/.cargo}/bin"
+
+has_header() { [ -e "/usr/include/$1" ] || [ -e "/usr/local/include/$1" ]; }
+
+# Each line: whether it is there, the packages that bring it (the first that exists is taken), what needs it.
+missing=""
+lacking=""
+need() {
+    check=$1 packages=$2 purpose=$3
+    if eval "$check"; then return 0; fi
+    missing="$missing $packages"
+    lacking="$lacking
+  $packages: $purpose"
+}
+check_all() {
+    missing="" lacking=""
+    need "has cc" build-essential "to link Rust programs"
+    need "has g++" build-essential "the DDS peers of the tests, fuzzing"
+    need "has make" build-essential "make"
+    need "has pkg-config" pkg-config "building"
+    need "has_header dds/ddsi/ddsi_serdata.h" cyclonedds-dev "tests between hosts (Cyclone DDS peer)"
+    need "has ddsperf" cyclonedds-tools "measuring Cyclone DDS by itself"
+    need "has_header fastdds/dds/topic/TopicDataType.hpp" "libfastrtps-dev|libfastdds-dev" \
+        "tests between hosts (Fast DDS peer)"
+    need "has_header fastcdr/Cdr.h" libfastcdr-dev "tests between hosts (Fast DDS peer)"
+    need "has ip" iproute2 "tests between hosts (network namespaces)"
+    need "has nsenter" util-linux "tests between hosts (network namespaces)"
+    need "has iptables" iptables "tests with a lossy link"
+}
+
+# The first of 'a|b' that the package lists know.
+existing() {
+    for package in $(echo "$1" | tr '|' ' '); do
+        if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; return 0; fi
+    done
+}
+
+install_missing() {
+    if ! has apt-get; then
+        say "this is not Debian or Ubuntu; these have to be installed by hand:$lacking"
+        return 0
+    fi
+    as_root=""
+    if [ "$(id -u)" -ne 0 ]; then
+        if has sudo && { sudo -n true 2>/dev/null || [ -t 0 ]; }; then
+            as_root="sudo"
+        else
+            return 0
+        fi
+    fi
+    say "missing:$lacking"
+    say "apt-get update${as_root:+ (by sudo)}"
+    $as_root apt-get update -qq || say "apt-get update failed; trying with the package lists of before"
+    packages=""
+    for names in $(echo "$missing" | tr ' ' '\n' | sort -u); do
+        package=$(existing "$names")
+        if [ -n "$package" ]; then packages="$packages $package"; fi
+    done
+    if [ -z "$packages" ]; then return 0; fi
+    say "apt-get install$packages"
+    # The list is words.
+    # shellcheck disable=SC2086
+    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $packages \
+        || say "apt-get install failed"
+}
+
+check_all
+if [ -n "$missing" ]; then
+    install_missing
+    check_all
+fi
+if [ -n "$missing" ]; then
+    say "******** not installed (no root, or not in this system's packages); what needs it will not run:$lacking"
+fi
+if ! has cc; then
+    say "error: a C compiler is needed to link Rust programs: apt-get install build-essential"
+    exit 1
+fi
+
+if ! has cargo; then
+    say "error: the Rust toolchain is missing; install it, then run this again:"
+    say "  curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs | sh -s -- -y"
+    exit 1
+fi
+for component in clippy rustfmt; do
+    case $component in clippy) tool=clippy ;; *) tool=fmt ;; esac
+    if cargo $tool --version >/dev/null 2>&1; then continue; fi
+    if has rustup; then
+        say "rustup component add $component"
+        rustup component add $component
+    else
+        say "error: cargo $tool is missing; install $component of your Rust toolchain"
+        exit 1
+    fi
+done
+if ! cargo fuzz --version >/dev/null 2>&1; then
+    say "cargo install cargo-fuzz --locked"
+    cargo install cargo-fuzz --locked
+fi
+say "done"

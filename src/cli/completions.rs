@@ -1,0 +1,28 @@
+//! `completions`: what a shell needs to complete command lines of this program.
+
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use clap::{Args, CommandFactory};
+use clap_complete::Shell;
+
+use super::{Cli, output_ended};
+
+/// What `completions` is asked.
+#[derive(Args, Debug)]
+pub(super) struct Arguments {
+    /// The shell
+    shell: Shell,
+}
+
+pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    let mut command = Cli::command();
+    let name = command.get_name().to_owned();
+    // Into memory first: the generator panics where it cannot write.
+    let mut script = Vec::new();
+    clap_complete::generate(arguments.shell, &mut command, name, &mut script);
+    match io::stdout().write_all(&script) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => output_ended(&error),
+    }
+}

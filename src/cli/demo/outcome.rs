@@ -1,0 +1,171 @@
+//! Both phases side by side: as text, and as JSON.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::scan::SCAN_BYTES;
+use super::tally::{Figures, Quantiles};
+use super::{HISTORY_SCANS, MAX_BLOCKING_MS, RATE_HZ, STALL_EVERY_MS, STALL_MS};
+use crate::model::DropReason;
+
+/// The remote lane's work, so that nobody takes it for a fault.
+const SUPERSEDED: &str = "Superseded: when the remote lane was due to send, 10 times a second, there was a \
+                          fresher scan, and it sent that one.";
+
+/// What the demo found.
+#[derive(Debug, Serialize)]
+pub(super) struct Outcome {
+    pub seconds_per_phase: u64,
+    pub scan_rate_hz: u64,
+    pub scan_bytes: usize,
+    pub history_scans: usize,
+    pub max_blocking_ms: u64,
+    pub stall_ms: u64,
+    pub stall_every_ms: u64,
+    pub without_bridge: Figures,
+    pub with_bridge: Figures,
+    /// Whether the run showed what the bridge is for.
+    pub shown: bool,
+    /// The run in a sentence.
+    pub summary: String,
+}
+
+impl Outcome {
+    pub fn new(seconds_per_phase: u64, without_bridge: Figures, with_bridge: Figures) -> Self {
+        Self {
+            seconds_per_phase,
+            scan_rate_hz: RATE_HZ,
+            scan_bytes: SCAN_BYTES,
+            history_scans: HISTORY_SCANS,
+            max_blocking_ms: MAX_BLOCKING_MS,
+            stall_ms: STALL_MS,
+            stall_every_ms: STALL_EVERY_MS,
+            shown: hurt(&without_bridge) && !hurt(&with_bridge),
+            summary: summary(&without_bridge, &with_bridge),
+            without_bridge,
+            with_bridge,
+        }
+    }
+
+    /// The comparison, at most 79 columns wide.
+    pub fn text(&self) -> String {
+        let (without, with) = (&self.without_bridge, &self.with_bridge);
+        let mut text = String::new();
+        let mut row = |label: &str, without: &str, with: &str| {
+            // Writing to a string cannot fail.
+            let _ = writeln!(text, "  {label:<37}{without:>18}{with:>18}");
+        };
+        row("", "without bridge", "with bridge");
+        let both = |figure: &dyn Fn(&Figures) -> String| [figure(without), figure(with)];
+        let rows: [(&str, [String; 2]); 10] = [
+            ("publisher: scans written", both(&|one| format!("{:.1} Hz", one.publisher.rate_hz))),
+            ("publisher: longest publish call", both(&|one| latency(one.publisher.call_max_ms))),
+            (
+                "critical: scans received",
+                both(&|one| format!("{} of {}", one.critical.received, one.publisher.due)),
+            ),
+            ("critical: scans lost", both(&|one| one.critical.lost.to_string())),
+            ("critical: longest silence", both(&|one| format!("{:.2} s", one.critical.silence_max_ms / 1e3))),
+            ("critical: latency p50", both(&|one| quantile(one, |all| all.p50))),
+            ("                  p95", both(&|one| quantile(one, |all| all.p95))),
+            ("                  p99", both(&|one| quantile(one, |all| all.p99))),
+            ("                  max", both(&|one| quantile(one, |all| all.max))),
+            ("remote: scans received", both(&|one| one.remote.received.to_string())),
+        ];
+        for (label, [without, with]) in &rows {
+            row(label, without, with);
+        }
+        if let Some(drops) = &with.drops {
+            let processes = [
+                ("ingress", &drops.ingress),
+                ("critical lane", &drops.critical),
+                ("remote lane", &drops.noncritical),
+            ];
+            for (process, dropped) in processes {
+                if dropped.is_empty() {
+                    row(&format!("drops, {process}"), "", "none");
+                }
+                for (name, count) in dropped {
+                    row(&format!("drops, {process}: {name}"), "", &count.to_string());
+                }
+            }
+            if drops.noncritical.contains_key(DropReason::Superseded.label()) {
+                let _ = writeln!(text, "\n{}", wrapped(SUPERSEDED));
+            }
+        }
+        let _ = write!(text, "\n{}", wrapped(&self.summary));
+        text
+    }
+}
+
+/// Whether the critical subscriber was made to suffer: more than one scan in a hundred is missing.
+fn hurt(figures: &Figures) -> bool {
+    figures.critical.lost * 100 > figures.publisher.due
+}
+
+fn summary(without: &Figures, with: &Figures) -> String {
+    let silence_s = |figures: &Figures| figures.critical.silence_max_ms / 1e3;
+    let bridge = format!(
+        "the publisher wrote {:.1} Hz, no publish call took longer than {}, and the critical subscriber got \
+         {} of {} scans",
+        with.publisher.rate_hz,
+        latency(with.publisher.call_max_ms),
+        with.critical.received,
+        with.publisher.due,
+    );
+    match (hurt(without), hurt(with)) {
+        (true, false) => format!(
+            "Shown: the remote subscriber's dead link filled the writer that both share, so that publish \
+             calls waited up to {} and the publisher fell to {:.1} Hz; the critical subscriber, whose own \
+             link was fine, missed {} of {} scans and once heard nothing for {:.1} s. Through the bridge, \
+             under the same stalls, {bridge}.",
+            latency(without.publisher.call_max_ms),
+            without.publisher.rate_hz,
+            without.critical.lost,
+            without.publisher.due,
+            silence_s(without),
+        ),
+        (true, true) => format!(
+            "Not shown: the critical subscriber missed {} scans without the bridge, and {} with it. The \
+             bridge should lose none: this machine may be too busy for 30 scans a second.",
+            without.critical.lost, with.critical.lost,
+        ),
+        (false, false) => format!(
+            "Not shown: in this run the stalls did not fill the writer that both subscribers share, so there \
+             was nothing to protect the critical one from. Through the bridge {bridge}."
+        ),
+        (false, true) => format!(
+            "Not shown: the critical subscriber missed {} scans through the bridge, and {} without it. This \
+             machine may be too busy for 30 scans a second.",
+            with.critical.lost, without.critical.lost,
+        ),
+    }
+}
+
+fn latency(ms: f64) -> String {
+    if ms < 10.0 { format!("{ms:.2} ms") } else { format!("{ms:.0} ms") }
+}
+
+fn quantile(figures: &Figures, which: impl Fn(&Quantiles) -> f64) -> String {
+    figures.critical.latency_ms.as_ref().map_or("-".to_owned(), |all| latency(which(all)))
+}
+
+/// The text in lines of at most 79 columns.
+pub(super) fn wrapped(text: &str) -> String {
+    let mut wrapped = String::new();
+    let mut columns = 0;
+    for word in text.split_whitespace() {
+        let width = word.chars().count();
+        if columns > 0 && columns + 1 + width > 79 {
+            wrapped.push('\n');
+            columns = 0;
+        } else if columns > 0 {
+            wrapped.push(' ');
+            columns += 1;
+        }
+        wrapped.push_str(word);
+        columns += width;
+    }
+    wrapped
+}

@@ -1,0 +1,202 @@
+//! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own, which know nothing
+//! of the bridge.
+
+use std::io::{self, Write};
+use std::net::Ipv4Addr;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Wake, Waker};
+use std::thread::{self, Thread};
+use std::time::Duration;
+
+use bytes::Bytes;
+use clap::{Args, ValueEnum};
+
+use super::report::Report;
+use super::scan::{DDS_TYPE, Scan};
+use super::{HISTORY_SCANS, MAX_BLOCKING_MS, due_at, first_due_after};
+use crate::cli::failed;
+use crate::clock;
+use crate::config::{DdsNetwork, NetworkSelector};
+use crate::dds::{DdsError, Participant, ParticipantOptions, ReaderQos, Take};
+use crate::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp, TopicName};
+
+/// Scans that may wait between the DDS library and a subscriber. More than a second of them, so that a
+/// subscriber loses nothing by itself.
+const READER_DEPTH: u32 = 64;
+
+/// The publisher's: nothing unacknowledged may be lost, within the limit of [`HISTORY_SCANS`].
+const PUBLISHER_QOS: QosProfile = QosProfile {
+    reliability: Reliability::Reliable,
+    history: History::KeepAll,
+    durability: Durability::Volatile,
+    lifespan_ms: None,
+    deadline_ms: None,
+};
+
+/// What the demo's publisher is told.
+#[derive(Args, Debug)]
+pub(in crate::cli) struct PublisherArguments {
+    /// DDS domain
+    #[arg(long)]
+    domain: u16,
+    /// ROS 2 topic
+    #[arg(long, value_parser = topic)]
+    topic: TopicName,
+}
+
+/// What a subscriber of the demo is told.
+#[derive(Args, Debug)]
+pub(in crate::cli) struct SubscriberArguments {
+    /// DDS domain
+    #[arg(long)]
+    domain: u16,
+    /// ROS 2 topic
+    #[arg(long, value_parser = topic)]
+    topic: TopicName,
+    /// Name of the node
+    #[arg(long)]
+    name: String,
+    /// RELIABILITY that it asks for
+    #[arg(long)]
+    reliability: ReliabilityArgument,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum ReliabilityArgument {
+    Reliable,
+    BestEffort,
+}
+
+fn topic(text: &str) -> Result<TopicName, String> {
+    TopicName::try_from(text).map_err(|error| error.to_string())
+}
+
+/// Why a publisher or subscriber had to end.
+enum PeerError {
+    Dds(DdsError),
+    /// Nobody reads the reports any more.
+    Unread(io::Error),
+}
+
+impl From<DdsError> for PeerError {
+    fn from(error: DdsError) -> Self {
+        Self::Dds(error)
+    }
+}
+
+impl From<io::Error> for PeerError {
+    fn from(error: io::Error) -> Self {
+        Self::Unread(error)
+    }
+}
+
+fn exit(error: &PeerError) -> ExitCode {
+    match error {
+        PeerError::Dds(error) => failed(error),
+        PeerError::Unread(error) => failed(error),
+    }
+}
+
+/// Publishes until it is killed.
+pub(in crate::cli) fn publisher(arguments: &PublisherArguments) -> ExitCode {
+    let Err(error) = publish(arguments);
+    exit(&error)
+}
+
+/// Subscribes until it is killed.
+pub(in crate::cli) fn subscriber(arguments: &SubscriberArguments) -> ExitCode {
+    let Err(error) = subscribe(arguments);
+    exit(&error)
+}
+
+/// A timer as rclcpp's: a publish call that takes longer than a period costs the scans that are due
+/// meanwhile.
+fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, PeerError> {
+    let mut participant = join(arguments.domain, "publisher")?;
+    let writer = participant.create_blocking_writer(
+        &arguments.topic.to_dds(),
+        DDS_TYPE,
+        &PUBLISHER_QOS,
+        HISTORY_SCANS,
+        Duration::from_millis(MAX_BLOCKING_MS),
+    )?;
+    let began_at = clock::monotonic();
+    report(Report::Began { at: began_at })?;
+    let mut number = 0;
+    loop {
+        thread::sleep(Duration::from_nanos(due_at(began_at, number).since(clock::monotonic())));
+        let taken_at = clock::monotonic();
+        let payload = Bytes::from(Scan { number, taken_at }.encode());
+        let timestamp = SourceTimestamp::from_wall(clock::wall());
+        let written = writer.write(payload, Encapsulation::CDR_LE, timestamp).is_ok();
+        let returned_at = clock::monotonic();
+        report(Report::Published { number, call_ns: returned_at.since(taken_at), written })?;
+        number += 1;
+        // A scan that was due before the call is late because this process was not scheduled; it is not
+        // skipped.
+        if due_at(began_at, number) >= taken_at {
+            number = first_due_after(began_at, returned_at).max(number);
+        }
+    }
+}
+
+fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible, PeerError> {
+    let mut participant = join(arguments.domain, &arguments.name)?;
+    let qos = ReaderQos {
+        reliability: match arguments.reliability {
+            ReliabilityArgument::Reliable => Reliability::Reliable,
+            ReliabilityArgument::BestEffort => Reliability::BestEffort,
+        },
+        durability: Durability::Volatile,
+        depth: READER_DEPTH,
+        deadline_ms: None,
+    };
+    let reader = participant.create_reader(&arguments.topic.to_dds(), DDS_TYPE, &qos)?;
+    let bell = Arc::new(Bell { rung: AtomicBool::new(false), thread: thread::current() });
+    let waker = Waker::from(Arc::clone(&bell));
+    loop {
+        reader.arm(&waker);
+        loop {
+            let mut scan = None;
+            let taken = reader.take(&mut |payload, _| scan = Scan::decode(payload));
+            let arrived_at = clock::monotonic();
+            if let Some(Scan { number, taken_at }) = scan {
+                report(Report::Arrived { number, taken_at, arrived_at })?;
+            }
+            if taken == Take::Empty {
+                break;
+            }
+        }
+        while !bell.rung.swap(false, Ordering::AcqRel) {
+            thread::park();
+        }
+    }
+}
+
+/// Rung by the DDS library's thread when a sample arrives.
+struct Bell {
+    rung: AtomicBool,
+    thread: Thread,
+}
+
+impl Wake for Bell {
+    fn wake(self: Arc<Self>) {
+        self.rung.store(true, Ordering::Release);
+        self.thread.unpark();
+    }
+}
+
+fn join(domain_id: u16, name: &str) -> Result<Participant, DdsError> {
+    Participant::open(&ParticipantOptions {
+        network: &DdsNetwork { domain_id, interfaces: vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)] },
+        namespace: "/demo".to_owned(),
+        node_name: name.to_owned(),
+        graph_gid_bytes: 16,
+    })
+}
+
+fn report(report: Report) -> io::Result<()> {
+    writeln!(io::stdout().lock(), "{report}")
+}

@@ -1,0 +1,89 @@
+//! What the demo's publisher and subscribers tell the demo: a line of text on their stdout for each scan.
+
+use std::fmt;
+
+use crate::model::MonotonicNs;
+
+/// One line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Report {
+    /// The publisher's timer began; scan `n` is due `n` periods later.
+    Began {
+        /// When scan 0 was due.
+        at: MonotonicNs,
+    },
+    /// The publisher's publish call for a scan has returned.
+    Published {
+        /// The scan.
+        number: u64,
+        /// How long the call took.
+        call_ns: u64,
+        /// Whether the writer took the scan.
+        written: bool,
+    },
+    /// A subscriber has got a scan.
+    Arrived {
+        /// The scan.
+        number: u64,
+        /// When the publisher took it.
+        taken_at: MonotonicNs,
+        /// When the subscriber had it.
+        arrived_at: MonotonicNs,
+    },
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Began { at } => write!(f, "began {}", at.0),
+            Self::Published { number, call_ns, written } => {
+                write!(f, "published {number} {call_ns} {}", u8::from(*written))
+            }
+            Self::Arrived { number, taken_at, arrived_at } => {
+                write!(f, "arrived {number} {} {}", taken_at.0, arrived_at.0)
+            }
+        }
+    }
+}
+
+impl Report {
+    /// The report in a line; `None` when it is none.
+    pub fn parse(line: &str) -> Option<Self> {
+        let mut words = line.split_ascii_whitespace();
+        let kind = words.next()?;
+        let numbers: Vec<u64> = words.map(str::parse).collect::<Result<_, _>>().ok()?;
+        match (kind, numbers.as_slice()) {
+            ("began", &[at]) => Some(Self::Began { at: MonotonicNs(at) }),
+            ("published", &[number, call_ns, written]) => {
+                Some(Self::Published { number, call_ns, written: written == 1 })
+            }
+            ("arrived", &[number, taken_at, arrived_at]) => Some(Self::Arrived {
+                number,
+                taken_at: MonotonicNs(taken_at),
+                arrived_at: MonotonicNs(arrived_at),
+            }),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_report_survives_the_round_trip() {
+        let reports = [
+            Report::Began { at: MonotonicNs(u64::MAX) },
+            Report::Published { number: 7, call_ns: 100_123_456, written: false },
+            Report::Published { number: 8, call_ns: 0, written: true },
+            Report::Arrived { number: 9, taken_at: MonotonicNs(1), arrived_at: MonotonicNs(2) },
+        ];
+        for report in reports {
+            assert_eq!(Report::parse(&report.to_string()), Some(report));
+        }
+        for line in ["", "arrived", "arrived 1 2", "arrived 1 2 3 4", "published x 1 1", "began -1"] {
+            assert_eq!(Report::parse(line), None, "{line}");
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! The demo's message: a `sensor_msgs/msg/LaserScan` of 360 beams with intensities, in plain little-endian
+//! CDR.
+
+use crate::model::MonotonicNs;
+
+/// ROS 2 message type.
+pub(super) const TYPE: &str = "sensor_msgs/msg/LaserScan";
+
+/// The same as DDS names it.
+pub(super) const DDS_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
+
+/// Bytes of one serialized scan, without the four of the encapsulation header.
+pub(super) const SCAN_BYTES: usize = 2_948;
+
+const BEAMS: u32 = 360;
+/// With its terminating zero 20 bytes, so that what follows needs no padding.
+const FRAME_ID: &[u8] = b"demo/base_scan_link\0";
+/// Where `ranges` begins, with its length: behind the stamp, the frame id and seven parameters of the scan.
+const RANGES_AT: usize = 8 + 4 + FRAME_ID.len() + 7 * 4;
+/// Where the first of `intensities` is.
+const NUMBER_AT: usize = RANGES_AT + 4 + BEAMS as usize * 4 + 4;
+
+/// An `f32` holds whole numbers of 24 bits: 155 hours of scans.
+const NUMBERS: u64 = 1 << 24;
+
+/// What the demo's subscribers look at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Scan {
+    /// Its number with the publisher; the intensity of the first beam.
+    pub number: u64,
+    /// When it was taken, `CLOCK_MONOTONIC`; `header.stamp`.
+    pub taken_at: MonotonicNs,
+}
+
+impl Scan {
+    /// The serialized scan, without the encapsulation header.
+    pub fn encode(self) -> Vec<u8> {
+        let mut cdr = Vec::with_capacity(SCAN_BYTES);
+        // A machine would have to be up for 68 years for its seconds to exceed 31 bits.
+        let seconds = (self.taken_at.0 / 1_000_000_000) as u32;
+        let nanos = (self.taken_at.0 % 1_000_000_000) as u32;
+        cdr.extend_from_slice(&seconds.to_le_bytes());
+        cdr.extend_from_slice(&nanos.to_le_bytes());
+        cdr.extend_from_slice(&(FRAME_ID.len() as u32).to_le_bytes());
+        cdr.extend_from_slice(FRAME_ID);
+        let step = std::f32::consts::TAU / BEAMS as f32;
+        // angle_min, angle_max, angle_increment, time_increment, scan_time, range_min, range_max
+        let parameters = [0.0, std::f32::consts::TAU - step, step, 0.0, 1.0 / 30.0, 0.12, 12.0];
+        let room = |beam: u32| 2.0 + (beam as f32 * step * 2.0).cos();
+        put_floats(&mut cdr, parameters.into_iter());
+        cdr.extend_from_slice(&BEAMS.to_le_bytes());
+        put_floats(&mut cdr, (0..BEAMS).map(room));
+        cdr.extend_from_slice(&BEAMS.to_le_bytes());
+        let number = (self.number % NUMBERS) as f32;
+        put_floats(&mut cdr, std::iter::once(number).chain((1..BEAMS).map(|_| 47.0)));
+        cdr
+    }
+
+    /// The scan in a payload; `None` when it is not one of the demo's.
+    pub fn decode(payload: &[u8]) -> Option<Self> {
+        let word = |at: usize| Some(u32::from_le_bytes(*payload.get(at..)?.first_chunk::<4>()?));
+        if payload.len() != SCAN_BYTES || payload.get(12..12 + FRAME_ID.len())? != FRAME_ID {
+            return None;
+        }
+        let taken_at = MonotonicNs(u64::from(word(0)?) * 1_000_000_000 + u64::from(word(4)?));
+        let number = f32::from_bits(word(NUMBER_AT)?);
+        (number >= 0.0 && number < NUMBERS as f32).then_some(Self { number: number as u64, taken_at })
+    }
+}
+
+fn put_floats(cdr: &mut Vec<u8>, floats: impl Iterator<Item = f32>) {
+    for float in floats {
+        cdr.extend_from_slice(&float.to_le_bytes());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scan_survives_the_round_trip_and_has_the_size_it_says() {
+        for number in [0, 1, 17_999, NUMBERS - 1] {
+            let scan = Scan { number, taken_at: MonotonicNs(86_400_123_456_789 + number) };
+            let cdr = scan.encode();
+            assert_eq!(cdr.len(), SCAN_BYTES);
+            assert_eq!(Scan::decode(&cdr), Some(scan));
+        }
+    }
+
+    #[test]
+    fn what_is_no_scan_of_the_demo_is_not_taken_for_one() {
+        let cdr = Scan { number: 1, taken_at: MonotonicNs(1) }.encode();
+        assert_eq!(Scan::decode(&cdr[..SCAN_BYTES - 1]), None);
+        assert_eq!(Scan::decode(&[]), None);
+        assert_eq!(Scan::decode(&[0; SCAN_BYTES]), None);
+        let mut not_a_number = cdr;
+        not_a_number[NUMBER_AT..NUMBER_AT + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+        assert_eq!(Scan::decode(&not_a_number), None);
+    }
+}

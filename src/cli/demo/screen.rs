@@ -1,0 +1,288 @@
+//! What the demo shows while it runs: a table that is redrawn in place on a terminal, a line now and then
+//! elsewhere, nothing with `--json`. 80 columns wide.
+
+use std::io::{self, IsTerminal, Write};
+
+use super::RATE_HZ;
+use super::children::Who;
+use super::phase::{Way, is_stalled};
+use super::tally::{Stalls, Tally, Window};
+use crate::model::MonotonicNs;
+
+/// In lines, how often there is one.
+const LINE_EVERY_MS: u64 = 2_000;
+/// A rate is that of the last second.
+const RATE_OVER_MS: u64 = 1_000;
+/// What takes no longer than this to arrive is not called lost meanwhile.
+const ON_THE_WAY_MS: u64 = 100;
+/// Characters of a timeline, each of half a second or more.
+const TIMELINE_CELLS: u64 = 40;
+const CELL_MIN_MS: u64 = 500;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Style {
+    InPlace,
+    Lines,
+    Quiet,
+}
+
+/// The terminal, or whatever stdout is.
+#[derive(Debug)]
+pub(super) struct Screen {
+    style: Style,
+    /// Lines of the table that is on the terminal.
+    table_lines: usize,
+    next_line_at: MonotonicNs,
+    gone: bool,
+}
+
+impl Screen {
+    pub fn new(quiet: bool) -> Self {
+        let dumb = std::env::var_os("TERM").is_none_or(|term| term == "dumb");
+        let style = match quiet {
+            true => Style::Quiet,
+            false if io::stdout().is_terminal() && !dumb => Style::InPlace,
+            false => Style::Lines,
+        };
+        Self { style, table_lines: 0, next_line_at: MonotonicNs(0), gone: false }
+    }
+
+    /// Whether nobody can see what is shown any more.
+    pub fn is_gone(&self) -> bool {
+        self.gone
+    }
+
+    /// Shows text that stays.
+    pub fn say(&mut self, text: &str) {
+        self.table_lines = 0;
+        self.next_line_at = MonotonicNs(0);
+        if self.style != Style::Quiet {
+            self.write(&format!("{text}\n"));
+        }
+    }
+
+    /// Shows how a phase goes.
+    pub fn draw(
+        &mut self,
+        way: Way,
+        tally: &Tally,
+        window: &Window,
+        stalls: Stalls,
+        stalled_since: Option<MonotonicNs>,
+        now: MonotonicNs,
+    ) {
+        let over = now >= window.end();
+        match self.style {
+            Style::Quiet => {}
+            Style::InPlace => {
+                let view = View::of(tally, window, stalls, stalled_since, now);
+                let lines = view.table(way, tally, window, now);
+                // Up to where the table begins; without wrapping, so that a line stays one on a narrow
+                // terminal.
+                let mut text = String::from("\x1b[?7l");
+                if self.table_lines > 0 {
+                    text.push_str(&format!("\x1b[{}A", self.table_lines));
+                }
+                for line in &lines {
+                    text.push_str(&format!("\r\x1b[2K{line}\n"));
+                }
+                text.push_str("\x1b[?7h");
+                self.table_lines = lines.len();
+                self.write(&text);
+            }
+            Style::Lines => {
+                let first = window.start().plus_ms(LINE_EVERY_MS);
+                if over || now >= self.next_line_at.max(first) {
+                    self.next_line_at = now.plus_ms(LINE_EVERY_MS);
+                    let view = View::of(tally, window, stalls, stalled_since, now);
+                    self.write(&format!("{}\n", view.line(window, now)));
+                }
+            }
+        }
+    }
+
+    fn write(&mut self, text: &str) {
+        let mut stdout = io::stdout().lock();
+        self.gone |= stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).is_err();
+    }
+}
+
+/// The state of a phase at an instant.
+struct View {
+    publisher_hz: usize,
+    critical_hz: usize,
+    remote_hz: usize,
+    due: u64,
+    written: u64,
+    call_max_ms: f64,
+    critical_received: u64,
+    silent_s: f64,
+    silence_max_s: f64,
+    remote_received: u64,
+    stalled_s: Option<f64>,
+}
+
+impl View {
+    fn of(
+        tally: &Tally,
+        window: &Window,
+        stalls: Stalls,
+        stalled_since: Option<MonotonicNs>,
+        now: MonotonicNs,
+    ) -> Self {
+        // At the end all is counted, and what is on its way has had its time.
+        let settled = if now >= window.end() {
+            now
+        } else {
+            MonotonicNs(now.0.saturating_sub(ON_THE_WAY_MS * 1_000_000))
+        };
+        let second = MonotonicNs(settled.0.saturating_sub(RATE_OVER_MS * 1_000_000))..settled;
+        let figures = tally.figures(window, stalls, settled);
+        Self {
+            publisher_hz: tally.written_in(window, second.clone()),
+            critical_hz: tally.arrived_in(Who::Critical, window, second.clone()),
+            remote_hz: tally.arrived_in(Who::Remote, window, second),
+            due: figures.publisher.due,
+            written: figures.publisher.written,
+            call_max_ms: figures.publisher.call_max_ms,
+            critical_received: figures.critical.received,
+            silent_s: tally.silent_ns(window, now) as f64 / 1e9,
+            silence_max_s: figures.critical.silence_max_ms / 1e3,
+            remote_received: figures.remote.received,
+            stalled_s: stalled_since.map(|since| now.since(since) as f64 / 1e9),
+        }
+    }
+
+    fn table(&self, way: Way, tally: &Tally, window: &Window, now: MonotonicNs) -> Vec<String> {
+        let seconds = window.end().since(window.start()) / 1_000_000_000;
+        let elapsed = (now.since(window.start()) / 1_000_000_000).min(seconds);
+        let missed = |got: u64| self.due.saturating_sub(got);
+        let silence = if self.silent_s > 0.3 {
+            format!("silent for {:.1} s!", self.silent_s)
+        } else {
+            format!("longest silence {:.2} s", self.silence_max_s)
+        };
+        let link = match self.stalled_s {
+            Some(stalled_s) => format!("link down for {stalled_s:.1} s"),
+            None => "link up".to_owned(),
+        };
+        let remote_missed = match way {
+            Way::Direct => missed(self.remote_received).to_string(),
+            // It is not to get all of them.
+            Way::Bridge => "-".to_owned(),
+        };
+        let row = |name: &str, hz: usize, got: u64, missed: String, note: String| {
+            format!("  {name:<12}{hz:>6} Hz {got:>8} {missed:>9}   {note}")
+        };
+        let mut lines = vec![
+            format!(
+                "  {:<12}{:>9} {:>8} {:>9}{:>36}",
+                "",
+                "now",
+                "scans",
+                "missed",
+                format!("{elapsed} of {seconds} s")
+            ),
+            row(
+                "publisher",
+                self.publisher_hz,
+                self.written,
+                missed(self.written).to_string(),
+                format!("longest publish call {:.1} ms", self.call_max_ms),
+            ),
+            row(
+                "critical",
+                self.critical_hz,
+                self.critical_received,
+                missed(self.critical_received).to_string(),
+                silence,
+            ),
+            row("remote", self.remote_hz, self.remote_received, remote_missed, link),
+        ];
+        lines.push(String::new());
+        lines.extend(timelines(tally, window, now));
+        lines
+    }
+
+    fn line(&self, window: &Window, now: MonotonicNs) -> String {
+        let link = if self.stalled_s.is_some() { "down" } else { "up" };
+        format!(
+            "  {:>3} s  publisher {:>2} Hz   critical {:>2} Hz, missed {:>3}   remote {:>2} Hz, link {link}",
+            (now.since(window.start()) / 1_000_000_000)
+                .min(window.end().since(window.start()) / 1_000_000_000),
+            self.publisher_hz,
+            self.critical_hz,
+            self.due.saturating_sub(self.critical_received),
+            self.remote_hz,
+        )
+    }
+}
+
+/// What happened when, a character for each half second.
+fn timelines(tally: &Tally, window: &Window, now: MonotonicNs) -> [String; 3] {
+    let seconds = window.end().since(window.start()) / 1_000_000_000;
+    let cell_ms = (seconds * 1_000).div_ceil(TIMELINE_CELLS).next_multiple_of(CELL_MIN_MS);
+    let in_cell = (cell_ms * RATE_HZ / 1_000) as usize;
+    let mut link = String::from("  remote link ");
+    let mut publisher = String::from("  publisher   ");
+    let mut critical = String::from("  critical    ");
+    for cell in 0..(seconds * 1_000).div_ceil(cell_ms) {
+        let from = window.start().plus_ms(cell * cell_ms);
+        let to = window.start().plus_ms((cell + 1) * cell_ms);
+        if to > now || to > window.end() {
+            break;
+        }
+        // Stalls begin and end with a half second.
+        let halves = (0..cell_ms / CELL_MIN_MS).map(|half| from.plus_ms(half * CELL_MIN_MS));
+        let up = halves.filter(|half| !is_stalled(window, *half)).count();
+        link.push(shade(up, (cell_ms / CELL_MIN_MS) as usize));
+        publisher.push(shade(tally.written_in(window, from..to), in_cell));
+        critical.push(shade(tally.arrived_in(Who::Critical, window, from..to), in_cell));
+    }
+    link = format!("{link:<55}# all   + some   . none");
+    [link, publisher, critical]
+}
+
+fn shade(scans: usize, expected: usize) -> char {
+    match scans {
+        0 => '.',
+        few if few * 5 < expected * 4 => '+',
+        _ => '#',
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::demo::due_at;
+    use crate::cli::demo::report::Report;
+
+    #[test]
+    fn no_line_is_wider_than_a_terminal_of_80_columns() {
+        for seconds in [6, 18, 600] {
+            let began_at = MonotonicNs(5_000_000_000);
+            let window = Window { began_at, numbers: 30..30 + seconds * RATE_HZ };
+            let mut tally = Tally::default();
+            for number in window.numbers.clone() {
+                let taken_at = due_at(began_at, number);
+                tally.add(Who::Publisher, Report::Published { number, call_ns: 100_123_456, written: true });
+                for who in [Who::Critical, Who::Remote] {
+                    tally.add(who, Report::Arrived { number, taken_at, arrived_at: taken_at });
+                }
+            }
+            for stalled_since in [None, Some(window.start())] {
+                let view = View::of(&tally, &window, Stalls::default(), stalled_since, window.end());
+                let mut lines = view.table(Way::Direct, &tally, &window, window.end());
+                lines.push(view.line(&window, window.end()));
+                for line in lines {
+                    assert!(line.chars().count() < 80, "{} columns: {line}", line.chars().count());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_timeline_shows_when_nothing_arrived() {
+        assert_eq!([0, 1, 11, 12, 15, 40].map(|scans| shade(scans, 15)), ['.', '+', '+', '#', '#', '#']);
+    }
+}

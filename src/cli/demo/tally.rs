@@ -1,0 +1,332 @@
+//! What was measured in one phase. Pure: reports go in, figures come out.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use serde::Serialize;
+
+use super::children::Who;
+use super::report::Report;
+use super::{RATE_HZ, due_at};
+use crate::model::{DropCounts, MonotonicNs};
+
+/// A scan that arrived.
+#[derive(Clone, Copy, Debug)]
+struct Arrival {
+    taken_at: MonotonicNs,
+    arrived_at: MonotonicNs,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Published {
+    call_ns: u64,
+    written: bool,
+}
+
+/// All reports of one phase.
+#[derive(Debug, Default)]
+pub(super) struct Tally {
+    began_at: Option<MonotonicNs>,
+    published: BTreeMap<u64, Published>,
+    critical: BTreeMap<u64, Arrival>,
+    remote: BTreeMap<u64, Arrival>,
+}
+
+impl Tally {
+    /// Takes a report in. The first arrival of a scan counts.
+    pub fn add(&mut self, who: Who, report: Report) {
+        match (who, report) {
+            (Who::Publisher, Report::Began { at }) => self.began_at = Some(at),
+            (Who::Publisher, Report::Published { number, call_ns, written }) => {
+                self.published.insert(number, Published { call_ns, written });
+            }
+            (Who::Critical, Report::Arrived { number, taken_at, arrived_at }) => {
+                self.critical.entry(number).or_insert(Arrival { taken_at, arrived_at });
+            }
+            (Who::Remote, Report::Arrived { number, taken_at, arrived_at }) => {
+                self.remote.entry(number).or_insert(Arrival { taken_at, arrived_at });
+            }
+            _ => {}
+        }
+    }
+
+    /// When the publisher's timer began.
+    pub fn began_at(&self) -> Option<MonotonicNs> {
+        self.began_at
+    }
+
+    /// Scans that have arrived at a subscriber.
+    pub fn arrived(&self, who: Who) -> usize {
+        match who {
+            Who::Critical => self.critical.len(),
+            Who::Remote => self.remote.len(),
+            Who::Publisher | Who::Bridge => 0,
+        }
+    }
+
+    /// Scans due in an interval that were written.
+    pub fn written_in(&self, window: &Window, interval: Range<MonotonicNs>) -> usize {
+        let written = self.published.range(window.numbers.clone()).filter(|(_, one)| one.written);
+        written.filter(|(number, _)| interval.contains(&due_at(window.began_at, **number))).count()
+    }
+
+    /// Scans of the window that arrived in an interval.
+    pub fn arrived_in(&self, who: Who, window: &Window, interval: Range<MonotonicNs>) -> usize {
+        let arrivals = if who == Who::Remote { &self.remote } else { &self.critical };
+        arrivals.range(window.numbers.clone()).filter(|(_, one)| interval.contains(&one.arrived_at)).count()
+    }
+
+    /// How long the critical subscriber has been without a scan.
+    pub fn silent_ns(&self, window: &Window, now: MonotonicNs) -> u64 {
+        let last = self.critical.range(window.numbers.clone()).next_back();
+        now.since(last.map_or(window.start(), |(_, one)| one.arrived_at))
+    }
+
+    /// The figures of a window; `until` cuts it short while the phase goes on.
+    pub fn figures(&self, window: &Window, stalls: Stalls, until: MonotonicNs) -> Figures {
+        let until = until.min(window.end());
+        let numbers = window.numbers.start..window.numbers_before(until);
+        let due = numbers.end - numbers.start;
+        let published: Vec<_> = self.published.range(numbers.clone()).collect();
+        let written = published.iter().filter(|(_, one)| one.written).count() as u64;
+        let timed_out = published.len() as u64 - written;
+        let call_max_ns = published.iter().map(|(_, one)| one.call_ns).max().unwrap_or(0);
+        let elapsed_s = until.since(window.start()) as f64 / 1e9;
+
+        let arrivals: Vec<_> = self.critical.range(numbers.clone()).collect();
+        let received = arrivals.len() as u64;
+        let never_written = due.saturating_sub(written);
+        let lost = due.saturating_sub(received);
+        let mut latencies_ns: Vec<u64> =
+            arrivals.iter().map(|(_, one)| one.arrived_at.since(one.taken_at)).collect();
+        latencies_ns.sort_unstable();
+        let mut arrived_at: Vec<_> = arrivals.iter().map(|(_, one)| one.arrived_at).collect();
+        arrived_at.extend([window.start(), until]);
+        arrived_at.sort_unstable();
+        let silence_max_ns = arrived_at.windows(2).map(|pair| pair[1].since(pair[0])).max().unwrap_or(0);
+
+        Figures {
+            publisher: PublisherFigures {
+                due,
+                written,
+                timed_out,
+                skipped: never_written.saturating_sub(timed_out),
+                rate_hz: if elapsed_s > 0.0 { written as f64 / elapsed_s } else { 0.0 },
+                call_max_ms: ms(call_max_ns),
+            },
+            critical: CriticalFigures {
+                received,
+                lost,
+                never_written,
+                lost_on_the_way: lost.saturating_sub(never_written),
+                silence_max_ms: ms(silence_max_ns),
+                latency_ms: Quantiles::of(&latencies_ns),
+            },
+            remote: RemoteFigures {
+                received: self.remote.range(numbers).count() as u64,
+                stalls: stalls.count,
+                stalled_s: stalls.ns as f64 / 1e9,
+            },
+            drops: None,
+        }
+    }
+}
+
+/// The part of a phase that is measured: the scans that are due in it.
+#[derive(Clone, Debug)]
+pub(super) struct Window {
+    /// When scan 0 was due.
+    pub began_at: MonotonicNs,
+    /// The scans.
+    pub numbers: Range<u64>,
+}
+
+impl Window {
+    pub fn start(&self) -> MonotonicNs {
+        due_at(self.began_at, self.numbers.start)
+    }
+
+    pub fn end(&self) -> MonotonicNs {
+        due_at(self.began_at, self.numbers.end)
+    }
+
+    /// One more than the last scan of the window that is due before then.
+    fn numbers_before(&self, instant: MonotonicNs) -> u64 {
+        if instant >= self.end() {
+            return self.numbers.end;
+        }
+        let number = super::first_due_after(self.began_at, instant);
+        number.clamp(self.numbers.start, self.numbers.end)
+    }
+}
+
+/// How often and how long the remote subscriber was stopped.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Stalls {
+    pub count: u64,
+    pub ns: u64,
+}
+
+/// The figures of one phase.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Figures {
+    pub publisher: PublisherFigures,
+    pub critical: CriticalFigures,
+    pub remote: RemoteFigures,
+    /// What the bridge dropped, by process and name; none without a bridge.
+    pub drops: Option<BridgeDrops>,
+}
+
+/// `due = written + timed_out + skipped`.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct PublisherFigures {
+    /// Scans that the laser had to publish.
+    pub due: u64,
+    /// Scans that the DDS writer took.
+    pub written: u64,
+    /// Scans that it refused after the blocking time.
+    pub timed_out: u64,
+    /// Scans whose time came while a publish call was still waiting.
+    pub skipped: u64,
+    pub rate_hz: f64,
+    pub call_max_ms: f64,
+}
+
+/// `due = received + lost`, `lost = never_written + lost_on_the_way`.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct CriticalFigures {
+    pub received: u64,
+    pub lost: u64,
+    pub never_written: u64,
+    pub lost_on_the_way: u64,
+    /// The longest time without an arrival.
+    pub silence_max_ms: f64,
+    /// From before the publish call to the subscriber; none when nothing arrived.
+    pub latency_ms: Option<Quantiles>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct RemoteFigures {
+    pub received: u64,
+    pub stalls: u64,
+    pub stalled_s: f64,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Quantiles {
+    pub p50: f64,
+    pub p95: f64,
+    pub p99: f64,
+    pub max: f64,
+}
+
+impl Quantiles {
+    /// Nearest-rank quantiles in milliseconds.
+    fn of(sorted_ns: &[u64]) -> Option<Self> {
+        let max = *sorted_ns.last()?;
+        let at = |quantile: f64| {
+            let rank = (quantile * sorted_ns.len() as f64).ceil() as usize;
+            ms(sorted_ns[rank.clamp(1, sorted_ns.len()) - 1])
+        };
+        Some(Self { p50: at(0.5), p95: at(0.95), p99: at(0.99), max: ms(max) })
+    }
+}
+
+/// What the bridge dropped while it was measured.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct BridgeDrops {
+    pub ingress: BTreeMap<&'static str, u64>,
+    pub critical: BTreeMap<&'static str, u64>,
+    pub noncritical: BTreeMap<&'static str, u64>,
+}
+
+/// By name, what was dropped between two readings.
+pub(super) fn drops_between(before: &DropCounts, after: &DropCounts) -> BTreeMap<&'static str, u64> {
+    after
+        .iter()
+        .map(|(reason, count)| (reason.label(), count.saturating_sub(before.get(reason))))
+        .filter(|(_, count)| *count > 0)
+        .collect()
+}
+
+fn ms(ns: u64) -> f64 {
+    ns as f64 / 1e6
+}
+
+/// Scans of so many seconds.
+pub(super) const fn scans_in_s(seconds: u64) -> u64 {
+    seconds * RATE_HZ
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BEGAN: MonotonicNs = MonotonicNs(1_000_000_000);
+
+    fn tally(published: &[(u64, bool)], arrived: &[u64], latency_ns: u64) -> Tally {
+        let mut tally = Tally::default();
+        tally.add(Who::Publisher, Report::Began { at: BEGAN });
+        for &(number, written) in published {
+            let call_ns = if written { 50_000 } else { 100_000_000 };
+            tally.add(Who::Publisher, Report::Published { number, call_ns, written });
+        }
+        for &number in arrived {
+            let taken_at = due_at(BEGAN, number);
+            let arrived_at = taken_at.plus_ns(latency_ns);
+            tally.add(Who::Critical, Report::Arrived { number, taken_at, arrived_at });
+        }
+        tally
+    }
+
+    fn window() -> Window {
+        Window { began_at: BEGAN, numbers: 30..60 }
+    }
+
+    #[test]
+    fn every_scan_that_was_due_is_accounted_for() {
+        // 30 to 39 written; 40 refused, 41 to 43 skipped; 44 to 59 written, of which 50 does not arrive.
+        let mut published: Vec<_> = (0..90).map(|number| (number, true)).collect();
+        published.retain(|(number, _)| !(41..44).contains(number));
+        published[40].1 = false;
+        let arrived: Vec<_> = (0..90).filter(|n| !(40..44).contains(n) && *n != 50).collect();
+        let figures =
+            tally(&published, &arrived, 250_000).figures(&window(), Stalls::default(), MonotonicNs(u64::MAX));
+        let publisher = &figures.publisher;
+        assert_eq!((publisher.due, publisher.written), (30, 26));
+        assert_eq!((publisher.timed_out, publisher.skipped), (1, 3));
+        assert!((publisher.rate_hz - 26.0).abs() < 0.01, "{}", publisher.rate_hz);
+        assert_eq!(publisher.call_max_ms, 100.0);
+        let critical = &figures.critical;
+        assert_eq!((critical.received, critical.lost), (25, 5));
+        assert_eq!((critical.never_written, critical.lost_on_the_way), (4, 1));
+        // From 39 to 44.
+        assert!((critical.silence_max_ms - 5.0 * 100.0 / 3.0).abs() < 0.01, "{}", critical.silence_max_ms);
+        let latency_ms = critical.latency_ms.as_ref().unwrap();
+        assert_eq!((latency_ms.p50, latency_ms.max), (0.25, 0.25));
+    }
+
+    #[test]
+    fn silence_at_the_edges_of_the_window_counts() {
+        let published: Vec<_> = (0..90).map(|number| (number, true)).collect();
+        let arrived: Vec<_> = (0..50).collect();
+        let tally = tally(&published, &arrived, 0);
+        let figures = tally.figures(&window(), Stalls::default(), MonotonicNs(u64::MAX));
+        assert!((figures.critical.silence_max_ms - 11.0 * 100.0 / 3.0).abs() < 0.01);
+        assert_eq!(figures.critical.lost_on_the_way, 10);
+        let nothing = Tally::default().figures(&window(), Stalls::default(), window().end());
+        assert!((nothing.critical.silence_max_ms - 1000.0).abs() < 0.01);
+        assert!(nothing.critical.latency_ms.is_none());
+        assert_eq!((nothing.publisher.skipped, nothing.critical.never_written), (30, 30));
+    }
+
+    #[test]
+    fn quantiles_are_of_the_nearest_rank() {
+        let values: Vec<u64> = (1..=100).map(|ms| ms * 1_000_000).collect();
+        let quantiles = Quantiles::of(&values).unwrap();
+        assert_eq!((quantiles.p50, quantiles.p95, quantiles.p99, quantiles.max), (50.0, 95.0, 99.0, 100.0));
+        let one = Quantiles::of(&[7_000_000]).unwrap();
+        assert_eq!((one.p50, one.max), (7.0, 7.0));
+        assert!(Quantiles::of(&[]).is_none());
+    }
+}

@@ -1,0 +1,135 @@
+//! `status`: what the bridge does at present, from its boards in shared memory.
+
+use std::io::{self, IsTerminal, Write};
+use std::ops::RangeInclusive;
+use std::path::Path;
+use std::process::ExitCode;
+
+use clap::{Args, value_parser};
+
+use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
+use crate::config::Settings;
+use crate::process::Stop;
+use crate::telemetry::{Report, Snapshot};
+
+/// From what tells a rate of 100 Hz to an hour.
+const INTERVALS_MS: RangeInclusive<u64> = 10..=3_600_000;
+
+/// What `status` is asked.
+#[derive(Args, Debug)]
+pub(super) struct Arguments {
+    /// Print JSON (docs/status-json.md): one object; with --watch one on each line
+    #[arg(long)]
+    json: bool,
+    /// Go on until Ctrl-C; on a terminal in place
+    #[arg(long, short)]
+    watch: bool,
+    /// The time over which rates and latencies are measured, and between two outputs
+    #[arg(long, value_name = "N", default_value_t = 1_000)]
+    #[arg(value_parser = value_parser!(u64).range(INTERVALS_MS))]
+    interval_ms: u64,
+    #[command(flatten)]
+    config: ConfigArguments,
+}
+
+pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    let settings = match arguments.config.load() {
+        Ok(settings) => settings,
+        Err(code) => return code,
+    };
+    let root = root(&settings);
+    let first = match read_bridge(&root, &settings) {
+        Ok(Some(snapshot)) => snapshot,
+        Ok(None) => return no_bridge(&settings, &root),
+        Err(error) => return failed(&error),
+    };
+    if arguments.watch {
+        return watch(arguments, &root, &settings, first);
+    }
+    std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
+    match read_bridge(&root, &settings) {
+        Ok(Some(second)) => match show(&second.since(&first), arguments.json) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => output_ended(&error),
+        },
+        Ok(None) => no_bridge(&settings, &root),
+        Err(error) => failed(&error),
+    }
+}
+
+/// Shows one report after the other. A bridge that ends meanwhile is waited for: it may be restarted.
+fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapshot) -> ExitCode {
+    let stop = match Stop::on_signals() {
+        Ok(stop) => stop,
+        Err(error) => return failed(&error),
+    };
+    let in_place = !arguments.json && io::stdout().is_terminal();
+    let mut last = Some(first);
+    while pause(arguments.interval_ms, &stop) {
+        let next = match read_bridge(root, settings) {
+            Ok(next) => next,
+            Err(error) => return failed(&error),
+        };
+        let shown = match (&next, &last) {
+            (Some(next), before) => {
+                let report = next.since(before.as_ref().unwrap_or(next));
+                if in_place { redraw(&report.to_string()) } else { show(&report, arguments.json) }
+            }
+            (None, Some(_)) => {
+                no_bridge(settings, root);
+                Ok(())
+            }
+            (None, None) => Ok(()),
+        };
+        if let Err(error) = shown {
+            return output_ended(&error);
+        }
+        last = next;
+    }
+    ExitCode::SUCCESS
+}
+
+fn show(report: &Report, json: bool) -> io::Result<()> {
+    let mut text = if json { serde_json::to_string(report)? } else { report.to_string() };
+    if json {
+        text.push('\n');
+    }
+    let mut stdout = io::stdout().lock();
+    stdout.write_all(text.as_bytes())?;
+    stdout.flush()
+}
+
+fn redraw(text: &str) -> io::Result<()> {
+    let (columns, lines) = match terminal_size::terminal_size() {
+        Some((terminal_size::Width(columns), terminal_size::Height(lines))) => (columns, lines),
+        None => (80, 24),
+    };
+    let mut stdout = io::stdout().lock();
+    stdout.write_all(frame(text, usize::from(columns), usize::from(lines)).as_bytes())?;
+    stdout.flush()
+}
+
+/// Draws over what was drawn before: from the upper left corner, each line cleared behind its text, then all
+/// that is below. Cut to the terminal, because a line that wraps or scrolls would spoil the next frame.
+fn frame(text: &str, columns: usize, lines: usize) -> String {
+    let mut frame = String::from("\x1b[H");
+    // The cursor needs the last line.
+    for line in text.lines().take(lines.saturating_sub(1)) {
+        frame.extend(line.chars().take(columns));
+        frame.push_str("\x1b[K\n");
+    }
+    frame.push_str("\x1b[J");
+    frame
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_fits_the_terminal_and_clears_what_was_there() {
+        assert_eq!(frame("one\ntwo µs\nthree", 5, 10), "\x1b[Hone\x1b[K\ntwo µ\x1b[K\nthree\x1b[K\n\x1b[J");
+        assert_eq!(frame("one\ntwo\nthree", 80, 3), "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J");
+        assert_eq!(frame("one", 0, 0), "\x1b[H\x1b[J");
+    }
+}

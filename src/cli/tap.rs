@@ -1,0 +1,355 @@
+//! `tap`: the samples of a route, straight from shared memory.
+//!
+//! A tap is a subscriber of its own with a short queue. Nobody wakes it and nobody waits for it: it looks,
+//! and what it does not look at in time is overwritten. Ingress and the lanes do not notice it.
+
+use std::fmt::Write as _;
+use std::io::{self, BufWriter, StdoutLock, Write};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+
+use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge, root};
+use crate::clock;
+use crate::config::Settings;
+use crate::model::{Encapsulation, MonotonicNs};
+use crate::policy::{SequenceTracker, Sighting};
+use crate::process::Stop;
+use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError};
+use crate::telemetry::Intervals;
+
+/// How often `--hz` says something.
+const REPORT_MS: u64 = 1_000;
+/// How often a tap looks whether the bridge is still there. A tap that stayed would keep the shared memory of
+/// a bridge that has ended, and one with other routes could not start.
+const BRIDGE_LOOK_MS: u64 = 200;
+
+/// What `tap` is asked.
+#[derive(Args, Debug)]
+pub(super) struct Arguments {
+    /// The input topic, such as /scan, or the id of the route
+    topic: String,
+    /// Show rate and regularity each second, as `ros2 topic hz` does
+    #[arg(long, conflicts_with = "raw")]
+    hz: bool,
+    /// Write the payloads to stdout and nothing else. Of each sample: the number of bytes that follow (u32,
+    /// little endian), the encapsulation header (4 bytes), the serialized message
+    #[arg(long)]
+    raw: bool,
+    /// Begin with the samples that the bridge retains, such as the last map
+    #[arg(long, conflicts_with = "hz")]
+    retained: bool,
+    /// End after so many samples
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+    #[command(flatten)]
+    config: ConfigArguments,
+}
+
+pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    let settings = match arguments.config.load() {
+        Ok(settings) => settings,
+        Err(code) => return code,
+    };
+    let Some(route) = find_route(&settings, &arguments.topic) else {
+        return failed(&unknown_topic(&settings, &arguments.topic));
+    };
+    // First of all, because joining would set up the shared memory of a bridge that does not run.
+    let root = root(&settings);
+    match read_bridge(&root, &settings) {
+        Ok(Some(_)) => {}
+        Ok(None) => return no_bridge(&settings, &root),
+        Err(error) => return failed(&error),
+    }
+    let stop = match Stop::on_signals() {
+        Ok(stop) => stop,
+        Err(error) => return failed(&error),
+    };
+    let subscriber = ShmNode::open(&root, &settings.instance, "tap").and_then(|node| {
+        let channel = RouteChannel::of(&settings, route);
+        SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, arguments.retained)
+    });
+    let subscriber = match subscriber {
+        Ok(subscriber) => subscriber,
+        Err(error) => return failed(&error),
+    };
+    let bridge_runs = || matches!(read_bridge(&root, &settings), Ok(Some(_)));
+    match Tap::new(arguments).follow(&subscriber, &stop, bridge_runs) {
+        Ok(End::Done) => ExitCode::SUCCESS,
+        Ok(End::BridgeGone) => failed(&"the bridge has ended"),
+        Err(error) => output_ended(&error),
+    }
+}
+
+fn find_route(settings: &Settings, topic: &str) -> Option<usize> {
+    let absolute = format!("/{}", topic.trim_start_matches('/'));
+    let by_topic = settings.routes.iter().position(|route| route.input_topic.as_str() == absolute);
+    by_topic.or_else(|| settings.routes.iter().position(|route| route.id.as_str() == topic))
+}
+
+fn unknown_topic(settings: &Settings, topic: &str) -> String {
+    let known: Vec<String> =
+        settings.routes.iter().map(|route| format!("{} ({})", route.input_topic, route.id)).collect();
+    format!("no route has the input topic or id {topic}; the configuration has: {}", known.join(", "))
+}
+
+/// Why a tap ended.
+enum End {
+    Done,
+    BridgeGone,
+}
+
+/// What is shown of the samples.
+enum Format {
+    Lines,
+    Raw,
+    Hz { intervals: Intervals, lost: u64, new: u64, report_at: MonotonicNs },
+}
+
+struct Tap {
+    format: Format,
+    left: Option<u64>,
+    tracker: SequenceTracker,
+    output: BufWriter<StdoutLock<'static>>,
+}
+
+impl Tap {
+    fn new(arguments: &Arguments) -> Self {
+        let format = if arguments.raw {
+            Format::Raw
+        } else if arguments.hz {
+            let report_at = clock::monotonic().plus_ms(REPORT_MS);
+            Format::Hz { intervals: Intervals::default(), lost: 0, new: 0, report_at }
+        } else {
+            Format::Lines
+        };
+        Self {
+            format,
+            left: arguments.count,
+            tracker: SequenceTracker::new(),
+            output: BufWriter::new(io::stdout().lock()),
+        }
+    }
+
+    /// Shows samples until `stop`, the last one, or the end of the bridge.
+    fn follow(
+        &mut self,
+        subscriber: &SampleSubscriber,
+        stop: &Stop,
+        bridge_runs: impl Fn() -> bool,
+    ) -> io::Result<End> {
+        let mut pace = Pace::default();
+        let mut look_at = clock::monotonic().plus_ms(BRIDGE_LOOK_MS);
+        while !stop.is_requested() {
+            let mut taken = 0;
+            loop {
+                match subscriber.take() {
+                    Ok(Some(sample)) => {
+                        taken += 1;
+                        self.show(&sample)?;
+                        if self.left == Some(0) {
+                            self.finish()?;
+                            return Ok(End::Done);
+                        }
+                    }
+                    Ok(None) | Err(TakeError::BorrowLimit) => break,
+                    Err(error) => {
+                        eprintln!("adaptive-bridge: {error}");
+                        break;
+                    }
+                }
+                if stop.is_requested() {
+                    break;
+                }
+            }
+            let now = clock::monotonic();
+            self.report(now)?;
+            self.output.flush()?;
+            if now >= look_at {
+                if !bridge_runs() {
+                    return Ok(End::BridgeGone);
+                }
+                look_at = now.plus_ms(BRIDGE_LOOK_MS);
+            }
+            std::thread::sleep(pace.after(taken));
+        }
+        self.finish()?;
+        Ok(End::Done)
+    }
+
+    fn show(&mut self, sample: &ShmSample) -> io::Result<()> {
+        let header = sample.header();
+        if let Some(left) = &mut self.left {
+            *left = left.saturating_sub(1);
+        }
+        let missed = match self.tracker.see(header.sequence) {
+            Sighting::AfterGap(missed) => missed,
+            Sighting::InOrder | Sighting::Duplicate => 0,
+        };
+        match &mut self.format {
+            Format::Lines => {
+                if missed > 0 {
+                    writeln!(self.output, "lost={missed}")?;
+                }
+                writeln!(self.output, "{}", line(sample))
+            }
+            Format::Raw => write_frame(&mut self.output, header.encapsulation, sample.payload()),
+            Format::Hz { intervals, lost, new, .. } => {
+                *lost += missed;
+                *new += 1;
+                intervals.see(header);
+                Ok(())
+            }
+        }
+    }
+
+    /// The line of `--hz`, when it is time for one.
+    fn report(&mut self, now: MonotonicNs) -> io::Result<()> {
+        match &mut self.format {
+            Format::Hz { report_at, .. } if now >= *report_at => {
+                *report_at = now.plus_ms(REPORT_MS);
+                self.report_now()
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn report_now(&mut self) -> io::Result<()> {
+        let Format::Hz { intervals, lost, new, .. } = &mut self.format else {
+            return Ok(());
+        };
+        let text = match intervals.statistics() {
+            _ if *new == 0 => "no new samples".to_owned(),
+            None => "one sample".to_owned(),
+            Some(found) => format!(
+                "rate {:.2} Hz  min {:.3} ms  max {:.3} ms  std {:.3} ms  window {}  lost {lost}",
+                found.rate_hz, found.min_ms, found.max_ms, found.std_ms, found.samples
+            ),
+        };
+        *new = 0;
+        writeln!(self.output, "{text}")
+    }
+
+    fn finish(&mut self) -> io::Result<()> {
+        if matches!(self.format, Format::Hz { new: 1.., .. }) {
+            self.report_now()?;
+        }
+        self.output.flush()
+    }
+}
+
+/// One sample as text; fields that scripts can cut out.
+fn line(sample: &ShmSample) -> String {
+    let header = sample.header();
+    let age = match header.source_timestamp.to_wall() {
+        Some(written) => format!("{:.1}", clock::wall().since(written) as f64 / 1e3),
+        None => "none".to_owned(),
+    };
+    let mut text = format!(
+        "sequence={} age_us={age} bytes={} encapsulation={} options={} writer=",
+        header.sequence,
+        sample.payload().len(),
+        representation(header.encapsulation),
+        hex(&header.encapsulation.options()),
+    );
+    text.push_str(&hex(&header.writer_guid.0));
+    text
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+/// The name of a representation (RTPS 2.5 clause 10.2, XTypes 1.3 clause 7.6.3.1.2), or its number.
+fn representation(encapsulation: Encapsulation) -> String {
+    let name = match encapsulation.representation() {
+        [0, 0] => "CDR_BE",
+        [0, 1] => "CDR_LE",
+        [0, 2] => "PL_CDR_BE",
+        [0, 3] => "PL_CDR_LE",
+        [0, 4] => "XML",
+        [0, 6] => "CDR2_BE",
+        [0, 7] => "CDR2_LE",
+        [0, 8] => "D_CDR2_BE",
+        [0, 9] => "D_CDR2_LE",
+        [0, 0x0a] => "PL_CDR2_BE",
+        [0, 0x0b] => "PL_CDR2_LE",
+        other => return format!("0x{}", hex(&other)),
+    };
+    name.to_owned()
+}
+
+/// One sample of `--raw`.
+fn write_frame(output: &mut impl Write, encapsulation: Encapsulation, payload: &[u8]) -> io::Result<()> {
+    // At most 64 MiB, the limit of `max_sample_bytes`, so it always fits.
+    let length = u32::try_from(payload.len() + encapsulation.0.len()).map_err(io::Error::other)?;
+    output.write_all(&length.to_le_bytes())?;
+    output.write_all(&encapsulation.0)?;
+    output.write_all(payload)
+}
+
+/// How long to wait before the next look: 1 ms while samples come, less when more than one had come at once,
+/// because the queue has room for four, and longer and longer when none come.
+struct Pace {
+    pause_us: u64,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { pause_us: Self::USUAL_US }
+    }
+}
+
+impl Pace {
+    const SHORTEST_US: u64 = 100;
+    const USUAL_US: u64 = 1_000;
+    const LONGEST_US: u64 = 20_000;
+
+    fn after(&mut self, taken: usize) -> Duration {
+        self.pause_us = match taken {
+            0 => (self.pause_us * 2).min(Self::LONGEST_US),
+            1 => self.pause_us.min(Self::USUAL_US),
+            _ => (self.pause_us / 2).clamp(Self::SHORTEST_US, Self::USUAL_US),
+        };
+        Duration::from_micros(self.pause_us)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_is_length_encapsulation_and_payload() {
+        let mut bytes = Vec::new();
+        write_frame(&mut bytes, Encapsulation([0, 7, 0, 2]), b"abc").unwrap();
+        write_frame(&mut bytes, Encapsulation::CDR_LE, b"").unwrap();
+        assert_eq!(bytes, [7, 0, 0, 0, 0, 7, 0, 2, b'a', b'b', b'c', 4, 0, 0, 0, 0, 1, 0, 0]);
+    }
+
+    #[test]
+    fn a_tap_looks_often_while_samples_come_and_seldom_while_none_do() {
+        let mut pace = Pace::default();
+        for _ in 0..10 {
+            pace.after(0);
+        }
+        assert_eq!(pace.after(0), Duration::from_millis(20));
+        assert_eq!(pace.after(1), Duration::from_millis(1));
+        for _ in 0..10 {
+            pace.after(4);
+        }
+        assert_eq!(pace.after(2), Duration::from_micros(100));
+        assert_eq!(pace.after(1), Duration::from_micros(100));
+    }
+
+    #[test]
+    fn an_encapsulation_without_a_name_is_shown_as_its_number() {
+        assert_eq!(representation(Encapsulation::CDR_LE), "CDR_LE");
+        assert_eq!(representation(Encapsulation([0x12, 0xab, 0, 0])), "0x12ab");
+    }
+}

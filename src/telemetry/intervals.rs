@@ -1,0 +1,145 @@
+//! The rate of a topic and the regularity of its samples, as `tap --hz` shows them.
+
+use std::collections::VecDeque;
+
+use crate::model::{MonotonicNs, SampleHeader};
+
+/// Samples looked back at; as many as `ros2 topic hz` does.
+pub const WINDOW_SAMPLES: usize = 10_000;
+
+/// The arrivals of the last samples.
+///
+/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The
+/// rate counts sequence numbers, so that samples which the tap itself missed do not lower it.
+#[derive(Clone, Debug)]
+pub struct Intervals {
+    window_samples: usize,
+    arrivals: VecDeque<(u64, MonotonicNs)>,
+}
+
+/// What the samples of the window say.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct IntervalStatistics {
+    /// Samples per second.
+    pub rate_hz: f64,
+    /// The shortest interval between two samples that follow one another.
+    pub min_ms: f64,
+    /// The longest.
+    pub max_ms: f64,
+    /// The standard deviation of the intervals.
+    pub std_ms: f64,
+    /// Samples in the window.
+    pub samples: usize,
+}
+
+impl Default for Intervals {
+    fn default() -> Self {
+        Self::new(WINDOW_SAMPLES)
+    }
+}
+
+impl Intervals {
+    /// Over the last `window_samples` samples, at least 2.
+    pub fn new(window_samples: usize) -> Self {
+        Self { window_samples: window_samples.max(2), arrivals: VecDeque::new() }
+    }
+
+    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins
+    /// anew.
+    pub fn see(&mut self, header: &SampleHeader) {
+        if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
+            self.arrivals.clear();
+        }
+        if self.arrivals.len() == self.window_samples {
+            self.arrivals.pop_front();
+        }
+        self.arrivals.push_back((header.sequence, header.taken_at));
+    }
+
+    /// The statistics; `None` before two samples that follow one another were seen.
+    pub fn statistics(&self) -> Option<IntervalStatistics> {
+        let (&(first, began_at), &(last, ended_at)) = (self.arrivals.front()?, self.arrivals.back()?);
+        let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        let (mut min_ms, mut max_ms) = (f64::INFINITY, 0.0_f64);
+        for (&(one, at), &(next, next_at)) in self.arrivals.iter().zip(self.arrivals.iter().skip(1)) {
+            if next == one + 1 {
+                let ms = next_at.since(at) as f64 / 1e6;
+                (count, sum, squares) = (count + 1.0, sum + ms, squares + ms * ms);
+                (min_ms, max_ms) = (min_ms.min(ms), max_ms.max(ms));
+            }
+        }
+        let span_ns = ended_at.since(began_at);
+        if count == 0.0 || span_ns == 0 {
+            return None;
+        }
+        let mean = sum / count;
+        Some(IntervalStatistics {
+            rate_hz: (last - first) as f64 * 1e9 / span_ns as f64,
+            min_ms,
+            max_ms,
+            // Rounding may take it below 0 where all intervals are alike.
+            std_ms: (squares / count - mean * mean).max(0.0).sqrt(),
+            samples: self.arrivals.len(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{Encapsulation, Guid, SourceTimestamp};
+
+    fn sample(sequence: u64, at_ms: u64) -> SampleHeader {
+        SampleHeader {
+            sequence,
+            source_timestamp: SourceTimestamp::NONE,
+            taken_at: MonotonicNs(0).plus_ms(at_ms),
+            published_at: MonotonicNs(0),
+            writer_sequence: 0,
+            writer_guid: Guid::default(),
+            encapsulation: Encapsulation::CDR_LE,
+            reserved: 0,
+        }
+    }
+
+    fn of(samples: &[(u64, u64)], window: usize) -> Option<IntervalStatistics> {
+        let mut intervals = Intervals::new(window);
+        for &(sequence, at_ms) in samples {
+            intervals.see(&sample(sequence, at_ms));
+        }
+        intervals.statistics()
+    }
+
+    #[test]
+    fn rate_and_spread_are_those_of_the_arrivals() {
+        let found = of(&[(1, 0), (2, 8), (3, 20), (4, 28), (5, 40)], 10).unwrap();
+        assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 8.0, 12.0));
+        assert!((found.std_ms - 2.0).abs() < 1e-9, "{found:?}");
+        assert_eq!(found.samples, 5);
+    }
+
+    #[test]
+    fn missed_samples_lower_no_rate_and_make_no_interval() {
+        let found = of(&[(1, 0), (2, 10), (7, 60), (8, 70)], 10).unwrap();
+        assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 10.0, 10.0));
+    }
+
+    #[test]
+    fn only_the_window_counts() {
+        let found = of(&[(1, 0), (2, 1_000), (3, 1_010), (4, 1_020)], 3).unwrap();
+        assert_eq!((found.rate_hz, found.samples), (100.0, 3));
+    }
+
+    #[test]
+    fn a_sequence_that_goes_back_begins_anew() {
+        let found = of(&[(900, 0), (901, 1), (1, 5_000), (2, 5_010)], 10).unwrap();
+        assert_eq!((found.rate_hz, found.samples), (100.0, 2));
+    }
+
+    #[test]
+    fn one_sample_has_no_rate() {
+        assert_eq!(of(&[], 10), None);
+        assert_eq!(of(&[(1, 5)], 10), None);
+        assert_eq!(of(&[(1, 5), (3, 6)], 10), None);
+    }
+}

@@ -1,0 +1,371 @@
+//! What is wrong with a bridge, in words.
+
+use super::liveness::ProcessState;
+use super::report::drops_since;
+use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
+use crate::model::{DropReason, LaneMode, TrafficClass};
+use crate::shm::ProcessRole;
+
+/// A lane writes the mode that it applies ten times a second; one that has not after so long does not look.
+const APPLY_MS: u64 = 1_000;
+
+/// Fewer samples may be on their way at the moment of the reading.
+const SILENT_LANE_SAMPLES: u64 = 5;
+
+/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing,
+/// drops, then what is only missing.
+pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
+    let mut problems = Vec::new();
+    for process in &now.processes {
+        let former = before.processes.iter().find(|former| former.name == process.name);
+        problems.extend(process_problem(process, former, now));
+    }
+    for (route, output) in outputs(now) {
+        problems.extend(unaccounted(route, output, &now.lanes[output.lane]));
+    }
+    for route in now.routes.iter().filter(|route| !route.is_whole()) {
+        let counters = &route.counters;
+        problems.push(format!(
+            "ingress, route {}: does not add up: {} received, {} published, {} dropped",
+            route.id,
+            counters.received,
+            counters.published,
+            counters.drops.total()
+        ));
+    }
+    for (route, output) in outputs(now) {
+        let former = before.route(route);
+        problems.extend(silent(now, route, output, former));
+    }
+    for lane in &now.lanes {
+        problems.extend(not_applied(lane, now));
+    }
+    for route in &now.routes {
+        let former = before.route(route);
+        let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
+        for (reason, count) in dropped.iter() {
+            let what = meaning(reason);
+            problems.push(format!("ingress, route {}: {count} samples dropped just now: {what}", route.id));
+        }
+        for output in &route.outputs {
+            let lane = &now.lanes[output.lane];
+            let former = former.and_then(|former| former.output(output));
+            let dropped = drops_since(&output.counters.drops, former.map(|former| former.counters.drops));
+            for (reason, count) in dropped.iter().filter(|(reason, _)| !is_expected(*reason, lane.class)) {
+                problems.push(format!(
+                    "lane {}, {}: {count} samples dropped just now: {}",
+                    lane.name,
+                    output.topic,
+                    meaning(reason)
+                ));
+            }
+        }
+        if let Some(former) = former
+            && let Some(lost @ 1..) = route.counters.lost_upstream.checked_sub(former.counters.lost_upstream)
+        {
+            problems.push(format!(
+                "route {}: {lost} samples lost just now on their way from the publisher to the bridge",
+                route.id
+            ));
+        }
+    }
+    problems.extend(now.routes.iter().filter_map(no_publisher));
+    problems
+}
+
+fn outputs(snapshot: &Snapshot) -> impl Iterator<Item = (&RouteReading, &OutputReading)> {
+    snapshot.routes.iter().flat_map(|route| route.outputs.iter().map(move |output| (route, output)))
+}
+
+fn process_problem(
+    process: &ProcessReading,
+    former: Option<&ProcessReading>,
+    now: &Snapshot,
+) -> Option<String> {
+    let (name, pid) = (&process.name, process.health.pid);
+    let consequence = match process.role {
+        ProcessRole::Ingress => "nothing is taken in".to_owned(),
+        ProcessRole::Control => "lanes keep their modes, then fall back to safe ones".to_owned(),
+        ProcessRole::Egress(lane) => match now.lanes.get(lane) {
+            Some(lane) => format!("lane {} forwards nothing", lane.name),
+            None => "its lane forwards nothing".to_owned(),
+        },
+    };
+    match process.state {
+        ProcessState::Dead => Some(format!("{name} (pid {pid}) is dead: {consequence}")),
+        ProcessState::Stopped => {
+            Some(format!("{name} (pid {pid}) is stopped: {consequence}; `kill -CONT {pid}` lets it go on"))
+        }
+        ProcessState::Silent => {
+            let silent_s = now.at.since(process.health.alive_at) as f64 / 1e9;
+            Some(format!("{name} (pid {pid}) has not turned for {silent_s:.1} s: {consequence}"))
+        }
+        ProcessState::NotStarted => Some(format!("{name} was never started: {consequence}")),
+        ProcessState::Running => {
+            let restarts = process.health.starts.checked_sub(former?.health.starts).filter(|&n| n > 0)?;
+            let times = if restarts == 1 { "once".to_owned() } else { format!("{restarts} times") };
+            Some(format!("{name} was restarted just now, {times}"))
+        }
+    }
+}
+
+fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<String> {
+    let counters = &output.counters;
+    (!counters.is_whole()).then(|| {
+        format!(
+            "lane {}, route {}: does not add up: {} received, {} forwarded, {} waiting, {} dropped",
+            lane.name,
+            route.id,
+            counters.received(),
+            counters.forwarded,
+            counters.waiting,
+            counters.drops.total()
+        )
+    })
+}
+
+/// A critical lane that is there, and forwards nothing of what comes in.
+fn silent(
+    now: &Snapshot,
+    route: &RouteReading,
+    output: &OutputReading,
+    former: Option<&RouteReading>,
+) -> Option<String> {
+    let lane = &now.lanes[output.lane];
+    let process = now.processes.iter().find(|process| process.role == ProcessRole::Egress(output.lane))?;
+    let former = former?;
+    let published = route.counters.published.checked_sub(former.counters.published)?;
+    let forwarded = output.counters.forwarded.checked_sub(former.output(output)?.counters.forwarded)?;
+    let may_forward = lane.class == TrafficClass::Critical && lane.mode != LaneMode::Stopped;
+    (may_forward
+        && process.state == ProcessState::Running
+        && published >= SILENT_LANE_SAMPLES
+        && forwarded == 0)
+        .then(|| {
+            format!(
+                "lane {}, {}: {published} samples came in just now and none was forwarded",
+                lane.name, output.topic
+            )
+        })
+}
+
+fn not_applied(lane: &LaneReading, now: &Snapshot) -> Option<String> {
+    let waited = now.at.since(lane.policy.written_at) > APPLY_MS * 1_000_000;
+    let applies = lane.health.policy_epoch == lane.policy.epoch;
+    (lane.health.pid != 0 && waited && !applies && lane.policy.epoch != 0).then(|| {
+        format!("lane {}: mode {} was set and the lane's process has not applied it", lane.name, lane.mode)
+    })
+}
+
+fn no_publisher(route: &RouteReading) -> Option<String> {
+    (route.counters.writers == 0).then(|| match route.counters.received {
+        0 => format!("route {}: waits for a publisher of {}", route.id, route.input_topic),
+        _ => format!("route {}: the publisher of {} is gone", route.id, route.input_topic),
+    })
+}
+
+/// Drops that are how a noncritical lane works. A critical lane has none of these.
+const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
+    match reason {
+        DropReason::Superseded | DropReason::QueueFull | DropReason::Suspended => {
+            matches!(class, TrafficClass::Noncritical)
+        }
+        // The lane's mode says it.
+        DropReason::Stopped => true,
+        _ => false,
+    }
+}
+
+/// What a reason means, and what to do about it where something can be done.
+const fn meaning(reason: DropReason) -> &'static str {
+    match reason {
+        DropReason::TooLarge => "larger than the route's max_sample_bytes; raise it (too_large)",
+        DropReason::PoolExhausted => "no free slot in shared memory; raise queue_depth (pool_exhausted)",
+        DropReason::Malformed => "an encapsulation that DDS does not know (malformed)",
+        DropReason::IngressDied => "an ingress process died while it had them (ingress_died)",
+        DropReason::QueueOverflow => "the lane took them too slowly; raise its queue_depth (queue_overflow)",
+        DropReason::LaneDown => "no process served the lane when they came (lane_down)",
+        DropReason::NoWriter => "the message type is not known yet (no_writer)",
+        DropReason::WindowFull => "a reader does not acknowledge and the window is full (window_full)",
+        DropReason::WriteFailed => "the DDS library refused them (write_failed)",
+        DropReason::Stale => "older than stale_threshold_ms; are the clocks in step? (stale)",
+        DropReason::Superseded => "a fresher one was there (superseded)",
+        DropReason::QueueFull => "the lane's queue was full (queue_full)",
+        DropReason::Suspended => "the lane is suspended (suspended)",
+        DropReason::Stopped => "forwarding is stopped (stopped)",
+        DropReason::Shutdown => "still waiting when the lane shut down (shutdown)",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::snapshot::ModeReason;
+    use super::*;
+    use crate::model::{
+        IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram, MonotonicNs,
+        ProcessHealth, RouteId, TopicName, WallNs,
+    };
+
+    /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
+    fn sound() -> Snapshot {
+        let at = MonotonicNs(100_000_000_000);
+        let health = ProcessHealth { pid: 7, alive_at: at, starts: 1, ..ProcessHealth::default() };
+        let process = |name: &str, role| ProcessReading {
+            name: name.into(),
+            role,
+            health,
+            state: ProcessState::Running,
+        };
+        let lane = |name, class| LaneReading {
+            name,
+            class,
+            policy: LanePolicy::default(),
+            mode: LaneMode::Normal,
+            reason: ModeReason::Default,
+            ends_at: None,
+            health,
+        };
+        let output = |lane, topic| OutputReading {
+            lane,
+            topic: TopicName::try_from(topic).unwrap(),
+            counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
+            shm: LatencyHistogram::default(),
+            dds_out: LatencyHistogram::default(),
+            age: LatencyHistogram::default(),
+        };
+        Snapshot {
+            instance: InstanceName::try_from("default").unwrap(),
+            at,
+            at_wall: WallNs(0),
+            processes: vec![
+                process("ingress", ProcessRole::Ingress),
+                process("egress-critical", ProcessRole::Egress(0)),
+                process("egress-noncritical", ProcessRole::Egress(1)),
+            ],
+            lanes: vec![
+                lane(LaneName::critical(), TrafficClass::Critical),
+                lane(LaneName::noncritical(), TrafficClass::Noncritical),
+            ],
+            routes: vec![RouteReading {
+                id: RouteId::try_from("scan").unwrap(),
+                input_topic: TopicName::try_from("/scan").unwrap(),
+                message_type: None,
+                counters: IngressCounters {
+                    received: 100,
+                    published: 100,
+                    writers: 1,
+                    ..IngressCounters::default()
+                },
+                dds_in: LatencyHistogram::default(),
+                outputs: vec![output(0, "/c/scan"), output(1, "/n/scan")],
+            }],
+        }
+    }
+
+    /// What is said of a bridge that was sound and then changed.
+    fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
+        let before = sound();
+        let mut now = before.clone();
+        now.at = now.at.plus_ms(1_000);
+        change(&mut now);
+        of(&now, &before)
+    }
+
+    fn drop_on(now: &mut Snapshot, output: usize, reason: DropReason, count: u64) {
+        let counters = &mut now.routes[0].outputs[output].counters;
+        counters.drops.add(reason, count);
+        counters.last_sequence += count;
+    }
+
+    #[test]
+    fn of_a_sound_bridge_nothing_is_said() {
+        assert_eq!(after(|_| {}), [""; 0]);
+        assert_eq!(after(|now| drop_on(now, 1, DropReason::Superseded, 90)), [""; 0]);
+    }
+
+    #[test]
+    fn a_process_that_hangs_or_was_restarted_is_named() {
+        let said = after(|now| {
+            now.processes[0].state = ProcessState::Silent;
+            now.processes[1].health.starts = 3;
+            now.processes[2].state = ProcessState::Dead;
+        });
+        assert_eq!(
+            said,
+            [
+                "ingress (pid 7) has not turned for 1.0 s: nothing is taken in",
+                "egress-critical was restarted just now, 2 times",
+                "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing",
+            ]
+        );
+    }
+
+    #[test]
+    fn an_account_that_does_not_add_up_is_shown() {
+        let said = after(|now| {
+            now.routes[0].counters.received += 2;
+            now.routes[0].outputs[1].counters.last_sequence += 1;
+        });
+        assert_eq!(
+            said,
+            [
+                "lane noncritical, route scan: does not add up: 101 received, 100 forwarded, 0 waiting, \
+             0 dropped",
+                "ingress, route scan: does not add up: 102 received, 100 published, 0 dropped",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_critical_lane_that_lives_and_forwards_nothing_is_named() {
+        let come = |now: &mut Snapshot| {
+            now.routes[0].counters.received += 50;
+            now.routes[0].counters.published += 50;
+        };
+        let said = after(come);
+        assert_eq!(said, ["lane critical, /c/scan: 50 samples came in just now and none was forwarded"]);
+        let said = after(|now| {
+            come(now);
+            now.lanes[0].mode = LaneMode::Stopped;
+        });
+        assert_eq!(said, [""; 0]);
+    }
+
+    #[test]
+    fn drops_that_are_no_part_of_the_work_are_named_while_they_go_on() {
+        let said = after(|now| {
+            now.routes[0].counters.received += 1;
+            now.routes[0].counters.drops.add(DropReason::TooLarge, 1);
+            now.routes[0].counters.lost_upstream += 4;
+            drop_on(now, 0, DropReason::WindowFull, 3);
+            drop_on(now, 0, DropReason::Superseded, 1);
+        });
+        assert_eq!(said.len(), 4, "{said:?}");
+        assert!(
+            said[0].starts_with("ingress, route scan: 1 samples dropped just now: larger than"),
+            "{said:?}"
+        );
+        assert!(said[1].contains("lane critical, /c/scan: 3 samples") && said[1].ends_with("(window_full)"));
+        assert!(said[2].ends_with("(superseded)"), "{said:?}");
+        assert!(said[3].contains("4 samples lost just now on their way"), "{said:?}");
+        let mut before = sound();
+        drop_on(&mut before, 0, DropReason::WindowFull, 3);
+        assert_eq!(of(&before, &before), [""; 0]);
+    }
+
+    #[test]
+    fn a_mode_that_is_not_applied_and_a_publisher_that_is_missing_are_named() {
+        let said = after(|now| {
+            now.lanes[1].policy = LanePolicy { epoch: 1, ..LanePolicy::default() };
+            now.lanes[1].mode = LaneMode::Suspended;
+            now.routes[0].counters.writers = 0;
+        });
+        assert_eq!(
+            said,
+            [
+                "lane noncritical: mode suspended was set and the lane's process has not applied it",
+                "route scan: the publisher of /scan is gone",
+            ]
+        );
+    }
+}

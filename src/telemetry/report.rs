@@ -1,0 +1,379 @@
+//! What two readings of the boards say together: counts, and rates and latencies of the time between.
+//!
+//! The types here are the JSON of `status --json`; `docs/status-json.md` documents every key.
+
+use serde::ser::{Serialize, SerializeMap, Serializer};
+
+use super::liveness::ProcessState;
+use super::problems;
+use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
+use crate::model::{DropCounts, DropReason, LatencyHistogram, MonotonicNs};
+
+/// The state of a bridge. Keys that end in a unit are in that unit; what cannot be told is null.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Report {
+    /// The bridge.
+    pub instance: String,
+    /// When the boards were read, in milliseconds since the Unix epoch.
+    pub time_unix_ms: u64,
+    /// The time between the two readings: rates, latencies and `drops_in_window` are of it.
+    pub window_ms: f64,
+    /// What is wrong, a sentence each, the gravest first.
+    pub problems: Vec<String>,
+    /// The processes.
+    pub processes: Vec<ProcessReport>,
+    /// The lanes.
+    pub lanes: Vec<LaneReport>,
+    /// The routes.
+    pub routes: Vec<RouteReport>,
+}
+
+/// One process.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct ProcessReport {
+    /// `ingress`, `control`, `egress-critical`, …
+    pub name: String,
+    /// Its process id; 0 when it never ran.
+    pub pid: u64,
+    /// Whether it is there and turns.
+    pub state: ProcessState,
+    /// How long ago it came up.
+    pub uptime_s: Option<f64>,
+    /// How often it was started in this bridge, the first time included.
+    pub starts: u64,
+    /// Turns of its data path.
+    pub turns: u64,
+    /// How long ago it turned last.
+    pub last_turn_age_ms: Option<f64>,
+}
+
+/// One lane.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct LaneReport {
+    /// Its name.
+    pub name: String,
+    /// `critical` or `noncritical`.
+    pub class: &'static str,
+    /// The mode that the policy board gives it.
+    pub mode: &'static str,
+    /// Why: `default`, `by_hand`, `control`, `held` or `expired`.
+    pub mode_reason: &'static str,
+    /// When the policy ends, unless it is confirmed or set anew.
+    pub mode_ends_in_s: Option<f64>,
+    /// The epoch of the policy on the board; 0 when nobody has set one.
+    pub policy_epoch: u64,
+    /// The mode that the lane's process applies.
+    pub applied_mode: Option<&'static str>,
+    /// The epoch of the policy that the lane's process applies.
+    pub applied_policy_epoch: u64,
+}
+
+/// One route.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct RouteReport {
+    /// Its id.
+    pub id: String,
+    /// What ingress subscribes to.
+    pub input_topic: String,
+    /// The message type; null until it is known.
+    pub message_type: Option<String>,
+    /// Publishers matched.
+    pub writers: u64,
+    /// Samples taken in.
+    pub received: u64,
+    /// Payload bytes of those.
+    pub received_bytes: u64,
+    /// Samples published to the lanes.
+    pub published: u64,
+    /// Samples that the publisher numbered and that never reached the bridge.
+    pub lost_upstream: u64,
+    /// Samples received and not published, by reason.
+    pub drops: Drops,
+    /// Of those, the ones within the window.
+    pub drops_in_window: Drops,
+    /// Whether `received = published + drops`.
+    pub whole: bool,
+    /// Samples received per second.
+    pub rate_hz: Option<f64>,
+    /// Payload bytes received per second.
+    pub bytes_per_s: Option<f64>,
+    /// How long ago the last sample was received.
+    pub last_received_age_ms: Option<f64>,
+    /// From the publisher's source timestamp to ingress.
+    pub dds_in: Latency,
+    /// The lanes that serve the route.
+    pub lanes: Vec<OutputReport>,
+}
+
+/// One route on one lane.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct OutputReport {
+    /// The lane.
+    pub lane: String,
+    /// What the lane publishes to.
+    pub topic: String,
+    /// Readers matched.
+    pub readers: u64,
+    /// Samples that the lane was offered since it began to account.
+    pub received: u64,
+    /// Samples given to the DDS writer.
+    pub forwarded: u64,
+    /// Payload bytes of those.
+    pub forwarded_bytes: u64,
+    /// Of the forwarded, those handed over by reference.
+    pub by_reference: u64,
+    /// Of the forwarded, those published while the lane was down.
+    pub caught_up: u64,
+    /// Samples waiting in the lane.
+    pub waiting: u64,
+    /// Samples not forwarded, by reason.
+    pub drops: Drops,
+    /// Of those, the ones within the window.
+    pub drops_in_window: Drops,
+    /// Whether `received = forwarded + waiting + drops`.
+    pub whole: bool,
+    /// Samples offered per second.
+    pub received_hz: Option<f64>,
+    /// Samples forwarded per second.
+    pub rate_hz: Option<f64>,
+    /// Payload bytes forwarded per second.
+    pub bytes_per_s: Option<f64>,
+    /// How long ago the last sample was forwarded.
+    pub last_forwarded_age_ms: Option<f64>,
+    /// From ingress to the lane.
+    pub shm: Latency,
+    /// Within the lane, up to its DDS writer.
+    pub dds_out: Latency,
+    /// From the source timestamp to the lane's DDS writer.
+    pub age: Latency,
+}
+
+/// A latency within the window; at most 6.3 % too large, for it is the upper edge of a bucket.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct Latency {
+    /// Samples measured.
+    pub count: u64,
+    /// Median.
+    pub p50_us: Option<f64>,
+    /// 99th percentile.
+    pub p99_us: Option<f64>,
+    /// The largest.
+    pub max_us: Option<f64>,
+}
+
+/// Drops, by name. In JSON every reason is there, so that a key that is missing is a mistake in its name.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Drops(pub DropCounts);
+
+impl Serialize for Drops {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(DropReason::COUNT))?;
+        for reason in DropReason::ALL {
+            map.serialize_entry(reason.label(), &self.0.get(*reason))?;
+        }
+        map.end()
+    }
+}
+
+impl Snapshot {
+    /// What this reading says, with rates and latencies since `earlier`. A bridge that was started anew in
+    /// between has no rates yet.
+    pub fn since(&self, earlier: &Self) -> Report {
+        let window_ms = self.at.since(earlier.at) as f64 / 1e6;
+        Report {
+            instance: self.instance.to_string(),
+            time_unix_ms: self.at_wall.0 / 1_000_000,
+            window_ms,
+            problems: problems::of(self, earlier),
+            processes: self.processes.iter().map(|process| process_report(process, self.at)).collect(),
+            lanes: self.lanes.iter().map(|lane| lane_report(lane, self.at)).collect(),
+            routes: self
+                .routes
+                .iter()
+                .map(|route| self.route_report(route, earlier.route(route), window_ms))
+                .collect(),
+        }
+    }
+
+    /// The same route in this reading.
+    pub(super) fn route(&self, other: &RouteReading) -> Option<&RouteReading> {
+        self.routes.iter().find(|route| route.id == other.id)
+    }
+
+    fn route_report(&self, now: &RouteReading, before: Option<&RouteReading>, window_ms: f64) -> RouteReport {
+        let (counters, former) = (&now.counters, before.map(|before| before.counters));
+        RouteReport {
+            id: now.id.to_string(),
+            input_topic: now.input_topic.to_string(),
+            message_type: now.message_type.clone(),
+            writers: counters.writers,
+            received: counters.received,
+            received_bytes: counters.received_bytes,
+            published: counters.published,
+            lost_upstream: counters.lost_upstream,
+            drops: Drops(counters.drops),
+            drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
+            whole: now.is_whole(),
+            rate_hz: per_s(counters.received, former.map(|former| former.received), window_ms),
+            bytes_per_s: per_s(
+                counters.received_bytes,
+                former.map(|former| former.received_bytes),
+                window_ms,
+            ),
+            last_received_age_ms: age_ms(counters.last_received_at, self.at),
+            dds_in: latency(&now.dds_in, before.map(|before| &before.dds_in)),
+            lanes: now
+                .outputs
+                .iter()
+                .map(|output| {
+                    let before = before.and_then(|before| before.output(output));
+                    self.output_report(output, before, window_ms)
+                })
+                .collect(),
+        }
+    }
+
+    fn output_report(
+        &self,
+        now: &OutputReading,
+        before: Option<&OutputReading>,
+        window_ms: f64,
+    ) -> OutputReport {
+        let (counters, former) = (&now.counters, before.map(|before| before.counters));
+        let rate = |now, before: Option<u64>| per_s(now, before, window_ms);
+        OutputReport {
+            lane: self.lanes[now.lane].name.to_string(),
+            topic: now.topic.to_string(),
+            readers: counters.readers,
+            received: counters.received(),
+            forwarded: counters.forwarded,
+            forwarded_bytes: counters.forwarded_bytes,
+            by_reference: counters.by_reference,
+            caught_up: counters.caught_up,
+            waiting: counters.waiting,
+            drops: Drops(counters.drops),
+            drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
+            whole: counters.is_whole(),
+            received_hz: rate(counters.received(), former.map(|former| former.received())),
+            rate_hz: rate(counters.forwarded, former.map(|former| former.forwarded)),
+            bytes_per_s: rate(counters.forwarded_bytes, former.map(|former| former.forwarded_bytes)),
+            last_forwarded_age_ms: age_ms(counters.last_forwarded_at, self.at),
+            shm: latency(&now.shm, before.map(|before| &before.shm)),
+            dds_out: latency(&now.dds_out, before.map(|before| &before.dds_out)),
+            age: latency(&now.age, before.map(|before| &before.age)),
+        }
+    }
+}
+
+impl RouteReading {
+    /// Whether every sample received was published or dropped for a named reason.
+    pub fn is_whole(&self) -> bool {
+        self.counters.received == self.counters.published + self.counters.drops.total()
+    }
+
+    /// The same lane's output in this reading.
+    pub(super) fn output(&self, other: &OutputReading) -> Option<&OutputReading> {
+        self.outputs.iter().find(|output| output.lane == other.lane && output.topic == other.topic)
+    }
+}
+
+/// What was dropped since an earlier reading; nothing when there is none, or when it is of another bridge.
+pub(super) fn drops_since(now: &DropCounts, before: Option<DropCounts>) -> DropCounts {
+    let mut drops = DropCounts::default();
+    if let Some(before) = before {
+        for &reason in DropReason::ALL {
+            drops.add(reason, now.get(reason).saturating_sub(before.get(reason)));
+        }
+    }
+    drops
+}
+
+fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
+    let health = &process.health;
+    ProcessReport {
+        name: process.name.clone(),
+        pid: health.pid,
+        state: process.state,
+        uptime_s: age_ms(health.started_at, now).filter(|_| process.state.exists()).map(|ms| ms / 1e3),
+        starts: health.starts,
+        turns: health.turns,
+        last_turn_age_ms: age_ms(health.alive_at, now),
+    }
+}
+
+fn lane_report(lane: &LaneReading, now: MonotonicNs) -> LaneReport {
+    let applied = crate::model::LaneMode::from_u8(lane.health.mode);
+    LaneReport {
+        name: lane.name.to_string(),
+        class: lane.class.label(),
+        mode: lane.mode.label(),
+        mode_reason: lane.reason.label(),
+        mode_ends_in_s: lane.ends_at.map(|at| at.since(now) as f64 / 1e9),
+        policy_epoch: lane.policy.epoch,
+        applied_mode: applied.filter(|_| lane.health.pid != 0).map(|mode| mode.label()),
+        applied_policy_epoch: lane.health.policy_epoch,
+    }
+}
+
+/// `None` for an instant that never was.
+fn age_ms(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
+    (at.0 != 0).then(|| now.since(at) as f64 / 1e6)
+}
+
+/// `None` without an earlier reading, and when the count went back: then it is another bridge's.
+fn per_s(now: u64, before: Option<u64>, window_ms: f64) -> Option<f64> {
+    let grown = now.checked_sub(before?)?;
+    (window_ms > 0.0).then(|| grown as f64 * 1e3 / window_ms)
+}
+
+fn latency(now: &LatencyHistogram, before: Option<&LatencyHistogram>) -> Latency {
+    let window = before.map_or_else(LatencyHistogram::default, |before| now.since(before));
+    let us = |quantile| window.quantile_ns(quantile).map(|ns| ns as f64 / 1e3);
+    Latency { count: window.count(), p50_us: us(0.5), p99_us: us(0.99), max_us: us(1.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rate_is_what_came_in_the_window() {
+        assert_eq!(per_s(150, Some(100), 500.0), Some(100.0));
+        assert_eq!(per_s(100, Some(100), 500.0), Some(0.0));
+    }
+
+    #[test]
+    fn there_is_no_rate_without_a_reading_before_of_the_same_bridge() {
+        assert_eq!(per_s(150, None, 500.0), None);
+        assert_eq!(per_s(99, Some(100), 500.0), None);
+        assert_eq!(per_s(150, Some(100), 0.0), None);
+    }
+
+    #[test]
+    fn latencies_are_those_of_the_window_also_the_largest() {
+        let mut histogram = LatencyHistogram::default();
+        histogram.record(90_000_000);
+        let before = histogram;
+        for _ in 0..100 {
+            histogram.record(100_000);
+        }
+        let found = latency(&histogram, Some(&before));
+        assert_eq!(found.count, 100);
+        for us in [found.p50_us, found.p99_us, found.max_us] {
+            assert!(us.is_some_and(|us| (100.0..=106.3).contains(&us)), "{us:?}");
+        }
+        assert_eq!(latency(&histogram, None).p50_us, None);
+    }
+
+    #[test]
+    fn drops_of_another_bridge_are_not_news() {
+        let mut now = DropCounts::default();
+        now.add(DropReason::Stale, 3);
+        assert_eq!(drops_since(&now, None).total(), 0);
+        let mut before = DropCounts::default();
+        before.add(DropReason::Stale, 1);
+        before.add(DropReason::WindowFull, 9);
+        let since: Vec<_> = drops_since(&now, Some(before)).iter().collect();
+        assert_eq!(since, [(DropReason::Stale, 2)]);
+    }
+}

@@ -1,0 +1,322 @@
+//! One reading of all boards of a bridge.
+
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
+
+use super::liveness::ProcessState;
+use crate::clock;
+use crate::config::Settings;
+use crate::model::{
+    IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName, LanePolicy, LatencyHistogram,
+    MonotonicNs, ProcessHealth, RouteId, TopicName, TrafficClass, TypeName, WallNs,
+};
+use crate::policy::effective_mode;
+use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
+
+/// Within a turn a lane has counted a sample here and not yet there. A lane that does not add up is looked at
+/// again so often, with this pause between: 20 ms, in which every turn ends.
+const WHOLE_ATTEMPTS: usize = 100;
+const WHOLE_PAUSE: Duration = Duration::from_micros(200);
+
+/// All that the processes of a bridge show of themselves, read at one instant as nearly as can be without
+/// making anybody wait.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    /// The bridge.
+    pub instance: InstanceName,
+    /// When it was read.
+    pub at: MonotonicNs,
+    /// The same by the wall clock.
+    pub at_wall: WallNs,
+    /// Ingress, control where it ever ran, then the egress of each lane.
+    pub processes: Vec<ProcessReading>,
+    /// The lanes, in the order of the configuration.
+    pub lanes: Vec<LaneReading>,
+    /// The routes, in the order of the configuration.
+    pub routes: Vec<RouteReading>,
+}
+
+/// One process.
+#[derive(Clone, Debug)]
+pub struct ProcessReading {
+    /// `ingress`, `control`, `egress-critical`, …
+    pub name: String,
+    /// Its role.
+    pub role: ProcessRole,
+    /// What it shows of itself.
+    pub health: ProcessHealth,
+    /// Whether it is there.
+    pub state: ProcessState,
+}
+
+/// One lane.
+#[derive(Clone, Debug)]
+pub struct LaneReading {
+    /// Its name.
+    pub name: LaneName,
+    /// Critical or noncritical.
+    pub class: TrafficClass,
+    /// What the policy board says to it.
+    pub policy: LanePolicy,
+    /// The mode that this comes to.
+    pub mode: LaneMode,
+    /// Why.
+    pub reason: ModeReason,
+    /// When the policy ends, unless it is confirmed or set anew.
+    pub ends_at: Option<MonotonicNs>,
+    /// What its process shows of itself, and with it the mode that it applies.
+    pub health: ProcessHealth,
+}
+
+/// Why a lane is in its mode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ModeReason {
+    /// Nobody has set one.
+    Default,
+    /// An operator set it.
+    ByHand,
+    /// The control process set it, and runs.
+    Control,
+    /// The control process set it and does not run; it holds for `policy_hold_s`.
+    Held,
+    /// What was set has expired, or the control process is gone for longer than `policy_hold_s`.
+    Expired,
+}
+
+impl ModeReason {
+    /// The name that `status` shows.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Default => "default",
+            Self::ByHand => "by_hand",
+            Self::Control => "control",
+            Self::Held => "held",
+            Self::Expired => "expired",
+        }
+    }
+}
+
+/// One route.
+#[derive(Clone, Debug)]
+pub struct RouteReading {
+    /// Its id.
+    pub id: RouteId,
+    /// What ingress subscribes to.
+    pub input_topic: TopicName,
+    /// The message type as far as it is known, in the terms of ROS 2 where it is one of those.
+    pub message_type: Option<String>,
+    /// What ingress counted.
+    pub counters: IngressCounters,
+    /// From the publisher's source timestamp to ingress.
+    pub dds_in: LatencyHistogram,
+    /// The lanes that serve it.
+    pub outputs: Vec<OutputReading>,
+}
+
+/// One route on one lane.
+#[derive(Clone, Debug)]
+pub struct OutputReading {
+    /// The lane, as an index into [`Snapshot::lanes`].
+    pub lane: usize,
+    /// What the lane publishes to.
+    pub topic: TopicName,
+    /// What the lane counted.
+    pub counters: LaneCounters,
+    /// From ingress to the lane.
+    pub shm: LatencyHistogram,
+    /// Within the lane, up to its DDS writer.
+    pub dds_out: LatencyHistogram,
+    /// From the source timestamp to the lane's DDS writer.
+    pub age: LatencyHistogram,
+}
+
+impl Snapshot {
+    /// Reads the boards of the bridge that these settings describe, below `root`. `None` when it does not
+    /// run; nothing is created then, and nothing of it is written or locked at any time.
+    ///
+    /// # Errors
+    /// The boards are those of other settings or of another version, or may not be opened.
+    pub fn take(root: &Path, settings: &Settings) -> Result<Option<Self>, ShmError> {
+        let boards = Boards::find(root, &settings.instance, &BridgeShape::of(settings))?;
+        let snapshot = boards.map(|boards| Self::read(&boards, settings)).transpose()?;
+        Ok(snapshot.filter(Self::is_running))
+    }
+
+    /// Reads boards, whether anybody runs or not.
+    ///
+    /// # Errors
+    /// A value changes faster than it can be read, which no process of ours does.
+    pub fn read(boards: &Boards, settings: &Settings) -> Result<Self, ShmError> {
+        let now = clock::monotonic();
+        let ingress = process(boards, "ingress".to_owned(), ProcessRole::Ingress, now)?;
+        let control = process(boards, "control".to_owned(), ProcessRole::Control, now)?;
+        let control_runs = control.state.exists();
+        let mut processes = vec![ingress];
+        processes.extend((control.state != ProcessState::NotStarted).then_some(control));
+        let mut lanes = Vec::with_capacity(settings.lanes.len());
+        for (index, lane) in settings.lanes.iter().enumerate() {
+            let egress = process(boards, format!("egress-{}", lane.name), ProcessRole::Egress(index), now)?;
+            let policy = steady(boards.policy(index))?;
+            let hold_ms = settings.policy_hold_ms;
+            let (reason, ends_at) = reason(&policy, control_runs, now, hold_ms);
+            lanes.push(LaneReading {
+                name: lane.name.clone(),
+                class: lane.class,
+                policy,
+                mode: effective_mode(&policy, lane.class, now, hold_ms),
+                reason,
+                ends_at,
+                health: egress.health,
+            });
+            processes.push(egress);
+        }
+        let routes = (0..settings.routes.len())
+            .map(|route| read_route(boards, settings, route))
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            instance: settings.instance.clone(),
+            at: now,
+            at_wall: clock::wall(),
+            processes,
+            lanes,
+            routes,
+        })
+    }
+
+    /// Whether any process of the bridge is there.
+    pub fn is_running(&self) -> bool {
+        self.processes.iter().any(|process| process.state.exists())
+    }
+}
+
+fn process(
+    boards: &Boards,
+    name: String,
+    role: ProcessRole,
+    now: MonotonicNs,
+) -> Result<ProcessReading, ShmError> {
+    let health = steady(boards.health(role))?;
+    Ok(ProcessReading { name, role, health, state: ProcessState::look(&health, now) })
+}
+
+/// As `effective_mode`, which says what and not why.
+fn reason(
+    policy: &LanePolicy,
+    control_runs: bool,
+    now: MonotonicNs,
+    policy_hold_ms: u64,
+) -> (ModeReason, Option<MonotonicNs>) {
+    if policy.epoch == 0 {
+        (ModeReason::Default, None)
+    } else if policy.by_hand != 0 {
+        match policy.expires_at {
+            MonotonicNs(0) => (ModeReason::ByHand, None),
+            at if now < at => (ModeReason::ByHand, Some(at)),
+            _ => (ModeReason::Expired, None),
+        }
+    } else {
+        let ends_at = policy.written_at.plus_ms(policy_hold_ms);
+        match control_runs {
+            _ if now > ends_at => (ModeReason::Expired, None),
+            true => (ModeReason::Control, Some(ends_at)),
+            false => (ModeReason::Held, Some(ends_at)),
+        }
+    }
+}
+
+fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<RouteReading, ShmError> {
+    let route = &settings.routes[index];
+    let found = steady(boards.route_info(index))?;
+    let found = match found.dds_type.as_str() {
+        "" => None,
+        dds_type => Some(TypeName::from_dds(dds_type).map_or(dds_type.to_owned(), |name| name.to_string())),
+    };
+    let mut outputs = Vec::new();
+    for (lane, configured) in settings.lanes.iter().enumerate() {
+        for output in configured.outputs.iter().filter(|output| output.route == index) {
+            outputs.push(OutputReading {
+                lane,
+                topic: output.topic.clone(),
+                counters: read_lane(boards, lane, index)?,
+                shm: boards.histogram(Stage::Shm(lane), index),
+                dds_out: boards.histogram(Stage::DdsOut(lane), index),
+                age: boards.histogram(Stage::Age(lane), index),
+            });
+        }
+    }
+    Ok(RouteReading {
+        id: route.id.clone(),
+        input_topic: route.input_topic.clone(),
+        message_type: found.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
+        counters: steady(boards.ingress(index))?,
+        dds_in: boards.histogram(Stage::DdsIn, index),
+        outputs,
+    })
+}
+
+fn read_lane(boards: &Boards, lane: usize, route: usize) -> Result<LaneCounters, ShmError> {
+    let mut counters = steady(boards.lane(lane, route))?;
+    for _ in 0..WHOLE_ATTEMPTS {
+        if counters.is_whole() {
+            break;
+        }
+        thread::sleep(WHOLE_PAUSE);
+        counters = steady(boards.lane(lane, route))?;
+    }
+    Ok(counters)
+}
+
+/// A value that was read while it stood still.
+fn steady<T>(value: Option<T>) -> Result<T, ShmError> {
+    value.ok_or_else(|| ShmError::Failed {
+        what: "to read a board".to_owned(),
+        path: "/dev/shm".into(),
+        reason: "its writer changes it faster than it can be read".to_owned(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mode_has_the_reason_that_its_policy_gives() {
+        let at = |ms| MonotonicNs(0).plus_ms(ms);
+        let mut policy = LanePolicy::default();
+        let of = |policy: &LanePolicy, control_runs, ms| reason(policy, control_runs, at(ms), 5_000);
+        assert_eq!(of(&policy, true, 1), (ModeReason::Default, None));
+        policy.epoch = 1;
+        policy.written_at = at(1_000);
+        assert_eq!(of(&policy, true, 6_000), (ModeReason::Control, Some(at(6_000))));
+        assert_eq!(of(&policy, false, 6_000), (ModeReason::Held, Some(at(6_000))));
+        assert_eq!(of(&policy, false, 6_001), (ModeReason::Expired, None));
+        policy.by_hand = 1;
+        assert_eq!(of(&policy, false, 1_000_000), (ModeReason::ByHand, None));
+        policy.expires_at = at(9_000);
+        assert_eq!(of(&policy, false, 8_999), (ModeReason::ByHand, Some(at(9_000))));
+        assert_eq!(of(&policy, true, 9_000), (ModeReason::Expired, None));
+    }
+
+    #[test]
+    fn a_reason_is_expired_exactly_when_the_policy_no_longer_decides_the_mode() {
+        for by_hand in [0, 1] {
+            for expires_at in [0, 1_999_000_000, 2_000_000_000, 2_001_000_000] {
+                for at_ms in [1_000, 1_999, 2_000, 2_001, 6_000, 6_001] {
+                    let policy = LanePolicy {
+                        epoch: 1,
+                        written_at: MonotonicNs(1_000_000_000),
+                        expires_at: MonotonicNs(expires_at),
+                        mode: LaneMode::Stopped as u8,
+                        by_hand,
+                        ..LanePolicy::default()
+                    };
+                    let now = MonotonicNs(0).plus_ms(at_ms);
+                    let mode = effective_mode(&policy, TrafficClass::Critical, now, 5_000);
+                    let expired = reason(&policy, false, now, 5_000).0 == ModeReason::Expired;
+                    assert_eq!(expired, mode != LaneMode::Stopped, "{policy:?} at {at_ms} ms");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,339 @@
+//! The report as text: what is wrong first, then a table for ingress and for each lane, in 100 columns.
+
+use std::fmt::{self, Write};
+
+use super::liveness::ProcessState;
+use super::report::{Drops, LaneReport, Latency, OutputReport, ProcessReport, Report, RouteReport};
+
+/// No line is longer, but for a sentence that says what is wrong, where names may be of any length.
+const COLUMNS: usize = 100;
+const TOPIC_COLUMNS: usize = 31;
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "bridge {}: routes {}, lanes {}; rates and latencies (p50/p99) of the last {}",
+            self.instance,
+            self.routes.len(),
+            self.lanes.len(),
+            latency_text(self.window_ms * 1e3)
+        )?;
+        match self.problems.len() {
+            0 => writeln!(f, "nothing is wrong")?,
+            1 => writeln!(f, "1 thing is wrong:")?,
+            count => writeln!(f, "{count} things are wrong:")?,
+        }
+        for problem in &self.problems {
+            f.write_str(&wrapped("  ! ", "    ", problem.split(' '), " "))?;
+        }
+        let process = |name: &str| self.processes.iter().find(|process| process.name == name);
+        if let Some(control) = process("control") {
+            writeln!(f, "\ncontrol: {}", process_text(control))?;
+        }
+        if let Some(ingress) = process("ingress") {
+            writeln!(f, "\ningress: {}", process_text(ingress))?;
+        }
+        f.write_str(&row(["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST BEFORE"]))?;
+        for route in &self.routes {
+            f.write_str(&route_text(route))?;
+        }
+        for lane in &self.lanes {
+            let process = process(&format!("egress-{}", lane.name));
+            let title = format!("lane {}: {};", lane.name, mode_text(lane));
+            let process = process.map(process_text).unwrap_or_default();
+            write!(f, "\n{}", wrapped("", "  ", [title.as_str(), &process].into_iter(), " "))?;
+            f.write_str(&row(["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"]))?;
+            let outputs = self.routes.iter().flat_map(|route| &route.lanes);
+            for output in outputs.filter(|output| output.lane == lane.name) {
+                f.write_str(&output_text(output))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn row([topic, peers, rate_in, rate_out, one, two, three]: [&str; 7]) -> String {
+    let line = format!(
+        "  {topic:<TOPIC_COLUMNS$} {peers:>5} {rate_in:>7} {rate_out:>7} {one:>13} {two:>13} {three:>13}"
+    );
+    format!("{}\n", line.trim_end())
+}
+
+fn route_text(route: &RouteReport) -> String {
+    let bytes = route.bytes_per_s.map_or("-".to_owned(), |rate| format!("{}/s", bytes_text(rate)));
+    let mut text = row([
+        &topic_text(&route.input_topic),
+        &route.writers.to_string(),
+        &rate_text(route.rate_hz),
+        "",
+        &bytes,
+        &latencies_text(&route.dds_in),
+        &route.lost_upstream.to_string(),
+    ]);
+    text.push_str(&drops_text(&route.drops, &route.drops_in_window));
+    text
+}
+
+fn output_text(output: &OutputReport) -> String {
+    let mut text = row([
+        &topic_text(&output.topic),
+        &output.readers.to_string(),
+        &rate_text(output.received_hz),
+        &rate_text(output.rate_hz),
+        &latencies_text(&output.shm),
+        &latencies_text(&output.dds_out),
+        &latencies_text(&output.age),
+    ]);
+    text.push_str(&drops_text(&output.drops, &output.drops_in_window));
+    text
+}
+
+fn drops_text(drops: &Drops, in_window: &Drops) -> String {
+    let entries: Vec<String> = drops
+        .0
+        .iter()
+        .enumerate()
+        .map(|(index, (reason, count))| {
+            let comma = if index == 0 { "" } else { ", " };
+            match in_window.0.get(reason) {
+                0 => format!("{comma}{reason} {count}"),
+                new => format!("{comma}{reason} {count} (+{new})"),
+            }
+        })
+        .collect();
+    if entries.is_empty() {
+        return String::new();
+    }
+    wrapped("    dropped: ", "      ", entries.iter().map(String::as_str), "")
+}
+
+/// Parts joined into lines of at most [`COLUMNS`], as long as no part is longer by itself.
+fn wrapped<'a>(first: &str, next: &str, parts: impl Iterator<Item = &'a str>, between: &str) -> String {
+    let mut text = String::new();
+    let mut line = first.to_owned();
+    let mut empty = true;
+    for part in parts {
+        let length = line.chars().count() + between.len() + part.trim_end().chars().count();
+        if !empty && length > COLUMNS {
+            let _ = writeln!(text, "{}", line.trim_end());
+            line = next.to_owned();
+            line.push_str(part.trim_start_matches([',', ' ']));
+        } else {
+            if !empty {
+                line.push_str(between);
+            }
+            line.push_str(part);
+        }
+        empty = false;
+    }
+    let _ = writeln!(text, "{}", line.trim_end());
+    text
+}
+
+fn mode_text(lane: &LaneReport) -> String {
+    let reason = match lane.mode_reason {
+        "by_hand" => "by hand",
+        other => other,
+    };
+    // What control confirms again and again does not really end.
+    match lane.mode_ends_in_s.filter(|_| lane.mode_reason != "control") {
+        Some(left_s) => format!("{} ({reason}, {left_s:.0} s left)", lane.mode),
+        None => format!("{} ({reason})", lane.mode),
+    }
+}
+
+fn process_text(process: &ProcessReport) -> String {
+    if process.state == ProcessState::NotStarted {
+        return process.state.label().to_owned();
+    }
+    let restarts = match process.starts.saturating_sub(1) {
+        1 => "1 restart".to_owned(),
+        restarts => format!("{restarts} restarts"),
+    };
+    let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
+    format!("process {} {}{up}, {restarts}", process.pid, process.state.label())
+}
+
+/// The end of a long topic tells more than its beginning.
+fn topic_text(topic: &str) -> String {
+    let length = topic.chars().count();
+    if length <= TOPIC_COLUMNS {
+        return topic.to_owned();
+    }
+    let end: String = topic.chars().skip(length + 1 - TOPIC_COLUMNS).collect();
+    format!("…{end}")
+}
+
+fn rate_text(rate_hz: Option<f64>) -> String {
+    rate_hz.map_or("-".to_owned(), |rate| format!("{rate:.1}"))
+}
+
+fn latencies_text(latency: &Latency) -> String {
+    match (latency.p50_us, latency.p99_us) {
+        (Some(p50_us), Some(p99_us)) => format!("{}/{}", latency_text(p50_us), latency_text(p99_us)),
+        _ => "-".to_owned(),
+    }
+}
+
+fn latency_text(us: f64) -> String {
+    match us {
+        ..999.5 => format!("{us:.0}µs"),
+        ..9_995.0 => format!("{:.1}ms", us / 1e3),
+        ..999_500.0 => format!("{:.0}ms", us / 1e3),
+        ..99_950_000.0 => format!("{:.1}s", us / 1e6),
+        _ => format!("{:.0}s", us / 1e6),
+    }
+}
+
+fn bytes_text(bytes: f64) -> String {
+    const KIB: f64 = 1024.0;
+    match bytes {
+        ..KIB => format!("{bytes:.0} B"),
+        ..1_048_576.0 => format!("{:.1} KiB", bytes / KIB),
+        _ => format!("{:.1} MiB", bytes / KIB / KIB),
+    }
+}
+
+fn duration_text(seconds: f64) -> String {
+    let seconds = seconds as u64;
+    let (days, hours, minutes) = (seconds / 86_400, seconds / 3_600 % 24, seconds / 60 % 60);
+    match (days, hours, minutes) {
+        (0, 0, 0) => format!("{seconds} s"),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {minutes} min"),
+        _ => format!("{days} d {hours} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{DropCounts, DropReason};
+
+    fn drops(each: u64) -> Drops {
+        let mut counts = DropCounts::default();
+        for &reason in DropReason::ALL {
+            counts.add(reason, each);
+        }
+        Drops(counts)
+    }
+
+    /// Figures as long as they come.
+    fn wide() -> Report {
+        let latency =
+            Latency { count: 1, p50_us: Some(99_940.0), p99_us: Some(137_000_000.0), max_us: Some(1e9) };
+        let topic = format!("/{}", "long_name/".repeat(20));
+        let output = OutputReport {
+            lane: "a_lane_of_24_characters_".into(),
+            topic: topic.clone(),
+            readers: 99_999,
+            received: u64::MAX,
+            forwarded: u64::MAX,
+            forwarded_bytes: u64::MAX,
+            by_reference: 0,
+            caught_up: 0,
+            waiting: 0,
+            drops: drops(u64::MAX / 100),
+            drops_in_window: drops(u64::MAX / 100),
+            whole: true,
+            received_hz: Some(99_999.9),
+            rate_hz: Some(99_999.9),
+            bytes_per_s: Some(1e10),
+            last_forwarded_age_ms: None,
+            shm: latency,
+            dds_out: latency,
+            age: latency,
+        };
+        Report {
+            instance: "an_instance_of_24_chars_".into(),
+            time_unix_ms: 0,
+            window_ms: 1_000.0,
+            problems: vec!["many words ".repeat(30)],
+            processes: vec![ProcessReport {
+                name: "egress-a_lane_of_24_characters_".into(),
+                pid: 4_194_304,
+                state: ProcessState::Running,
+                uptime_s: Some(86_399.0),
+                starts: 100_001,
+                turns: 0,
+                last_turn_age_ms: None,
+            }],
+            lanes: vec![LaneReport {
+                name: output.lane.clone(),
+                class: "noncritical",
+                mode: "suspended",
+                mode_reason: "by_hand",
+                mode_ends_in_s: Some(3_600.0),
+                policy_epoch: 1,
+                applied_mode: None,
+                applied_policy_epoch: 1,
+            }],
+            routes: vec![RouteReport {
+                id: "scan".into(),
+                input_topic: topic,
+                message_type: None,
+                writers: 99_999,
+                received: 0,
+                received_bytes: 0,
+                published: 0,
+                lost_upstream: 9_999_999_999_999,
+                drops: drops(u64::MAX / 100),
+                drops_in_window: drops(0),
+                whole: true,
+                rate_hz: Some(99_999.9),
+                bytes_per_s: Some(1e11),
+                last_received_age_ms: None,
+                dds_in: latency,
+                lanes: vec![output],
+            }],
+        }
+    }
+
+    #[test]
+    fn no_line_is_longer_than_100_columns() {
+        let text = wide().to_string();
+        for line in text.lines() {
+            assert!(line.chars().count() <= COLUMNS, "{} columns: {line}", line.chars().count());
+        }
+        for reason in DropReason::ALL {
+            assert!(text.contains(&format!("{reason} 184467440737095516")), "{reason} is not shown:\n{text}");
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_comes_first() {
+        let mut report = wide();
+        report.problems = vec!["ingress is dead".into(), "lane critical is not whole".into()];
+        let text = report.to_string();
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(
+            lines[1..4],
+            ["2 things are wrong:", "  ! ingress is dead", "  ! lane critical is not whole"]
+        );
+        report.problems.clear();
+        assert_eq!(report.to_string().lines().nth(1), Some("nothing is wrong"));
+    }
+
+    #[test]
+    fn figures_are_short_and_have_their_unit() {
+        for (us, text) in [
+            (0.0, "0µs"),
+            (999.4, "999µs"),
+            (999.6, "1.0ms"),
+            (9_994.0, "10.0ms"),
+            (9_996.0, "10ms"),
+            (999_600.0, "1.0s"),
+            (137_000_000.0, "137s"),
+        ] {
+            assert_eq!(latency_text(us), text);
+        }
+        assert_eq!(bytes_text(1_023.0), "1023 B");
+        assert_eq!(bytes_text(589_600.0), "575.8 KiB");
+        assert_eq!(duration_text(59.9), "59 s");
+        assert_eq!(duration_text(3_720.0), "1 h 2 min");
+        assert_eq!(duration_text(90_000.0), "1 d 1 h");
+        assert_eq!(topic_text("/scan"), "/scan");
+        assert_eq!(topic_text(&"a/".repeat(40)).chars().count(), TOPIC_COLUMNS);
+    }
+}

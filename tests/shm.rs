@@ -1,0 +1,946 @@
+//! The shared-memory edge on real shared memory, with real processes that are killed, stopped and restarted.
+
+#[path = "shm/child.rs"]
+mod child;
+#[path = "shm/support.rs"]
+mod support;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+use std::process::Command;
+use std::time::Duration;
+
+use adaptive_bridge::model::{InstanceName, LaneMode, LatencyHistogram, MonotonicNs, RouteId};
+use adaptive_bridge::shm::{
+    Boards, BridgeShape, HeaderError, LaneQueue, LoanError, ProcessRole, RoleLock, RouteChannel,
+    SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole, TakeError, Woken,
+};
+use nix::sys::signal::Signal;
+use support::{LANE, Place, Process, channel, deep_channel, header, payload, route, shape, skip, until};
+
+/// Counts the allocations of each thread.
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: hands everything to the system's allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn allocations() -> u64 {
+    ALLOCATIONS.with(Cell::get)
+}
+
+/// Not a test of its own: what the children of the others run.
+#[test]
+fn child_entry() {
+    if let Some((what, child)) = child::Child::from_environment() {
+        child.run(&what);
+    }
+}
+
+fn lane(node: &ShmNode, channel: &RouteChannel) -> SampleSubscriber {
+    SampleSubscriber::open(node, channel, SubscriberRole::Lane(channel.lanes[0]), false).unwrap()
+}
+
+fn publish(publisher: &SamplePublisher, sequence: u64, length: usize) -> usize {
+    publisher.copy_in(&payload(sequence, length)).unwrap().publish(header(sequence)).unwrap()
+}
+
+fn sequences(subscriber: &SampleSubscriber) -> Vec<u64> {
+    std::iter::from_fn(|| subscriber.take().unwrap()).map(|sample| sample.header().sequence).collect()
+}
+
+#[test]
+fn samples_of_every_size_arrive_as_they_were_sent() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(100_000);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    let tap = SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, false).unwrap();
+    for (sequence, length) in [(1, 0), (2, 1), (3, 7), (4, 2_948), (5, 99_999), (6, 100_000), (7, 0)] {
+        assert_eq!(publish(&publisher, sequence, length), 2);
+        for subscriber in [&lane, &tap] {
+            let sample = subscriber.take().unwrap().unwrap();
+            assert_eq!(*sample.header(), header(sequence));
+            assert_eq!(sample.payload(), payload(sequence, length));
+            assert_eq!(sample.as_ref().len(), length);
+            assert!(subscriber.take().unwrap().is_none());
+        }
+    }
+    let too_large = publisher.copy_in(&vec![0; 100_001]).unwrap_err();
+    assert_eq!(too_large, LoanError::TooLarge { len: 100_001, max: 100_000 });
+    assert_eq!(publish(&publisher, 8, 10), 2);
+    assert_eq!(sequences(&lane), [8]);
+}
+
+#[test]
+fn a_slot_that_is_not_published_is_free_again() {
+    let place = Place::new();
+    let node = place.node();
+    let publisher = SamplePublisher::create(&node, &channel(64)).unwrap();
+    for _ in 0..10_000 {
+        drop(publisher.copy_in(&[1; 64]).unwrap());
+    }
+    assert_eq!(publish(&publisher, 1, 64), 0, "nobody is there");
+}
+
+#[test]
+fn the_pool_is_as_large_as_computed_and_all_of_it_is_there() {
+    for (bytes, retained_samples, max_taps) in [(2_948, 0, 0), (100, 3, 2), (1 << 20, 1, 1)] {
+        let place = Place::new();
+        let node = place.node();
+        let channel = RouteChannel { max_taps, retained_samples, ..channel(bytes) };
+        let pool = channel.pool_size();
+        let before = place.shm_files();
+        let _publisher = SamplePublisher::create(&node, &channel).unwrap();
+        let pools: Vec<_> = place
+            .shm_files()
+            .into_iter()
+            .filter(|path| !before.contains(path) && path.to_string_lossy().ends_with(".data"))
+            .collect();
+        assert_eq!(pools.len(), 1);
+        let metadata = fs::metadata(&pools[0]).unwrap();
+        println!("{channel:?}: {pool:?}, {} bytes, {} blocks", metadata.len(), metadata.blocks());
+        assert_eq!(metadata.len().next_multiple_of(4096), pool.bytes);
+        for path in place.shm_files() {
+            let metadata = fs::metadata(&path).unwrap();
+            assert!(metadata.blocks() * 512 >= metadata.len(), "{path:?} lacks pages");
+        }
+    }
+}
+
+#[test]
+fn the_pool_suffices_when_everybody_holds_all_it_may() {
+    let place = Place::new();
+    let node = place.node();
+    let shares =
+        [LaneQueue { queue_depth: 5, max_borrowed: 3 }, LaneQueue { queue_depth: 2, max_borrowed: 7 }];
+    let channel = RouteChannel { lanes: shares.to_vec(), max_taps: 1, retained_samples: 2, ..channel(1_000) };
+    assert_eq!(channel.pool_size().slots, (5 + 3) + (2 + 7) + (4 + 2) + 2 + 2);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let subscribers = [
+        SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shares[0]), false).unwrap(),
+        SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shares[1]), false).unwrap(),
+        SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, false).unwrap(),
+    ];
+    let mut held: Vec<ShmSample> = Vec::new();
+    let mut sequence = 0;
+    for subscriber in &subscribers {
+        for _ in 0..subscriber.max_borrowed() {
+            sequence += 1;
+            publish(&publisher, sequence, 1_000);
+            // The others' queues overflow meanwhile, so what is borrowed differs from one to the other.
+            held.push(subscriber.take().unwrap().unwrap());
+        }
+        assert_eq!(subscriber.take().unwrap_err(), TakeError::BorrowLimit);
+    }
+    for _ in 0..100 {
+        sequence += 1;
+        publish(&publisher, sequence, 1_000);
+    }
+    let copies: Vec<_> = (0..2).map(|_| publisher.copy_in(&[0; 1_000]).unwrap()).collect();
+    assert!(publisher.copy_in(&[0; 1_000]).is_err());
+    drop(copies);
+    drop(held);
+    for (subscriber, depth) in subscribers.iter().zip([5, 2, 4]) {
+        assert_eq!(sequences(subscriber), (sequence - depth + 1..=sequence).collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn the_borrow_limit_loses_nothing_and_samples_go_back_from_any_thread() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(100);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    for sequence in 1..=20 {
+        publish(&publisher, sequence, 100);
+    }
+    let mut held: Vec<_> = (0..8).map(|_| lane.take().unwrap().unwrap()).collect();
+    assert_eq!((lane.borrowed(), lane.max_borrowed()), (8, 8));
+    assert_eq!(lane.take().unwrap_err(), TakeError::BorrowLimit);
+    assert_eq!(lane.borrowed(), 8);
+    let one = held.remove(3);
+    std::thread::spawn(move || drop(one)).join().unwrap();
+    assert_eq!(lane.borrowed(), 7);
+    let ninth = lane.take().unwrap().unwrap();
+    assert_eq!(ninth.header().sequence, 9);
+    // What `Bytes::from_owner` asks for.
+    let bytes = bytes::Bytes::from_owner(ninth);
+    assert_eq!(bytes, payload(9, 100));
+    assert_eq!(lane.borrowed(), 8);
+    drop((bytes, held));
+    assert_eq!(lane.borrowed(), 0);
+    assert_eq!(sequences(&lane), (10..=20).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_full_queue_gives_up_its_oldest_sample() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(100);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    for sequence in 1..=1_000 {
+        assert_eq!(publish(&publisher, sequence, 100), 1);
+    }
+    assert_eq!(sequences(&lane), (1_000 - 63..=1_000).collect::<Vec<_>>());
+}
+
+#[test]
+fn publisher_and_subscribers_may_come_in_any_order() {
+    let place = Place::new();
+    let channel = channel(100);
+    let (lane_node, tap_node) = (place.node(), place.node());
+    let early = lane(&lane_node, &channel);
+    let publisher = SamplePublisher::create(&place.node(), &channel).unwrap();
+    publish(&publisher, 1, 100);
+    let late = SampleSubscriber::open(&tap_node, &channel, SubscriberRole::Tap, false).unwrap();
+    publish(&publisher, 2, 100);
+    assert_eq!(sequences(&early), [1, 2]);
+    assert_eq!(sequences(&late), [2]);
+    drop(publisher);
+    let publisher = SamplePublisher::create(&place.node(), &channel).unwrap();
+    publish(&publisher, 3, 100);
+    assert_eq!(sequences(&early), [3]);
+    assert_eq!(sequences(&late), [3]);
+    drop((publisher, early, late, lane_node, tap_node));
+    place.assert_nothing_left();
+}
+
+#[test]
+fn what_is_borrowed_outlives_publisher_and_subscriber() {
+    let place = Place::new();
+    let channel = channel(100);
+    let (one, other) = (place.node(), place.node());
+    let publisher = SamplePublisher::create(&one, &channel).unwrap();
+    let lane = lane(&other, &channel);
+    publish(&publisher, 1, 100);
+    publish(&publisher, 2, 100);
+    let first = lane.take().unwrap().unwrap();
+    drop((publisher, one));
+    let second = lane.take().unwrap().unwrap();
+    drop((lane, other));
+    assert_eq!(first.payload(), payload(1, 100));
+    assert_eq!(second.payload(), payload(2, 100));
+    assert!(!place.root_files().is_empty(), "a sample keeps the membership");
+    drop((first, second));
+    place.assert_nothing_left();
+}
+
+#[test]
+fn a_lane_outlives_more_publishers_than_it_holds_samples_of() {
+    let place = Place::new();
+    let channel = channel(100);
+    let node = place.node();
+    let lane = lane(&node, &channel);
+    let mut held = Vec::new();
+    for sequence in 1..=300 {
+        let publisher = SamplePublisher::create(&place.node(), &channel).unwrap();
+        publish(&publisher, sequence, 100);
+        let sample = lane.take().unwrap().unwrap();
+        assert_eq!(sample.header().sequence, sequence);
+        if sequence % 40 == 0 {
+            held.push(sample);
+        }
+    }
+    for sample in held {
+        assert_eq!(sample.payload(), payload(sample.header().sequence, 100));
+    }
+}
+
+#[test]
+fn retained_samples_come_to_those_who_ask_also_without_new_ones() {
+    let place = Place::new();
+    let node = place.node();
+    let shallow = LaneQueue { queue_depth: 1, max_borrowed: 2 };
+    let channel = RouteChannel { lanes: vec![shallow; 2], retained_samples: 3, ..channel(100) };
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    for sequence in 1..=10 {
+        publish(&publisher, sequence, 100);
+    }
+    let asks = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), true).unwrap();
+    let does_not = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), false).unwrap();
+    assert_eq!(sequences(&asks), [0u64; 0]);
+    publisher.attend();
+    assert_eq!(sequences(&asks), [8, 9, 10]);
+    assert_eq!(sequences(&does_not), [0u64; 0]);
+    publish(&publisher, 11, 100);
+    assert_eq!(sequences(&asks), [11]);
+    assert_eq!(sequences(&does_not), [11]);
+}
+
+#[test]
+fn a_header_that_makes_no_sense_is_an_error_and_the_next_sample_comes() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(100);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    let mut wrong = header(1);
+    wrong.reserved = 1;
+    publisher.copy_in(&[1]).unwrap().publish(wrong).unwrap();
+    publisher.copy_in(&[1]).unwrap().publish(header(0)).unwrap();
+    publish(&publisher, 2, 100);
+    assert_eq!(lane.take().unwrap_err(), TakeError::Malformed(HeaderError::ReservedNotZero));
+    assert_eq!(lane.take().unwrap_err(), TakeError::Malformed(HeaderError::SequenceZero));
+    assert_eq!(lane.borrowed(), 0);
+    assert_eq!(sequences(&lane), [2]);
+}
+
+#[test]
+fn a_sample_costs_no_allocation() {
+    // In a process of its own: what a loan needs is kept for the whole process, and other tests loan too.
+    let place = Place::new();
+    let child = Process::start("allocations", &place, "");
+    child.expect("steady 0, overflowing 0, control 1");
+    child.finish();
+}
+
+#[test]
+fn nobody_else_may_read_what_is_shared() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = RouteChannel { retained_samples: 1, ..channel(100) };
+    let _role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
+    let boards = node.boards(&shape()).unwrap();
+    boards.set_policy(0, |policy| policy).unwrap();
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let _lane = lane(&node, &channel);
+    let _tap = SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, true).unwrap();
+    publish(&publisher, 1, 100);
+    let files = place.shm_files();
+    assert!(files.len() >= 5, "{files:?}");
+    let instance = fs::symlink_metadata(place.root().join("test")).unwrap();
+    assert_eq!(instance.permissions().mode() & 0o7777, 0o700);
+    for path in files.into_iter().chain(place.root_files()) {
+        let metadata = fs::symlink_metadata(&path).unwrap();
+        // Folders deeper down are of iceoryx2's making; the instance's own, 0700, bars the way to them.
+        if !metadata.is_dir() || path.parent() == Some(&place.root().join("test")) {
+            assert_eq!(metadata.permissions().mode() & 0o077, 0, "{path:?}");
+        }
+    }
+}
+
+#[test]
+fn nothing_is_left_when_the_last_one_has_gone() {
+    let place = Place::new();
+    let role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
+    let (first, second) = (place.node(), place.node());
+    let channel = channel(100);
+    let publisher = SamplePublisher::create(&first, &channel).unwrap();
+    let boards = first.boards(&shape()).unwrap();
+    boards.ingress_writer(0).update(|counters| counters.published = 5);
+    drop((publisher, boards, first));
+    assert_eq!(second.boards(&shape()).unwrap().ingress(0).unwrap().published, 5);
+    drop(second);
+    assert_eq!(place.shm_files().len(), 0);
+    assert_eq!(place.root_files().len(), 2, "the role is still held: {:?}", place.root_files());
+    drop(role);
+    place.assert_nothing_left();
+    assert!(Boards::find(place.root(), &place.instance, &shape()).unwrap().is_none());
+}
+
+#[test]
+fn two_instances_and_two_roots_do_not_meet() {
+    let (here, mut there) = (Place::new(), Place::new());
+    let channel = channel(100);
+    let other_name = InstanceName::try_from("other").unwrap();
+    let nodes = [here.node(), there.node(), ShmNode::open(here.root(), &other_name, "test").unwrap()];
+    let ends = nodes.each_ref().map(|node| {
+        (
+            SamplePublisher::create(node, &channel).unwrap(),
+            lane(node, &channel),
+            node.boards(&shape()).unwrap(),
+        )
+    });
+    let _roles = [
+        RoleLock::acquire(here.root(), &here.instance, "ingress").unwrap(),
+        RoleLock::acquire(there.root(), &there.instance, "ingress").unwrap(),
+        RoleLock::acquire(here.root(), &other_name, "ingress").unwrap(),
+    ];
+    for (number, (publisher, _, boards)) in (1..).zip(&ends) {
+        assert_eq!(publish(publisher, number, 100), 1);
+        boards.ingress_writer(0).update(|counters| counters.published = number);
+    }
+    for (number, (_, lane, boards)) in (1..).zip(&ends) {
+        assert_eq!(sequences(lane), [number]);
+        assert_eq!(boards.ingress(0).unwrap().published, number);
+    }
+    // One that ends, and sweeps, takes nothing of the others along.
+    let [first, second, third] = ends;
+    let [first_node, second_node, third_node] = nodes;
+    drop((first, first_node));
+    assert_eq!(here.shm_files().len(), 0);
+    for (publisher, lane, _) in [&second, &third] {
+        assert_eq!(publish(publisher, 9, 100), 1);
+        assert_eq!(sequences(lane), [9]);
+    }
+    drop((second, second_node, third, third_node));
+    there.instance = other_name;
+    assert_eq!(there.shm_files().len(), 0);
+}
+
+#[test]
+fn those_who_disagree_about_sizes_do_not_meet() {
+    let place = Place::new();
+    let node = place.node();
+    let _lane = lane(&node, &channel(100));
+    for other in [
+        channel(101),
+        RouteChannel { retained_samples: 1, ..channel(100) },
+        RouteChannel { lanes: vec![LANE], ..channel(100) },
+        RouteChannel { max_taps: 1, ..channel(100) },
+    ] {
+        let error = SamplePublisher::create(&node, &other).unwrap_err();
+        assert!(matches!(error, ShmError::Incompatible { .. }), "{error}");
+        assert!(error.to_string().contains("stop all processes"), "{error}");
+    }
+    let _boards = node.boards(&shape()).unwrap();
+    let other = RouteId::try_from("other").unwrap();
+    for routes in [vec![route(), other.clone()], vec![other]] {
+        let error = node.boards(&BridgeShape { routes, ..shape() }).unwrap_err();
+        assert!(matches!(error, ShmError::Incompatible { .. }), "{error}");
+    }
+}
+
+#[test]
+fn taps_beyond_the_limit_are_refused_and_take_no_lanes_place() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(100);
+    let open = || SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, false);
+    let mut taps = vec![open().unwrap(), open().unwrap()];
+    let error = open().unwrap_err();
+    assert!(matches!(error, ShmError::TooManySubscribers { max: 2, .. }), "{error}");
+    assert!(error.to_string().contains("scan") && error.to_string().contains("max_taps"), "{error}");
+    let lanes = [lane(&node, &channel), lane(&node, &channel)];
+    taps.pop();
+    taps.push(open().unwrap());
+    taps.pop();
+    drop((taps, lanes));
+    let open = || SampleSubscriber::open(&node, &deep_channel(100), SubscriberRole::Tap, false);
+    let mut others = [0, 1].map(|_| Process::start("tap", &place, "100"));
+    others.iter().for_each(|other| other.expect("ready"));
+    assert!(open().is_err());
+    others[1].kill();
+    open().unwrap();
+}
+
+#[test]
+fn a_folder_that_others_could_tamper_with_is_refused() {
+    let place = Place::new();
+    let open = |root: &std::path::Path| ShmNode::open(root, &place.instance, "test").map(drop);
+    let root = place.root().join("root");
+
+    fs::create_dir(&root).unwrap();
+    fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).unwrap();
+    let error = open(&root).unwrap_err();
+    assert!(matches!(error, ShmError::RootNotOurs { .. }), "{error}");
+    assert!(error.to_string().contains("others may write"), "{error}");
+    fs::set_permissions(&root, fs::Permissions::from_mode(0o755)).unwrap();
+    open(&root).unwrap();
+
+    let link = place.root().join("link");
+    symlink(&root, &link).unwrap();
+    assert!(matches!(open(&link).unwrap_err(), ShmError::RootNotOurs { .. }));
+    assert!(matches!(open("relative".as_ref()).unwrap_err(), ShmError::RootNotOurs { .. }));
+    let file = place.root().join("file");
+    fs::write(&file, "").unwrap();
+    assert!(matches!(open(&file).unwrap_err(), ShmError::RootNotOurs { .. }));
+    let below_file = open(&file.join("below")).unwrap_err();
+    assert!(matches!(below_file, ShmError::CannotCreateRoot { .. }), "{below_file}");
+
+    let long = place.root().join("a".repeat(120));
+    let error = open(&long).unwrap_err();
+    assert!(matches!(error, ShmError::PathTooLong { .. }), "{error}");
+    let ShmError::PathTooLong { max, .. } = error else { unreachable!() };
+    let fits = max - place.root().as_os_str().len() - "/".len() - "/test".len();
+    let longest = place.root().join("b".repeat(fits));
+    let node = ShmNode::open(&longest, &place.instance, "test").unwrap();
+    let channel = channel(100);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    publish(&publisher, 1, 100);
+    assert_eq!(sequences(&lane), [1]);
+    assert!(matches!(open(&place.root().join("b".repeat(fits + 1))), Err(ShmError::PathTooLong { .. })));
+
+    if nix::unistd::geteuid().is_root() {
+        std::os::unix::fs::chown(&root, Some(12_345), None).unwrap();
+        let error = open(&root).unwrap_err();
+        assert!(error.to_string().contains("belongs to user 12345"), "{error}");
+    } else {
+        skip("a folder of another user: needs root");
+    }
+}
+
+#[test]
+fn a_configuration_file_in_the_working_folder_changes_nothing() {
+    let place = Place::new();
+    let elsewhere = tempfile::tempdir().unwrap();
+    let stranger = "[global]\nroot-path = \"/nonexistent\"\nprefix = \"stranger_\"\n";
+    fs::write(elsewhere.path().join("iceoryx2.toml"), stranger).unwrap();
+    fs::create_dir(elsewhere.path().join("config")).unwrap();
+    fs::write(elsewhere.path().join("config/iceoryx2.toml"), stranger).unwrap();
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.current_dir(elsewhere.path());
+    let mut child = Process::start_with(command, "open", &place, "");
+    child.expect("ready");
+    assert!(place.shm_files().iter().any(|path| path.to_string_lossy().ends_with(".data")));
+    child.kill();
+    let node = place.node();
+    assert!(node.cleaned_up().stray_files > 0, "{:?}", node.cleaned_up());
+    drop(node);
+    place.assert_nothing_left();
+}
+
+#[test]
+fn a_role_has_one_process_at_a_time() {
+    let place = Place::new();
+    let mut holder = Process::start("role", &place, "");
+    holder.expect("served");
+    let error = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap_err();
+    let pid = holder.pid();
+    assert!(
+        matches!(&error, ShmError::AlreadyServed { role, pid: held } if role == "ingress" && *held == pid)
+    );
+    assert!(error.to_string().contains(&format!("process {pid}")), "{error}");
+    let other = RoleLock::acquire(place.root(), &place.instance, "egress-critical").unwrap();
+    holder.kill();
+    let role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
+    let refused = Process::start("role", &place, "");
+    let said = refused.hear();
+    assert!(
+        said.contains(&format!("ingress is served already, by process {}", std::process::id())),
+        "{said}"
+    );
+    refused.finish();
+    drop(role);
+    let next = Process::start("role", &place, "");
+    next.expect("served");
+    next.finish();
+    drop(other);
+    place.assert_nothing_left();
+}
+
+#[test]
+fn lanes_go_on_when_ingress_is_killed_again_and_again() {
+    let place = Place::new();
+    let lanes = [0, 1].map(|lane| Process::start("lane", &place, &format!("{lane} 2948 0")));
+    lanes.iter().for_each(|lane| lane.expect("ready"));
+    let boards = || Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+    for _ in 0..10 {
+        let mut ingress = Process::start("publisher", &place, "100 2948");
+        ingress.expect("ready");
+        let before = boards().lane(0, 0).unwrap().last_sequence;
+        until("samples flow", || boards().lane(0, 0).unwrap().last_sequence > before + 200);
+        ingress.kill();
+        let dead = boards().ingress(0).unwrap();
+        assert_eq!(dead.received, dead.published, "the pool suffices");
+    }
+    let last = Process::start("publisher", &place, "100 2948");
+    last.expect("ready");
+    let before = boards().lane(1, 0).unwrap().last_sequence;
+    until("samples flow", || boards().lane(1, 0).unwrap().last_sequence > before + 200);
+    let published: u64 = last.finish().parse().unwrap();
+    for number in 0..2 {
+        until("the lane has them all", || boards().lane(number, 0).unwrap().last_sequence == published);
+        let counters = boards().lane(number, 0).unwrap();
+        assert!(counters.is_whole(), "{counters:?}");
+        if number == 0 {
+            // One for each death: numbered, and not published.
+            assert!(counters.drops.total() <= 10, "{counters:?}");
+        }
+    }
+    for lane in lanes {
+        lane.finish();
+    }
+    place.assert_nothing_left();
+}
+
+#[test]
+fn ingress_and_the_other_lane_go_on_when_a_lane_is_killed_with_samples_in_its_hands() {
+    let place = Place::new();
+    let ingress = Process::start("publisher", &place, "100 2948");
+    ingress.expect("ready");
+    let healthy = Process::start("lane", &place, "0 2948 0");
+    healthy.expect("ready");
+    let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+    for _ in 0..10 {
+        let mut victim = Process::start("lane", &place, "1 2948 7");
+        victim.expect("ready");
+        victim.expect("holding");
+        victim.kill();
+    }
+    // With what the ten held, 70 slots, and their queues, the pool would be empty long since.
+    let fresh = Process::start("lane", &place, "1 2948 0");
+    fresh.expect("ready");
+    let before = boards.lane(1, 0).unwrap().last_sequence;
+    until("the new lane flows", || boards.lane(1, 0).unwrap().last_sequence > before + 500);
+    assert!(fresh.finish().parse::<u64>().unwrap() > 0);
+    let published: u64 = ingress.finish().parse().unwrap();
+    let counters = boards.ingress(0).unwrap();
+    assert_eq!(counters.received, published, "no sample found the pool empty: {counters:?}");
+    until("the healthy lane has them all", || boards.lane(0, 0).unwrap().last_sequence == published);
+    let counters = boards.lane(0, 0).unwrap();
+    assert_eq!(counters.drops.total(), 0, "{counters:?}");
+    healthy.finish();
+    place.assert_nothing_left();
+}
+
+#[test]
+fn a_stopped_lane_holds_up_nobody_and_goes_on_after_a_gap() {
+    let place = Place::new();
+    let lanes = [0, 1].map(|lane| Process::start("lane", &place, &format!("{lane} 2948 0")));
+    lanes.iter().for_each(|lane| lane.expect("ready"));
+    let ingress = Process::start("publisher", &place, "50 2948");
+    ingress.expect("ready");
+    let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+    until("both flow", || (0..2).all(|lane| boards.lane(lane, 0).unwrap().forwarded > 100));
+    lanes[1].signal(Signal::SIGSTOP);
+    let stopped_at = boards.ingress(0).unwrap().published;
+    // Far more than a queue of 64, and more wakes than a socket's buffer would take.
+    until("ingress goes on", || boards.ingress(0).unwrap().published > stopped_at + 20_000);
+    lanes[1].signal(Signal::SIGCONT);
+    let resumed_at = boards.ingress(0).unwrap().published;
+    until("the lane goes on", || boards.lane(1, 0).unwrap().last_sequence > resumed_at + 500);
+    let published: u64 = ingress.finish().parse().unwrap();
+    assert_eq!(boards.ingress(0).unwrap().received, published);
+    until("all is accounted for", || {
+        (0..2).all(|lane| boards.lane(lane, 0).unwrap().last_sequence == published)
+    });
+    let counters = [0, 1].map(|lane| boards.lane(lane, 0).unwrap());
+    assert!(counters.iter().all(|counters| counters.is_whole()), "{counters:?}");
+    assert_eq!(counters[0].drops.total(), 0, "{counters:?}");
+    assert!(counters[1].drops.total() >= 19_000, "{counters:?}");
+    for lane in lanes {
+        lane.finish();
+    }
+    place.assert_nothing_left();
+}
+
+#[test]
+fn taps_that_come_and_are_killed_disturb_nobody() {
+    let place = Place::new();
+    let healthy = Process::start("lane", &place, "0 500 0");
+    healthy.expect("ready");
+    let ingress = Process::start("publisher", &place, "200 500");
+    ingress.expect("ready");
+    for _ in 0..10 {
+        let mut taps = [0, 1].map(|_| Process::start("tap", &place, "500"));
+        taps.iter().for_each(|tap| tap.expect("ready"));
+        taps.iter_mut().for_each(Process::kill);
+    }
+    let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+    let published: u64 = ingress.finish().parse().unwrap();
+    until("all has arrived", || boards.lane(0, 0).unwrap().last_sequence == published);
+    assert_eq!(boards.lane(0, 0).unwrap().drops.total(), 0);
+    healthy.finish();
+    place.assert_nothing_left();
+}
+
+#[test]
+fn processes_killed_while_they_start_leave_nothing() {
+    let place = Place::new();
+    let survivor = Process::start("lane", &place, "0 1000 0");
+    survivor.expect("ready");
+    for delay_ms in 0..40 {
+        let mut victim = Process::start("open", &place, "");
+        std::thread::sleep(Duration::from_millis(delay_ms / 2));
+        victim.kill();
+    }
+    let ingress = Process::start("publisher", &place, "100 1000");
+    ingress.expect("ready");
+    let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+    until("samples flow", || boards.lane(0, 0).unwrap().forwarded > 100);
+    ingress.finish();
+    survivor.finish();
+    place.assert_nothing_left();
+    for delay_ms in 0..20 {
+        let mut victim = Process::start("open", &place, "");
+        std::thread::sleep(Duration::from_millis(delay_ms));
+        victim.kill();
+    }
+    drop(place.node());
+    place.assert_nothing_left();
+}
+
+#[test]
+fn what_a_process_leaves_half_made_is_removed_and_holds_up_nobody() {
+    let place = Place::new();
+    let survivor = Process::start("tap", &place, "1000");
+    survivor.expect("ready");
+    // As after kill -9 between the calls that create a file, set its length, fill it and publish it.
+    let instance = place.root().join("test");
+    let services = || fs::read_dir(instance.join("services")).unwrap().flatten().map(|entry| entry.path());
+    let other = RouteChannel { route: RouteId::try_from("other").unwrap(), ..channel(100) };
+    let service = {
+        let before: Vec<_> = services().collect();
+        let node = place.node();
+        let _publisher = SamplePublisher::create(&node, &other).unwrap();
+        services().find(|path| !before.contains(path)).unwrap()
+    };
+    assert!(!service.exists(), "the service goes with its last user");
+    let count = place.shm_files().into_iter().find(|path| path.to_string_lossy().ends_with("global_mgmt"));
+    let count = count.unwrap();
+    let connection = std::path::Path::new("/dev/shm")
+        .join(format!("{}b9fc73e5c1f646968758453273c6c65cb372831b_1_2.connection", place.prefix()));
+    let node_folder = instance.join("nodes/12345678901234567890");
+    let write = |path: &std::path::Path, content: &[u8], mode| {
+        let _ = fs::remove_file(path);
+        fs::write(path, content).unwrap();
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    };
+    for content in [&[][..], &[0; 64]] {
+        write(&count, content, 0o200);
+        write(&connection, content, 0o200);
+        write(&service, content, 0o600);
+        fs::create_dir(&node_folder).unwrap();
+        fs::write(node_folder.join("x.details"), "half").unwrap();
+        let node = place.node();
+        assert_eq!(node.cleaned_up().stray_files, 4);
+        assert!(!connection.exists() && !service.exists() && !node_folder.exists());
+        let publisher = SamplePublisher::create(&node, &other).unwrap();
+        let lane = lane(&node, &other);
+        publish(&publisher, 1, 100);
+        assert_eq!(sequences(&lane), [1]);
+    }
+    survivor.finish();
+    place.assert_nothing_left();
+}
+
+#[test]
+fn counters_survive_their_writer_whole() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let mut last = 0;
+    for round in 1..=30 {
+        let mut writer = Process::start("counter", &place, "");
+        let resumed: u64 = writer.hear().parse().unwrap();
+        assert_eq!(resumed, last, "the new writer begins where the dead one ended");
+        let mut read = 0;
+        while read < 20_000 || boards.ingress(0).unwrap().received < last + 1_000 {
+            let counters = boards.ingress(0).unwrap();
+            let n = counters.received;
+            let whole = (n, n, n) == (counters.received_bytes, counters.published, counters.lost_upstream);
+            assert!(whole, "a torn value: {counters:?}");
+            assert!(boards.lane(1, 0).unwrap().is_whole());
+            read += 1;
+        }
+        writer.kill();
+        let counters = boards.ingress(0).unwrap();
+        assert_eq!(counters.received, counters.published);
+        assert!(counters.received >= last + 1_000);
+        last = counters.received;
+        assert_eq!(boards.health(ProcessRole::Egress(1)).unwrap().starts, round);
+        let found = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
+        assert_eq!(found.ingress(0).unwrap(), counters);
+    }
+}
+
+#[test]
+fn each_value_has_its_own_place_on_the_boards() {
+    let place = Place::new();
+    let node = place.node();
+    let shape = BridgeShape {
+        routes: vec![route(), RouteId::try_from("map").unwrap(), RouteId::try_from("tf").unwrap()],
+        ..shape()
+    };
+    let boards = node.boards(&shape).unwrap();
+    let roles = [ProcessRole::Ingress, ProcessRole::Control, ProcessRole::Egress(0), ProcessRole::Egress(1)];
+    let stages = |lane| [Stage::Shm(lane), Stage::DdsOut(lane), Stage::Age(lane)];
+    let stages: Vec<_> = [Stage::DdsIn]
+        .into_iter()
+        .chain((0..2).flat_map(stages))
+        .flat_map(|s| [(s, 0), (s, 1), (s, 2)])
+        .collect();
+    for (n, role) in (1..).zip(roles) {
+        boards.health_writer(role).update(|health| health.turns = n);
+    }
+    for (n, &(stage, route)) in (1u64..).zip(&stages) {
+        let mut latencies = boards.histogram_writer(stage, route);
+        (0..n).for_each(|_| latencies.record(u64::MAX));
+    }
+    for route in 0..3 {
+        boards.ingress_writer(route).update(|counters| counters.published = 100 + route as u64);
+        let name = adaptive_bridge::model::FixedText::new(&format!("type {route}"));
+        boards.route_info_writer(route).update(|info| info.dds_type = name);
+        for lane in 0..2 {
+            let mut counters = boards.lane_writer(lane, route);
+            counters.update(|counters| counters.forwarded = (10 * lane + route) as u64);
+        }
+    }
+    for (n, role) in (1..).zip(roles) {
+        assert_eq!(boards.health(role).unwrap().turns, n);
+    }
+    for (n, &(stage, route)) in (1..).zip(&stages) {
+        let found = boards.histogram(stage, route);
+        assert_eq!((found.count(), found.max_ns), (n, u64::MAX), "{stage:?} {route}");
+    }
+    for route in 0..3 {
+        assert_eq!(boards.ingress(route).unwrap().published, 100 + route as u64);
+        assert_eq!(boards.route_info(route).unwrap().dds_type.as_str(), format!("type {route}"));
+        for lane in 0..2 {
+            assert_eq!(boards.lane(lane, route).unwrap().forwarded, (10 * lane + route) as u64);
+        }
+    }
+}
+
+#[test]
+fn a_histogram_on_the_board_counts_as_the_model_does() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let mut expected = LatencyHistogram::default();
+    let mut latencies = boards.histogram_writer(Stage::Age(1), 0);
+    let mut value = 0x9e37_79b9_7f4a_7c15u64;
+    let edges = (0..64).flat_map(|bit| [(1u64 << bit) - 1, 1 << bit, (1 << bit) + 1]);
+    let random = std::iter::repeat_with(|| {
+        value ^= value << 13;
+        value ^= value >> 7;
+        value ^= value << 17;
+        value >> (value % 64)
+    });
+    for latency_ns in edges.chain([0, u64::MAX]).chain(random.take(100_000)) {
+        expected.record(latency_ns);
+        latencies.record(latency_ns);
+    }
+    assert_eq!(boards.histogram(Stage::Age(1), 0), expected);
+}
+
+#[test]
+fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    assert_eq!(boards.policy(0).unwrap().epoch, 0);
+    let set = |mode: LaneMode, at| {
+        boards
+            .set_policy(0, |mut policy| {
+                (policy.mode, policy.written_at) = (mode as u8, MonotonicNs(at));
+                policy
+            })
+            .unwrap()
+            .epoch
+    };
+    assert_eq!(set(LaneMode::Normal, 0), 1, "also when it says what nobody had said");
+    assert_eq!(set(LaneMode::Normal, 7), 1);
+    assert_eq!(boards.policy(0).unwrap().written_at, MonotonicNs(7));
+    assert_eq!(set(LaneMode::Suspended, 8), 2);
+    assert_eq!(boards.policy(0).unwrap().mode(), LaneMode::Suspended);
+    assert_eq!(boards.policy(1).unwrap().epoch, 0);
+    // Another process confirms and changes meanwhile; no change is lost, and one that is killed blocks
+    // nobody.
+    for _ in 0..5 {
+        let mut other = Process::start("policy", &place, "");
+        other.expect("ready");
+        for _ in 0..500 {
+            let mut before = 0;
+            let after = boards.set_policy(0, |mut policy| {
+                before = policy.written_at.0;
+                policy.written_at.0 += 1;
+                policy
+            });
+            assert_eq!(after.unwrap().written_at.0, before + 1);
+        }
+        other.kill();
+        assert_eq!(set(LaneMode::Stopped, 1), set(LaneMode::Stopped, 2));
+    }
+}
+
+#[test]
+fn no_wake_is_missed() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let pong = Process::start("pong", &place, "");
+    pong.expect("ready");
+    let (waker, mut sleeper) = (boards.waker(0), boards.sleeper(1));
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
+    for turn in 0..200_000 {
+        // The other side falls asleep meanwhile, or has done so, or not yet.
+        (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
+        waker.wake();
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "turn {turn}");
+    }
+    pong.finish();
+    while sleeper.sleep(Duration::from_millis(20)) == Woken::Woken {}
+    boards.waker(1).wake();
+    boards.waker(1).wake();
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "a wake before the sleep counts");
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::TimedOut, "and two of them are one");
+    let start = std::time::Instant::now();
+    assert_eq!(sleeper.sleep(Duration::from_millis(30)), Woken::TimedOut);
+    assert!(start.elapsed() >= Duration::from_millis(30), "the whole time is slept");
+}
+
+#[test]
+fn waking_a_stopped_lane_never_blocks() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let mut lane = Process::start("pong", &place, "");
+    lane.expect("ready");
+    lane.signal(Signal::SIGSTOP);
+    let (waker, mut sleeper) = (boards.waker(0), boards.sleeper(1));
+    for _ in 0..1_000_000 {
+        waker.wake();
+    }
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken);
+    lane.signal(Signal::SIGCONT);
+    assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "it goes on");
+    lane.kill();
+    // The dead one may have been asleep: its flag stays up, and waking it is harmless.
+    waker.wake();
+    let next = Process::start("pong", &place, "");
+    next.expect("ready");
+    while sleeper.sleep(Duration::from_millis(10)) == Woken::Woken {}
+    waker.wake();
+    assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken);
+    next.finish();
+}
+
+#[test]
+fn a_full_shared_memory_is_an_error_at_the_start_and_never_later() {
+    let unshare = Command::new("unshare").args(["-m", "true"]).status();
+    if !nix::unistd::geteuid().is_root() || !unshare.is_ok_and(|status| status.success()) {
+        return skip("a small /dev/shm of its own: needs root and unshare(1)");
+    }
+    let place = Place::new();
+    let mut command = Command::new("unshare");
+    let script = "mount -t tmpfs -o size=4m tmpfs /dev/shm && exec \"$0\" \"$@\"";
+    command.args(["-m", "sh", "-c", script]).arg(std::env::current_exe().unwrap());
+    let child = Process::start_with(command, "full", &place, "");
+    let error = child.hear();
+    let needed = channel(1 << 20).pool_size().bytes;
+    for part in [&format!("needs {}", needed + 512 * 1024), "/dev/shm", "scan", "remount", "max_sample_bytes"]
+    {
+        assert!(error.contains(part), "{part} is not in: {error}");
+    }
+    let error = child.hear();
+    assert!(error.contains("0 free"), "{error}");
+    child.expect("done");
+    child.finish();
+    place.assert_nothing_left();
+}

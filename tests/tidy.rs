@@ -1,0 +1,14 @@
+//! Rules of this source tree that nobody has to remember: layers, purity, words, sizes, links. Pure: reads
+//! files.
+//!
+//! Each rule is a function of a file's path and text that lists what breaks it, so that the tests can also
+//! show that it finds what it is for.
+
+#[path = "tidy/docs.rs"]
+mod docs;
+#[path = "tidy/layers.rs"]
+mod layers;
+#[path = "tidy/source.rs"]
+mod source;
+#[path = "tidy/text.rs"]
+mod text;

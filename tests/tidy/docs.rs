@@ -1,0 +1,137 @@
+//! What the documents promise: links that lead somewhere, numbers that are unique, a changelog.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use super::source::{Rust, files};
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Links of a page that lead nowhere. `exists` answers for paths from the root of the project.
+fn dead_links(path: &str, text: &str, exists: &dyn Fn(&Path) -> bool) -> Vec<String> {
+    let folder = Path::new(path).parent().unwrap_or(Path::new(""));
+    let mut fenced = false;
+    let mut dead = Vec::new();
+    for (index, line) in text.lines().enumerate() {
+        if line.trim_start().starts_with("```") {
+            fenced = !fenced;
+        }
+        if fenced {
+            continue;
+        }
+        for target in line.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let target = target.split(' ').next().unwrap_or_default();
+            let file = target.split('#').next().unwrap_or_default();
+            let elsewhere = target.contains("://") || target.starts_with("mailto:");
+            if !elsewhere && !file.is_empty() && !normal(&folder.join(file)).is_some_and(|path| exists(&path))
+            {
+                dead.push(format!("{path}:{}: {target}", index + 1));
+            }
+        }
+    }
+    dead
+}
+
+/// The path without `.` and `..`; `None` when it leaves the project.
+fn normal(path: &Path) -> Option<PathBuf> {
+    let mut normal = PathBuf::new();
+    for component in path.components() {
+        match component {
+            Component::CurDir => {}
+            Component::ParentDir => {
+                if !normal.pop() {
+                    return None;
+                }
+            }
+            Component::Normal(name) => normal.push(name),
+            Component::RootDir | Component::Prefix(_) => return None,
+        }
+    }
+    Some(normal)
+}
+
+/// What is wrong with the names of decision records, `NNNN-words.md` each with a number of its own.
+fn bad_records(names: &[&str]) -> Vec<String> {
+    let mut bad = Vec::new();
+    let mut numbers: BTreeMap<&str, &str> = BTreeMap::new();
+    for name in names {
+        let number = name.split('-').next().unwrap_or_default();
+        if number.len() != 4 || !number.chars().all(|c| c.is_ascii_digit()) || !name.ends_with(".md") {
+            bad.push(format!("{name} is not NNNN-words.md"));
+        } else if let Some(other) = numbers.insert(number, name) {
+            bad.push(format!("{name} has the number of {other}"));
+        }
+    }
+    bad
+}
+
+#[test]
+fn every_relative_link_leads_to_a_file() {
+    let pages = files("", "md");
+    assert!(pages.iter().any(|page| page.path == "config/README.md"), "no pages are found");
+    let exists = |path: &Path| root().join(path).exists();
+    let dead: Vec<String> =
+        pages.iter().flat_map(|page| dead_links(&page.path, &page.text, &exists)).collect();
+    assert!(dead.is_empty(), "{}", dead.join("\n"));
+}
+
+#[test]
+fn every_page_that_the_source_names_is_there() {
+    let mut named = 0;
+    for source in ["src", "tests", "benches"].iter().flat_map(|folder| files(folder, "rs")) {
+        for comment in Rust::new(&source.text).comments {
+            let words = comment.text.split(|c: char| c.is_whitespace() || "`()[],;:'\"".contains(c));
+            for word in words.filter(|word| word.starts_with("docs/") && word.ends_with(".md")) {
+                named += 1;
+                assert!(root().join(word).exists(), "{}:{}: {word}", source.path, comment.line);
+            }
+        }
+    }
+    assert!(named > 0, "no page is named anywhere");
+}
+
+#[test]
+fn every_decision_record_has_a_number_of_its_own() {
+    let records: Vec<String> = files("docs/decisions", "md").into_iter().map(|page| page.path).collect();
+    let names: Vec<&str> = records.iter().filter_map(|path| path.rsplit('/').next()).collect();
+    assert!(names.len() >= 3, "{names:?}");
+    let bad = bad_records(&names);
+    assert!(bad.is_empty(), "{}", bad.join("\n"));
+}
+
+#[test]
+fn the_changelog_has_a_section_for_what_is_not_released() {
+    let text = std::fs::read_to_string(root().join("CHANGELOG.md")).unwrap();
+    let headings: Vec<&str> = text.lines().filter_map(|line| line.strip_prefix("## ")).collect();
+    let first = headings.first().map(|heading| heading.trim_matches(['[', ']']));
+    assert_eq!(first, Some("Unreleased"));
+}
+
+#[test]
+fn the_documentation_of_the_configuration_keys_is_tested() {
+    let text = std::fs::read_to_string(root().join("tests/config.rs")).unwrap();
+    for test in
+        ["every_key_is_documented_and_every_documented_key_exists", "every_key_is_in_the_default_file"]
+    {
+        assert!(text.contains(&format!("#[test]\nfn {test}()")), "tests/config.rs has no test {test}");
+    }
+}
+
+#[test]
+fn dead_links_and_bad_records_are_found() {
+    let exists = |path: &Path| path == Path::new("docs/there.md");
+    let dead = |path: &str, text: &str| dead_links(path, text, &exists);
+    assert_eq!(dead("docs/a.md", "x\n[b](gone.md#c) [d](there.md)"), ["docs/a.md:2: gone.md#c"]);
+    assert_eq!(dead("docs/x/a.md", "[b](../there.md)[c](there.md)"), ["docs/x/a.md:1: there.md"]);
+    assert_eq!(dead("a.md", "[b](../docs/there.md)"), ["a.md:1: ../docs/there.md"]);
+    assert!(dead("a.md", "[b](https://c.d/e) [f](#g) [h](docs/there.md \"i\")").is_empty());
+    assert!(dead("a.md", "```\n[b](gone.md)\n```").is_empty());
+    assert_eq!(
+        bad_records(&["0001-a.md", "0002-b.md", "0001-c.md"]),
+        ["0001-c.md has the number of 0001-a.md"]
+    );
+    assert_eq!(bad_records(&["1-a.md"]), ["1-a.md is not NNNN-words.md"]);
+    assert!(bad_records(&["0001-a.md", "0002-b.md"]).is_empty());
+}

@@ -1,0 +1,208 @@
+//! Who may use whom.
+
+use super::source::{Rust, SourcePath, files};
+
+/// The layers: each may use those before it and none after it.
+const LAYERS: &[&str] =
+    &["model", "policy", "config", "clock", "dds", "shm", "telemetry", "process", "cli", "eval"];
+
+/// Layers that never name each other, though their order would allow it. The evaluation drives the bridge as
+/// its users do, by its program.
+const STRANGERS: &[(&str, &str)] = &[("dds", "shm"), ("shm", "dds"), ("eval", "process")];
+
+/// What a pure layer may not reach: clocks, threads, the outside, logs.
+const IMPURE: &[&[&str]] = &[
+    &["std", "time", "Instant"],
+    &["std", "time", "SystemTime"],
+    &["std", "thread"],
+    &["std", "process"],
+    &["std", "env"],
+    &["std", "fs"],
+    &["std", "io"],
+    &["std", "net"],
+    &["std", "os"],
+    &["tracing"],
+    &["log"],
+    &["nix"],
+    &["crate", "clock"],
+];
+
+const PRINTING: &[&str] = &["print", "println", "eprint", "eprintln"];
+
+/// Libraries, and the only place that knows them.
+const LIBRARIES: &[(&str, &str)] = &[
+    ("iceoryx2", "src/shm/"),
+    ("iceoryx2_bb_posix", "src/shm/"),
+    ("iceoryx2_cal", "src/shm/"),
+    ("rustdds", "src/dds/"),
+    ("ros2_client", "src/dds/"),
+    ("serde_yaml", "src/config/yaml.rs"),
+    ("granit_parser", "src/config/yaml.rs"),
+];
+
+/// What breaks the rules in a file of `src`.
+fn violations(path: &str, text: &str) -> Vec<String> {
+    let rust = Rust::new(text);
+    let paths = rust.paths();
+    let mut found = Vec::new();
+    let mut say = |line: usize, what: String| found.push(format!("{path}:{line}: {what}"));
+    let layer = layer_of(path);
+    for used in &paths {
+        if let (Some(layer), Some(other)) = (layer, layer_used(path, used))
+            && let Some(what) = forbidden(layer, &other)
+        {
+            say(used.line, format!("{}: {what}", used.text()));
+        }
+        if matches!(layer, Some("model" | "policy")) && IMPURE.iter().any(|names| used.starts_with(names)) {
+            say(used.line, format!("{} in a pure layer", used.text()));
+        }
+        let reads_clock = used.names.ends_with(&["Instant".into(), "now".into()])
+            || used.names.ends_with(&["SystemTime".into(), "now".into()])
+            || used.names.iter().any(|name| name == "clock_gettime");
+        if reads_clock && path != "src/clock.rs" {
+            say(used.line, format!("{}: only src/clock.rs reads clocks", used.text()));
+        }
+        for (library, home) in LIBRARIES {
+            if used.names.iter().any(|name| name == library) && !path.starts_with(home) {
+                say(used.line, format!("{}: only {home} knows {library}", used.text()));
+            }
+        }
+    }
+    for (at, token) in rust.tokens.iter().enumerate() {
+        let prints = PRINTING.contains(&token.text.as_str()) && rust.reads(at + 1, &["!"]);
+        if prints && matches!(layer, Some("model" | "policy")) {
+            say(token.line, format!("{}! in a pure layer", token.text));
+        }
+    }
+    found
+}
+
+/// The layer that a file belongs to; none for the roots of the program and of the library.
+fn layer_of(path: &str) -> Option<&str> {
+    let inside = path.strip_prefix("src/")?.strip_suffix(".rs")?;
+    let layer = inside.split('/').next()?;
+    (!["main", "lib"].contains(&layer)).then_some(layer)
+}
+
+/// What of the crate a path uses: the name behind `crate`, or behind as many `super` as lead there.
+fn layer_used(path: &str, used: &SourcePath) -> Option<String> {
+    let below_root = path.strip_prefix("src/")?.strip_suffix(".rs")?;
+    let depth = below_root.split('/').filter(|name| *name != "mod").count() + used.inline_modules;
+    let skipped = match used.names.first()?.as_str() {
+        "crate" | "adaptive_bridge" => 1,
+        "super" => {
+            let supers = used.names.iter().take_while(|name| *name == "super").count();
+            if supers < depth {
+                return None;
+            }
+            supers
+        }
+        _ => return None,
+    };
+    Some(used.names.get(skipped).map_or("*", String::as_str).to_owned())
+}
+
+fn forbidden(layer: &str, other: &str) -> Option<String> {
+    let place = |name: &str| LAYERS.iter().position(|known| *known == name);
+    match (place(layer), place(other)) {
+        (None, _) => Some(format!("{layer} is no layer")),
+        (_, None) => Some(format!("{other} is no layer")),
+        _ if STRANGERS.contains(&(layer, other)) => Some(format!("{layer} may not know {other}")),
+        (Some(own), Some(used)) if used > own => {
+            Some(format!("{layer} may not use {other}, which is above it"))
+        }
+        _ => None,
+    }
+}
+
+#[test]
+fn every_layer_uses_only_those_below_it() {
+    let sources = files("src", "rs");
+    assert!(sources.len() > 50, "{} files", sources.len());
+    let found: Vec<String> =
+        sources.iter().flat_map(|source| violations(&source.path, &source.text)).collect();
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn the_map_of_the_library_lists_the_layers_in_their_order() {
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/src/lib.rs")).unwrap();
+    let listed: Vec<&str> =
+        text.lines().filter_map(|line| line.strip_prefix("//! - [`")?.split('`').next()).collect();
+    let declared = |name: &&&str| text.contains(&format!("pub mod {name};"));
+    let layers: Vec<&str> = LAYERS.iter().filter(declared).copied().collect();
+    assert_eq!(listed, layers);
+    let modules = text.lines().filter(|line| line.starts_with("pub mod ")).count();
+    assert_eq!(modules, layers.len(), "a module of the library is no layer");
+}
+
+#[test]
+fn what_breaks_a_layer_is_found() {
+    for (path, text, what) in [
+        ("src/model/a.rs", "use crate::policy::B;", "model may not use policy"),
+        ("src/policy/a.rs", "use crate::{model::B, config::C};", "policy may not use config"),
+        ("src/policy/a.rs", "fn a() { super::super::clock::monotonic(); }", "policy may not use clock"),
+        ("src/policy/mod.rs", "use super::process;", "policy may not use process"),
+        ("src/policy/a.rs", "mod tests { use super::super::super::shm::B; }", "policy may not use shm"),
+        ("src/clock.rs", "use super::dds;", "clock may not use dds"),
+        ("src/config/a.rs", "fn a() { let b = crate::dds::C::new(); }", "config may not use dds"),
+        ("src/dds/a.rs", "use crate::shm::B;", "dds may not know shm"),
+        ("src/shm/a.rs", "use crate::{\n    clock,\n    dds::B,\n};", "shm may not know dds"),
+        ("src/telemetry/a.rs", "use crate::process;", "telemetry may not use process"),
+        ("src/process/a/b.rs", "use super::super::super::cli::C;", "process may not use cli"),
+        ("src/eval/a.rs", "use crate::process::B;", "eval may not know process"),
+        ("src/cli/a.rs", "use crate::helpers::B;", "helpers is no layer"),
+        ("src/helpers.rs", "use crate::model::B;", "helpers is no layer"),
+        ("src/cli/a.rs", "use crate::*;", "* is no layer"),
+    ] {
+        let found = violations(path, text).join("\n");
+        assert!(found.contains(what), "{path}: {text}: found: {found}");
+    }
+}
+
+#[test]
+fn what_is_impure_or_knows_a_library_is_found() {
+    for (path, text, what) in [
+        ("src/policy/a.rs", "use std::time::{Duration, Instant};", "std::time::Instant in a pure layer"),
+        ("src/policy/a.rs", "use std::time::SystemTime;", "in a pure layer"),
+        ("src/policy/a.rs", "fn a() { std::thread::yield_now() }", "std::thread::yield_now in a pure layer"),
+        ("src/policy/a.rs", "use std::{fs, cell};", "std::fs in a pure layer"),
+        ("src/policy/a.rs", "use std::io;", "in a pure layer"),
+        ("src/policy/a.rs", "use std::net::IpAddr;", "in a pure layer"),
+        ("src/policy/a.rs", "fn a() { tracing::info!(\"b\") }", "tracing::info in a pure layer"),
+        ("src/policy/a.rs", "use tracing;", "tracing in a pure layer"),
+        ("src/policy/a.rs", "use crate::clock;", "crate::clock in a pure layer"),
+        ("src/policy/a.rs", "fn a() { println!(\"b\") }", "println! in a pure layer"),
+        ("src/model/a.rs", "use std::env;", "in a pure layer"),
+        ("src/process/a.rs", "fn a() { Instant::now() }", "only src/clock.rs reads clocks"),
+        ("src/cli/a.rs", "fn a() { std::time::SystemTime::now() }", "only src/clock.rs reads clocks"),
+        ("src/shm/a.rs", "use nix::time::clock_gettime;", "only src/clock.rs reads clocks"),
+        ("src/process/a.rs", "use iceoryx2::prelude::*;", "only src/shm/ knows iceoryx2"),
+        ("src/process/a.rs", "use ros2_client::dds::rustdds;", "only src/dds/ knows rustdds"),
+        ("src/process/a.rs", "use ros2_client::Context;", "only src/dds/ knows ros2_client"),
+        ("src/config/load.rs", "fn a() { granit_parser::parse() }", "only src/config/yaml.rs knows granit"),
+        ("src/config/load.rs", "use serde_yaml;", "only src/config/yaml.rs knows serde_yaml"),
+    ] {
+        let found = violations(path, text).join("\n");
+        assert!(found.contains(what), "{path}: {text}: found: {found}");
+    }
+}
+
+#[test]
+fn what_is_allowed_is_not_found() {
+    for (path, text) in [
+        ("src/policy/a.rs", "use crate::model::B; use super::b; use std::time::Duration;"),
+        ("src/policy/mod.rs", "mod tests { use super::*; }"),
+        ("src/policy/a.rs", "mod tests { use super::super::b::C; }"),
+        ("src/process/a/b.rs", "use super::super::role::Role; use crate::{dds, shm};"),
+        ("src/process/a.rs", "// use crate::cli::B;\nconst B: &str = \"use crate::cli::B; Instant::now()\";"),
+        ("src/clock.rs", "fn a() { clock_gettime(b) } use crate::model::MonotonicNs;"),
+        ("src/shm/a.rs", "use iceoryx2::prelude::*; use crate::config::Settings;"),
+        ("src/config/yaml.rs", "use granit_parser::Parser;"),
+        ("src/lib.rs", "pub mod cli; use crate::cli;"),
+        ("src/main.rs", "fn main() { adaptive_bridge::cli::main() }"),
+    ] {
+        let found = violations(path, text);
+        assert!(found.is_empty(), "{path}: {text}: found: {}", found.join("\n"));
+    }
+}

@@ -1,0 +1,166 @@
+//! What a file of Rust may look like: sizes, words, `unsafe`.
+
+use super::source::{Rust, SourceFile, files};
+
+const MAX_COLUMNS: usize = 110;
+/// Of a line with a string in it, which rustfmt leaves alone: a message is found by its words only where it
+/// stands in one line.
+const MAX_STRING_COLUMNS: usize = 120;
+/// Of `src`. Tests may be longer.
+const MAX_LINES: usize = 600;
+/// `main.rs` only dispatches.
+const MAX_MAIN_LINES: usize = 20;
+
+/// Files that may contain `unsafe`, each for what safe Rust has no means for.
+const UNSAFE: &[&str] = &[
+    // Memory that other processes write, and the futex in it.
+    "src/shm/board.rs",
+    "src/shm/channel.rs",
+    "src/shm/header.rs",
+    "src/shm/segment.rs",
+    "src/shm/service.rs",
+    "src/shm/wake.rs",
+    // System calls without a safe wrapper.
+    "src/process/scheduling.rs",
+    // What a child does between fork and exec.
+    "benches/hop/children.rs",
+    "src/cli/demo/children.rs",
+    "tests/support/process.rs",
+    // Scheduling of the benchmark, and an allocator that counts.
+    "benches/hop/system.rs",
+    "tests/shm.rs",
+];
+
+/// Lines of a statement that may stand between `unsafe` and the comment before the statement.
+const STATEMENT_LINES: usize = 3;
+
+/// What breaks the rules in a file of Rust.
+fn violations(path: &str, text: &str) -> Vec<String> {
+    let rust = Rust::new(text);
+    let mut found = Vec::new();
+    let mut say = |line: usize, what: &str| found.push(format!("{path}:{line}: {what}"));
+    let lines: Vec<&str> = text.lines().collect();
+    for (index, line) in lines.iter().enumerate() {
+        let columns = line.chars().count();
+        let in_string = |&(first, last): &(usize, usize)| (first..=last).contains(&(index + 1));
+        let max = if rust.strings.iter().any(in_string) { MAX_STRING_COLUMNS } else { MAX_COLUMNS };
+        if columns > max {
+            say(index + 1, &format!("{columns} columns, at most {max}"));
+        }
+    }
+    if path.starts_with("src/") && lines.len() > MAX_LINES {
+        say(lines.len(), &format!("{} lines, at most {MAX_LINES}", lines.len()));
+    }
+    if path == "src/main.rs" && lines.len() > MAX_MAIN_LINES {
+        say(lines.len(), "main.rs does more than dispatch");
+    }
+    for (at, token) in rust.tokens.iter().enumerate() {
+        match token.text.as_str() {
+            word @ ("todo" | "unimplemented" | "dbg") if rust.reads(at + 1, &["!"]) => {
+                say(token.line, &format!("{word}!"));
+            }
+            "ignore" if at >= 2 && rust.reads(at - 2, &["#", "["]) => say(token.line, "an ignored test"),
+            "unsafe" if !UNSAFE.contains(&path) => say(token.line, "unsafe in a file that is not listed"),
+            "unsafe" if relies(&rust, at) && !is_justified(&lines, token.line) => {
+                say(token.line, "unsafe without a SAFETY comment before it");
+            }
+            _ => {}
+        }
+    }
+    for comment in &rust.comments {
+        let words = |word: &&str| ["TODO", "FIXME", "XXX"].contains(word);
+        let is_word = |c: char| !c.is_alphanumeric();
+        for (offset, line) in comment.text.lines().enumerate() {
+            if let Some(word) = line.split(is_word).find(words) {
+                say(comment.line + offset, word);
+            }
+        }
+    }
+    found
+}
+
+/// Whether this `unsafe` relies on something, as a block and an `impl` do; a function or trait asks for it.
+fn relies(rust: &Rust, at: usize) -> bool {
+    rust.reads(at + 1, &["{"]) || rust.reads(at + 1, &["impl"])
+}
+
+/// Whether the comment before the statement with `unsafe` on this line, counted from 1, says why it is sound.
+fn is_justified(lines: &[&str], line: usize) -> bool {
+    let before = lines[..line - 1].iter().rev().map(|line| line.trim());
+    let ends_statement = |line: &str| line.is_empty() || line.ends_with([';', '{', '}']);
+    let mut between = 0;
+    let comment = before.skip_while(|line| {
+        between += 1;
+        !line.starts_with("//") && !ends_statement(line) && between <= STATEMENT_LINES
+    });
+    comment.take_while(|line| line.starts_with("//")).any(|line| line.starts_with("// SAFETY:"))
+}
+
+fn rust_files() -> Vec<SourceFile> {
+    ["src", "tests", "benches", "examples", "fuzz"].iter().flat_map(|folder| files(folder, "rs")).collect()
+}
+
+#[test]
+fn every_file_keeps_to_sizes_words_and_the_list_of_unsafe() {
+    let sources = rust_files();
+    assert!(sources.len() > 60, "{} files", sources.len());
+    let found: Vec<String> =
+        sources.iter().flat_map(|source| violations(&source.path, &source.text)).collect();
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn main_only_dispatches() {
+    let main = rust_files().into_iter().find(|source| source.path == "src/main.rs").unwrap();
+    let rust = Rust::new(&main.text);
+    let functions = rust.tokens.iter().filter(|token| token.text == "fn").count();
+    assert_eq!(functions, 1, "main.rs has functions beside main");
+}
+
+#[test]
+fn what_breaks_a_rule_is_found() {
+    let long_line = format!("// {}", "x".repeat(MAX_COLUMNS));
+    let long_string = format!("\n\"{}\"", "x".repeat(MAX_STRING_COLUMNS - 1));
+    let many_lines = "\n".repeat(MAX_LINES + 1);
+    let long_main = "\n".repeat(MAX_MAIN_LINES + 1);
+    for (path, text, what) in [
+        ("src/a.rs", long_line.as_str(), ":1: 113 columns"),
+        ("src/a.rs", &long_string, ":2: 121 columns"),
+        ("src/a.rs", &many_lines, "601 lines"),
+        ("src/main.rs", &long_main, "more than dispatch"),
+        ("src/a.rs", "fn a() {\n    todo!()\n}", ":2: todo!"),
+        ("tests/a.rs", "fn a() { unimplemented!(\"b\") }", "unimplemented!"),
+        ("src/a.rs", "fn a() { dbg!(1); }", "dbg!"),
+        ("tests/a.rs", "#[test]\n#[ignore]\nfn a() {}", ":2: an ignored test"),
+        ("tests/a.rs", "#[ignore = \"slow\"]\nfn a() {}", "an ignored test"),
+        ("src/a.rs", "// TODO: b", "TODO"),
+        ("src/a.rs", "/* b\n FIXME c */", ":2: FIXME"),
+        ("src/a.rs", "fn a() { unsafe { b() } }", "not listed"),
+        ("src/shm/wake.rs", "fn a() {\n    unsafe { b() }\n}", ":2: unsafe without"),
+        ("src/shm/wake.rs", "// Sound.\nunsafe impl A for B {}", "unsafe without"),
+        ("src/shm/wake.rs", "// SAFETY: b.\nfn a() {\n    c();\n    unsafe { d() }\n}", ":4: unsafe without"),
+        ("src/shm/wake.rs", "// SAFETY: b.\n\nunsafe impl A for B {}", "unsafe without"),
+    ] {
+        let found = violations(path, text).join("\n");
+        assert!(found.contains(what), "{path}: {text:.60}: found: {found}");
+    }
+}
+
+#[test]
+fn what_is_allowed_is_not_found() {
+    for (path, text) in [
+        ("src/a.rs", "const A: &str = \"TODO todo!() unsafe { }\"; // a todo list of a dbg"),
+        (
+            "src/shm/wake.rs",
+            "fn a() {\n    // SAFETY: b\n    // and c.\n    let d =\n        unsafe { e() };\n}",
+        ),
+        ("src/shm/wake.rs", "// SAFETY: b.\nunsafe impl A for B {}"),
+        ("src/shm/wake.rs", "/// # Safety\n/// b\nunsafe trait A {}"),
+        ("src/a.rs", "fn ignore() {} #[allow(dead_code)] fn todo() {}"),
+    ] {
+        let found = violations(path, text);
+        assert!(found.is_empty(), "{path}: {text}: found: {}", found.join("\n"));
+    }
+    assert!(violations("tests/a.rs", &"\n".repeat(MAX_LINES + 1)).is_empty());
+    assert!(violations("src/a.rs", &format!("\"{}\"", "x".repeat(MAX_STRING_COLUMNS - 2))).is_empty());
+}
