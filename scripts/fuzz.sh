@@ -1,23 +1,52 @@
 #!/bin/sh
-# Runs each fuzz target for so many seconds: scripts/fuzz.sh SECONDS [TARGET…]
+# Runs each fuzz target for so many seconds, 20 unless told: scripts/fuzz.sh [SECONDS [TARGET…]]
+#
+# A run begins with fuzz/seeds and fuzz/regressions, which tests/regressions.rs also runs, and with what former runs
+# have found (fuzz/corpus, on this machine only).
 set -eu
 cd "$(dirname "$0")/.."
-seconds=$1
-shift
+PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
+seconds=${1:-20}
+[ $# -eq 0 ] || shift
+
+if ! cargo fuzz --version >/dev/null 2>&1; then
+    cargo install cargo-fuzz --locked
+fi
 
 # The sanitizers are nightly's; this lets a stable toolchain have them. Only cargo-fuzz' own target directory is
 # built with it: to change it between builds makes cargo build everything anew.
 export RUSTC_BOOTSTRAP=1
+# Link-time optimisation takes minutes and finds nothing.
+export CARGO_PROFILE_RELEASE_LTO=off
+all=$(cargo fuzz list)
 if [ $# -eq 0 ]; then
     # The list is words.
-    # shellcheck disable=SC2046
-    set -- $(cargo fuzz list)
+    # shellcheck disable=SC2086
+    set -- $all
 fi
 if [ $# -eq 0 ]; then
     echo "fuzz: there are no targets"
     exit 1
 fi
+
+echo "fuzz: building"
+cargo fuzz build
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
 for target in "$@"; do
-    echo "fuzz: $target for $seconds s"
-    cargo fuzz run "$target" -- -max_total_time="$seconds" -rss_limit_mb=2048 -print_final_stats=1 -verbosity=0
+    corpus=fuzz/corpus/$target
+    mkdir -p "$corpus" "fuzz/regressions/$target"
+    # The default file of the configuration has 5 KiB. An input that takes longer than 10 s counts as a crash.
+    if ! cargo fuzz run "$target" "$corpus" "fuzz/seeds/$target" "fuzz/regressions/$target" -- \
+        -max_total_time="$seconds" -max_len=8192 -timeout=10 -rss_limit_mb=2048 \
+        -print_final_stats=1 -verbosity=0 >"$log" 2>&1; then
+        cat "$log"
+        input=$(sed -n 's/.*Test unit written to \.*\/*//p' "$log" | tail -n 1)
+        echo "fuzz: $target FAILED. Again: RUSTC_BOOTSTRAP=1 cargo fuzz run $target ${input:-INPUT}"
+        echo "fuzz: once it is fixed, keep the input: mv ${input:-INPUT} fuzz/regressions/$target/"
+        exit 1
+    fi
+    executions=$(sed -n 's/^stat::number_of_executed_units: *//p' "$log")
+    echo "fuzz: $target: ${executions:-?} executions in $seconds s"
+    rmdir "fuzz/regressions/$target" 2>/dev/null || true
 done

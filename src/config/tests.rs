@@ -347,7 +347,11 @@ fn what_is_not_a_configuration_at_all_is_said_so() {
         ("a: 1\n? [b]\n: 2\n", "f.yaml:2: a key must be text, not a list or a mapping"),
         ("a: *b\n", "f.yaml:1: not YAML: "),
         ("a: &a\n  b: *a\n", "f.yaml:2: this alias refers to what it is part of"),
+        ("a: &a\n  c: 1\n  b: [*a]\n", "f.yaml:3: this alias refers to what it is part of"),
         ("a: !include b\n", "f.yaml:1: must be without YAML tags (`!name`)"),
+        ("a: 1\nb: !!int c\n", "f.yaml:2: must be without YAML tags (`!name`)"),
+        ("a: 1\nb: !!binary c\n", "f.yaml:2: must be without YAML tags (`!name`)"),
+        ("a: 1\n...\n# the end\nb: 2\n", "f.yaml:4: must be one YAML document; a second one begins here"),
     ] {
         let found = messages(text);
         assert_eq!(found.len(), 1, "{text}");
@@ -355,6 +359,30 @@ fn what_is_not_a_configuration_at_all_is_said_so() {
     }
     let error = parse(b"a: b\nc: \xff\n", "f.yaml", &no_env).unwrap_err();
     assert_eq!(error.to_string(), "f.yaml:2: must be text in UTF-8");
+}
+
+#[test]
+fn lines_are_those_of_an_editor() {
+    // A byte order mark is no line, both bytes of CR LF are one, NEL and LS end none.
+    for (text, line) in [
+        ("\n\ninstance: 7", 4),
+        ("\r\n# a\r\ninstance: 7", 4),
+        ("# a\rinstance: 7", 3),
+        ("x: \"a\u{85}b\u{2028}c\"\ninstance: 7", 3),
+        ("?\n instance\n:\n 7", 3),
+        ("diagnostics: {\n}\ninstance:\n\n  7", 4),
+    ] {
+        let found = messages(&format!("\u{feff}{TOPIC}{text}"));
+        let found = found.iter().find(|message| message.contains("instance = 7"));
+        let expected = format!("f.yaml:{line}: instance = 7: must be text (put it in quotes)");
+        assert_eq!(found, Some(&expected), "{text:?}");
+    }
+    let items = "topics:\n- {id: a, input_topic: /a}\n- {\n  }\n- &b\n  id: b\n-\n  5\n- *b\n- []\n";
+    let lines = messages(items);
+    for (index, line) in [(1, 3), (2, 5), (3, 8), (4, 9), (5, 10)] {
+        let start = format!("f.yaml:{line}: topics[{index}]");
+        assert!(lines.iter().any(|message| message.starts_with(&start)), "{start}: {lines:#?}");
+    }
 }
 
 #[test]
@@ -366,7 +394,7 @@ fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
     }
     let mebibyte = 1 << 20;
     let many = "must have at most 65536 keys and values, those of aliases included";
-    let deep = "not YAML: recursion limit exceeded";
+    let deep = "must be nested at most 32 deep";
     for (text, message) in [
         (bomb, format!("f.yaml:5: {many}")),
         ("[".repeat(mebibyte), format!("f.yaml:1: {deep}")),
@@ -375,6 +403,19 @@ fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
         ("? ".repeat(mebibyte / 2), format!("f.yaml:1: {deep}")),
         (format!("[{}]", "a,".repeat(mebibyte / 2 - 1)), format!("f.yaml:1: {many}")),
         (" ".repeat(mebibyte + 1), "f.yaml: must be at most 1048576 bytes long".to_owned()),
+        (
+            format!("a: &a {}\nb:\n- *a\n- *a\n- *a", "b ".repeat(mebibyte / 2 - 50)),
+            "f.yaml:4: must have at most 2097152 bytes of text, that of aliases included".to_owned(),
+        ),
+        (
+            format!("a: &a '{}'\nb: [{}]\n", "b".repeat(mebibyte / 2), "*a, ".repeat(4000)),
+            "f.yaml:2: must use at most 993 aliases in a file of this size".to_owned(),
+        ),
+        // What is after the end of the document is not read by the library, and was not counted by it.
+        (
+            format!("a: 1\n...\n{}", "{a: ".repeat(mebibyte / 5)),
+            "f.yaml:3: must be one YAML document; a second one begins here".to_owned(),
+        ),
     ] {
         assert_eq!(messages(&text), [message]);
     }

@@ -68,7 +68,8 @@ impl fmt::Display for DropReason {
     }
 }
 
-/// How many samples were dropped, for each reason.
+/// How many samples were dropped, for each reason. They are read from shared memory, where any process of the
+/// user's could have written anything: no sum of them overflows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct DropCounts([u64; DropReason::COUNT]);
@@ -76,7 +77,8 @@ pub struct DropCounts([u64; DropReason::COUNT]);
 impl DropCounts {
     /// Counts `n` more drops for `reason`.
     pub fn add(&mut self, reason: DropReason, n: u64) {
-        self.0[reason as usize] += n;
+        let count = &mut self.0[reason as usize];
+        *count = count.saturating_add(n);
     }
 
     /// Drops for `reason`.
@@ -86,7 +88,7 @@ impl DropCounts {
 
     /// Drops for all reasons together.
     pub fn total(&self) -> u64 {
-        self.0.iter().sum()
+        self.0.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
     /// The reasons that occurred, with their counts.

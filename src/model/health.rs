@@ -71,7 +71,8 @@ impl LaneCounters {
 
     /// Whether every sample offered is forwarded, waiting, or dropped for a named reason.
     pub fn is_whole(&self) -> bool {
-        self.received() == self.forwarded + self.drops.total() + self.waiting
+        let counted = self.forwarded.saturating_add(self.drops.total()).saturating_add(self.waiting);
+        self.received() == counted
     }
 }
 
@@ -197,7 +198,8 @@ impl LatencyHistogram {
 
     /// Latencies counted.
     pub fn count(&self) -> u64 {
-        self.counts.iter().sum()
+        // As in `DropCounts`, the counts may be any.
+        self.counts.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
     /// The latency below or at which a share of `quantile` (0 to 1) of all counted ones lies, in nanoseconds,
@@ -210,7 +212,7 @@ impl LatencyHistogram {
         let rank = ((quantile.clamp(0.0, 1.0) * total as f64).ceil() as u64).max(1);
         let mut seen = 0;
         for (bucket, count) in self.counts.iter().enumerate() {
-            seen += count;
+            seen = u64::saturating_add(seen, *count);
             if seen >= rank {
                 return Some(Self::upper_edge_ns(bucket).min(self.max_ns.max(1)));
             }

@@ -1,0 +1,301 @@
+//! Everything that reads bytes which somebody else wrote, as functions of those bytes. A function panics when
+//! the bridge breaks a promise, or the bridge does. `tests/regressions.rs` runs the same ones on kept inputs.
+
+use std::collections::HashMap;
+use std::fs::DirEntry;
+use std::os::unix::fs::{DirEntryExt, FileExt};
+use std::path::PathBuf;
+
+use adaptive_bridge::config::{self, Place};
+use adaptive_bridge::dds::encode_graph;
+use adaptive_bridge::model::{DropReason, Guid, InstanceName, LaneName, RouteId, TopicName, TypeName};
+use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
+use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing};
+
+/// A target's name and function.
+pub type Target = (&'static str, fn(&[u8]));
+
+/// All targets, by the names under which cargo-fuzz and the folders of inputs know them.
+pub const TARGETS: &[Target] = &[
+    ("config", config),
+    ("shm_header", shm_header),
+    ("boards", boards),
+    ("names", names),
+    ("graph", graph),
+    ("rtps_message", rtps_message),
+    ("rtps_receive", rtps_receive),
+    ("rtps_discovery", rtps_discovery),
+];
+
+/// A configuration, and after the last NUL, if there is one, the environment as lines of `NAME=value`.
+pub fn config(bytes: &[u8]) {
+    let end = bytes.iter().rposition(|&byte| byte == 0);
+    let (file, environment) = end.map_or((bytes, &[][..]), |end| (&bytes[..end], &bytes[end + 1..]));
+    let environment = String::from_utf8_lossy(environment);
+    let variables: HashMap<&str, &str> =
+        environment.lines().filter_map(|line| line.split_once('=')).collect();
+    let env = |name: &str| variables.get(name).map(|value| (*value).to_owned());
+
+    let outcome = config::parse(file, "f.yaml", &env);
+    assert_eq!(outcome, config::parse(file, "f.yaml", &env), "read differently the second time");
+    match outcome {
+        Ok(settings) => {
+            // What the other layers take for granted.
+            assert!(!settings.routes.is_empty() && settings.lanes.len() >= 2);
+            let outputs = settings.lanes.iter().flat_map(|lane| &lane.outputs);
+            assert!(outputs.clone().all(|output| output.route < settings.routes.len()));
+            assert!(outputs.map(|output| output.topic.to_dds().len()).max() <= Some(255));
+            let shape = BridgeShape::of(&settings);
+            assert_eq!(
+                (shape.lanes.len(), shape.routes.len()),
+                (settings.lanes.len(), settings.routes.len())
+            );
+        }
+        Err(error) => {
+            let printed = error.to_string();
+            assert!(!error.problems().is_empty());
+            assert_eq!(printed.lines().count(), error.problems().len(), "{printed}");
+            let last = file.iter().filter(|&&byte| matches!(byte, b'\n' | b'\r')).count() + 1;
+            for problem in error.problems() {
+                if let Place::Line(line) = problem.place {
+                    assert!((1..=last).contains(&line), "line {line} of {last}: {printed}");
+                }
+            }
+        }
+    }
+}
+
+/// A sample's header in shared memory.
+pub fn shm_header(bytes: &[u8]) {
+    let Ok(header) = decode_header(bytes) else { return };
+    assert_eq!(bytes.len(), HEADER_BYTES);
+    assert!(header.sequence > 0 && header.reserved == 0);
+    let mut again = Vec::with_capacity(HEADER_BYTES);
+    for word in [
+        header.sequence,
+        header.source_timestamp.0,
+        header.taken_at.0,
+        header.published_at.0,
+        header.writer_sequence.cast_unsigned(),
+    ] {
+        again.extend(word.to_ne_bytes());
+    }
+    again.extend(header.writer_guid.0);
+    again.extend(header.encapsulation.0);
+    again.extend(header.reserved.to_ne_bytes());
+    assert_eq!(again, bytes);
+}
+
+/// The boards of a bridge of one lane and one route, filled with these bytes by a foreign process.
+pub fn boards(bytes: &[u8]) {
+    thread_local! {
+        static FOREIGN: Foreign = Foreign::new();
+    }
+    FOREIGN.with(|foreign| foreign.check(bytes));
+}
+
+/// Boards, and the file that they are in.
+struct Foreign {
+    boards: Boards,
+    file: std::fs::File,
+    file_bytes: u64,
+    _node: ShmNode,
+    _root: tempfile::TempDir,
+}
+
+impl Foreign {
+    fn new() -> Self {
+        let root = tempfile::tempdir().expect("a folder");
+        let instance = InstanceName::try_from("fuzz").expect("a name");
+        let node = ShmNode::open(root.path(), &instance, "fuzz").expect("shared memory");
+        let lanes = vec![LaneName::critical()];
+        let routes = vec![RouteId::try_from("scan").expect("a name")];
+        let boards = node.boards(&BridgeShape { lanes, routes }).expect("boards");
+        let file = std::fs::File::options().write(true).open(mapped_boards()).expect("the boards' file");
+        let file_bytes = file.metadata().expect("its size").len();
+        Self { boards, file, file_bytes, _node: node, _root: root }
+    }
+
+    fn check(&self, bytes: &[u8]) {
+        // The two words in front are those by which boards are known; a foreign file is refused for them. The
+        // bytes are repeated, so that few of them reach every value.
+        let wanted = self.file_bytes as usize - 16;
+        let source = if bytes.is_empty() { &[0] } else { bytes };
+        let content: Vec<u8> = source.iter().copied().cycle().take(wanted).collect();
+        self.file.write_all_at(&content, 16).expect("room in shared memory");
+
+        for role in [ProcessRole::Ingress, ProcessRole::Control, ProcessRole::Egress(0)] {
+            let health = self.boards.health(role).expect("nobody writes");
+            assert_eq!(*self.boards.health_writer(role).get(), health);
+        }
+        let ingress = self.boards.ingress(0).expect("nobody writes");
+        let drops: Vec<u64> = ingress.drops.iter().map(|(_, count)| count).collect();
+        assert!(drops.len() <= DropReason::COUNT && !drops.contains(&0));
+        let _ = ingress.drops.total();
+        let lane = self.boards.lane(0, 0).expect("nobody writes");
+        let _ = (lane.received(), lane.is_whole());
+        self.boards.lane_writer(0, 0).update(|counters| {
+            counters.drops.add(DropReason::Stale, 1);
+        });
+        let info = self.boards.route_info(0).expect("nobody writes");
+        assert!(info.dds_type.as_str().len() <= 127);
+        let _ = TypeName::from_dds(info.dds_type.as_str());
+
+        let policy = self.boards.policy(0).expect("nobody writes");
+        let _ = policy.mode();
+        let set = self.boards.set_policy(0, |mut policy| {
+            policy.mode = 1;
+            policy.by_hand ^= 1;
+            policy
+        });
+        let set = set.expect("the lock of a folder of our own");
+        assert!(set.epoch != 0 && set.epoch != policy.epoch, "{policy:?} {set:?}");
+        assert_eq!(self.boards.policy(0), Some(set));
+
+        for stage in [Stage::DdsIn, Stage::Shm(0), Stage::DdsOut(0), Stage::Age(0)] {
+            let before = self.boards.histogram(stage, 0);
+            for quantile in [0.0, 0.5, 0.99, 1.0] {
+                assert_eq!(before.quantile_ns(quantile).is_some(), before.count() > 0);
+            }
+            assert_eq!(before.since(&before).count(), 0);
+            assert!(before.buckets().map(|(edge_ns, _)| edge_ns).is_sorted());
+            self.boards.histogram_writer(stage, 0).record(bytes.len() as u64 * 1_000);
+            let _ = self.boards.histogram(stage, 0).since(&before).count();
+        }
+    }
+}
+
+/// The file of shared memory that this process has mapped as boards.
+fn mapped_boards() -> PathBuf {
+    let maps = std::fs::read_to_string("/proc/self/maps").expect("the maps of this process");
+    let mapped: Vec<&str> = maps.lines().filter_map(|line| line.split_whitespace().nth(4)).collect();
+    let files = std::fs::read_dir("/dev/shm").expect("shared memory").filter_map(Result::ok);
+    let is_mapped = |file: &DirEntry| {
+        let inode = file.ino().to_string();
+        file.file_name().as_encoded_bytes().ends_with(b"boards") && mapped.contains(&inode.as_str())
+    };
+    files.map(|file| (is_mapped(&file), file.path())).find(|(found, _)| *found).expect("boards").1
+}
+
+/// Names from configurations, from the network and from other processes.
+pub fn names(bytes: &[u8]) {
+    let text = &*String::from_utf8_lossy(bytes);
+    if let Ok(name) = TopicName::try_from(text) {
+        assert_eq!(name.as_str(), text);
+        assert!(name.to_dds().starts_with("rt/") && name.to_dds().len() <= 255);
+    }
+    if let Ok(name) = LaneName::try_from(text) {
+        // It becomes part of file names.
+        assert!(name.as_str() == text && (1..=24).contains(&text.len()) && !text.contains(['/', '.', '\0']));
+        assert!(InstanceName::try_from(text).is_ok());
+    }
+    if let Ok(id) = RouteId::try_from(text) {
+        assert!(id.as_str() == text && text.is_ascii());
+    }
+    if let Ok(name) = TypeName::try_from(text) {
+        assert_eq!(TypeName::from_dds(&name.to_dds()), Some(name.clone()));
+        assert_eq!(TypeName::try_from(name.to_string().as_str()), Ok(name));
+    }
+    if let Some(name) = TypeName::from_dds(text) {
+        assert_eq!(name.to_dds(), text);
+    }
+}
+
+/// A graph entry of arbitrary content, which must be read by the rules of CDR as it was written.
+pub fn graph(bytes: &[u8]) {
+    let mut left = bytes;
+    let mut take = |most: usize| {
+        let (taken, rest) = left.split_at(most.min(left.len()));
+        left = rest;
+        taken
+    };
+    let gid_bytes = if take(1).first().is_some_and(|byte| byte % 2 == 1) { 24 } else { 16 };
+    let mut length = || usize::from(take(1).first().copied().unwrap_or(0));
+    let (namespace, node, readers, writers) = (length(), length(), length() % 16, length() % 16);
+    let namespace = String::from_utf8_lossy(take(namespace)).into_owned();
+    let node = String::from_utf8_lossy(take(node)).into_owned();
+    let mut guid = || {
+        let mut guid = [0; 16];
+        let taken = take(16);
+        guid[..taken.len()].copy_from_slice(taken);
+        Guid(guid)
+    };
+    let participant = guid();
+    let readers: Vec<Guid> = (0..readers).map(|_| guid()).collect();
+    let writers: Vec<Guid> = (0..writers).map(|_| guid()).collect();
+
+    let cdr = encode_graph(participant, &namespace, &node, &readers, &writers, gid_bytes);
+    let mut reader = Cdr { bytes: &cdr, at: 0 };
+    assert_eq!(reader.gid(gid_bytes), participant);
+    assert_eq!(reader.number(), 1);
+    assert_eq!(reader.text(), namespace);
+    assert_eq!(reader.text(), node);
+    for guids in [readers, writers] {
+        assert_eq!(reader.number() as usize, guids.len());
+        for guid in guids {
+            assert_eq!(reader.gid(gid_bytes), guid);
+        }
+    }
+    assert_eq!(reader.at, cdr.len());
+}
+
+/// A reader of little-endian CDR.
+struct Cdr<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl Cdr<'_> {
+    fn take(&mut self, count: usize) -> &[u8] {
+        self.at += count;
+        &self.bytes[self.at - count..self.at]
+    }
+
+    fn number(&mut self) -> u32 {
+        self.at = self.at.next_multiple_of(4);
+        u32::from_le_bytes(self.take(4).try_into().expect("4 bytes"))
+    }
+
+    fn gid(&mut self, gid_bytes: usize) -> Guid {
+        let (guid, rest) = self.take(gid_bytes).split_at(16);
+        assert!(rest.iter().all(|&byte| byte == 0));
+        Guid(guid.try_into().expect("16 bytes"))
+    }
+
+    fn text(&mut self) -> String {
+        let length = self.number() as usize;
+        let (last, text) = self.take(length).split_last().expect("a terminating zero");
+        assert_eq!(*last, 0);
+        String::from_utf8(text.to_vec()).expect("UTF-8")
+    }
+}
+
+/// A datagram, read as an RTPS message.
+pub fn rtps_message(bytes: &[u8]) {
+    fuzzing::read_message(bytes);
+}
+
+/// Datagrams of the submessages of a writer that a reader has matched, each after its length in two bytes;
+/// the reader is RELIABLE if the first byte is odd.
+pub fn rtps_receive(bytes: &[u8]) {
+    let Some((&first, mut left)) = bytes.split_first() else { return };
+    let mut datagrams = Vec::new();
+    while let Some((length, rest)) = left.split_first_chunk::<2>() {
+        let (submessages, rest) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
+        left = rest;
+        // Protocol 2.3 of vendor 1.15, eProsima.
+        datagrams.push([b"RTPS\x02\x03\x01\x0f", &fuzzing::SENDER[..], submessages].concat());
+    }
+    fuzzing::receive(first % 2 == 1, datagrams.iter().map(Vec::as_slice));
+}
+
+/// What another participant announces of itself and its endpoints; big-endian if the first byte is odd.
+pub fn rtps_discovery(bytes: &[u8]) {
+    let Some((&first, parameters)) = bytes.split_first() else { return };
+    let is_big_endian = first % 2 == 1;
+    let encoding = match is_big_endian {
+        true => RepresentationIdentifier::PL_CDR_BE,
+        false => RepresentationIdentifier::PL_CDR_LE,
+    };
+    fuzzing::read_discovery(parameters, encoding);
+}
