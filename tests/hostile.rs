@@ -1,0 +1,157 @@
+//! A hostile network: for a minute, datagrams that are no RTPS, nearly RTPS, and cut off in the middle, at every
+//! port of a running bridge, while samples flow. No process dies, none is restarted, no sample is lost.
+
+mod support;
+
+use std::fs::{self, File};
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use nix::sched::{CloneFlags, setns};
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::peer::{Peer, Received, Sent};
+
+const ATTACK: Duration = Duration::from_secs(60);
+
+/// A sequence of numbers that looks random and is the same for a seed (xorshift64*).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
+    }
+
+    fn below(&mut self, bound: usize) -> usize {
+        (self.next() % bound as u64) as usize
+    }
+
+    fn bytes(&mut self, count: usize) -> Vec<u8> {
+        (0..count).map(|_| self.next() as u8).collect()
+    }
+}
+
+/// The entity ids that a bridge listens to or may be thought to: discovery's, and the first ones of users.
+const ENTITIES: [[u8; 4]; 10] = [
+    [0, 1, 0, 0xc2],
+    [0, 1, 0, 0xc7],
+    [0, 0, 3, 0xc2],
+    [0, 0, 3, 0xc7],
+    [0, 0, 4, 0xc2],
+    [0, 0, 4, 0xc7],
+    [0, 2, 0, 0xc2],
+    [0, 0, 1, 0x03],
+    [0, 0, 1, 0x04],
+    [0, 0, 0, 0],
+];
+
+/// The submessages of RTPS 2.5 (clause 9.4.5.1.1), and one that there is not.
+const KINDS: [u8; 14] = [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x7f];
+
+/// Numbers at the edges of what their fields can hold.
+const EDGES: [u32; 8] = [0, 1, 2, 255, 256, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff];
+
+/// One datagram of the attack.
+fn datagram(random: &mut Random) -> Vec<u8> {
+    if random.below(8) == 0 {
+        let length = random.below(1500);
+        return random.bytes(length);
+    }
+    let mut datagram = b"RTPS\x02\x03\x01\x12".to_vec();
+    datagram.extend(random.bytes(12));
+    for _ in 0..=random.below(4) {
+        let kind = KINDS[random.below(KINDS.len())];
+        let mut body = Vec::new();
+        for _ in 0..random.below(24) {
+            match random.below(4) {
+                0 => body.extend(ENTITIES[random.below(ENTITIES.len())]),
+                1 => body.extend(EDGES[random.below(EDGES.len())].to_le_bytes()),
+                2 => body.extend((random.below(64) as u32).to_le_bytes()),
+                _ => body.extend(random.bytes(4)),
+            }
+        }
+        // The length is right, wrong, or the zero that means "to the end".
+        let length = match random.below(4) {
+            0 => random.next() as u16,
+            1 => 0,
+            _ => body.len() as u16,
+        };
+        datagram.extend([kind, random.next() as u8]);
+        datagram.extend(length.to_le_bytes());
+        datagram.extend(body);
+    }
+    if random.below(3) == 0 {
+        let cut = random.below(datagram.len()).max(1);
+        datagram.truncate(cut);
+    }
+    datagram
+}
+
+/// The UDP ports that anybody listens to in the network namespace of a process.
+fn udp_ports(pid: i32) -> Vec<u16> {
+    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
+    let mut ports: Vec<u16> = table
+        .lines()
+        .skip(1)
+        .filter_map(|line| u16::from_str_radix(line.split_whitespace().nth(1)?.rsplit(':').next()?, 16).ok())
+        .collect();
+    ports.sort_unstable();
+    ports.dedup();
+    ports
+}
+
+/// Sends for a while from inside a network namespace; how many datagrams were sent.
+fn attack(namespace: &str, address: Ipv4Addr, ports: &[u16], seed: u64) -> u64 {
+    setns(File::open(format!("/run/netns/{namespace}")).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+    let mut random = Random(seed);
+    let until = Instant::now() + ATTACK;
+    let mut sent = 0;
+    while Instant::now() < until {
+        // Some 20,000 datagrams a second are more than a robot's network carries, and leave the machine, which is
+        // also the robot, the time to forward.
+        for _ in 0..40 {
+            let port = ports[random.below(ports.len())];
+            // By unicast also to the ports of multicast: it is the bridge that is attacked, not the peers.
+            if socket.send_to(&datagram(&mut random), (address, port)).is_ok() {
+                sent += 1;
+            }
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    sent
+}
+
+#[test]
+fn a_minute_of_malformed_datagrams_at_every_port_disturbs_nothing() {
+    let test = "a_minute_of_malformed_datagrams_at_every_port_disturbs_nothing";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    let slow = bed.subscribe("critical", Peer::fast().best_effort(), NONCRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+    critical.wait_received(50);
+
+    let roles = ["ingress", "egress-critical", "egress-noncritical"];
+    let ports = udp_ports(bed.pid("ingress"));
+    assert!(ports.contains(&7400) && ports.len() >= 8, "{ports:?}");
+    let seed = u64::from(std::process::id()) | 1;
+    println!("seed {seed}");
+    let attacker = bed.host("slow").namespace().to_owned();
+    let address = bed.host("bridge").address();
+    let sent = std::thread::spawn(move || attack(&attacker, address, &ports, seed)).join().unwrap();
+    assert!(sent > 10_000, "only {sent} datagrams were sent");
+
+    for role in roles {
+        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+    }
+    let before = slow.received();
+    slow.wait_received(before + 5);
+    let sent: Sent = publisher.end();
+    critical.wait_received(sent.ok);
+    critical.end::<Received>().assert_all_of(&sent);
+    slow.end::<Received>().assert_sound();
+    bed.wait_whole();
+    bed.end();
+}
