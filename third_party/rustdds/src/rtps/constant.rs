@@ -116,7 +116,9 @@ pub const FRAGMENT_SIZE: usize = 256;
 /// budget, so an underestimate degrades to one submessage per datagram rather
 /// than dropping data.
 pub const fn payload_budget_for_mtu(mtu: u32) -> usize {
-  let mtu = mtu as usize;
+  // An IPv4 packet has at most 65,535 bytes, and Linux gives its loopback
+  // interface an MTU of 65,536.
+  let mtu = if mtu > 65_535 { 65_535 } else { mtu as usize };
   if mtu <= DATAGRAM_HEADER_OVERHEAD {
     // Nonsensical / tiny MTU: fall back to a minimal but non-zero budget.
     64
