@@ -3,7 +3,7 @@
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
@@ -211,7 +211,7 @@ impl Bed {
                 relay = Some(program);
             }
             Kind::Bridge => {
-                let (started, path) = start_bridge(domain, place(1), place(2))?;
+                let (started, path) = start_bridge(domain, place(1), place(2), &options.bridge)?;
                 bridge = Some(started);
                 config = Some(path);
             }
@@ -305,14 +305,19 @@ impl Bed {
 }
 
 /// The shipped binary: ingress and the critical egress, each with its place.
-fn start_bridge(domain: u16, ingress: Place, egress: Place) -> Result<(Bridge, PathBuf), String> {
+fn start_bridge(
+    domain: u16,
+    ingress: Place,
+    egress: Place,
+    executable: &Path,
+) -> Result<(Bridge, PathBuf), String> {
     let folder = std::env::temp_dir().join(format!("adaptive-bridge-bench-{}", std::process::id()));
     fs::create_dir_all(&folder).map_err(|error| error.to_string())?;
     let path = folder.join("bridge.yaml");
     fs::write(&path, configuration(domain, &folder, ingress, egress)).map_err(|error| error.to_string())?;
     let mut processes = Vec::new();
     for role in [&["ingress"][..], &["egress", "--lane", "critical"]] {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_adaptive-bridge"));
+        let mut command = Command::new(executable);
         command.args(role).arg("--config").arg(&path).stdin(Stdio::null()).stdout(Stdio::null());
         if std::env::var_os("RUST_LOG").is_none() {
             command.env("RUST_LOG", "warn");
@@ -324,7 +329,7 @@ fn start_bridge(domain: u16, ingress: Place, egress: Place) -> Result<(Bridge, P
     Ok((Bridge { processes, boards, folder }, path))
 }
 
-fn configuration(domain: u16, folder: &std::path::Path, ingress: Place, egress: Place) -> String {
+fn configuration(domain: u16, folder: &Path, ingress: Place, egress: Place) -> String {
     let scheduling = |place: Place| {
         let cpus = place.cpu.map_or(String::new(), |cpu| cpu.to_string());
         let policy = match place.scheduling {

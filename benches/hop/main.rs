@@ -53,6 +53,8 @@ pub struct Options {
     pub only: Option<String>,
     /// `--no-loss`: without the checks for loss.
     pub no_loss: bool,
+    /// `--bridge FILE`: another build of the bridge than this one.
+    pub bridge: PathBuf,
 }
 
 impl Options {
@@ -65,6 +67,7 @@ impl Options {
             scheduling: Scheduling::Other,
             only: None,
             no_loss: false,
+            bridge: PathBuf::from(env!("CARGO_BIN_EXE_adaptive-bridge")),
         };
         let mut rest = arguments.iter();
         while let Some(argument) = rest.next() {
@@ -75,6 +78,7 @@ impl Options {
                 "--quick" => options.quick = true,
                 "--save" => options.save = true,
                 "--no-loss" => options.no_loss = true,
+                "--bridge" => options.bridge = PathBuf::from(value()?),
                 "--only" => options.only = Some(value()?.clone()),
                 "--repetitions" => {
                     let text = value()?;

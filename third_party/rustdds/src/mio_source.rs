@@ -4,6 +4,11 @@
 //
 // The internal reactors do not use this channel.
 
+use std::sync::{
+  atomic::{AtomicBool, Ordering},
+  Arc,
+};
+
 macro_rules! socketpair_bridge {
   ($modname:ident, $mio:ident) => {
     mod $modname {
@@ -140,14 +145,20 @@ macro_rules! socketpair_bridge {
 socketpair_bridge!(bridge_08, mio_08);
 socketpair_bridge!(bridge_1, mio1);
 
+// Events are sent only once somebody has registered the source with a poll. A
+// reader that is used with a waker, or polled, would otherwise pay two or three
+// system calls for each sample, for nobody.
 pub struct PollEventSource {
   #[cfg(feature = "mio_08")]
   mio08: bridge_08::Source,
   mio1: bridge_1::Source,
+  // To announce at registration what may have come before.
+  sender: PollEventSender,
 }
 
 #[derive(Clone)]
 pub struct PollEventSender {
+  registered: Arc<AtomicBool>,
   #[cfg(feature = "mio_08")]
   mio08: bridge_08::Sender,
   mio1: bridge_1::Sender,
@@ -157,22 +168,29 @@ pub fn make_poll_channel() -> std::io::Result<(PollEventSource, PollEventSender)
   #[cfg(feature = "mio_08")]
   let (mio08_source, mio08_sender) = bridge_08::make()?;
   let (mio1_source, mio1_sender) = bridge_1::make()?;
+  let sender = PollEventSender {
+    registered: Arc::new(AtomicBool::new(false)),
+    #[cfg(feature = "mio_08")]
+    mio08: mio08_sender,
+    mio1: mio1_sender,
+  };
   Ok((
     PollEventSource {
       #[cfg(feature = "mio_08")]
       mio08: mio08_source,
       mio1: mio1_source,
+      sender: sender.clone(),
     },
-    PollEventSender {
-      #[cfg(feature = "mio_08")]
-      mio08: mio08_sender,
-      mio1: mio1_sender,
-    },
+    sender,
   ))
 }
 
 impl PollEventSender {
   pub fn send(&self) {
+    // Whoever registers sends an event itself afterwards, so none is missed.
+    if !self.registered.load(Ordering::SeqCst) {
+      return;
+    }
     #[cfg(feature = "mio_08")]
     self.mio08.send();
     self.mio1.send();
@@ -183,9 +201,17 @@ impl PollEventSource {
   /// Drain sent bytes so the socketpair can trigger again. Call before acting
   /// on the event.
   pub fn drain(&self) {
+    if !self.sender.registered.load(Ordering::SeqCst) {
+      return;
+    }
     #[cfg(feature = "mio_08")]
     self.mio08.drain();
     self.mio1.drain();
+  }
+
+  fn announce(&self) {
+    self.sender.registered.store(true, Ordering::SeqCst);
+    self.sender.send();
   }
 }
 
@@ -197,7 +223,9 @@ impl mio_08::event::Source for PollEventSource {
     token: mio_08::Token,
     interests: mio_08::Interest,
   ) -> std::io::Result<()> {
-    self.mio08.register(registry, token, interests)
+    self.mio08.register(registry, token, interests)?;
+    self.announce();
+    Ok(())
   }
 
   fn reregister(
@@ -221,7 +249,9 @@ impl mio1::event::Source for PollEventSource {
     token: mio1::Token,
     interests: mio1::Interest,
   ) -> std::io::Result<()> {
-    self.mio1.register(registry, token, interests)
+    self.mio1.register(registry, token, interests)?;
+    self.announce();
+    Ok(())
   }
 
   fn reregister(

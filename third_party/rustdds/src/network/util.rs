@@ -108,6 +108,10 @@ pub fn local_interface_table() -> Vec<IfAddr> {
 /// submessages in one datagram) for `peer_ip`, using the "local
 /// egress-interface MTU" heuristic:
 ///
+/// * If `peer_ip` is an address of this host, the kernel delivers over the
+///   loopback interface whatever interface has the address, so we use that
+///   one's MTU. A remote host may have the same private address (that of
+///   `docker0`, say) beside others; the caller takes the least of all budgets.
 /// * If some local IPv4 interface's subnet contains `peer_ip`, the peer is
 ///   reachable in one hop, so we use that interface's MTU (minus headers).
 ///   Loopback peers (e.g. `127.0.0.1`) naturally match `lo`/`lo0` and inherit
@@ -120,6 +124,12 @@ pub fn local_interface_table() -> Vec<IfAddr> {
 /// An overestimate is a soft failure (IP fragmentation), never data loss, so
 /// this errs toward the safe default when unsure.
 pub fn path_mtu_payload_for_peer(ifaces: &[IfAddr], peer_ip: IpAddr) -> usize {
+  if ifaces.iter().any(|ifa| ifa.ip == peer_ip) {
+    let loopback = ifaces.iter().find(|ifa| ifa.ip.is_loopback());
+    if let Some(mtu) = loopback.and_then(|ifa| ifa.mtu) {
+      return payload_budget_for_mtu(mtu);
+    }
+  }
   if let IpAddr::V4(peer) = peer_ip {
     for ifa in ifaces {
       let (IpAddr::V4(local), Some(mask)) = (ifa.ip, ifa.netmask) else {

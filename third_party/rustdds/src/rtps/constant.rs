@@ -25,6 +25,12 @@ pub const CACHE_CLEAN_PERIOD: Duration = Duration::from_secs(4);
 pub const NACK_RESPONSE_DELAY: Duration = Duration::from_millis(5);
 pub const NACK_SUPPRESSION_DURATION: Duration = Duration::from_millis(0);
 
+// How long a Reliable Reader waits before it acknowledges samples that came in
+// one message with the HEARTBEAT and after which none is missing. The application
+// gets them first, and several are acknowledged at once at high rates. RTPS v2.5
+// Table 8.60 names this heartbeatResponseDelay and defaults it to 500 ms.
+pub const ACKNACK_DELAY: Duration = Duration::from_millis(1);
+
 // Time between two repair rounds (SendRepairData, SendRepairFrags) for one
 // reader, and the backoff while the reader's send socket has queued control
 // datagrams. A Writer with a finite, positive Deadline uses a fifth of it,
@@ -116,7 +122,9 @@ pub const FRAGMENT_SIZE: usize = 256;
 /// budget, so an underestimate degrades to one submessage per datagram rather
 /// than dropping data.
 pub const fn payload_budget_for_mtu(mtu: u32) -> usize {
-  let mtu = mtu as usize;
+  // An IPv4 packet has at most 65,535 bytes, and Linux gives its loopback
+  // interface an MTU of 65,536.
+  let mtu = if mtu > 65_535 { 65_535 } else { mtu as usize };
   if mtu <= DATAGRAM_HEADER_OVERHEAD {
     // Nonsensical / tiny MTU: fall back to a minimal but non-zero budget.
     64

@@ -1,6 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{btree_map::Entry, BTreeMap},
+  net::SocketAddr,
   rc::Rc,
   sync::mpsc::TrySendError,
 };
@@ -84,6 +85,12 @@ pub struct MessageReceiverState<'a> {
 
   pub source_timestamp: Option<Timestamp>,
 
+  /// Where the datagram came from, if it is known.
+  pub source_address: Option<SocketAddr>,
+
+  /// Whether a DATA submessage came before this one in the same message.
+  pub follows_data: bool,
+
   #[allow(dead_code)] // TODO: Remove this when/if SecureWrapping actually does something.
   #[cfg(feature = "security")]
   pub secure_rtps_wrapped: Option<SecureWrapping>,
@@ -96,6 +103,8 @@ impl Default for MessageReceiverState<'_> {
       unicast_reply_locator_list: &[],
       multicast_reply_locator_list: &[],
       source_timestamp: Some(Timestamp::INVALID),
+      source_address: None,
+      follows_data: false,
       #[cfg(feature = "security")]
       secure_rtps_wrapped: None,
     }
@@ -132,6 +141,8 @@ pub(crate) struct MessageReceiver {
   pub unicast_reply_locator_list: Vec<Locator>,
   pub multicast_reply_locator_list: Vec<Locator>,
   pub source_timestamp: Option<Timestamp>,
+  source_address: Option<SocketAddr>,
+  follows_data: bool,
 
   submessage_count: usize, // Used in tests and error messages only?
   secure_receiver_state: Option<SecureReceiverState>,
@@ -166,6 +177,8 @@ impl MessageReceiver {
       unicast_reply_locator_list: vec![Locator::Invalid],
       multicast_reply_locator_list: vec![Locator::Invalid],
       source_timestamp: None,
+      source_address: None,
+      follows_data: false,
 
       submessage_count: 0,
       secure_receiver_state: None,
@@ -185,6 +198,7 @@ impl MessageReceiver {
     self.unicast_reply_locator_list.clear();
     self.multicast_reply_locator_list.clear();
     self.source_timestamp = None;
+    self.follows_data = false;
 
     self.submessage_count = 0;
 
@@ -210,6 +224,8 @@ impl MessageReceiver {
       unicast_reply_locator_list: &self.unicast_reply_locator_list,
       multicast_reply_locator_list: &self.multicast_reply_locator_list,
       source_timestamp: self.source_timestamp,
+      source_address: self.source_address,
+      follows_data: self.follows_data,
       #[cfg(feature = "security")]
       secure_rtps_wrapped: self.secure_rtps_wrapped.clone(),
     };
@@ -285,7 +301,10 @@ impl MessageReceiver {
     self.record_observation(rtps_message.header.guid_prefix, origin);
 
     // And process message
+    self.source_address = origin.source;
     self.handle_parsed_message(rtps_message);
+    // Messages of this participant to itself come without a datagram.
+    self.source_address = None;
   }
 
   /// Note the interface/source a packet from `source_prefix` arrived on.
@@ -636,6 +655,7 @@ impl MessageReceiver {
           target_reader,
           &mr_state,
         );
+        self.follows_data = true;
 
         // Notify discovery that the remote PArticipant seems to be alive
         if writer_entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER

@@ -1,6 +1,7 @@
 use std::{
   collections::BTreeMap,
   fmt, iter,
+  net::SocketAddr,
   rc::Rc,
   sync::{Arc, Mutex, MutexGuard},
   task::Waker,
@@ -42,7 +43,7 @@ use crate::{
   network::udp_sender::UDPSender,
   polling::{ReadySender, SharedTimer, WakeReceiver},
   rtps::{
-    fragment_assembler::FragmentAssembler, message_receiver::MessageReceiverState,
+    constant::ACKNACK_DELAY, fragment_assembler::FragmentAssembler, message_receiver::MessageReceiverState,
     rtps_writer_proxy::RtpsWriterProxy, timed_event::DpTimerEvent, Message,
   },
   structure::{
@@ -66,6 +67,7 @@ use crate::no_security::SecurityPluginsHandle;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum TimedEvent {
   DeadlineMissedCheck,
+  SendDelayedAcknacks,
 }
 
 // Some pieces necessary to construct a reader.
@@ -141,6 +143,10 @@ pub(crate) struct Reader {
   requested_deadline_missed_count: i32,
   offered_incompatible_qos_count: i32,
 
+  // Writers whose samples are to be acknowledged when the timer set for it
+  // expires, and where to. See `ACKNACK_DELAY`.
+  delayed_acknacks: Vec<(GUID, Vec<Locator>)>,
+
   pub(crate) timed_event_timer: SharedTimer<DpTimerEvent>,
   pub(crate) data_reader_command_receiver: WakeReceiver<ReaderCommand>,
   data_reader_waker: Arc<Mutex<Option<Waker>>>,
@@ -151,6 +157,31 @@ pub(crate) struct Reader {
 
   #[allow(dead_code)] // to avoid warning if no security feature
   security_plugins: Option<SecurityPluginsHandle>,
+}
+
+// Where to answer a message of that Writer. A Writer announces an address for each
+// interface of its host, and answering at all of them makes it handle each answer
+// several times. The address that its message came from is one of those, unless
+// there is a translation of addresses in between.
+fn reply_locators<'a>(
+  mr_state: &MessageReceiverState<'a>,
+  writer_proxy: &'a RtpsWriterProxy,
+) -> &'a [Locator] {
+  match mr_state.unicast_reply_locator_list {
+    [] | [Locator::Invalid] => {
+      let announced = &writer_proxy.unicast_locator_list;
+      let came_from = |locator: &&Locator| {
+        mr_state
+          .source_address
+          .is_some_and(|source| locator.is_udp() && SocketAddr::from(**locator).ip() == source.ip())
+      };
+      announced
+        .iter()
+        .find(came_from)
+        .map_or(announced, std::slice::from_ref)
+    }
+    others => others,
+  }
 }
 
 // If we are assembling a fragment, but it does not receive any updates
@@ -206,6 +237,7 @@ impl Reader {
       writer_match_count_total: 0,
       requested_deadline_missed_count: 0,
       offered_incompatible_qos_count: 0,
+      delayed_acknacks: Vec::new(),
       timed_event_timer,
       data_reader_command_receiver: i.data_reader_command_receiver,
       data_reader_waker: i.data_reader_waker,
@@ -324,7 +356,53 @@ impl Reader {
         self.handle_requested_deadline_event();
         self.set_requested_deadline_check_timer(); // re-prime timer
       }
+      TimedEvent::SendDelayedAcknacks => self.send_delayed_acknacks(),
     }
+  }
+
+  fn delay_acknack(&mut self, writer_guid: GUID, reply_locators: &[Locator]) {
+    if self.delayed_acknacks.is_empty() {
+      self.timed_event_timer.borrow_mut().set_timeout(
+        ACKNACK_DELAY,
+        DpTimerEvent::Reader {
+          entity_id: self.my_guid.entity_id,
+          event: TimedEvent::SendDelayedAcknacks,
+        },
+      );
+    }
+    if !self.delayed_acknacks.iter().any(|(guid, _)| *guid == writer_guid) {
+      self
+        .delayed_acknacks
+        .push((writer_guid, reply_locators.to_vec()));
+    }
+  }
+
+  // Acknowledges what there is by now.
+  fn send_delayed_acknacks(&mut self) {
+    let mut delayed_acknacks = std::mem::take(&mut self.delayed_acknacks);
+    for (writer_guid, reply_locators) in delayed_acknacks.drain(..) {
+      let reader_id = self.entity_id();
+      let Some(writer_proxy) = self.matched_writer_mut(writer_guid) else {
+        continue; // gone
+      };
+      let acknack = AckNack {
+        reader_id,
+        writer_id: writer_guid.entity_id,
+        reader_sn_state: SequenceNumberSet::new_empty(writer_proxy.all_ackable_before()),
+        count: writer_proxy.next_ack_nack_sequence_number(),
+      };
+      self.send_acknack_to(
+        BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Endianness)
+          | BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Final),
+        acknack,
+        InfoDestination {
+          guid_prefix: writer_guid.prefix,
+        },
+        &reply_locators,
+        writer_guid,
+      );
+    }
+    self.delayed_acknacks = delayed_acknacks; // keeps its capacity
   }
 
   pub fn process_command(&mut self) {
@@ -959,6 +1037,14 @@ impl Reader {
         // samples are missing. The response may be delayed to avoid message storms.
 
         if !missing_seqnums.is_empty() || !final_flag_set {
+          if missing_seqnums.is_empty()
+            && mr_state.follows_data
+            && reader_id.kind().is_user_defined()
+          {
+            this.delay_acknack(writer_guid, reply_locators(mr_state, writer_proxy));
+            return true;
+          }
+
           let mut partially_received = Vec::new();
           // report of what we have.
           // We claim to have received all SNs before "base" and produce a set of missing
@@ -1047,13 +1133,7 @@ impl Reader {
             }
           }
 
-          // Decide where should we send a reply, i.e. ACKNACK
-          let reply_locators = match mr_state.unicast_reply_locator_list {
-            [] | [Locator::Invalid] => &writer_proxy.unicast_locator_list,
-            //TODO: What is writer_proxy has an empty list?
-            others => others,
-          };
-
+          let reply_locators = reply_locators(mr_state, writer_proxy);
           if !nackfrags.is_empty() {
             this.send_nackfrags_to(
               nackfrag_flags,
