@@ -62,6 +62,29 @@ drop_reasons! {
     Shutdown = "shutdown",
 }
 
+impl DropReason {
+    /// What has happened to the samples, and what to do about it, for people.
+    pub const fn meaning(self) -> &'static str {
+        match self {
+            Self::TooLarge => "larger than the route's max_sample_bytes; raise it",
+            Self::PoolExhausted => "no free slot in shared memory; raise queue_depth",
+            Self::Malformed => "an encapsulation that DDS does not know",
+            Self::IngressDied => "an ingress process died while it had them",
+            Self::QueueOverflow => "the lane took them too slowly; raise its queue_depth",
+            Self::LaneDown => "no process served the lane when they came, or it was killed while it had them",
+            Self::NoWriter => "the message type is not known yet",
+            Self::WindowFull => "a reader does not acknowledge and the window is full",
+            Self::WriteFailed => "the DDS library refused them",
+            Self::Stale => "older than stale_threshold_ms; are the clocks in step?",
+            Self::Superseded => "a fresher one was there",
+            Self::QueueFull => "the lane's queue was full",
+            Self::Suspended => "the lane is suspended",
+            Self::Stopped => "forwarding is stopped",
+            Self::Shutdown => "still waiting when the lane shut down",
+        }
+    }
+}
+
 impl fmt::Display for DropReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.label())

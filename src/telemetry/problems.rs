@@ -44,8 +44,11 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
         let former = before.route(route);
         let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
         for (reason, count) in dropped.iter() {
-            let what = meaning(reason);
-            problems.push(format!("ingress, route {}: {count} samples dropped just now: {what}", route.id));
+            let what = reason.meaning();
+            problems.push(format!(
+                "ingress, route {}: {count} samples dropped just now: {what} ({reason})",
+                route.id
+            ));
         }
         for output in &route.outputs {
             let lane = &now.lanes[output.lane];
@@ -53,10 +56,10 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
             let dropped = drops_since(&output.counters.drops, former.map(|former| former.counters.drops));
             for (reason, count) in dropped.iter().filter(|(reason, _)| !is_expected(*reason, lane.class)) {
                 problems.push(format!(
-                    "lane {}, {}: {count} samples dropped just now: {}",
+                    "lane {}, {}: {count} samples dropped just now: {} ({reason})",
                     lane.name,
                     output.topic,
-                    meaning(reason)
+                    reason.meaning()
                 ));
             }
         }
@@ -173,27 +176,6 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
         // The lane's mode says it.
         DropReason::Stopped => true,
         _ => false,
-    }
-}
-
-/// What a reason means, and what to do about it where something can be done.
-const fn meaning(reason: DropReason) -> &'static str {
-    match reason {
-        DropReason::TooLarge => "larger than the route's max_sample_bytes; raise it (too_large)",
-        DropReason::PoolExhausted => "no free slot in shared memory; raise queue_depth (pool_exhausted)",
-        DropReason::Malformed => "an encapsulation that DDS does not know (malformed)",
-        DropReason::IngressDied => "an ingress process died while it had them (ingress_died)",
-        DropReason::QueueOverflow => "the lane took them too slowly; raise its queue_depth (queue_overflow)",
-        DropReason::LaneDown => "no process served the lane when they came (lane_down)",
-        DropReason::NoWriter => "the message type is not known yet (no_writer)",
-        DropReason::WindowFull => "a reader does not acknowledge and the window is full (window_full)",
-        DropReason::WriteFailed => "the DDS library refused them (write_failed)",
-        DropReason::Stale => "older than stale_threshold_ms; are the clocks in step? (stale)",
-        DropReason::Superseded => "a fresher one was there (superseded)",
-        DropReason::QueueFull => "the lane's queue was full (queue_full)",
-        DropReason::Suspended => "the lane is suspended (suspended)",
-        DropReason::Stopped => "forwarding is stopped (stopped)",
-        DropReason::Shutdown => "still waiting when the lane shut down (shutdown)",
     }
 }
 

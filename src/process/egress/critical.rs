@@ -10,36 +10,25 @@ use crate::policy::critical_drop;
 /// Samples taken of one route before the next route has its turn.
 const SAMPLES_PER_TURN: usize = 32;
 
-/// A critical lane.
-pub(super) struct Critical;
-
-impl Critical {
-    pub const fn new() -> Self {
-        Self
-    }
-
-    /// Forwards what is there.
-    #[allow(clippy::unused_self)]
-    pub fn step(
-        &mut self,
-        outputs: &mut [Output],
-        participant: &mut Participant,
-        arena: &mut CopyArena,
-        mode: LaneMode,
-    ) -> Turn {
-        let mut busy = false;
-        for output in outputs {
-            for _ in 0..SAMPLES_PER_TURN {
-                let Some(sample) = output.take() else {
-                    break;
-                };
-                busy = true;
-                match critical_drop(mode) {
-                    Some(reason) => output.drop_sample(&sample, reason),
-                    None => output.send(sample, participant, arena),
-                }
+/// Forwards what is there.
+pub(super) fn step(
+    outputs: &mut [Output],
+    participant: &mut Participant,
+    arena: &mut CopyArena,
+    mode: LaneMode,
+) -> Turn {
+    let mut busy = false;
+    for output in outputs {
+        for _ in 0..SAMPLES_PER_TURN {
+            let Some(sample) = output.take() else {
+                break;
+            };
+            busy = true;
+            match critical_drop(mode) {
+                Some(reason) => output.drop_sample(&sample, reason),
+                None => output.send(sample, participant, arena),
             }
         }
-        if busy { Turn::Busy } else { Turn::UntilWoken(MonotonicNs(u64::MAX)) }
     }
+    if busy { Turn::Busy } else { Turn::UntilWoken(MonotonicNs(u64::MAX)) }
 }

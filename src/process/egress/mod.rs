@@ -24,9 +24,11 @@ use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::effective_mode;
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
-use critical::Critical;
 use noncritical::Noncritical;
 use output::Output;
+
+/// At a shutdown, how long a critical lane goes on forwarding what waits, and what still comes.
+const LAST_SAMPLES_MS: u64 = 200;
 
 /// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping
 /// it stays well within the second that a role has to end.
@@ -76,13 +78,12 @@ struct Egress {
     sleeper: LaneSleeper,
     policy: PolicyWatch,
     housekeeping_at: MonotonicNs,
-    /// Whether the last sleep was one without a wake.
-    asleep_for_token: bool,
+    applied_mode: LaneMode,
 }
 
 /// How the lane chooses what to send.
 enum Forwarder {
-    Critical(Critical),
+    Critical,
     Noncritical(Noncritical),
 }
 
@@ -103,7 +104,7 @@ impl Egress {
         }
         let now = clock::monotonic();
         let forwarder = match lane.class {
-            TrafficClass::Critical => Forwarder::Critical(Critical::new()),
+            TrafficClass::Critical => Forwarder::Critical,
             TrafficClass::Noncritical => Forwarder::Noncritical(Noncritical::new(lane, now)),
         };
         let sleeper = role.boards.sleeper(index);
@@ -116,7 +117,7 @@ impl Egress {
             arena: CopyArena::new(),
             sleeper,
             housekeeping_at: now,
-            asleep_for_token: false,
+            applied_mode: LaneMode::Normal,
         };
         egress.keep_house(now);
         Ok(egress)
@@ -128,9 +129,15 @@ impl Egress {
             self.keep_house(now);
         }
         let mode = self.policy.look(&self.role.boards, now);
+        if mode != self.applied_mode {
+            for output in &mut self.outputs {
+                output.set_mode(mode);
+            }
+            self.applied_mode = mode;
+        }
         match &mut self.forwarder {
-            Forwarder::Critical(critical) => {
-                critical.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
+            Forwarder::Critical => {
+                critical::step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
             }
             Forwarder::Noncritical(lane) => {
                 lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
@@ -154,7 +161,6 @@ impl Egress {
         } else {
             std::thread::sleep(Duration::from_nanos(wait_ns));
         }
-        self.asleep_for_token = !woken;
     }
 
     fn keep_house(&mut self, now: MonotonicNs) {
@@ -169,16 +175,18 @@ impl Egress {
 
     /// Forwards what still waits, as far as the lane's mode allows, and accounts for the rest.
     fn shut_down(&mut self) {
-        let mode = self.policy.look(&self.role.boards, clock::monotonic());
-        if let Forwarder::Critical(critical) = &mut self.forwarder {
-            while let Turn::Busy =
-                critical.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
-            {}
+        let began_at = clock::monotonic();
+        match &mut self.forwarder {
+            Forwarder::Critical => {
+                while clock::monotonic() < began_at.plus_ms(LAST_SAMPLES_MS) {
+                    if !matches!(self.turn(), Turn::Busy) {
+                        break;
+                    }
+                }
+            }
+            Forwarder::Noncritical(lane) => lane.shut_down(&mut self.outputs),
         }
-        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
-            lane.shut_down(&mut self.outputs);
-        }
-        let give_up_at = clock::monotonic().plus_ms(LAST_ACKNOWLEDGEMENTS_MS);
+        let give_up_at = began_at.plus_ms(LAST_SAMPLES_MS + LAST_ACKNOWLEDGEMENTS_MS);
         for output in &mut self.outputs {
             let patience_ns = give_up_at.since(clock::monotonic());
             if !output.wait_acknowledged(Duration::from_nanos(patience_ns)) {

@@ -13,7 +13,8 @@ use crate::clock;
 use crate::config::{self, DropPolicy, Settings};
 use crate::dds::{Participant, RawWriter, WriteError, WriterEvent};
 use crate::model::{
-    DropReason, Durability, LaneCounters, MonotonicNs, QosProfile, Reliability, SampleHeader, TrafficClass,
+    DropReason, Durability, LaneCounters, LaneMode, MonotonicNs, QosProfile, Reliability, SampleHeader,
+    TrafficClass,
 };
 use crate::policy::{SequenceTracker, Sighting};
 use crate::shm::{
@@ -25,12 +26,15 @@ use crate::shm::{
 pub(super) struct Output {
     id: String,
     lane: String,
+    class: TrafficClass,
     route: usize,
     dds_topic: String,
     qos: QosProfile,
     window_samples: usize,
     by_reference_min_bytes: usize,
-    /// What a gap in the sequence means while the lane runs.
+    /// What a gap in the sequence means while the lane forwards.
+    overwritten: DropReason,
+    /// What it means in the present mode.
     gap_reason: DropReason,
     /// Drops that are how the lane works.
     expected_drops: &'static [DropReason],
@@ -83,12 +87,14 @@ impl Output {
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
+            class: lane.class,
             route: output.route,
             dds_topic: output.topic.to_dds(),
             qos: output.qos,
             window_samples: lane.window_samples,
             by_reference_min_bytes: lane.by_reference_min_bytes,
-            gap_reason: gap_reason(lane.class, lane.rates.normal.drop_policy),
+            overwritten: overwritten(lane.class, lane.rates.normal.drop_policy),
+            gap_reason: overwritten(lane.class, lane.rates.normal.drop_policy),
             expected_drops: expected_drops(lane.class),
             subscriber,
             writer: None,
@@ -211,6 +217,15 @@ impl Output {
             account(counters, &self.tracker);
             counters.drops.add(reason, 1);
         });
+    }
+
+    /// The lane applies another mode. One that forwards nothing takes samples at leisure, so most are overwritten.
+    pub fn set_mode(&mut self, mode: LaneMode) {
+        self.gap_reason = match (mode, self.class) {
+            (LaneMode::Stopped, _) => DropReason::Stopped,
+            (LaneMode::Suspended, TrafficClass::Noncritical) => DropReason::Suspended,
+            _ => self.overwritten,
+        };
     }
 
     /// Shows how many taken samples wait in the lane.
@@ -371,7 +386,7 @@ fn account(counters: &mut LaneCounters, tracker: &SequenceTracker) {
 
 /// A critical lane that misses samples was too slow. A noncritical one sleeps until it has a token, and what
 /// is overwritten meanwhile gave way as its drop policy has it.
-const fn gap_reason(class: TrafficClass, policy: DropPolicy) -> DropReason {
+const fn overwritten(class: TrafficClass, policy: DropPolicy) -> DropReason {
     match (class, policy) {
         (TrafficClass::Critical, _) => DropReason::QueueOverflow,
         (TrafficClass::Noncritical, DropPolicy::DropOldest) => DropReason::Superseded,

@@ -22,6 +22,9 @@ use input::Input;
 /// Samples taken of one route before the next route has its turn.
 const SAMPLES_PER_TURN: usize = 32;
 
+/// At a shutdown, how long ingress goes on taking what DDS has received, and what still comes.
+const LAST_SAMPLES_MS: u64 = 200;
+
 /// While a route still waits for its publisher, discovery is looked at this often: what the publisher sends
 /// before the reader exists is lost to a VOLATILE reader.
 const SEARCHING_MS: u64 = 10;
@@ -39,8 +42,9 @@ pub fn ingress(settings: &Settings, stop: &Stop) -> Result<(), RoleError> {
         }
         ingress.sleep();
     }
-    // What DDS has received by now still goes on its way.
-    while ingress.turn() {}
+    // What DDS has received by now still goes on its way; a publisher that goes on does not hold us up.
+    let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
+    while ingress.turn() && clock::monotonic() < give_up_at {}
     info!("ingress is done");
     Ok(())
 }
