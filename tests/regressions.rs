@@ -1,5 +1,5 @@
-//! The inputs that fuzzing began with and those that it found, through the functions that are fuzzed. They are
-//! checked here without a fuzzer; `scripts/fuzz.sh` looks for more.
+//! The inputs that fuzzing began with and those that it found, through the functions that are fuzzed. They
+//! are checked here without a fuzzer; `scripts/fuzz.sh` looks for more.
 
 use std::fs;
 use std::path::{Path, PathBuf};

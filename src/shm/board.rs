@@ -406,7 +406,7 @@ impl Boards {
         after.epoch = before.epoch;
         let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
         if before.epoch == 0 || !only_time_differs {
-            // Only a foreign process can have written the last number. 0 goes on meaning that nobody has set one.
+            // Only a foreign process can have written the last number. 0 still means that none has set one.
             after.epoch = after.epoch.checked_add(1).unwrap_or(1);
         }
         cell.write(&self.segment, &after);

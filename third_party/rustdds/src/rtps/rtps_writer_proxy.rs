@@ -77,6 +77,9 @@ pub(crate) struct RtpsWriterProxy {
   last_received_timestamp: Timestamp,
 }
 
+// Sequence numbers in an ACKNACK: RTPS v2.5 Section 8.3.5.5 SequenceNumberSet.
+const ACKNACK_MAX_BITS: i64 = 256;
+
 impl RtpsWriterProxy {
   pub fn new(
     remote_writer_guid: GUID,
@@ -137,6 +140,9 @@ impl RtpsWriterProxy {
   // Note: Heartbeat gives bounds only. Some samples within that range may
   // have been received already, or not really available, i.e. there may be GAPs
   // in the range.
+  //
+  // Only the first of them and those that an ACKNACK can name together with it
+  // are returned, because the range is as wide as the sender says.
   pub fn missing_seqnums(
     &self,
     hb_first_sn: SequenceNumber,
@@ -144,7 +150,7 @@ impl RtpsWriterProxy {
   ) -> Vec<SequenceNumber> {
     // Need to verify first <= last, or BTreeMap::range will crash
     if hb_first_sn > hb_last_sn {
-      if hb_first_sn > hb_last_sn + SequenceNumber::from(1) {
+      if hb_first_sn - SequenceNumber::from(1) > hb_last_sn {
         warn!("Negative range of missing_seqnums first={hb_first_sn:?} last={hb_last_sn:?}");
       } else {
         // first == last+1
@@ -176,6 +182,11 @@ impl RtpsWriterProxy {
 
     // Iterate over all SequenceNumbers (indices) in the advertised range.
     for s in relevant_interval {
+      if let Some(&first) = missing_seqnums.first() {
+        if s - first >= SequenceNumber::new(ACKNACK_MAX_BITS) {
+          break;
+        }
+      }
       match known_head {
         None => missing_seqnums.push(s), // no known changes left => s is missing
         Some(known_sn) => {
@@ -281,13 +292,22 @@ impl RtpsWriterProxy {
         self.ack_base, remove_from, remove_until_before, self.remote_writer_guid
       );
     } else {
-      // TODO: This potentially generates a very large BTreeMap
-      for na in
-        SequenceNumber::range_inclusive(remove_from, remove_until_before - SequenceNumber::new(1))
-      {
+      // The range is as wide as the sender says. Of one that is wider than what we
+      // track, only the end would be left by enforce_change_map_cap.
+      let first_tracked =
+        remove_until_before - SequenceNumber::from(MAX_TRACKED_CHANGES_PER_WRITER);
+      if remove_from < first_tracked {
+        self.ack_base = max(self.ack_base, first_tracked);
+        self.prune_below_ack_base();
+      }
+      for na in SequenceNumber::range_inclusive(
+        max(remove_from, first_tracked),
+        remove_until_before - SequenceNumber::new(1),
+      ) {
         self.changes.insert(na, None);
       }
       self.enforce_change_map_cap();
+      self.advance_ack_base();
     }
   }
 
@@ -433,6 +453,41 @@ mod bounded_map_tests {
       "changes map grew unbounded on contiguous delivery: {} entries",
       wp.tracked_changes_count()
     );
+  }
+
+  // A single HEARTBEAT can advertise any range. Naming each of its sequence
+  // numbers would take all memory.
+  #[test]
+  fn missing_seqnums_are_no_more_than_an_acknack_can_name() {
+    let mut wp = test_proxy();
+    wp.received_changes_add(SequenceNumber::new(3), Timestamp::INVALID);
+    let missing = wp.missing_seqnums(SequenceNumber::new(1), SequenceNumber::new(1 << 62));
+    let numbers: Vec<i64> = missing.into_iter().map(i64::from).collect();
+    let expected: Vec<i64> = (1..=256).filter(|n| *n != 3).collect();
+    assert_eq!(numbers, expected);
+  }
+
+  // A single GAP can have any range, too.
+  #[test]
+  fn changes_map_bounded_with_a_wide_gap() {
+    let mut wp = test_proxy();
+    wp.received_changes_add(SequenceNumber::new(5), Timestamp::INVALID);
+    let after = 1 << 62;
+    wp.irrelevant_changes_range(SequenceNumber::new(10), SequenceNumber::new(after));
+    assert_eq!(wp.all_ackable_before(), SequenceNumber::new(after));
+    assert!(wp.tracked_changes_count() <= 1);
+    assert!(!wp.should_ignore_change(SequenceNumber::new(after)));
+  }
+
+  // One that can be tracked leaves what is missing before it missing.
+  #[test]
+  fn a_narrow_gap_gives_nothing_up() {
+    let mut wp = test_proxy();
+    wp.irrelevant_changes_range(SequenceNumber::new(3), SequenceNumber::new(8));
+    assert_eq!(wp.all_ackable_before(), SequenceNumber::new(1));
+    let missing = wp.missing_seqnums(SequenceNumber::new(1), SequenceNumber::new(9));
+    let numbers: Vec<i64> = missing.into_iter().map(i64::from).collect();
+    assert_eq!(numbers, [1, 2, 8, 9]);
   }
 
   // Regression: with a permanently missing sample (best-effort loss) ack_base

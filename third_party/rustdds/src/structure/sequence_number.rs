@@ -36,6 +36,9 @@ pub struct SequenceNumber(i64);
 impl SequenceNumber {
   pub const UNKNOWN: Self = Self((u32::MAX as i64) << 32);
 
+  // The farthest from zero that is accepted from the network.
+  const MAX_READ: i64 = 1 << 62;
+
   pub fn new(value: i64) -> Self {
     Self::from(value)
   }
@@ -160,7 +163,14 @@ impl<'a, C: Context> Readable<'a, C> for SequenceNumber {
     let high: i32 = reader.read_value()?;
     let low: u32 = reader.read_value()?;
 
-    Ok(Self(((i64::from(high)) << 32) + i64::from(low)))
+    let value = (i64::from(high) << 32) + i64::from(low);
+    // No writer comes that far, and near the end of i64 the sums of those who
+    // count on would overflow.
+    if (-Self::MAX_READ..=Self::MAX_READ).contains(&value) {
+      Ok(Self(value))
+    } else {
+      Err(speedy::Error::custom(format!("SequenceNumber out of range: {value}")).into())
+    }
   }
 
   #[inline]
