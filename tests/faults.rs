@@ -1,5 +1,6 @@
-//! What goes wrong on a robot, while samples flow: processes of the bridge stopped and killed, subscribers that
-//! stall, links that break, memory that is full. Real processes, real signals, real DDS peers on hosts of their own.
+//! What goes wrong on a robot, while samples flow: processes of the bridge stopped and killed, subscribers
+//! that stall, links that break, memory that is full. Real processes, real signals, real DDS peers on hosts
+//! of their own.
 
 mod support;
 
@@ -127,8 +128,8 @@ fn a_killed_critical_egress_comes_back_and_states_what_was_lost() {
     let critical = lane(&status, "critical");
     let received: Received = flow.critical.end();
     received.assert_sound();
-    // What the lane says it forwarded and what arrived differ only by what was on its way when the process was
-    // killed, and by what was written before the subscriber knew the new writer.
+    // What the lane says it forwarded and what arrived differ only by what was on its way when the process
+    // was killed, and by what was written before the subscriber knew the new writer.
     let forwarded = critical["forwarded"].as_u64().unwrap();
     let stated: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
     assert_eq!(forwarded + stated, sent.ok, "every sample is forwarded or named: {critical}");
@@ -155,7 +156,8 @@ fn a_killed_ingress_comes_back_and_goes_on_counting() {
     let status = bed.wait_whole();
     let route = &status["routes"][0];
     assert_eq!(route["whole"], true, "{route}");
-    // Numbers go on across restarts, and what no ingress took is the publisher's knowledge and the subscriber's.
+    // Numbers go on across restarts, and what no ingress took is the publisher's knowledge and the
+    // subscriber's.
     let published = route["published"].as_u64().unwrap();
     let critical = lane(&status, "critical");
     assert!(published <= sent.ok, "{route}");
@@ -177,7 +179,8 @@ fn nothing_of_a_bridge_is_left_whose_processes_were_killed() {
         children.iter().all(|child| nix::sys::signal::kill(Pid::from_raw(*child), None).is_err())
     });
 
-    // The next bridge of the same name cleans up what the former left, flows, and leaves nothing when it ends.
+    // The next bridge of the same name cleans up what the former left, flows, and leaves nothing when it
+    // ends.
     bed.up = bed.bridge.start_on(bed.net.host("bridge"), "up");
     bed.wait_up();
     let before = flow.critical.received();

@@ -1,5 +1,5 @@
-//! A hostile network: for a minute, datagrams that are no RTPS, nearly RTPS, and cut off in the middle, at every
-//! port of a running bridge, while samples flow. No process dies, none is restarted, no sample is lost.
+//! A hostile network: for a minute, datagrams that are no RTPS, nearly RTPS, and cut off in the middle, at
+//! every port of a running bridge, while samples flow. No process dies, none is restarted, no sample is lost.
 
 mod support;
 
@@ -110,8 +110,8 @@ fn attack(namespace: &str, address: Ipv4Addr, ports: &[u16], seed: u64) -> u64 {
     let until = Instant::now() + ATTACK;
     let mut sent = 0;
     while Instant::now() < until {
-        // Some 20,000 datagrams a second are more than a robot's network carries, and leave the machine, which is
-        // also the robot, the time to forward.
+        // Some 20,000 datagrams a second are more than a robot's network carries, and leave the machine,
+        // which is also the robot, the time to forward.
         for _ in 0..40 {
             let port = ports[random.below(ports.len())];
             // By unicast also to the ports of multicast: it is the bridge that is attacked, not the peers.

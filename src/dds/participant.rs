@@ -105,9 +105,9 @@ impl Participant {
         Guid(self.participant.guid().to_bytes())
     }
 
-    /// Says goodbye for a participant that died and could not: the others forget its readers and writers at once,
-    /// instead of when its lease ends, 15 s later. Until then a RELIABLE, KEEP_ALL publisher waits for the
-    /// acknowledgements of a reader that is no more.
+    /// Says goodbye for a participant that died and could not: the others forget its readers and writers at
+    /// once, instead of when its lease ends, 15 s later. Until then a RELIABLE, KEEP_ALL publisher waits for
+    /// the acknowledgements of a reader that is no more.
     pub fn say_goodbye_for(&self, dead: Guid) {
         if dead != Guid::default() && self.participant.dispose_participant(GUID::from_bytes(dead.0)).is_err()
         {

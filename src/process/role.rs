@@ -136,8 +136,8 @@ impl Role {
         Ok(Self { node, boards, health, former_participant, _lock: lock })
     }
 
-    /// Opens the role's DDS participant. If the process that served the role before was killed, the others are
-    /// told that its participant is gone.
+    /// Opens the role's DDS participant. If the process that served the role before was killed, the others
+    /// are told that its participant is gone.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
         participant.say_goodbye_for(self.former_participant);

@@ -219,7 +219,8 @@ impl Output {
         });
     }
 
-    /// The lane applies another mode. One that forwards nothing takes samples at leisure, so most are overwritten.
+    /// The lane applies another mode. One that forwards nothing takes samples at leisure, so most are
+    /// overwritten.
     pub fn set_mode(&mut self, mode: LaneMode) {
         self.gap_reason = match (mode, self.class) {
             (LaneMode::Stopped, _) => DropReason::Stopped,
