@@ -50,6 +50,8 @@ pub(super) struct Input {
     route: Route,
     source: Source,
     connection: Option<Connection>,
+    /// Whether the publishers have changed since the reader was last thought over.
+    source_changed: bool,
     publisher: SamplePublisher,
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
@@ -79,6 +81,7 @@ impl Input {
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
             connection: None,
+            source_changed: true,
             publisher: SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?,
             watch: DropWatch::new(counters.get().drops),
             counters,
@@ -193,7 +196,11 @@ impl Input {
 
     /// Discovery knows a writer; whatever its topic.
     pub fn writer_found(&mut self, writer: &Endpoint) {
-        if writer.topic == self.dds_topic && self.source.found(writer) {
+        if writer.topic != self.dds_topic {
+            return;
+        }
+        self.source_changed = true;
+        if self.source.found(writer) {
             info!(
                 route = self.id,
                 topic = self.dds_topic,
@@ -207,6 +214,7 @@ impl Input {
     /// A writer is gone; whatever its topic.
     pub fn writer_gone(&mut self, guid: Guid) {
         self.source.gone(guid);
+        self.source_changed = true;
     }
 
     /// Connects to the publisher, attends to lanes that came, logs.
@@ -235,6 +243,9 @@ impl Input {
     }
 
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
+        if self.connection.is_some() && !std::mem::take(&mut self.source_changed) {
+            return Ok(());
+        }
         let configured_type = self.configured_type.as_deref();
         // Once a type is read it stays, whoever else claims the topic.
         let settled = self.connection.as_ref().map(|connection| connection.dds_type.as_str());
