@@ -52,6 +52,8 @@ pub(super) struct Input {
     connection: Option<Connection>,
     /// The type that the lanes have writers for: once read, it stays.
     settled_type: Option<String>,
+    /// Whether the publishers have changed since the reader was last thought over.
+    source_changed: bool,
     publisher: SamplePublisher,
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
@@ -82,6 +84,7 @@ impl Input {
             source: Source::default(),
             connection: None,
             settled_type: None,
+            source_changed: true,
             publisher: SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?,
             watch: DropWatch::new(counters.get().drops),
             counters,
@@ -196,7 +199,11 @@ impl Input {
 
     /// Discovery knows a writer; whatever its topic.
     pub fn writer_found(&mut self, writer: &Endpoint) {
-        if writer.topic == self.dds_topic && self.source.found(writer) {
+        if writer.topic != self.dds_topic {
+            return;
+        }
+        self.source_changed = true;
+        if self.source.found(writer) {
             info!(
                 route = self.id,
                 topic = self.dds_topic,
@@ -210,6 +217,7 @@ impl Input {
     /// A writer is gone; whatever its topic.
     pub fn writer_gone(&mut self, guid: Guid) {
         self.source.gone(guid);
+        self.source_changed = true;
     }
 
     /// Connects to the publisher, attends to lanes that came, logs.
@@ -238,6 +246,9 @@ impl Input {
     }
 
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
+        if self.connection.is_some() && !std::mem::take(&mut self.source_changed) {
+            return Ok(());
+        }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
         if let Some(dds_type) = known_type
             && let Some(other) = self.source.of_other_type(dds_type)

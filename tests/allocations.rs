@@ -1,0 +1,269 @@
+//! What a sample costs in steady state: no heap allocation of ours, and no copy of its payload but those that
+//! must be. The roles run as they are, as threads of this process, over real shared memory and real RTPS, with
+//! an allocator that counts. What the libraries for DDS and shared memory allocate within their own calls is not
+//! ours; whose an allocation is, its backtrace says: the innermost frame that belongs to either of them or to us.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::backtrace::Backtrace;
+use std::cell::Cell;
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use adaptive_bridge::config::{self, DdsNetwork, Settings};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take};
+use adaptive_bridge::model::{
+    Durability, Encapsulation, IngressCounters, LaneCounters, QosProfile, Reliability, SourceTimestamp,
+    WallNs,
+};
+use adaptive_bridge::process::{self, Stop};
+use adaptive_bridge::shm::{Boards, BridgeShape, ShmNode};
+use bytes::Bytes;
+
+const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
+const DOMAIN_ID: u16 = 76;
+/// The critical lane is the first one.
+const LANES: [&str; 2] = ["critical", "noncritical"];
+const ROLES: [&str; 3] = ["ingress", "critical", "noncritical"];
+/// A laser scan, copied for DDS; and a size that DDS is given by reference.
+const SMALL_BYTES: usize = 2_948;
+const LARGE_BYTES: usize = 1 << 20;
+
+static COUNTING: AtomicBool = AtomicBool::new(false);
+static OURS: [AtomicU64; 3] = [const { AtomicU64::new(0) }; 3];
+static DDS: [AtomicU64; 3] = [const { AtomicU64::new(0) }; 3];
+static SHARED_MEMORY: [AtomicU64; 3] = [const { AtomicU64::new(0) }; 3];
+/// Allocations of ours that have room for a large payload, which is what a copy of one would take.
+static PAYLOADS: AtomicU64 = AtomicU64::new(0);
+/// Where the first few allocations of ours came from.
+static CULPRITS: Mutex<Vec<String>> = Mutex::new(Vec::new());
+
+thread_local! {
+    /// The role that this thread runs.
+    static ROLE: Cell<Option<usize>> = const { Cell::new(None) };
+}
+
+struct Counting;
+
+// SAFETY: every call goes to the system's allocator unchanged. Counting touches atomics and const-initialised
+// thread-local cells, and a thread does not count while it takes a backtrace, which allocates itself.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout.size());
+        // SAFETY: as the caller promises.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count(layout.size());
+        // SAFETY: as the caller promises.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count(new_size);
+        // SAFETY: as the caller promises.
+        unsafe { System.realloc(pointer, layout, new_size) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promises.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn count(bytes: usize) {
+    if !COUNTING.load(Ordering::Relaxed) {
+        return;
+    }
+    let Some(role) = ROLE.get() else {
+        return;
+    };
+    // Taking a backtrace allocates.
+    ROLE.set(None);
+    let backtrace = Backtrace::force_capture().to_string();
+    let position = |names: &[&str]| names.iter().filter_map(|name| backtrace.find(name)).min();
+    let owners = [
+        (position(&["rustdds"]), &DDS),
+        (position(&["iceoryx2"]), &SHARED_MEMORY),
+        (position(&["adaptive_bridge::", "./src/"]), &OURS),
+    ];
+    let owner =
+        owners.iter().filter(|(position, _)| position.is_some()).min_by_key(|(position, _)| *position);
+    // What nobody is to be seen behind is ours until the contrary is shown.
+    let counts = owner.map_or(&OURS, |(_, counts)| counts);
+    counts[role].fetch_add(1, Ordering::Relaxed);
+    if std::ptr::eq(counts, &OURS) {
+        PAYLOADS.fetch_add(u64::from(bytes >= LARGE_BYTES), Ordering::Relaxed);
+        if let Ok(mut culprits) = CULPRITS.try_lock()
+            && culprits.len() < 3
+        {
+            culprits.push(format!("{}: {bytes} bytes\n{backtrace}", ROLES[role]));
+        }
+    }
+    ROLE.set(Some(role));
+}
+
+/// A bridge of one route and both lanes in this process, with a publisher and a critical subscriber.
+struct Bench {
+    boards: Boards,
+    writer: RawWriter,
+    reader: RawReader,
+    _participants: [Participant; 2],
+}
+
+fn settings(folder: &Path) -> Settings {
+    let path = folder.join("bridge.yaml");
+    let text = format!(
+        "ros: {{domain_id: {DOMAIN_ID}}}\nshared_memory: {{root_path: {}, max_sample_bytes: {}}}\n\
+         routing_policy: {{noncritical_max_rate_hz: 100}}\n\
+         topics:\n  - {{id: blob, input_topic: /in, critical_output: /out, noncritical_output: /slow}}\n",
+        folder.display(),
+        2 * LARGE_BYTES
+    );
+    std::fs::write(&path, text).unwrap();
+    config::load(Some(&path), &|_| None).unwrap()
+}
+
+fn participant(name: &str) -> Participant {
+    Participant::open(&ParticipantOptions {
+        network: &DdsNetwork { domain_id: DOMAIN_ID, interfaces: Vec::new() },
+        namespace: "/test".into(),
+        node_name: name.into(),
+        graph_gid_bytes: 16,
+    })
+    .unwrap()
+}
+
+impl Bench {
+    fn open(settings: &Settings) -> Self {
+        let mut source = participant("source");
+        let writer = source.create_writer("rt/in", TYPE, &QosProfile::CRITICAL, 256).unwrap();
+        let mut sink = participant("sink");
+        let qos = ReaderQos {
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            depth: 64,
+            deadline_ms: None,
+        };
+        let reader = sink.create_reader("rt/out", TYPE, &qos).unwrap();
+        let root = settings.shared_memory.root_path.clone().unwrap();
+        let node = ShmNode::open(&root, &settings.instance, "test").unwrap();
+        let boards = node.boards(&BridgeShape::of(settings)).unwrap();
+        Self { boards, writer, reader, _participants: [source, sink] }
+    }
+
+    /// Sends that many samples at 200 Hz, one when the one before it has arrived or a moment is over, and
+    /// returns how many arrived.
+    fn send(&self, samples: usize, bytes: usize) -> usize {
+        let mut arrived = 0;
+        for sample in 0..samples {
+            let payload = Bytes::from(vec![sample as u8; bytes]);
+            let now = adaptive_bridge::clock::wall();
+            let timestamp = SourceTimestamp::from_wall(WallNs(now.0));
+            self.writer.write(payload, Encapsulation::CDR_LE, timestamp).unwrap();
+            let give_up = Instant::now() + Duration::from_millis(300);
+            thread::sleep(Duration::from_millis(5));
+            while self.take_all(bytes) == 0 && Instant::now() < give_up {
+                thread::sleep(Duration::from_millis(1));
+            }
+            arrived += usize::from(Instant::now() < give_up);
+        }
+        arrived
+    }
+
+    fn take_all(&self, bytes: usize) -> usize {
+        let mut taken = 0;
+        let mut lend = |payload: &[u8], _| assert_eq!(payload.len(), bytes);
+        while self.reader.take(&mut lend) != Take::Empty {
+            taken += 1;
+        }
+        taken
+    }
+
+    fn counters(&self) -> (IngressCounters, LaneCounters) {
+        (self.boards.ingress(0).unwrap(), self.boards.lane(0, 0).unwrap())
+    }
+}
+
+/// The allocations of ours by each role while so many samples are sent in steady state; how many the critical
+/// lane forwarded, and how many of those by reference.
+fn measure(bench: &Bench, samples: usize, bytes: usize) -> ([u64; 3], u64, u64) {
+    let (ingress_before, lane_before) = bench.counters();
+    let before = [0, 1, 2].map(|role: usize| OURS[role].load(Ordering::Relaxed));
+    COUNTING.store(true, Ordering::SeqCst);
+    let arrived = bench.send(samples, bytes);
+    COUNTING.store(false, Ordering::SeqCst);
+    let (ingress, lane) = bench.counters();
+    assert_eq!(arrived, samples, "samples of {bytes} bytes did not arrive");
+    assert_eq!(ingress.published - ingress_before.published, samples as u64);
+    let ours = [0, 1, 2].map(|role| OURS[role].load(Ordering::Relaxed) - before[role]);
+    (ours, lane.forwarded - lane_before.forwarded, lane.by_reference - lane_before.by_reference)
+}
+
+fn culprits() -> String {
+    CULPRITS.lock().map(|culprits| culprits.join("\n")).unwrap_or_default()
+}
+
+#[test]
+fn in_steady_state_no_step_of_ours_allocates_and_payloads_are_copied_once_or_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings = settings(folder.path());
+    let stop = Stop::default();
+    thread::scope(|scope| {
+        let (settings, stop) = (&settings, &stop);
+        scope.spawn(move || {
+            ROLE.set(Some(0));
+            process::ingress(settings, stop).unwrap();
+        });
+        for (index, lane) in LANES.into_iter().enumerate() {
+            scope.spawn(move || {
+                ROLE.set(Some(1 + index));
+                process::egress(settings, lane, stop).unwrap();
+            });
+        }
+        // The roles stop also when an assertion fails, or the scope would wait for them for ever.
+        let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| check(settings)));
+        stop.request();
+        if let Err(panic) = outcome {
+            std::panic::resume_unwind(panic);
+        }
+    });
+}
+
+fn check(settings: &Settings) {
+    let bench = Bench::open(settings);
+    // Until discovery is through, and then until every buffer that is used again has been used once.
+    let give_up = Instant::now() + Duration::from_secs(30);
+    while bench.send(1, SMALL_BYTES) == 0 {
+        assert!(Instant::now() < give_up, "nothing arrives");
+    }
+    for bytes in [LARGE_BYTES, SMALL_BYTES] {
+        bench.send(600, bytes.min(SMALL_BYTES));
+        bench.send(40, bytes);
+    }
+
+    let (ours, forwarded, by_reference) = measure(&bench, 1_000, SMALL_BYTES);
+    assert_eq!(ours, [0; 3], "allocations for 1,000 small samples, by {ROLES:?}:\n{}", culprits());
+    // One copy into shared memory, one for DDS.
+    assert_eq!((forwarded, by_reference), (1_000, 0));
+
+    let (ours, forwarded, by_reference) = measure(&bench, 60, LARGE_BYTES);
+    // A payload that is handed over by reference takes one handle of some 100 bytes: `Bytes::from_owner`.
+    let handles = [0, by_reference];
+    assert_eq!(ours[..2], handles, "allocations for 60 large samples:\n{}", culprits());
+    // One copy, into shared memory; and nothing was allocated that could hold another.
+    assert_eq!((forwarded, by_reference), (60, 60));
+    assert_eq!(PAYLOADS.load(Ordering::Relaxed), 0, "{}", culprits());
+
+    let of = |counts: &[AtomicU64; 3]| [0, 1, 2].map(|role: usize| counts[role].load(Ordering::Relaxed));
+    let (dds, shared_memory) = (of(&DDS), of(&SHARED_MEMORY));
+    println!("allocations in 1,060 samples by {ROLES:?}: DDS library {dds:?}, iceoryx2 {shared_memory:?}");
+    // iceoryx2 allocates a handle of 104 bytes for each slot that it lends to ingress.
+    assert_eq!(shared_memory, [1_060, 0, 0]);
+}
