@@ -265,6 +265,7 @@ fn check(settings: &Settings) {
     let of = |counts: &[AtomicU64; 3]| [0, 1, 2].map(|role: usize| counts[role].load(Ordering::Relaxed));
     let (dds, shared_memory) = (of(&DDS), of(&SHARED_MEMORY));
     println!("allocations in 1,060 samples by {ROLES:?}: DDS library {dds:?}, iceoryx2 {shared_memory:?}");
-    // iceoryx2 allocates a handle of 104 bytes for each slot that it lends to ingress.
-    assert_eq!(shared_memory, [1_060, 0, 0]);
+    // Of itself iceoryx2 allocates a handle for each slot that it lends; our service variant (shm/service.rs)
+    // does not.
+    assert_eq!(shared_memory, [0, 0, 0]);
 }
