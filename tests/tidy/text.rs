@@ -28,6 +28,7 @@ const UNSAFE: &[&str] = &[
     "tests/support/process.rs",
     // Scheduling of the benchmark, and an allocator that counts.
     "benches/hop/system.rs",
+    "tests/allocations.rs",
     "tests/shm.rs",
 ];
 
