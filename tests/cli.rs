@@ -331,20 +331,36 @@ fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
     let _publisher = Publisher::new(104).run();
     let before = status(&bridge);
     assert_eq!(before["lanes"][1]["mode_reason"], "default");
-    assert!(bridge.run("mode noncritical suspended").status.success());
+    assert!(bridge.run("mode noncritical suspended --for 90s").status.success());
     let after = wait_status(&bridge, "suspended samples", |status| {
         lane(status, "noncritical")["drops_in_window"]["suspended"].as_u64() > Some(0)
     });
     let shown = &after["lanes"][1];
     assert_eq!(shown["mode"], "suspended");
     assert_eq!(shown["mode_reason"], "by_hand");
-    assert_eq!(shown["policy_epoch"], 1);
+    assert!(shown["mode_ends_in_s"].as_f64().is_some_and(|s| s <= 90.0), "{shown}");
     let applied = wait_status(&bridge, "the mode to be applied", |status| {
-        status["lanes"][1]["applied_policy_epoch"] == 1
+        let lane = &status["lanes"][1];
+        lane["applied_policy_epoch"] == lane["policy_epoch"]
     });
     assert_eq!(applied["lanes"][1]["applied_mode"], "suspended");
     assert_eq!(applied["lanes"][0]["mode"], "normal");
-    assert!(text(&bridge.run("status").stdout).contains("lane noncritical: suspended (by hand)"));
+    assert!(text(&bridge.run("status").stdout).contains("lane noncritical: suspended (by hand, "));
+
+    // An override ends by itself, or when it is taken back.
+    assert!(bridge.run("mode noncritical degraded --for 300ms").status.success());
+    wait_status(&bridge, "the override to expire", |status| status["lanes"][1]["mode_reason"] != "by_hand");
+    assert!(bridge.run("mode noncritical stopped --for forever").status.success());
+    wait_status(&bridge, "an override without an end", |status| {
+        let lane = &status["lanes"][1];
+        lane["mode_reason"] == "by_hand" && lane["mode_ends_in_s"].is_null()
+    });
+    assert!(bridge.run("mode noncritical auto").status.success());
+    wait_status(&bridge, "samples again", |status| {
+        status["lanes"][1]["applied_mode"] == "normal"
+            && lane(status, "noncritical")["rate_hz"].as_f64() > Some(1.0)
+    });
+    assert_eq!(bridge.run("mode noncritical degraded --for soon").status.code(), Some(2));
 }
 
 #[test]

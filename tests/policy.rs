@@ -754,42 +754,47 @@ proptest! {
     }
 
     #[test]
-    fn the_mode_is_the_policy_while_it_holds_and_the_safe_default_afterwards(
-        epoch in 0..3_u64,
+    fn the_mode_is_what_hand_control_and_safety_say_while_they_hold(
         written_at in 0..100_000_u64,
         expires_at in 0..100_000_u64,
         mode in 0..6_u8,
+        safety_floor in 0..6_u8,
+        mode_by_hand in 0..6_u8,
         by_hand in 0..2_u8,
         now in 0..100_000_u64,
         hold in 0..100_u64,
     ) {
         let (ms, hold_ms) = (1_000_000, hold);
         let policy = LanePolicy {
-            epoch,
+            epoch: 1,
             written_at: MonotonicNs(written_at * ms / 100),
             expires_at: MonotonicNs(expires_at * ms / 100),
             mode,
+            safety_floor,
             by_hand,
+            mode_by_hand,
             ..LanePolicy::default()
         };
         let now = MonotonicNs(now * ms / 100);
-        let said = LaneMode::from_u8(mode).unwrap_or(LaneMode::Normal);
+        let said = |number| LaneMode::from_u8(number).unwrap_or(LaneMode::Normal);
+        let confirmed = written_at != 0 && now <= policy.written_at.plus_ms(hold_ms);
         let cases =
- [(TrafficClass::Critical, LaneMode::Normal), (TrafficClass::Noncritical, LaneMode::Degraded)];
+            [(TrafficClass::Critical, LaneMode::Normal), (TrafficClass::Noncritical, LaneMode::Degraded)];
         for (class, safe) in cases {
             let effective = effective_mode(&policy, class, now, hold_ms);
-            let holds = match (epoch, by_hand) {
-                (0, _) => None,
-                (_, 1) => Some(policy.expires_at == MonotonicNs(0) || now < policy.expires_at),
-                _ => Some(now <= policy.written_at.plus_ms(hold_ms)),
+            let asked = if by_hand == 1 && (expires_at == 0 || now < policy.expires_at) {
+                said(mode_by_hand)
+            } else if confirmed {
+                said(mode)
+            } else if written_at == 0 {
+                LaneMode::Normal
+            } else {
+                safe
             };
-            prop_assert_eq!(effective, match holds {
-                None => LaneMode::Normal,
-                Some(true) => said,
-                Some(false) => safe,
-            });
+            let floor = if confirmed { said(safety_floor) } else { LaneMode::Normal };
+            prop_assert_eq!(effective as u8, (asked as u8).max(floor as u8));
             // Without control nothing can stop a critical lane for longer than the hold, but a hand.
-            if by_hand == 0 && now > policy.written_at.plus_ms(hold_ms) && class == TrafficClass::Critical {
+            if by_hand == 0 && !confirmed && class == TrafficClass::Critical {
                 prop_assert_eq!(critical_drop(effective), None);
             }
         }

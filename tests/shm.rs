@@ -324,7 +324,7 @@ fn nobody_else_may_read_what_is_shared() {
     let channel = RouteChannel { retained_samples: 1, ..channel(100) };
     let _role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
     let boards = node.boards(&shape()).unwrap();
-    boards.set_policy(0, |policy| policy).unwrap();
+    boards.set_policy(0, MonotonicNs(1), |policy| policy).unwrap();
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
     let _lane = lane(&node, &channel);
     let _tap = SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, true).unwrap();
@@ -837,7 +837,7 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
     assert_eq!(boards.policy(0).unwrap().epoch, 0);
     let set = |mode: LaneMode, at| {
         boards
-            .set_policy(0, |mut policy| {
+            .set_policy(0, MonotonicNs(1), |mut policy| {
                 (policy.mode, policy.written_at) = (mode as u8, MonotonicNs(at));
                 policy
             })
@@ -848,7 +848,7 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
     assert_eq!(set(LaneMode::Normal, 7), 1);
     assert_eq!(boards.policy(0).unwrap().written_at, MonotonicNs(7));
     assert_eq!(set(LaneMode::Suspended, 8), 2);
-    assert_eq!(boards.policy(0).unwrap().mode(), LaneMode::Suspended);
+    assert_eq!(boards.policy(0).unwrap().mode, LaneMode::Suspended as u8);
     assert_eq!(boards.policy(1).unwrap().epoch, 0);
     // Another process confirms and changes meanwhile; no change is lost, and one that is killed blocks
     // nobody.
@@ -857,7 +857,7 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
         other.expect("ready");
         for _ in 0..500 {
             let mut before = 0;
-            let after = boards.set_policy(0, |mut policy| {
+            let after = boards.set_policy(0, MonotonicNs(1), |mut policy| {
                 before = policy.written_at.0;
                 policy.written_at.0 += 1;
                 policy

@@ -8,7 +8,11 @@ use std::path::PathBuf;
 
 use adaptive_bridge::config::{self, Place};
 use adaptive_bridge::dds::encode_graph;
-use adaptive_bridge::model::{DropReason, Guid, InstanceName, LaneName, RouteId, TopicName, TypeName};
+use adaptive_bridge::model::{
+    DropReason, Guid, InstanceName, LaneName, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, RouteId,
+    TopicName, TrafficClass, TypeName,
+};
+use adaptive_bridge::policy::effective_mode;
 use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
 use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing};
 
@@ -142,8 +146,8 @@ impl Foreign {
         let _ = TypeName::from_dds(info.dds_type.as_str());
 
         let policy = self.boards.policy(0).expect("nobody writes");
-        let _ = policy.mode();
-        let set = self.boards.set_policy(0, |mut policy| {
+        let _ = effective_mode(&policy, TrafficClass::Critical, MonotonicNs(1), 1);
+        let set = self.boards.set_policy(0, MonotonicNs(1), |mut policy| {
             policy.mode = 1;
             policy.by_hand ^= 1;
             policy
@@ -151,6 +155,14 @@ impl Foreign {
         let set = set.expect("the lock of a folder of our own");
         assert!(set.epoch != 0 && set.epoch != policy.epoch, "{policy:?} {set:?}");
         assert_eq!(self.boards.policy(0), Some(set));
+
+        let control = self.boards.control().expect("nobody writes");
+        let _ = (control.safety(), control.safety_reason.as_str());
+        let subscriber = self.boards.subscriber(MAX_SUBSCRIBERS - 1).expect("nobody writes");
+        let _ = (subscriber.state(), subscriber.id.as_str());
+        assert!(subscriber.loss().is_none_or(|loss| (0.0..=1.0).contains(&loss)));
+        let intruder = self.boards.intruder(MAX_INTRUDERS - 1).expect("nobody writes");
+        assert!(intruder.host.as_str().len() <= 127);
 
         for stage in [Stage::DdsIn, Stage::Shm(0), Stage::DdsOut(0), Stage::Age(0)] {
             let before = self.boards.histogram(stage, 0);

@@ -2,7 +2,6 @@
 //! nothing of the process that wrote them, not even that it is still alive.
 
 use super::drops::DropCounts;
-use super::modes::LaneMode;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 
@@ -98,30 +97,49 @@ pub struct ProcessHealth {
     pub policy_epoch: u64,
     /// The process' DDS participant, for its successor to say goodbye for it should it be killed.
     pub participant: Guid,
+    /// What failed in the process, samples apart: housekeeping, a board, a policy that could not be written.
+    pub errors: u64,
+    /// Tells the settings that the process applies from others.
+    pub settings_fingerprint: u64,
+    /// Reloads that the process refused because the file was bad.
+    pub refused_reloads: u64,
 }
 
-/// What the policy board says to one lane.
+/// What the policy board says to one lane: what control decided, what safety demands at least, and what an
+/// operator has set. Each part has its own writer, and none takes away what another has said.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct LanePolicy {
     /// Grows by one with each change; 0 means that nobody has set a policy yet.
     pub epoch: u64,
-    /// When it was written, or confirmed by a control process that is alive.
+    /// When control last wrote or confirmed its part; 0 means that control never did.
     pub written_at: MonotonicNs,
-    /// When it ends, if it is an override by hand; 0 never.
+    /// When the override by hand ends; 0 never.
     pub expires_at: MonotonicNs,
-    /// The mode, as [`LaneMode`]'s number.
+    /// When the epoch last grew.
+    pub changed_at: MonotonicNs,
+    /// The mode that control decided on, as [`LaneMode`]'s number.
     pub mode: u8,
-    /// 1 when set by hand, 0 when by control.
+    /// The mildest mode that the safety supervisor allows, as [`LaneMode`]'s number. It holds against an
+    /// override, too.
+    pub safety_floor: u8,
+    /// 1 while there is an override by hand.
     pub by_hand: u8,
+    /// The mode of that override, as [`LaneMode`]'s number.
+    pub mode_by_hand: u8,
     /// Always 0.
-    pub reserved: [u8; 6],
+    pub reserved: [u8; 4],
 }
 
 impl LanePolicy {
-    /// The mode; a number that is none reads as normal.
-    pub fn mode(&self) -> LaneMode {
-        LaneMode::from_u8(self.mode).unwrap_or_default()
+    /// Whether an override by hand is in force.
+    pub const fn is_overridden(&self, now: MonotonicNs) -> bool {
+        self.by_hand != 0 && (self.expires_at.0 == 0 || now.0 < self.expires_at.0)
+    }
+
+    /// Whether control has written or confirmed its part within `policy_hold_ms`.
+    pub const fn is_confirmed(&self, now: MonotonicNs, policy_hold_ms: u64) -> bool {
+        self.written_at.0 != 0 && now.since(self.written_at) <= policy_hold_ms.saturating_mul(1_000_000)
     }
 }
 

@@ -3,6 +3,7 @@
 //! Nothing here does anything but hold, check and convert itself. The terms are those of DDS, RTPS, ROS 2 and
 //! teletraffic engineering; each is defined at the type that carries its name.
 
+mod control;
 mod drops;
 mod health;
 mod modes;
@@ -12,6 +13,7 @@ mod rates;
 mod sample;
 mod time;
 
+pub use control::{ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord};
 pub use drops::{DropCounts, DropReason};
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, ProcessHealth, RouteInfo,

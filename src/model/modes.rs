@@ -98,6 +98,18 @@ impl SubscriberState {
     }
 }
 
+impl SubscriberState {
+    /// The state of that numeric value, as shared memory carries it.
+    pub const fn from_u8(value: u8) -> Option<Self> {
+        match value {
+            0 => Some(Self::Unknown),
+            1 => Some(Self::Critical),
+            2 => Some(Self::Noncritical),
+            _ => None,
+        }
+    }
+}
+
 impl fmt::Display for SubscriberState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.label())
@@ -124,6 +136,18 @@ impl SafetyMode {
             Self::Normal => "normal",
             Self::Degraded => "degraded",
             Self::Emergency => "emergency",
+        }
+    }
+}
+
+impl SafetyMode {
+    /// The mode of that numeric value, as shared memory carries it.
+    pub const fn from_u8(value: u8) -> Option<Self> {
+        match value {
+            0 => Some(Self::Normal),
+            1 => Some(Self::Degraded),
+            2 => Some(Self::Emergency),
+            _ => None,
         }
     }
 }

@@ -168,35 +168,40 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
 
 /// The mode that a lane applies, given what the policy board says.
 ///
-/// - Nobody has set a policy yet: normal.
-/// - Set by hand: as set, until it expires.
-/// - Set by control: as set, while control confirms it at least every `policy_hold_ms`.
-/// - Expired or unconfirmed: the safe default, which is full rate for a critical lane and degraded for a
-///   noncritical one. So a stop that control ordered does not outlive control.
+/// - An override by hand, until it expires.
+/// - Else what control decided, while control confirms it at least every `policy_hold_ms`; when it no longer
+///   does, the safe default, which is full rate for a critical lane and degraded for a noncritical one. Where
+///   control never ran: normal.
+/// - Never milder than safety demands, as long as control confirms that. So a stop that control ordered does
+///   not outlive control, and an operator's override does not outweigh an emergency.
 pub const fn effective_mode(
     policy: &LanePolicy,
     class: TrafficClass,
     now: MonotonicNs,
     policy_hold_ms: u64,
 ) -> LaneMode {
-    if policy.epoch == 0 {
-        return LaneMode::Normal;
-    }
-    let holds = if policy.by_hand != 0 {
-        policy.expires_at.0 == 0 || now.0 < policy.expires_at.0
-    } else {
-        now.since(policy.written_at) <= policy_hold_ms.saturating_mul(1_000_000)
-    };
-    if holds {
-        match LaneMode::from_u8(policy.mode) {
-            Some(mode) => mode,
-            None => LaneMode::Normal,
-        }
+    let confirmed = policy.is_confirmed(now, policy_hold_ms);
+    let mode = if policy.is_overridden(now) {
+        mode_of(policy.mode_by_hand)
+    } else if confirmed {
+        mode_of(policy.mode)
+    } else if policy.written_at.0 == 0 {
+        LaneMode::Normal
     } else {
         match class {
             TrafficClass::Critical => LaneMode::Normal,
             TrafficClass::Noncritical => LaneMode::Degraded,
         }
+    };
+    let floor = mode_of(policy.safety_floor);
+    if confirmed && floor as u8 > mode as u8 { floor } else { mode }
+}
+
+/// A number that is no mode, which only a foreign process can have written, reads as normal.
+const fn mode_of(number: u8) -> LaneMode {
+    match LaneMode::from_u8(number) {
+        Some(mode) => mode,
+        None => LaneMode::Normal,
     }
 }
 
@@ -414,26 +419,43 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_by_hand_holds_until_it_expires() {
+    fn an_override_holds_until_it_expires_and_then_control_decides_again() {
         let mut policy = LanePolicy {
             epoch: 1,
+            written_at: at_ms(4_000),
             expires_at: at_ms(5_000),
-            mode: LaneMode::Suspended as u8,
+            mode: LaneMode::Degraded as u8,
+            mode_by_hand: LaneMode::Suspended as u8,
             by_hand: 1,
             ..LanePolicy::default()
         };
         let class = TrafficClass::Noncritical;
-        assert_eq!(effective_mode(&policy, class, at_ms(4_999), 0), LaneMode::Suspended);
-        assert_eq!(effective_mode(&policy, class, at_ms(5_000), 0), LaneMode::Degraded);
+        assert_eq!(effective_mode(&policy, class, at_ms(4_999), 2_000), LaneMode::Suspended);
+        assert_eq!(effective_mode(&policy, class, at_ms(5_000), 2_000), LaneMode::Degraded);
         policy.expires_at = at_ms(0);
         assert_eq!(effective_mode(&policy, class, MonotonicNs(u64::MAX), 0), LaneMode::Suspended);
     }
 
     #[test]
-    fn without_a_policy_every_lane_is_normal() {
-        let policy = LanePolicy { mode: LaneMode::Stopped as u8, by_hand: 1, ..LanePolicy::default() };
+    fn safety_holds_against_an_override_as_long_as_control_confirms_it() {
+        let policy = LanePolicy {
+            epoch: 1,
+            written_at: at_ms(1_000),
+            safety_floor: LaneMode::Stopped as u8,
+            mode_by_hand: LaneMode::Normal as u8,
+            by_hand: 1,
+            ..LanePolicy::default()
+        };
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
-            assert_eq!(effective_mode(&policy, class, at_ms(9), 1), LaneMode::Normal);
+            assert_eq!(effective_mode(&policy, class, at_ms(3_000), 2_000), LaneMode::Stopped);
+            assert_eq!(effective_mode(&policy, class, at_ms(3_001), 2_000), LaneMode::Normal);
+        }
+    }
+
+    #[test]
+    fn without_a_policy_every_lane_is_normal() {
+        for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
+            assert_eq!(effective_mode(&LanePolicy::default(), class, at_ms(9), 1), LaneMode::Normal);
         }
     }
 }

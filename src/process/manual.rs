@@ -1,17 +1,25 @@
 //! What an operator sets by hand.
 
+use std::time::Duration;
+
 use super::role::{RoleError, lane_index, root};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{LaneMode, LanePolicy, MonotonicNs};
 use crate::shm::{BridgeShape, ProcessRole, ShmNode};
 
-/// Puts a lane into `mode` until another is set, and returns the epoch of that policy. The lane applies it
-/// within one sample.
+/// Overrides the mode of a lane for `duration`, or until another is set when that is `None`; a `mode` of
+/// `None` ends an override. Returns the epoch of the policy that says so. The lane applies it within one
+/// sample.
 ///
 /// # Errors
 /// There is no such lane, the bridge does not run, or shared memory cannot be had.
-pub fn set_mode(settings: &Settings, lane: &str, mode: LaneMode) -> Result<u64, RoleError> {
+pub fn set_mode(
+    settings: &Settings,
+    lane: &str,
+    mode: Option<LaneMode>,
+    duration: Option<Duration>,
+) -> Result<u64, RoleError> {
     let index = lane_index(settings, lane)?;
     let node = ShmNode::open(&root(settings), &settings.instance, "mode")?;
     let boards = node.boards(&BridgeShape::of(settings))?;
@@ -19,11 +27,17 @@ pub fn set_mode(settings: &Settings, lane: &str, mode: LaneMode) -> Result<u64, 
     if !serves {
         return Err(RoleError::NotRunning { instance: settings.instance.to_string(), lane: lane.to_owned() });
     }
-    let policy = boards.set_policy(index, |former| LanePolicy {
-        mode: mode as u8,
-        by_hand: 1,
-        written_at: clock::monotonic(),
-        expires_at: MonotonicNs(0),
+    let now = clock::monotonic();
+    let expires_at = match (mode, duration) {
+        (Some(_), Some(duration)) => {
+            now.plus_ns(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX).max(1))
+        }
+        _ => MonotonicNs(0),
+    };
+    let policy = boards.set_policy(index, now, |former| LanePolicy {
+        by_hand: u8::from(mode.is_some()),
+        mode_by_hand: mode.unwrap_or_default() as u8,
+        expires_at,
         ..former
     })?;
     Ok(policy.epoch)

@@ -23,8 +23,9 @@ use super::segment::Segment;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
-    IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram, ProcessHealth,
-    RouteId, RouteInfo,
+    ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
+    LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProcessHealth, RouteId, RouteInfo,
+    SubscriberRecord,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.
@@ -83,7 +84,7 @@ pub enum Stage {
 }
 
 /// Counts up when the meaning of a word changes.
-const LAYOUT_VERSION: u32 = 1;
+const LAYOUT_VERSION: u32 = 2;
 /// "ABboards", so that a foreign file is not taken for boards.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 /// Words of a cache line, on which every value begins, so that two writers never share one.
@@ -113,16 +114,25 @@ unsafe impl Plain for ProcessHealth {}
 unsafe impl Plain for IngressCounters {}
 // SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
 unsafe impl Plain for LaneCounters {}
-// SAFETY: `repr(C)`; three words, then 8 single bytes; integers only.
+// SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
 unsafe impl Plain for LanePolicy {}
+// SAFETY: `repr(C)`; seven words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
+unsafe impl Plain for ControlRecord {}
+// SAFETY: `repr(C)`; 128 bytes of text, nine words, 8 single bytes, 128 bytes of text.
+unsafe impl Plain for SubscriberRecord {}
+// SAFETY: `repr(C)`; four times 128 bytes of text, then a word.
+unsafe impl Plain for IntruderRecord {}
 // SAFETY: `repr(C)`, 128 bytes of text, which is checked when it is looked at.
 unsafe impl Plain for RouteInfo {}
 // SAFETY: `repr(C)`, 64-bit integers only.
 unsafe impl Plain for LatencyHistogram {}
 
 const _: () = {
-    assert!(size_of::<ProcessHealth>() == 9 * 8);
-    assert!(size_of::<LanePolicy>() == 4 * 8);
+    assert!(size_of::<ProcessHealth>() == 12 * 8);
+    assert!(size_of::<ControlRecord>() == (7 + 1 + 16) * 8);
+    assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
+    assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
+    assert!(size_of::<LanePolicy>() == 5 * 8);
     assert!(size_of::<RouteInfo>() == 16 * 8);
 };
 
@@ -202,6 +212,9 @@ struct Layout {
     wake: usize,
     health: usize,
     policy: usize,
+    control: usize,
+    subscribers: usize,
+    intruders: usize,
     route_info: usize,
     ingress: usize,
     lane: usize,
@@ -215,12 +228,29 @@ impl Layout {
         let wake = LINE;
         let health = wake + lanes * LINE;
         let policy = health + (2 + lanes) * Cell::<ProcessHealth>::WORDS;
-        let route_info = policy + lanes * Cell::<LanePolicy>::WORDS;
+        let control = policy + lanes * Cell::<LanePolicy>::WORDS;
+        let subscribers = control + Cell::<ControlRecord>::WORDS;
+        let intruders = subscribers + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
+        let route_info = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
         let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
         let lane = ingress + routes * Cell::<IngressCounters>::WORDS;
         let histograms = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
         let words = histograms + routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE);
-        Self { lanes, routes, wake, health, policy, route_info, ingress, lane, histograms, words }
+        Self {
+            lanes,
+            routes,
+            wake,
+            health,
+            policy,
+            control,
+            subscribers,
+            intruders,
+            route_info,
+            ingress,
+            lane,
+            histograms,
+            words,
+        }
     }
 
     fn health(&self, role: ProcessRole) -> Cell<ProcessHealth> {
@@ -234,6 +264,20 @@ impl Layout {
 
     fn policy(&self, lane: usize) -> Cell<LanePolicy> {
         Cell::at(self.policy + self.check_lane(lane) * Cell::<LanePolicy>::WORDS)
+    }
+
+    fn control(&self) -> Cell<ControlRecord> {
+        Cell::at(self.control)
+    }
+
+    fn subscriber(&self, place: usize) -> Cell<SubscriberRecord> {
+        assert!(place < MAX_SUBSCRIBERS, "subscriber {place} of {MAX_SUBSCRIBERS}");
+        Cell::at(self.subscribers + place * Cell::<SubscriberRecord>::WORDS)
+    }
+
+    fn intruder(&self, place: usize) -> Cell<IntruderRecord> {
+        assert!(place < MAX_INTRUDERS, "intruder {place} of {MAX_INTRUDERS}");
+        Cell::at(self.intruders + place * Cell::<IntruderRecord>::WORDS)
     }
 
     fn route_info(&self, route: usize) -> Cell<RouteInfo> {
@@ -280,7 +324,8 @@ impl Layout {
 /// All boards of an instance.
 ///
 /// # Panics
-/// All methods, when the number of a lane or route is not one of the [`BridgeShape`].
+/// All methods, when the number of a lane or route is not one of the [`BridgeShape`], or a place in a table
+/// is not below its size.
 #[derive(Clone, Debug)]
 pub struct Boards {
     segment: Arc<Segment>,
@@ -361,6 +406,36 @@ impl Boards {
         self.writer(self.layout.lane(lane, route))
     }
 
+    /// What control found and decided for the bridge as a whole.
+    pub fn control(&self) -> Option<ControlRecord> {
+        self.layout.control().read(&self.segment)
+    }
+
+    /// Writes what control found and decided; one writer at a time, as for the health.
+    pub fn control_writer(&self) -> BoardWriter<ControlRecord> {
+        self.writer(self.layout.control())
+    }
+
+    /// What control knows of the subscriber at a place below [`MAX_SUBSCRIBERS`].
+    pub fn subscriber(&self, place: usize) -> Option<SubscriberRecord> {
+        self.layout.subscriber(place).read(&self.segment)
+    }
+
+    /// Writes what control knows of the subscriber at a place below [`MAX_SUBSCRIBERS`].
+    pub fn subscriber_writer(&self, place: usize) -> BoardWriter<SubscriberRecord> {
+        self.writer(self.layout.subscriber(place))
+    }
+
+    /// The intruder at a place below [`MAX_INTRUDERS`].
+    pub fn intruder(&self, place: usize) -> Option<IntruderRecord> {
+        self.layout.intruder(place).read(&self.segment)
+    }
+
+    /// Writes the intruder at a place below [`MAX_INTRUDERS`].
+    pub fn intruder_writer(&self, place: usize) -> BoardWriter<IntruderRecord> {
+        self.writer(self.layout.intruder(place))
+    }
+
     /// What ingress found out about a route.
     pub fn route_info(&self, route: usize) -> Option<RouteInfo> {
         self.layout.route_info(route).read(&self.segment)
@@ -397,17 +472,19 @@ impl Boards {
     pub fn set_policy(
         &self,
         lane: usize,
+        now: MonotonicNs,
         change: impl FnOnce(LanePolicy) -> LanePolicy,
     ) -> Result<LanePolicy, ShmError> {
         let cell = self.layout.policy(lane);
         let _one_at_a_time = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
         let before = cell.read(&self.segment).unwrap_or_default();
         let mut after = change(before);
-        after.epoch = before.epoch;
+        (after.epoch, after.changed_at) = (before.epoch, before.changed_at);
         let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
         if before.epoch == 0 || !only_time_differs {
             // Only a foreign process can have written the last number. 0 still means that none has set one.
             after.epoch = after.epoch.checked_add(1).unwrap_or(1);
+            after.changed_at = now;
         }
         cell.write(&self.segment, &after);
         Ok(after)

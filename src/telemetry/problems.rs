@@ -153,7 +153,7 @@ fn silent(
 }
 
 fn not_applied(lane: &LaneReading, now: &Snapshot) -> Option<String> {
-    let waited = now.at.since(lane.policy.written_at) > APPLY_MS * 1_000_000;
+    let waited = now.at.since(lane.policy.changed_at) > APPLY_MS * 1_000_000;
     let applies = lane.health.policy_epoch == lane.policy.epoch;
     (lane.health.pid != 0 && waited && !applies && lane.policy.epoch != 0).then(|| {
         format!("lane {}: mode {} was set and the lane's process has not applied it", lane.name, lane.mode)

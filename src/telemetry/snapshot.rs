@@ -76,11 +76,13 @@ pub enum ModeReason {
     Default,
     /// An operator set it.
     ByHand,
-    /// The control process set it, and runs.
+    /// The control process decided on it, and runs.
     Control,
-    /// The control process set it and does not run; it holds for `policy_hold_s`.
+    /// The safety supervisor allows no milder one.
+    Safety,
+    /// The control process decided on it and does not run; it holds for `policy_hold_s`.
     Held,
-    /// What was set has expired, or the control process is gone for longer than `policy_hold_s`.
+    /// The control process is gone for longer than `policy_hold_s`.
     Expired,
 }
 
@@ -91,6 +93,7 @@ impl ModeReason {
             Self::Default => "default",
             Self::ByHand => "by_hand",
             Self::Control => "control",
+            Self::Safety => "safety",
             Self::Held => "held",
             Self::Expired => "expired",
         }
@@ -207,21 +210,21 @@ fn reason(
     now: MonotonicNs,
     policy_hold_ms: u64,
 ) -> (ModeReason, Option<MonotonicNs>) {
-    if policy.epoch == 0 {
+    let confirmed = policy.is_confirmed(now, policy_hold_ms);
+    let holds_until = policy.written_at.plus_ms(policy_hold_ms);
+    let below_floor = if policy.is_overridden(now) { policy.mode_by_hand } else { policy.mode };
+    if confirmed && policy.safety_floor > below_floor {
+        (ModeReason::Safety, Some(holds_until))
+    } else if policy.is_overridden(now) {
+        (ModeReason::ByHand, Some(policy.expires_at).filter(|at| at.0 != 0))
+    } else if policy.written_at.0 == 0 {
         (ModeReason::Default, None)
-    } else if policy.by_hand != 0 {
-        match policy.expires_at {
-            MonotonicNs(0) => (ModeReason::ByHand, None),
-            at if now < at => (ModeReason::ByHand, Some(at)),
-            _ => (ModeReason::Expired, None),
-        }
+    } else if !confirmed {
+        (ModeReason::Expired, None)
+    } else if control_runs {
+        (ModeReason::Control, Some(holds_until))
     } else {
-        let ends_at = policy.written_at.plus_ms(policy_hold_ms);
-        match control_runs {
-            _ if now > ends_at => (ModeReason::Expired, None),
-            true => (ModeReason::Control, Some(ends_at)),
-            false => (ModeReason::Held, Some(ends_at)),
-        }
+        (ModeReason::Held, Some(holds_until))
     }
 }
 
@@ -280,13 +283,15 @@ fn steady<T>(value: Option<T>) -> Result<T, ShmError> {
 mod tests {
     use super::*;
 
+    fn at(ms: u64) -> MonotonicNs {
+        MonotonicNs(0).plus_ms(ms)
+    }
+
     #[test]
     fn a_mode_has_the_reason_that_its_policy_gives() {
-        let at = |ms| MonotonicNs(0).plus_ms(ms);
         let mut policy = LanePolicy::default();
         let of = |policy: &LanePolicy, control_runs, ms| reason(policy, control_runs, at(ms), 5_000);
         assert_eq!(of(&policy, true, 1), (ModeReason::Default, None));
-        policy.epoch = 1;
         policy.written_at = at(1_000);
         assert_eq!(of(&policy, true, 6_000), (ModeReason::Control, Some(at(6_000))));
         assert_eq!(of(&policy, false, 6_000), (ModeReason::Held, Some(at(6_000))));
@@ -296,27 +301,42 @@ mod tests {
         policy.expires_at = at(9_000);
         assert_eq!(of(&policy, false, 8_999), (ModeReason::ByHand, Some(at(9_000))));
         assert_eq!(of(&policy, true, 9_000), (ModeReason::Expired, None));
+        policy.safety_floor = LaneMode::Suspended as u8;
+        assert_eq!(of(&policy, true, 6_000), (ModeReason::Safety, Some(at(6_000))));
+        policy.mode_by_hand = LaneMode::Stopped as u8;
+        assert_eq!(of(&policy, true, 6_000), (ModeReason::ByHand, Some(at(9_000))));
     }
 
     #[test]
-    fn a_reason_is_expired_exactly_when_the_policy_no_longer_decides_the_mode() {
-        for by_hand in [0, 1] {
-            for expires_at in [0, 1_999_000_000, 2_000_000_000, 2_001_000_000] {
-                for at_ms in [1_000, 1_999, 2_000, 2_001, 6_000, 6_001] {
-                    let policy = LanePolicy {
-                        epoch: 1,
-                        written_at: MonotonicNs(1_000_000_000),
-                        expires_at: MonotonicNs(expires_at),
-                        mode: LaneMode::Stopped as u8,
-                        by_hand,
-                        ..LanePolicy::default()
-                    };
-                    let now = MonotonicNs(0).plus_ms(at_ms);
-                    let mode = effective_mode(&policy, TrafficClass::Critical, now, 5_000);
-                    let expired = reason(&policy, false, now, 5_000).0 == ModeReason::Expired;
-                    assert_eq!(expired, mode != LaneMode::Stopped, "{policy:?} at {at_ms} ms");
-                }
-            }
+    fn each_reason_names_the_part_of_the_policy_that_gives_the_mode() {
+        let modes = LaneMode::ALL.map(|mode| mode as u8);
+        for (mode, safety_floor, mode_by_hand, by_hand, at_ms) in modes
+            .iter()
+            .flat_map(|&mode| modes.iter().map(move |&floor| (mode, floor)))
+            .flat_map(|(mode, floor)| {
+                [(3 - mode, 0, 2_000), (3 - mode, 1, 2_000), (3 - mode, 1, 9_000)]
+                    .map(|(hand, by_hand, at_ms)| (mode, floor, hand, by_hand, at_ms))
+            })
+        {
+            let policy = LanePolicy {
+                epoch: 1,
+                written_at: at(1_000),
+                expires_at: at(3_000),
+                mode,
+                safety_floor,
+                by_hand,
+                mode_by_hand,
+                ..LanePolicy::default()
+            };
+            let effective = effective_mode(&policy, TrafficClass::Noncritical, at(at_ms), 5_000);
+            let expected = match reason(&policy, true, at(at_ms), 5_000).0 {
+                ModeReason::Safety => safety_floor,
+                ModeReason::ByHand => mode_by_hand,
+                ModeReason::Control => mode,
+                ModeReason::Expired => LaneMode::Degraded as u8,
+                other => panic!("{other:?}"),
+            };
+            assert_eq!(effective as u8, expected, "{policy:?} at {at_ms} ms");
         }
     }
 }

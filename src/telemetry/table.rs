@@ -137,7 +137,7 @@ fn mode_text(lane: &LaneReport) -> String {
         other => other,
     };
     // What control confirms again and again does not really end.
-    match lane.mode_ends_in_s.filter(|_| lane.mode_reason != "control") {
+    match lane.mode_ends_in_s.filter(|_| !matches!(lane.mode_reason, "control" | "safety")) {
         Some(left_s) => format!("{} ({reason}, {left_s:.0} s left)", lane.mode),
         None => format!("{} ({reason})", lane.mode),
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use adaptive_bridge::model::{DropReason, InstanceName, LaneMode};
+use adaptive_bridge::model::{DropReason, InstanceName, LaneMode, MonotonicNs};
 use adaptive_bridge::shm::{
     LoanError, ProcessRole, RoleLock, RouteChannel, SamplePublisher, SampleSubscriber, ShmNode, Stage,
     SubscriberRole, TakeError, Woken,
@@ -199,7 +199,7 @@ impl Child {
         println!("@ ready");
         while !self.stopping() {
             boards
-                .set_policy(0, |mut policy| {
+                .set_policy(0, MonotonicNs(1), |mut policy| {
                     policy.mode = LaneMode::Degraded as u8;
                     policy.written_at.0 += 1;
                     policy

@@ -235,7 +235,7 @@ impl PolicyWatch {
                 lane = self.name.as_str(),
                 from = self.mode.label(),
                 to = mode.label(),
-                by_hand = self.policy.by_hand != 0,
+                by_hand = self.policy.is_overridden(now),
                 "mode changed"
             );
             self.mode = mode;
