@@ -8,6 +8,7 @@ mod drops;
 mod health;
 mod modes;
 mod names;
+mod probe;
 mod qos;
 mod rates;
 mod sample;
@@ -20,6 +21,7 @@ pub use health::{
 };
 pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
+pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{Encapsulation, Guid, SampleHeader};

@@ -8,6 +8,7 @@ mod arena;
 mod egress;
 mod ingress;
 mod manual;
+pub mod probes;
 mod role;
 mod scheduling;
 mod stop;

@@ -1,0 +1,489 @@
+//! Requests and responses: JSON in a `std_msgs/String`, as in the original package, and its fields. `nonce` and
+//! `hmac` are ours. Fields that a reader does not know are skipped, so that old and new sides work together.
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::model::{Encapsulation, ProbeRefusal, WallNs, is_probe_id};
+
+/// The DDS type of both topics.
+pub const PROBE_TYPE: &str = "std_msgs::msg::dds_::String_";
+
+/// The largest message that is read, in bytes of its serialized payload.
+pub const MAX_MESSAGE_BYTES: usize = 4096;
+
+/// The one version of the protocol there is.
+const VERSION: u64 = 1;
+
+/// Times and sequence numbers go up to here, so that every language can hold them in a signed integer.
+const MAX_NUMBER: u64 = i64::MAX as u64;
+
+/// What tells one probe from another. We send text. A control that numbers its probes gets a number back.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum ProbeId {
+    /// 1 to 127 bytes without control characters.
+    Text(String),
+    /// 0 to 2⁶³ - 1.
+    Number(u64),
+}
+
+impl ProbeId {
+    fn is_valid(&self) -> bool {
+        match self {
+            Self::Text(text) => is_probe_id(text),
+            Self::Number(number) => *number <= MAX_NUMBER,
+        }
+    }
+}
+
+impl std::fmt::Display for ProbeId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Text(text) => f.write_str(text),
+            Self::Number(number) => number.fmt(f),
+        }
+    }
+}
+
+/// What shows that a message is of somebody who has the secret, and not a repetition.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Signature {
+    /// Differs in every message.
+    pub nonce: [u8; 16],
+    /// HMAC-SHA-256 of the message.
+    pub hmac: [u8; 32],
+}
+
+/// A probe.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ProbeRequest {
+    /// The probe's number with its sender.
+    pub seq: u64,
+    /// When it was sent, by the sender's wall clock.
+    pub send_time: WallNs,
+    /// The bridge that asks.
+    pub sender_id: String,
+    /// To be repeated in the response.
+    pub probe_id: ProbeId,
+    /// `None` where it is unsigned, or carries something that is no signature.
+    pub signature: Option<Signature>,
+}
+
+/// The answer to a probe. Its times are of the responder's wall clock.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ProbeResponse {
+    /// Of the request.
+    pub seq: u64,
+    /// Of the request.
+    pub probe_id: ProbeId,
+    /// When the request was received.
+    pub recv_time: WallNs,
+    /// When the response was begun.
+    pub reply_time: WallNs,
+    /// When the response was sent.
+    pub response_send_time: WallNs,
+    /// Who answers.
+    pub responder_id: String,
+    /// `None` where it is unsigned, or carries something that is no signature.
+    pub signature: Option<Signature>,
+}
+
+/// `v` alone: what else a message of another version holds is not for us to judge.
+#[derive(Deserialize)]
+struct Version {
+    v: u64,
+}
+
+#[derive(Serialize, Deserialize)]
+struct RequestFields<'a> {
+    v: u64,
+    seq: u64,
+    send_time_ns: u64,
+    sender_id: std::borrow::Cow<'a, str>,
+    probe_id: ProbeId,
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    nonce: Value,
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    hmac: Value,
+}
+
+#[derive(Serialize, Deserialize)]
+struct ResponseFields<'a> {
+    v: u64,
+    seq: u64,
+    probe_id: ProbeId,
+    recv_time_ns: u64,
+    reply_time_ns: u64,
+    response_send_time_ns: u64,
+    responder_id: std::borrow::Cow<'a, str>,
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    nonce: Value,
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    hmac: Value,
+}
+
+impl ProbeRequest {
+    /// Reads a request from a sample's payload and encapsulation. Nothing of its signature is checked.
+    ///
+    /// # Errors
+    /// Oversized, malformed or of another version.
+    pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
+        let fields: RequestFields<'_> = read(payload, encapsulation)?;
+        let is_valid = [fields.seq, fields.send_time_ns].iter().all(|number| *number <= MAX_NUMBER)
+            && is_probe_id(&fields.sender_id)
+            && fields.probe_id.is_valid();
+        if !is_valid {
+            return Err(ProbeRefusal::Malformed);
+        }
+        Ok(Self {
+            seq: fields.seq,
+            send_time: WallNs(fields.send_time_ns),
+            sender_id: fields.sender_id.into_owned(),
+            probe_id: fields.probe_id,
+            signature: signature(&fields.nonce, &fields.hmac),
+        })
+    }
+
+    /// The payload of a sample, of encapsulation [`Encapsulation::CDR_LE`].
+    pub fn encode(&self) -> Bytes {
+        let (nonce, hmac) = signature_fields(self.signature);
+        write(&RequestFields {
+            v: VERSION,
+            seq: self.seq,
+            send_time_ns: self.send_time.0,
+            sender_id: self.sender_id.as_str().into(),
+            probe_id: self.probe_id.clone(),
+            nonce,
+            hmac,
+        })
+    }
+}
+
+impl ProbeResponse {
+    /// Reads a response from a sample's payload and encapsulation. Nothing of its signature is checked.
+    ///
+    /// # Errors
+    /// Oversized, malformed or of another version.
+    pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
+        let fields: ResponseFields<'_> = read(payload, encapsulation)?;
+        let numbers = [fields.seq, fields.recv_time_ns, fields.reply_time_ns, fields.response_send_time_ns];
+        let is_valid = numbers.iter().all(|number| *number <= MAX_NUMBER)
+            && is_probe_id(&fields.responder_id)
+            && fields.probe_id.is_valid();
+        if !is_valid {
+            return Err(ProbeRefusal::Malformed);
+        }
+        Ok(Self {
+            seq: fields.seq,
+            probe_id: fields.probe_id,
+            recv_time: WallNs(fields.recv_time_ns),
+            reply_time: WallNs(fields.reply_time_ns),
+            response_send_time: WallNs(fields.response_send_time_ns),
+            responder_id: fields.responder_id.into_owned(),
+            signature: signature(&fields.nonce, &fields.hmac),
+        })
+    }
+
+    /// The payload of a sample, of encapsulation [`Encapsulation::CDR_LE`].
+    pub fn encode(&self) -> Bytes {
+        let (nonce, hmac) = signature_fields(self.signature);
+        write(&ResponseFields {
+            v: VERSION,
+            seq: self.seq,
+            probe_id: self.probe_id.clone(),
+            recv_time_ns: self.recv_time.0,
+            reply_time_ns: self.reply_time.0,
+            response_send_time_ns: self.response_send_time.0,
+            responder_id: self.responder_id.as_str().into(),
+            nonce,
+            hmac,
+        })
+    }
+}
+
+fn read<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation) -> Result<T, ProbeRefusal> {
+    if payload.len() > MAX_MESSAGE_BYTES {
+        return Err(ProbeRefusal::Oversized);
+    }
+    let json = decode_string(payload, encapsulation).ok_or(ProbeRefusal::Malformed)?;
+    let version: Version = serde_json::from_str(json).map_err(|_| ProbeRefusal::Malformed)?;
+    if version.v != VERSION {
+        return Err(ProbeRefusal::UnsupportedVersion);
+    }
+    serde_json::from_str(json).map_err(|_| ProbeRefusal::Malformed)
+}
+
+fn write(fields: &impl Serialize) -> Bytes {
+    // Numbers and texts under keys that are texts: none of this can fail.
+    encode_string(&serde_json::to_string(fields).unwrap_or_default())
+}
+
+/// The text of a `std_msgs/String`, in any encapsulation in which a final type is plain (RTPS 2.5 table 10.3,
+/// and XTypes 1.3 table 60, which numbers CDR2 otherwise). Up to three bytes of padding may follow.
+fn decode_string(payload: &[u8], encapsulation: Encapsulation) -> Option<&str> {
+    let (length, rest) = payload.split_first_chunk::<4>()?;
+    let length = match encapsulation.representation() {
+        [0, 0x00 | 0x06 | 0x10] => u32::from_be_bytes(*length),
+        [0, 0x01 | 0x07 | 0x11] => u32::from_le_bytes(*length),
+        _ => return None,
+    };
+    let (text, padding) = rest.split_at_checked(usize::try_from(length).ok()?)?;
+    let text = text.strip_suffix(&[0])?;
+    if padding.len() > 3 { None } else { std::str::from_utf8(text).ok() }
+}
+
+/// A `std_msgs/String` in plain little-endian CDR: its length with the terminating zero, its bytes, the zero.
+fn encode_string(text: &str) -> Bytes {
+    let mut cdr = Vec::with_capacity(text.len() + 5);
+    // A message of ours has less than 1 KiB, see `MAX_ID_BYTES`.
+    cdr.extend_from_slice(&(text.len() as u32 + 1).to_le_bytes());
+    cdr.extend_from_slice(text.as_bytes());
+    cdr.push(0);
+    Bytes::from(cdr)
+}
+
+/// Where signatures are not looked at, one of another making does no harm: it counts as none.
+fn signature(nonce: &Value, hmac: &Value) -> Option<Signature> {
+    Some(Signature { nonce: from_hex(nonce.as_str()?)?, hmac: from_hex(hmac.as_str()?)? })
+}
+
+fn signature_fields(signature: Option<Signature>) -> (Value, Value) {
+    signature.map_or((Value::Null, Value::Null), |signature| {
+        (to_hex(&signature.nonce).into(), to_hex(&signature.hmac).into())
+    })
+}
+
+/// Bytes as lowercase hexadecimal digits.
+pub(super) fn to_hex(bytes: &[u8]) -> String {
+    const DIGITS: [u8; 16] = *b"0123456789abcdef";
+    let digits = bytes.iter().flat_map(|byte| [byte >> 4, byte & 15]);
+    digits.map(|digit| char::from(DIGITS[usize::from(digit)])).collect()
+}
+
+/// Only lowercase: the nonce is signed as it is written, so there must be one way to write it.
+fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
+    let digit = |byte: u8| match byte {
+        b'0'..=b'9' => Some(byte - b'0'),
+        b'a'..=b'f' => Some(byte - b'a' + 10),
+        _ => None,
+    };
+    if text.len() != 2 * N {
+        return None;
+    }
+    let mut bytes = [0; N];
+    for (byte, pair) in bytes.iter_mut().zip(text.as_bytes().chunks_exact(2)) {
+        *byte = (digit(pair[0])? << 4) | digit(pair[1])?;
+    }
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const REQUEST: &str = r#"{"v": 1, "seq": 7, "send_time_ns": 1763000000000000001, "sender_id": "bridge", "probe_id": "p-7"}"#;
+    const RESPONSE: &str = r#"{"v":1,"seq":7,"probe_id":"p-7","recv_time_ns":2,"reply_time_ns":3,"response_send_time_ns":4,"responder_id":"laptop"}"#;
+
+    fn cdr(json: &str) -> Vec<u8> {
+        encode_string(json).to_vec()
+    }
+
+    fn request(json: &str) -> Result<ProbeRequest, ProbeRefusal> {
+        ProbeRequest::decode(&cdr(json), Encapsulation::CDR_LE)
+    }
+
+    fn expected() -> ProbeRequest {
+        ProbeRequest {
+            seq: 7,
+            send_time: WallNs(1_763_000_000_000_000_001),
+            sender_id: "bridge".to_owned(),
+            probe_id: ProbeId::Text("p-7".to_owned()),
+            signature: None,
+        }
+    }
+
+    #[test]
+    fn messages_of_the_original_are_read() {
+        assert_eq!(request(REQUEST), Ok(expected()));
+        let response = ProbeResponse::decode(&cdr(RESPONSE), Encapsulation::CDR_LE).unwrap();
+        assert_eq!((response.seq, response.probe_id.to_string().as_str()), (7, "p-7"));
+        let times = (response.recv_time, response.reply_time, response.response_send_time);
+        assert_eq!(times, (WallNs(2), WallNs(3), WallNs(4)));
+        assert_eq!((response.responder_id.as_str(), response.signature), ("laptop", None));
+    }
+
+    #[test]
+    fn an_unsigned_message_has_the_fields_of_the_original_and_no_others() {
+        let keys = |bytes: Bytes| -> Vec<String> {
+            let json: Value =
+                serde_json::from_str(decode_string(&bytes, Encapsulation::CDR_LE).unwrap()).unwrap();
+            json.as_object().unwrap().keys().cloned().collect()
+        };
+        assert_eq!(keys(expected().encode()), ["probe_id", "send_time_ns", "sender_id", "seq", "v"]);
+        let response = ProbeResponse::decode(&cdr(RESPONSE), Encapsulation::CDR_LE).unwrap();
+        let all = [
+            "probe_id",
+            "recv_time_ns",
+            "reply_time_ns",
+            "responder_id",
+            "response_send_time_ns",
+            "seq",
+            "v",
+        ];
+        assert_eq!(keys(response.encode()), all);
+    }
+
+    #[test]
+    fn every_plain_encapsulation_is_read_in_its_byte_order() {
+        let little = cdr(REQUEST);
+        let mut big = little.clone();
+        big[..4].reverse();
+        for (id, bytes) in [(0, &big), (1, &little), (6, &big), (7, &little), (0x10, &big), (0x11, &little)] {
+            let read = ProbeRequest::decode(bytes, Encapsulation([0, id, 0, 0]));
+            assert_eq!(read, Ok(expected()), "{id:#x}");
+        }
+        for id in [2, 3, 4, 8, 9, 10, 11, 0x12, 0x14, 0xff] {
+            let read = ProbeRequest::decode(&little, Encapsulation([0, id, 0, 0]));
+            assert_eq!(read, Err(ProbeRefusal::Malformed), "{id:#x}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_string_is_malformed() {
+        let whole = cdr(REQUEST);
+        for wrong in [
+            vec![],
+            vec![0; 3],
+            vec![0; 4],
+            whole[..whole.len() - 1].to_vec(),
+            [&whole[..], &[0; 4]].concat(),
+            [&u32::MAX.to_le_bytes(), &whole[4..]].concat(),
+            [&(whole.len() as u32 - 5).to_le_bytes(), &whole[4..]].concat(),
+        ] {
+            let read = ProbeRequest::decode(&wrong, Encapsulation::CDR_LE);
+            assert_eq!(read, Err(ProbeRefusal::Malformed), "{wrong:?}");
+        }
+        let padded = [&whole[..], &[0; 3]].concat();
+        assert_eq!(ProbeRequest::decode(&padded, Encapsulation::CDR_LE), Ok(expected()));
+        let mut no_utf8 = whole;
+        no_utf8[70] = 0xff;
+        assert_eq!(ProbeRequest::decode(&no_utf8, Encapsulation::CDR_LE), Err(ProbeRefusal::Malformed));
+    }
+
+    #[test]
+    fn a_message_is_refused_for_what_is_wrong_with_it() {
+        let with = |from: &str, to: &str| {
+            assert!(REQUEST.contains(from), "{from}");
+            request(&REQUEST.replace(from, to))
+        };
+        for (from, to) in [
+            ("\"seq\": 7, ", ""),
+            ("7,", "-7,"),
+            ("7,", "7.5,"),
+            ("7,", "\"7\","),
+            ("7,", "9223372036854775808,"),
+            ("7,", "99999999999999999999999999,"),
+            ("1763000000000000001", "9223372036854775808"),
+            ("\"bridge\"", "\"\""),
+            ("\"bridge\"", "null"),
+            ("bridge", "bri\\ndge"),
+            ("bridge", "bri\\u0000dge"),
+            ("bridge", &"x".repeat(128)),
+            ("\"p-7\"", "[1]"),
+            ("\"p-7\"", "-1"),
+            ("p-7", ""),
+            ("\"v\": 1", "\"v\": 1, \"seq\": 8"),
+            ("\"v\": 1, ", ""),
+            ("\"v\": 1", "\"v\": \"1\""),
+            ("}", ""),
+            ("}", "} {}"),
+        ] {
+            assert_eq!(with(from, to), Err(ProbeRefusal::Malformed), "{from} {to}");
+        }
+        assert_eq!(with("\"v\": 1", "\"v\": 2"), Err(ProbeRefusal::UnsupportedVersion));
+        assert_eq!(request(r#"{"v": 0}"#), Err(ProbeRefusal::UnsupportedVersion));
+        for wrong in ["", "[]", "1", "null", "{", &"[".repeat(4000)] {
+            assert_eq!(request(wrong), Err(ProbeRefusal::Malformed), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_message_has_at_most_4_kib() {
+        let with_spaces = |bytes: usize| format!("{REQUEST}{}", " ".repeat(bytes - 5 - REQUEST.len()));
+        assert_eq!(request(&with_spaces(4096)), Ok(expected()));
+        assert_eq!(request(&with_spaces(4097)), Err(ProbeRefusal::Oversized));
+    }
+
+    #[test]
+    fn unknown_fields_and_foreign_signatures_are_skipped() {
+        for field in [
+            r#""zone": {"a": [1, 2]}"#,
+            r#""hmac": "swordfish", "nonce": 7"#,
+            r#""nonce": null, "hmac": null"#,
+            r#""nonce": "00112233445566778899aabbccddeeff""#,
+        ] {
+            assert_eq!(request(&REQUEST.replace("\"v\": 1", &format!("\"v\": 1, {field}"))), Ok(expected()));
+        }
+    }
+
+    #[test]
+    fn a_number_comes_back_as_a_number() {
+        let numbered = request(&REQUEST.replace("\"p-7\"", "12")).unwrap();
+        assert_eq!(numbered.probe_id, ProbeId::Number(12));
+        assert!(numbered.encode().windows(14).any(|part| part == b"\"probe_id\":12}"));
+    }
+
+    #[test]
+    fn hexadecimal_digits_are_lowercase() {
+        assert_eq!(to_hex(&[0x0a, 0xff]), "0aff");
+        assert_eq!(from_hex("0aff"), Some([0x0a, 0xff]));
+        for wrong in ["0Aff", "0af", "0aff0", "0ag0", "+aff", "ä0f"] {
+            assert_eq!(from_hex::<2>(wrong), None, "{wrong}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_encoded_is_decoded(
+            seq in 0..=MAX_NUMBER,
+            time in 0..=MAX_NUMBER,
+            id in "[^\\p{C}]{1,31}",
+            probe_id in prop_oneof![
+                "[^\\p{C}]{1,31}".prop_map(ProbeId::Text),
+                (0..=MAX_NUMBER).prop_map(ProbeId::Number),
+            ],
+            signature in proptest::option::of(
+                any::<([u8; 16], [u8; 32])>().prop_map(|(nonce, hmac)| Signature { nonce, hmac })
+            ),
+        ) {
+            let request = ProbeRequest {
+                seq,
+                send_time: WallNs(time),
+                sender_id: id.clone(),
+                probe_id: probe_id.clone(),
+                signature,
+            };
+            prop_assert_eq!(ProbeRequest::decode(&request.encode(), Encapsulation::CDR_LE), Ok(request));
+            let response = ProbeResponse {
+                seq,
+                probe_id,
+                recv_time: WallNs(time),
+                reply_time: WallNs(seq),
+                response_send_time: WallNs(time / 2),
+                responder_id: id,
+                signature,
+            };
+            prop_assert_eq!(ProbeResponse::decode(&response.encode(), Encapsulation::CDR_LE), Ok(response));
+        }
+
+        #[test]
+        fn any_bytes_are_read_or_refused(bytes: Vec<u8>, id in 0_u8..=0x15) {
+            let _ = ProbeRequest::decode(&bytes, Encapsulation([0, id, 0, 0]));
+            let _ = ProbeResponse::decode(&bytes, Encapsulation([0, id, 0, 0]));
+        }
+    }
+}
