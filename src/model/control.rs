@@ -2,6 +2,7 @@
 
 use super::health::FixedText;
 use super::modes::{SafetyMode, SubscriberState};
+use super::probe::RefusalCounts;
 use super::time::MonotonicNs;
 
 /// Subscribers that are followed at once: listed ones first, then those that answer without being listed.
@@ -28,6 +29,8 @@ pub struct ControlRecord {
     pub probes_sent: u64,
     /// Responses that were taken for what they claim to be.
     pub responses_accepted: u64,
+    /// Responses that were not, by reason.
+    pub refused: RefusalCounts,
     /// The safety mode, as [`SafetyMode`]'s number.
     pub safety: u8,
     /// 1 while subscribers are classified.

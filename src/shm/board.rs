@@ -24,8 +24,8 @@ use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
     ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
-    LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProcessHealth, RouteId, RouteInfo,
-    SubscriberRecord,
+    LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId,
+    RouteInfo, SubscriberRecord,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.
@@ -116,7 +116,7 @@ unsafe impl Plain for IngressCounters {}
 unsafe impl Plain for LaneCounters {}
 // SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
 unsafe impl Plain for LanePolicy {}
-// SAFETY: `repr(C)`; seven words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
+// SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
 unsafe impl Plain for ControlRecord {}
 // SAFETY: `repr(C)`; 128 bytes of text, nine words, 8 single bytes, 128 bytes of text.
 unsafe impl Plain for SubscriberRecord {}
@@ -129,7 +129,7 @@ unsafe impl Plain for LatencyHistogram {}
 
 const _: () = {
     assert!(size_of::<ProcessHealth>() == 12 * 8);
-    assert!(size_of::<ControlRecord>() == (7 + 1 + 16) * 8);
+    assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
     assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
     assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
     assert!(size_of::<LanePolicy>() == 5 * 8);
