@@ -10,6 +10,7 @@ mod names;
 mod qos;
 mod rates;
 mod sample;
+mod thresholds;
 mod time;
 
 pub use drops::{DropCounts, DropReason};
@@ -21,4 +22,5 @@ pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName}
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{Encapsulation, Guid, SampleHeader};
+pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
