@@ -19,6 +19,10 @@ const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
 /// The longest round trip worth a threshold: an hour.
 const MAX_RTT_MS: f64 = 3_600_000.0;
 
+/// Slowest and fastest rate of the safety supervisor. In less than 50 ms a few errors would look like many per
+/// second.
+const SAFETY_RATES_HZ: std::ops::RangeInclusive<f64> = 0.1..=20.0;
+
 /// The longest silence worth a threshold: an hour.
 const HOUR_MS: u64 = 3_600_000;
 
@@ -169,7 +173,7 @@ pub(super) fn safety(root: &Field<'_>) -> Safety {
         check_below((&silent, silent_ms as f64), (&emergency_silent, emergency_silent_ms as f64));
     }
     Safety {
-        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(RATES_HZ).unwrap_or(2.0),
+        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(SAFETY_RATES_HZ).unwrap_or(2.0),
         rules: SafetyRules {
             preserve_critical_path: flag("preserve_critical_path"),
             allow_noncritical_degrade: flag("allow_noncritical_degrade"),
