@@ -19,8 +19,8 @@ const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
 /// The longest round trip worth a threshold: an hour.
 const MAX_RTT_MS: f64 = 3_600_000.0;
 
-/// Slowest and fastest rate of the safety supervisor. In less than 50 ms a few errors would look like many per
-/// second.
+/// Slowest and fastest rate of the safety supervisor. In less than 50 ms a few errors would look like many
+/// a second.
 const SAFETY_RATES_HZ: std::ops::RangeInclusive<f64> = 0.1..=20.0;
 
 /// The longest silence worth a threshold: an hour.

@@ -35,8 +35,8 @@ impl Default for ClassifierThresholds {
 /// ours, and `policy::SafetySupervisor` says why.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SafetyRules {
-    /// Whether the critical path is preserved in DEGRADED; otherwise it stops there too, unless the trouble is
-    /// of noncritical lanes alone.
+    /// Whether the critical path is preserved in DEGRADED; otherwise it stops there too, unless the trouble
+    /// is of noncritical lanes alone.
     pub preserve_critical_path: bool,
     /// Whether noncritical lanes may be degraded or suspended at all; EMERGENCY stops them all the same.
     pub allow_noncritical_degrade: bool,
