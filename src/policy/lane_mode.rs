@@ -1,5 +1,5 @@
-//! The mode of a lane (paper, section III-D): the worst of its subscribers decides, and the safety mode goes
-//! over it.
+//! The mode of a lane (paper, section III-D): the worst of its subscribers decides, and the safety mode sets
+//! a floor.
 
 use crate::model::{LaneMode, SafetyMode, SafetyRules, SubscriberState, TrafficClass};
 
@@ -29,10 +29,6 @@ pub enum LaneReason<'a> {
         /// How many are.
         impaired: usize,
     },
-    /// The safety supervisor is in DEGRADED.
-    SafetyDegraded,
-    /// The safety supervisor is in EMERGENCY.
-    SafetyEmergency,
 }
 
 impl LaneReason<'_> {
@@ -45,8 +41,6 @@ impl LaneReason<'_> {
             Self::NoSubscribers => "no_subscribers",
             Self::Healthy { .. } => "healthy",
             Self::Subscriber { .. } => "subscriber",
-            Self::SafetyDegraded => "safety_degraded",
-            Self::SafetyEmergency => "safety_emergency",
         }
     }
 }
@@ -100,30 +94,27 @@ pub fn lane_mode<'a>(
     }
 }
 
-/// What a safety mode makes of a lane's mode (paper, section III-E): DEGRADED suspends the noncritical lanes,
-/// EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where the configuration
-/// doesn't preserve the critical path, it is given up for its own trouble only.
+/// The mildest mode that a safety mode leaves a lane (paper, section III-E): DEGRADED suspends the noncritical
+/// lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where the
+/// configuration doesn't preserve the critical path, it is given up for its own trouble only.
 ///
 /// [`SafetyDecision::critical_trouble`]: super::SafetyDecision::critical_trouble
-pub const fn under_safety<'a>(
-    decision: LaneDecision<'a>,
+pub const fn safety_floor(
     class: TrafficClass,
     safety: SafetyMode,
     critical_trouble: bool,
     rules: &SafetyRules,
-) -> LaneDecision<'a> {
+) -> LaneMode {
     match (safety, class) {
-        (SafetyMode::Emergency, _) => {
-            LaneDecision { mode: LaneMode::Stopped, reason: LaneReason::SafetyEmergency }
-        }
+        (SafetyMode::Emergency, _) => LaneMode::Stopped,
         (SafetyMode::Degraded, TrafficClass::Noncritical) if rules.allow_noncritical_degrade => {
-            LaneDecision { mode: LaneMode::Suspended, reason: LaneReason::SafetyDegraded }
+            LaneMode::Suspended
         }
         (SafetyMode::Degraded, TrafficClass::Critical)
             if critical_trouble && !rules.preserve_critical_path =>
         {
-            LaneDecision { mode: LaneMode::Stopped, reason: LaneReason::SafetyDegraded }
+            LaneMode::Stopped
         }
-        _ => decision,
+        _ => LaneMode::Normal,
     }
 }

@@ -10,7 +10,7 @@
 //! - [`SequenceTracker`]: what the number of a sample says about those that are missing.
 //! - [`ProbeWindow`]: what the probes say about the link to one subscriber.
 //! - [`SubscriberClassifier`]: the state of one subscriber.
-//! - [`lane_mode()`] and [`under_safety`]: the mode of a lane, and why.
+//! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, and why; the mildest that safety leaves it.
 //! - [`SafetySupervisor`]: the mode of the whole bridge.
 //! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
 //! - [`RestartBackoff`]: when a supervised child is started again.
@@ -31,7 +31,7 @@ pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
 };
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
-pub use lane_mode::{LaneDecision, LaneReason, lane_mode, under_safety};
+pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, Stamps};
 pub use probe_window::{Answer, LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, STOPPED_NS};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};

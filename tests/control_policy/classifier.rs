@@ -5,7 +5,7 @@ use adaptive_bridge::model::{
 };
 use adaptive_bridge::policy::{
     FORGET_UNLISTED_MS, LaneDecision, LaneReason, LinkReading, MIN_SETTLED, SubscriberClassifier,
-    TransitionReason, is_forgotten, lane_mode, under_safety,
+    TransitionReason, is_forgotten, lane_mode, safety_floor,
 };
 use proptest::prelude::*;
 
@@ -225,26 +225,24 @@ fn no_classifier_degrades_a_critical_lane_or_one_that_may_not_be() {
 }
 
 #[test]
-fn the_safety_mode_goes_over_that_of_the_lane() {
-    use LaneMode::{Degraded, Normal, Stopped, Suspended};
+fn the_safety_mode_sets_the_mildest_mode_of_a_lane() {
+    use LaneMode::{Normal, Stopped, Suspended};
     let default = SafetyRules::default();
     let forbidden = SafetyRules { allow_noncritical_degrade: false, ..default };
     let given_up = SafetyRules { preserve_critical_path: false, ..default };
-    // Rules, safety mode, trouble of the critical path; then a critical lane, and a degraded noncritical one.
+    // Rules, safety mode, trouble of the critical path; then the floors of a critical and a noncritical lane.
     let cases = [
-        (&default, SafetyMode::Normal, true, Normal, Degraded),
+        (&default, SafetyMode::Normal, true, Normal, Normal),
         (&default, SafetyMode::Degraded, true, Normal, Suspended),
         (&default, SafetyMode::Emergency, false, Stopped, Stopped),
-        (&forbidden, SafetyMode::Degraded, true, Normal, Degraded),
+        (&forbidden, SafetyMode::Degraded, true, Normal, Normal),
         (&forbidden, SafetyMode::Emergency, true, Stopped, Stopped),
         (&given_up, SafetyMode::Degraded, false, Normal, Suspended),
         (&given_up, SafetyMode::Degraded, true, Stopped, Suspended),
     ];
     for (rules, safety, trouble, critical, noncritical) in cases {
-        let normal = LaneDecision { mode: Normal, reason: LaneReason::CriticalLane };
-        let degraded = decided(&[("a", Noncritical)]);
-        let mode = |decision, class| under_safety(decision, class, safety, trouble, rules).mode;
-        assert_eq!(mode(normal, TrafficClass::Critical), critical, "{safety} {trouble}");
-        assert_eq!(mode(degraded, TrafficClass::Noncritical), noncritical, "{safety} {trouble}");
+        let floor = |class| safety_floor(class, safety, trouble, rules);
+        assert_eq!(floor(TrafficClass::Critical), critical, "{safety} {trouble}");
+        assert_eq!(floor(TrafficClass::Noncritical), noncritical, "{safety} {trouble}");
     }
 }
