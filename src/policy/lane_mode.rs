@@ -94,9 +94,9 @@ pub fn lane_mode<'a>(
     }
 }
 
-/// The mildest mode that a safety mode leaves a lane (paper, section III-E): DEGRADED suspends the noncritical
-/// lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where the
-/// configuration doesn't preserve the critical path, it is given up for its own trouble only.
+/// The mildest mode that a safety mode leaves a lane (paper, section III-E): DEGRADED suspends the
+/// noncritical lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where
+/// the configuration doesn't preserve the critical path, it is given up for its own trouble only.
 ///
 /// [`SafetyDecision::critical_trouble`]: super::SafetyDecision::critical_trouble
 pub const fn safety_floor(

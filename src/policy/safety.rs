@@ -230,8 +230,8 @@ pub struct SafetyDecision {
 ///
 /// Up: `hysteresis_count` readings in a row that speak for DEGRADED or worse, and from there as many that
 /// speak for EMERGENCY. Back: `recovery_count` readings in a row, below EMERGENCY for the step to DEGRADED
-/// and clean for that to NORMAL. DEGRADED frees what the noncritical lanes used, so that the trouble may return
-/// when they do; the longer way back keeps them from being switched on and off all the time.
+/// and clean for that to NORMAL. DEGRADED frees what the noncritical lanes used, so that the trouble may
+/// return when they do; the longer way back keeps them from being switched on and off all the time.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SafetySupervisor {
     mode: SafetyMode,
