@@ -12,6 +12,7 @@ mod probe;
 mod qos;
 mod rates;
 mod sample;
+mod thresholds;
 mod time;
 
 pub use control::{ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord};
@@ -25,4 +26,5 @@ pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{Encapsulation, Guid, SampleHeader};
+pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
