@@ -35,7 +35,8 @@ check_all() {
     need "has_header fastcdr/Cdr.h" libfastcdr-dev "tests between hosts (Fast DDS peer)"
     need "has ip" iproute2 "tests between hosts (network namespaces)"
     need "has nsenter" util-linux "tests between hosts (network namespaces)"
-    need "has iptables" iptables "tests with a lossy link"
+    need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
+    need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
 }
 
 # The first of 'a|b' that the package lists know.

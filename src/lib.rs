@@ -12,13 +12,17 @@
 //! - [`telemetry`]: what the processes show: readings of the boards, logs.
 //! - [`process`]: the roles; the only place where the edges meet policy.
 //! - [`cli`]: one file for each subcommand.
+//! - [`eval`]: with the feature of that name, the evaluation harness.
 
 #![warn(missing_docs)]
+#![cfg_attr(not(feature = "eval"), allow(rustdoc::broken_intra_doc_links))]
 
 pub mod cli;
 pub mod clock;
 pub mod config;
 pub mod dds;
+#[cfg(feature = "eval")]
+pub mod eval;
 pub mod model;
 pub mod policy;
 pub mod process;

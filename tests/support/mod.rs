@@ -8,6 +8,8 @@
 
 pub mod bed;
 pub mod bridge;
+#[cfg(feature = "eval")]
+pub mod impairment;
 pub mod netns;
 pub mod peer;
 pub mod process;

@@ -1,13 +1,14 @@
 //! Hosts on one Ethernet switch, as network namespaces: each has its own addresses, ports and multicast.
 
 use std::cell::Cell;
-use std::fs;
-use std::net::Ipv4Addr;
+use std::fs::{self, File};
+use std::net::{Ipv4Addr, UdpSocket};
 use std::path::Path;
 use std::process::Command;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use nix::sched::{CloneFlags, setns};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
@@ -189,6 +190,18 @@ impl Host {
         let mut all = vec![network.as_str(), program];
         all.extend_from_slice(arguments);
         try_run("nsenter", &all).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// A UDP socket of this host, bound to a port of its `eth0`, which this process uses from where it is.
+    pub fn udp_socket(&self) -> UdpSocket {
+        let network = File::open(format!("{NAMESPACES}/{}", self.namespace)).unwrap();
+        let address = self.address;
+        // A namespace is a thread's, and stays with the sockets that it makes.
+        let made = std::thread::spawn(move || {
+            setns(network, CloneFlags::CLONE_NEWNET).unwrap();
+            UdpSocket::bind((address, 0)).unwrap()
+        });
+        made.join().unwrap()
     }
 
     /// Connects the host to the switch, or pulls its cable at the switch's end.

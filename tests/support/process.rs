@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Instant;
 
@@ -62,8 +62,19 @@ pub struct Process {
 impl Process {
     /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started
     /// it ends.
-    pub fn spawn(name: &str, mut command: Command) -> Process {
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
+    pub fn spawn(name: &str, command: Command) -> Process {
+        Process::start(name, command, Stdio::null())
+    }
+
+    /// As [`spawn`](Self::spawn), with a stdin to write to.
+    pub fn spawn_with_stdin(name: &str, command: Command) -> (Process, ChildStdin) {
+        let mut process = Process::start(name, command, Stdio::piped());
+        let stdin = process.child.stdin.take().unwrap();
+        (process, stdin)
+    }
+
+    fn start(name: &str, mut command: Command, stdin: Stdio) -> Process {
+        command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
         // SAFETY: between fork and exec the closure makes one system call (prctl), which is
         // async-signal-safe; it neither allocates nor takes a lock.
         unsafe {

@@ -77,11 +77,11 @@ fn violations(path: &str, text: &str) -> Vec<String> {
     found
 }
 
-/// The layer that a file belongs to; none for the roots of the program and of the library.
+/// The layer that a file belongs to; none for the roots of the programs and of the library.
 fn layer_of(path: &str) -> Option<&str> {
     let inside = path.strip_prefix("src/")?.strip_suffix(".rs")?;
     let layer = inside.split('/').next()?;
-    (!["main", "lib"].contains(&layer)).then_some(layer)
+    (!["main", "lib", "bin"].contains(&layer)).then_some(layer)
 }
 
 /// What of the crate a path uses: the name behind `crate`, or behind as many `super` as lead there.
@@ -201,6 +201,7 @@ fn what_is_allowed_is_not_found() {
         ("src/config/yaml/mod.rs", "use granit_parser::Parser;"),
         ("src/lib.rs", "pub mod cli; use crate::cli;"),
         ("src/main.rs", "fn main() { adaptive_bridge::cli::main() }"),
+        ("src/bin/a.rs", "fn main() { adaptive_bridge::eval::main() }"),
     ] {
         let found = violations(path, text);
         assert!(found.is_empty(), "{path}: {text}: found: {}", found.join("\n"));

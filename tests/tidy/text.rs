@@ -8,7 +8,7 @@ const MAX_COLUMNS: usize = 110;
 const MAX_STRING_COLUMNS: usize = 120;
 /// Of `src`. Tests may be longer.
 const MAX_LINES: usize = 600;
-/// `main.rs` only dispatches.
+/// The roots of the programs only dispatch.
 const MAX_MAIN_LINES: usize = 20;
 
 /// Files that may contain `unsafe`, each for what safe Rust has no means for.
@@ -52,8 +52,8 @@ fn violations(path: &str, text: &str) -> Vec<String> {
     if path.starts_with("src/") && lines.len() > MAX_LINES {
         say(lines.len(), &format!("{} lines, at most {MAX_LINES}", lines.len()));
     }
-    if path == "src/main.rs" && lines.len() > MAX_MAIN_LINES {
-        say(lines.len(), "main.rs does more than dispatch");
+    if is_program(path) && lines.len() > MAX_MAIN_LINES {
+        say(lines.len(), "the root of a program does more than dispatch");
     }
     for (at, token) in rust.tokens.iter().enumerate() {
         match token.text.as_str() {
@@ -78,6 +78,11 @@ fn violations(path: &str, text: &str) -> Vec<String> {
         }
     }
     found
+}
+
+/// Whether a file is the root of a program.
+fn is_program(path: &str) -> bool {
+    path == "src/main.rs" || path.starts_with("src/bin/")
 }
 
 /// Whether this `unsafe` relies on something, as a block and an `impl` do; a function or trait asks for it.
@@ -111,11 +116,15 @@ fn every_file_keeps_to_sizes_words_and_the_list_of_unsafe() {
 }
 
 #[test]
-fn main_only_dispatches() {
-    let main = rust_files().into_iter().find(|source| source.path == "src/main.rs").unwrap();
-    let rust = Rust::new(&main.text);
-    let functions = rust.tokens.iter().filter(|token| token.text == "fn").count();
-    assert_eq!(functions, 1, "main.rs has functions beside main");
+fn programs_only_dispatch() {
+    let mut programs = rust_files();
+    programs.retain(|source| is_program(&source.path));
+    assert!(programs.len() >= 2, "{} programs", programs.len());
+    for program in programs {
+        let rust = Rust::new(&program.text);
+        let functions = rust.tokens.iter().filter(|token| token.text == "fn").count();
+        assert_eq!(functions, 1, "{} has functions beside main", program.path);
+    }
 }
 
 #[test]
@@ -129,6 +138,7 @@ fn what_breaks_a_rule_is_found() {
         ("src/a.rs", &long_string, ":2: 121 columns"),
         ("src/a.rs", &many_lines, "601 lines"),
         ("src/main.rs", &long_main, "more than dispatch"),
+        ("src/bin/a.rs", &long_main, "more than dispatch"),
         ("src/a.rs", "fn a() {\n    todo!()\n}", ":2: todo!"),
         ("tests/a.rs", "fn a() { unimplemented!(\"b\") }", "unimplemented!"),
         ("src/a.rs", "fn a() { dbg!(1); }", "dbg!"),

@@ -1,0 +1,361 @@
+//! The link by `tc netem`, which impairs what an interface sends. What is received is first sent through an
+//! intermediate device (ifb), so that the link is in the same place as that of NFQUEUE: in the receiver's
+//! network namespace, before fragments are put together, and for one source only.
+
+use std::net::Ipv4Addr;
+use std::os::fd::BorrowedFd;
+
+use serde_json::Value;
+
+use super::backend::Backend;
+use super::delay::NormalDelay;
+use super::error::ImpairmentError;
+use super::gilbert_elliott::GilbertElliott;
+use super::link::{Counters, HELD_MAX, Impairment, LinkState};
+use super::system::{run, words};
+use crate::model::MonotonicNs;
+
+/// Why this machine has no netem; `None` when it has. It is tried in the present network namespace, on a
+/// device of its own.
+pub(super) fn missing(queue: u16) -> Option<String> {
+    let device = format!("abprobe{queue}");
+    let _ = run(&words(&format!("ip link del {device}")));
+    let tried = [
+        format!("ip link add {device} type ifb"),
+        format!("tc qdisc add dev {device} root netem limit 10 loss gemodel 1% 10% 50% 1%"),
+        format!("tc qdisc add dev {device} ingress"),
+        format!(
+            "tc filter add dev {device} parent ffff: protocol ip prio 1 u32 match ip src 192.0.2.1/32 \
+             action mirred egress redirect dev {device}"
+        ),
+    ];
+    let failed = tried.iter().find_map(|line| run(&words(line)).err());
+    let _ = run(&words(&format!("ip link del {device}")));
+    failed.map(|error| error.to_string())
+}
+
+/// The command lines of one impairment.
+struct Commands {
+    /// The intermediate device.
+    device: String,
+    /// The interface through which packets of the source arrive.
+    interface: String,
+    source: Ipv4Addr,
+    impairment: Impairment,
+}
+
+impl Commands {
+    fn netem(&self, verb: &str, state: LinkState) -> String {
+        let mut line = format!("tc qdisc {verb} dev {} root netem limit {HELD_MAX}", self.device);
+        match state {
+            LinkState::On => {
+                line.push_str(&delay(&self.impairment.delay));
+                line.push_str(&loss(&self.impairment.loss));
+            }
+            LinkState::Off => {}
+            LinkState::Down => line.push_str(" loss 100%"),
+        }
+        line
+    }
+
+    /// Each with what undoes it, where that is not part of undoing another.
+    fn set_up(&self) -> Vec<(String, Option<String>)> {
+        let Self { device, interface, source, .. } = self;
+        vec![
+            (format!("ip link add {device} type ifb"), Some(format!("ip link del {device}"))),
+            (format!("ip link set {device} up"), None),
+            (self.netem("add", LinkState::On), None),
+            (
+                format!("tc qdisc add dev {interface} ingress"),
+                Some(format!("tc qdisc del dev {interface} ingress")),
+            ),
+            (
+                format!(
+                    "tc filter add dev {interface} parent ffff: protocol ip prio 1 u32 match ip src {source}/32 \
+                     action mirred egress redirect dev {device}"
+                ),
+                None,
+            ),
+        ]
+    }
+
+    fn statistics(&self) -> String {
+        format!("tc -s -j qdisc show dev {}", self.device)
+    }
+}
+
+/// netem takes the loss in the bad state before that in the good one: `p r 1-h 1-k` (tc-netem(8)).
+fn loss(model: &GilbertElliott) -> String {
+    if *model == GilbertElliott::CLEAN {
+        return String::new();
+    }
+    let [p, r, bad, good] = [model.p(), model.r(), model.loss_bad(), model.loss_good()].map(percent);
+    format!(" loss gemodel {p} {r} {bad} {good}")
+}
+
+fn delay(delay: &NormalDelay) -> String {
+    let (mean, sigma) = (decimal(delay.mean_ms()), decimal(delay.sigma_ms()));
+    match (delay.is_none(), delay.sigma_ms() > 0.0) {
+        (true, _) => String::new(),
+        (false, false) => format!(" delay {mean}ms"),
+        (false, true) => format!(" delay {mean}ms {sigma}ms distribution normal"),
+    }
+}
+
+fn percent(share: f64) -> String {
+    format!("{}%", decimal(share * 100.0))
+}
+
+/// Without an exponent, without zeros at the end.
+fn decimal(value: f64) -> String {
+    let text = format!("{value:.6}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+/// What the queueing discipline has counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Statistics {
+    passed: u64,
+    dropped: u64,
+    held: u64,
+}
+
+impl Statistics {
+    fn parse(json: &str) -> Option<Self> {
+        let shown: Value = serde_json::from_str(json).ok()?;
+        let netem = shown.as_array()?.iter().find(|qdisc| qdisc["kind"] == "netem")?;
+        let number = |name: &str| netem[name].as_u64();
+        Some(Self { passed: number("packets")?, dropped: number("drops")?, held: number("qlen")? })
+    }
+
+    fn arrived(&self) -> u64 {
+        self.passed + self.dropped + self.held
+    }
+}
+
+/// An impairment by `tc netem`. Its random numbers are not seeded: that takes a newer kernel and a newer `tc`
+/// than are common.
+pub struct Netem {
+    commands: Commands,
+    undo: Vec<String>,
+    state: LinkState,
+    last: Statistics,
+    counters: Counters,
+}
+
+impl Netem {
+    /// Begins to impair what the present network namespace receives from `source`. What a former one with the
+    /// same number has left is removed; there is one to an interface.
+    ///
+    /// # Errors
+    /// The machine can't, or the interface has an ingress discipline of another's.
+    pub fn open(source: Ipv4Addr, queue: u16, impairment: &Impairment) -> Result<Self, ImpairmentError> {
+        let route = run(&words(&format!("ip -j route get {source}")))?;
+        let interface = interface_of(&route).ok_or_else(|| ImpairmentError::Unexpected {
+            what: format!("no interface in the route to {source}: {}", route.trim()),
+        })?;
+        let commands =
+            Commands { device: format!("abimpair{queue}"), interface, source, impairment: *impairment };
+        if run(&words(&format!("ip link show {}", commands.device))).is_ok() {
+            for undo in commands.set_up().into_iter().rev().filter_map(|(_, undo)| undo) {
+                let _ = run(&words(&undo));
+            }
+        }
+        let set_up = commands.set_up();
+        let mut netem = Self {
+            commands,
+            undo: Vec::new(),
+            state: LinkState::On,
+            last: Statistics::default(),
+            counters: Counters::default(),
+        };
+        for (line, undo) in set_up {
+            run(&words(&line))?;
+            netem.undo.extend(undo);
+        }
+        Ok(netem)
+    }
+
+    /// Adds what has happened since the last time, all of it in the present state.
+    fn count(&mut self) -> Result<(), ImpairmentError> {
+        let shown = run(&words(&self.commands.statistics()))?;
+        let now = Statistics::parse(&shown)
+            .ok_or_else(|| ImpairmentError::Unexpected { what: format!("statistics of tc: {shown}") })?;
+        self.add(now);
+        Ok(())
+    }
+
+    fn add(&mut self, now: Statistics) {
+        let arrived = now.arrived().saturating_sub(self.last.arrived());
+        let dropped = now.dropped.saturating_sub(self.last.dropped);
+        self.counters.seen += arrived;
+        match self.state {
+            LinkState::On => {
+                self.counters.judged += arrived;
+                self.counters.lost += dropped;
+            }
+            LinkState::Off => self.counters.overflowed += dropped,
+            LinkState::Down => self.counters.cut += dropped,
+        }
+        self.counters.passed = now.passed;
+        self.counters.held = now.held;
+        self.last = now;
+    }
+}
+
+impl Backend for Netem {
+    fn name(&self) -> &'static str {
+        "netem"
+    }
+
+    fn is_seeded(&self) -> bool {
+        false
+    }
+
+    fn fd(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
+
+    fn next_release(&self) -> Option<MonotonicNs> {
+        None
+    }
+
+    fn work(&mut self, _now: MonotonicNs) -> Result<(), ImpairmentError> {
+        Ok(())
+    }
+
+    fn switch(&mut self, state: LinkState) -> Result<(), ImpairmentError> {
+        self.count()?;
+        run(&words(&self.commands.netem("change", state)))?;
+        self.state = state;
+        Ok(())
+    }
+
+    fn state(&self) -> LinkState {
+        self.state
+    }
+
+    fn counters(&mut self) -> Result<Counters, ImpairmentError> {
+        self.count()?;
+        Ok(self.counters)
+    }
+
+    fn kernel_dropped(&self) -> Result<u64, ImpairmentError> {
+        Ok(0)
+    }
+}
+
+impl Drop for Netem {
+    fn drop(&mut self) {
+        for line in self.undo.drain(..).rev() {
+            if let Err(error) = run(&words(&line)) {
+                tracing::warn!(%error, "an impairment was not removed");
+            }
+        }
+    }
+}
+
+/// The interface in an answer of `ip -j route get`.
+fn interface_of(json: &str) -> Option<String> {
+    let routes: Value = serde_json::from_str(json).ok()?;
+    Some(routes.get(0)?.get("dev")?.as_str()?.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::levels::{Level, Reading};
+    use super::*;
+
+    fn commands(level: Level, reading: Reading, mean_ms: f64, sigma_ms: f64) -> Commands {
+        let delay = NormalDelay::new(mean_ms, sigma_ms).expect("in range");
+        Commands {
+            device: "abimpair7".to_owned(),
+            interface: "eth0".to_owned(),
+            source: Ipv4Addr::new(10, 1, 2, 3),
+            impairment: Impairment { loss: level.model(reading), delay, seed: 1 },
+        }
+    }
+
+    #[test]
+    fn the_loss_in_the_bad_state_comes_before_that_in_the_good_one() {
+        let line = |level, reading| commands(level, reading, 20.0, 10.0).netem("add", LinkState::On);
+        let head = "tc qdisc add dev abimpair7 root netem limit 20000 delay 20ms 10ms distribution normal";
+        for (level, printed, run) in [
+            (Level::Clean, "", ""),
+            (Level::Mild, " loss gemodel 1% 15% 30% 0.5%", " loss gemodel 1% 15% 0.5% 30%"),
+            (Level::Moderate, " loss gemodel 3% 15% 40% 0.5%", " loss gemodel 3% 15% 0.5% 40%"),
+            (Level::Strong, " loss gemodel 2% 10% 50% 1%", " loss gemodel 2% 10% 1% 50%"),
+        ] {
+            assert_eq!(line(level, Reading::AsPrinted), format!("{head}{printed}"));
+            assert_eq!(line(level, Reading::AsRun), format!("{head}{run}"));
+        }
+    }
+
+    #[test]
+    fn a_link_that_is_off_or_down_is_changed_in_place() {
+        let commands = commands(Level::Strong, Reading::AsPrinted, 0.25, 0.0);
+        let head = "tc qdisc change dev abimpair7 root netem limit 20000";
+        assert_eq!(
+            commands.netem("change", LinkState::On),
+            format!("{head} delay 0.25ms loss gemodel 2% 10% 50% 1%")
+        );
+        assert_eq!(commands.netem("change", LinkState::Off), head);
+        assert_eq!(commands.netem("change", LinkState::Down), format!("{head} loss 100%"));
+    }
+
+    #[test]
+    fn what_is_set_up_is_undone() {
+        let set_up = commands(Level::Clean, Reading::AsRun, 0.0, 0.0).set_up();
+        let (lines, undo): (Vec<_>, Vec<_>) = set_up.into_iter().unzip();
+        assert_eq!(
+            lines,
+            [
+                "ip link add abimpair7 type ifb",
+                "ip link set abimpair7 up",
+                "tc qdisc add dev abimpair7 root netem limit 20000",
+                "tc qdisc add dev eth0 ingress",
+                "tc filter add dev eth0 parent ffff: protocol ip prio 1 u32 match ip src 10.1.2.3/32 action \
+                 mirred egress redirect dev abimpair7",
+            ]
+        );
+        let undo: Vec<String> = undo.into_iter().flatten().collect();
+        assert_eq!(undo, ["ip link del abimpair7", "tc qdisc del dev eth0 ingress"]);
+    }
+
+    #[test]
+    fn statistics_are_counted_by_the_state_of_the_link() {
+        // As iproute2 6.1 prints them, shortened.
+        let json = |packets, drops, qlen| {
+            format!(
+                "[{{\"kind\":\"netem\",\"handle\":\"8001:\",\"root\":true,\"refcnt\":2,\"options\":{{}},\
+                 \"bytes\":1,\"packets\":{packets},\"drops\":{drops},\"overlimits\":0,\"requeues\":0,\
+                 \"backlog\":0,\"qlen\":{qlen}}}]"
+            )
+        };
+        let mut netem = Netem {
+            commands: commands(Level::Mild, Reading::AsRun, 0.0, 0.0),
+            undo: Vec::new(),
+            state: LinkState::On,
+            last: Statistics::default(),
+            counters: Counters::default(),
+        };
+        netem.add(Statistics::parse(&json(60, 30, 10)).expect("statistics"));
+        netem.state = LinkState::Down;
+        netem.add(Statistics::parse(&json(70, 55, 0)).expect("statistics"));
+        let expected =
+            Counters { seen: 125, judged: 100, lost: 30, cut: 25, passed: 70, ..Counters::default() };
+        assert_eq!(netem.counters, expected);
+        assert_eq!(Statistics::parse("[]"), None);
+        assert_eq!(Statistics::parse("no JSON"), None);
+        assert_eq!(Statistics::parse("[{\"kind\":\"netem\",\"packets\":-1}]"), None);
+    }
+
+    #[test]
+    fn the_interface_is_that_of_the_route() {
+        let json =
+            "[{\"dst\":\"10.1.2.3\",\"dev\":\"eth0\",\"prefsrc\":\"10.1.2.4\",\"uid\":0,\"cache\":[]}]";
+        assert_eq!(interface_of(json).as_deref(), Some("eth0"));
+        assert_eq!(interface_of("[]"), None);
+        assert_eq!(interface_of(""), None);
+    }
+}

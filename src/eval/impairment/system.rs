@@ -1,0 +1,54 @@
+//! The programs that set up the network.
+
+use std::ffi::OsString;
+use std::process::{Command, Stdio};
+
+use super::error::ImpairmentError;
+
+/// Where Debian keeps them, which is not in every user's path.
+const SYSTEM_FOLDERS: &str = "/usr/local/sbin:/usr/sbin:/sbin";
+
+/// Runs a program to its end; yields what it wrote to stdout.
+pub(super) fn run(words: &[String]) -> Result<String, ImpairmentError> {
+    let failed = |said: String| ImpairmentError::Command { command: words.join(" "), said };
+    let Some((program, arguments)) = words.split_first() else {
+        return Err(failed("no program".to_owned()));
+    };
+    let mut command = Command::new(program);
+    command.args(arguments).env("PATH", path()).env("LC_ALL", "C").stdin(Stdio::null());
+    let output = command.output().map_err(|error| failed(error.to_string()))?;
+    if output.status.success() {
+        return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    Err(failed(format!("{} ({})", said.trim().replace('\n', "; "), output.status)))
+}
+
+fn path() -> OsString {
+    let mut path = std::env::var_os("PATH").unwrap_or_default();
+    if !path.is_empty() {
+        path.push(":");
+    }
+    path.push(SYSTEM_FOLDERS);
+    path
+}
+
+/// A command line without quotes as words.
+pub(super) fn words(line: &str) -> Vec<String> {
+    line.split_whitespace().map(str::to_owned).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failure_names_the_command_and_what_it_said() {
+        let error = run(&words("ls /nowhere-at-all")).expect_err("no such folder").to_string();
+        assert!(error.contains("`ls /nowhere-at-all`") && error.contains("No such file"), "{error}");
+        let error = run(&words("no-such-program a")).expect_err("no such program").to_string();
+        assert!(error.contains("`no-such-program a`"), "{error}");
+        assert!(run(&[]).is_err());
+        assert_eq!(run(&words("echo a  b")).expect("it runs"), "a b\n");
+    }
+}
