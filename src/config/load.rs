@@ -32,6 +32,25 @@ pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result
     parse(bytes, &name, env)
 }
 
+/// `security.hmac_secret` of the configuration file, found as [`load`] finds it. The settings never hold it.
+///
+/// # Errors
+/// There is no file, or it cannot be read.
+pub fn inline_secret(
+    path: Option<&Path>,
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Option<String>, ConfigError> {
+    let path = find(path, env, Path::new(DEFAULT_PATH))?;
+    let name = path.display().to_string();
+    let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
+    let document = yaml::parse(&bytes)
+        .map_err(|error| failure(&name, error.line.map_or(Place::File, Place::Line), error.message))?;
+    let problems = Problems::default();
+    let root = Field::root(document.as_deref(), &problems);
+    let secret = root.section("security").get("hmac_secret").text().map(str::to_owned);
+    Ok(secret)
+}
+
 fn find(
     path: Option<&Path>,
     env: &dyn Fn(&str) -> Option<String>,

@@ -1,5 +1,7 @@
-//! The probe protocol: its messages as they are on the wire (docs/probe-protocol.md).
+//! The probe protocol: its messages as they are on the wire, and who is believed (docs/probe-protocol.md).
 
 mod message;
+mod secret;
 
 pub use message::{MAX_MESSAGE_BYTES, PROBE_TYPE, ProbeId, ProbeRequest, ProbeResponse, Signature};
+pub use secret::{Secret, SecretError};
