@@ -6,6 +6,7 @@
 
 mod arena;
 mod egress;
+mod inbox;
 mod ingress;
 mod manual;
 pub mod probes;
