@@ -6,8 +6,8 @@ use std::fs;
 use std::path::Path;
 
 use adaptive_bridge::config::{
-    self, Classifier, ConfigError, Diagnostics, DropPolicy, KEYS, LaneRates, Place, Probes, RatePolicy,
-    Safety, Security, Settings, TrustMode, Verbosity,
+    self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, KEYS, LaneRates, Place,
+    Probes, RatePolicy, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
 };
 use adaptive_bridge::model::{QosProfile, TopicName, TypeName};
 use proptest::prelude::*;
@@ -64,12 +64,14 @@ fn original_classifier() -> Classifier {
         enabled: true,
         subscriber_id: None,
         evaluate_rate_hz: 2.0,
-        demote_loss_threshold: 0.04,
-        promote_loss_threshold: 0.02,
-        demote_rtt_ms: 80.0,
-        promote_rtt_ms: 40.0,
-        hysteresis_count: 3,
-        allow_unknown_state: true,
+        thresholds: ClassifierThresholds {
+            demote_loss: 0.04,
+            promote_loss: 0.02,
+            demote_rtt_ms: 80.0,
+            promote_rtt_ms: 40.0,
+            hysteresis_count: 3,
+            allow_unknown_state: true,
+        },
     }
 }
 
@@ -89,12 +91,14 @@ fn original_probes() -> Probes {
 }
 
 fn original_safety(max_noncritical_queue: usize) -> Safety {
-    Safety {
+    let rules = SafetyRules {
         preserve_critical_path: true,
         allow_noncritical_degrade: true,
         max_noncritical_queue,
         overload_drop_noncritical_first: true,
-    }
+        ..SafetyRules::default()
+    };
+    Safety { evaluate_rate_hz: 2.0, rules }
 }
 
 fn original_security() -> Security {
@@ -170,8 +174,11 @@ fn the_originals_stress_file_keeps_its_meaning() {
     assert_eq!(lane.rates, LaneRates { normal, degraded });
     let classifier = Classifier {
         evaluate_rate_hz: 5.0,
-        hysteresis_count: 5,
-        allow_unknown_state: false,
+        thresholds: ClassifierThresholds {
+            hysteresis_count: 5,
+            allow_unknown_state: false,
+            ..original_classifier().thresholds
+        },
         ..original_classifier()
     };
     assert_eq!(settings.classifier, classifier);

@@ -8,8 +8,8 @@ use super::field::Field;
 use super::qos::DAY_MS;
 use super::rates::MAX_QUEUE;
 use super::settings::{
-    Classifier, Diagnostics, Lane, MetricsListener, Probes, Safety, SecretSource, Security, TrustMode,
-    Verbosity,
+    Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
+    SecretSource, Security, TrustMode, Verbosity,
 };
 use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
 
@@ -18,6 +18,19 @@ const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
 
 /// The longest round trip worth a threshold: an hour.
 const MAX_RTT_MS: f64 = 3_600_000.0;
+
+/// Slowest and fastest rate of the safety supervisor. In less than 50 ms a few errors would look like many
+/// a second.
+const SAFETY_RATES_HZ: std::ops::RangeInclusive<f64> = 0.1..=20.0;
+
+/// The longest silence worth a threshold: an hour.
+const HOUR_MS: u64 = 3_600_000;
+
+/// An idle process turns every 100 ms or so: a shorter silence is none.
+const MIN_SILENT_MS: u64 = 500;
+
+/// More than any process could count.
+const MAX_ERRORS_PER_S: f64 = 1_000_000.0;
 
 const TRUST_MODES: &[(&str, TrustMode)] = &[
     ("default_deny", TrustMode::DefaultDeny),
@@ -47,41 +60,47 @@ pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     let promote_loss = section.get("promote_loss_threshold");
     let demote_rtt = section.get("demote_rtt_ms");
     let promote_rtt = section.get("promote_rtt_ms");
+    let default = ClassifierThresholds::default();
     let classifier = Classifier {
         enabled: section.get("enabled").flag().unwrap_or(true),
         subscriber_id: subscriber.map(str::to_owned),
         evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(RATES_HZ).unwrap_or(2.0),
-        demote_loss_threshold: demote_loss.decimal(0.0..=1.0).unwrap_or(0.015),
-        promote_loss_threshold: promote_loss.decimal(0.0..=1.0).unwrap_or(0.005),
-        demote_rtt_ms: demote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(50.0),
-        promote_rtt_ms: promote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(35.0),
-        hysteresis_count: hysteresis(&section),
-        allow_unknown_state: section.get("allow_unknown_state").flag().unwrap_or(true),
+        thresholds: ClassifierThresholds {
+            demote_loss: demote_loss.decimal(0.0..=1.0).unwrap_or(default.demote_loss),
+            promote_loss: promote_loss.decimal(0.0..=1.0).unwrap_or(default.promote_loss),
+            demote_rtt_ms: demote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(default.demote_rtt_ms),
+            promote_rtt_ms: promote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(default.promote_rtt_ms),
+            hysteresis_count: readings(&section.get("hysteresis_count"), default.hysteresis_count),
+            allow_unknown_state: section
+                .get("allow_unknown_state")
+                .flag()
+                .unwrap_or(default.allow_unknown_state),
+        },
     };
-    check_below(
-        (&promote_loss, classifier.promote_loss_threshold),
-        (&demote_loss, classifier.demote_loss_threshold),
-    );
-    check_below((&promote_rtt, classifier.promote_rtt_ms), (&demote_rtt, classifier.demote_rtt_ms));
+    let thresholds = &classifier.thresholds;
+    check_below((&promote_loss, thresholds.promote_loss), (&demote_loss, thresholds.demote_loss));
+    check_below((&promote_rtt, thresholds.promote_rtt_ms), (&demote_rtt, thresholds.demote_rtt_ms));
     classifier
 }
 
-/// Without a gap between the thresholds a subscriber would be promoted and demoted in turn.
-fn check_below((promote, low): (&Field<'_>, f64), (demote, high): (&Field<'_>, f64)) {
-    if low < high || promote.was_reported() || demote.was_reported() {
+/// Without a gap between the thresholds a subscriber would be promoted and demoted in turn, and the step from
+/// DEGRADED to EMERGENCY would be none.
+fn check_below((lower, low): (&Field<'_>, f64), (upper, high): (&Field<'_>, f64)) {
+    if low < high || lower.was_reported() || upper.was_reported() {
         return;
     }
     // Where only the other one is given, that is the one to change.
-    if promote.is_given() {
-        promote.report::<()>(&format!("must be below {} ({high})", demote.path));
+    if lower.is_given() {
+        lower.report::<()>(&format!("must be below {} ({high})", upper.path));
     } else {
-        demote.report::<()>(&format!("must be above {} ({low})", promote.path));
+        upper.report::<()>(&format!("must be above {} ({low})", lower.path));
     }
 }
 
-fn hysteresis(section: &Field<'_>) -> u32 {
-    let count = section.get("hysteresis_count").whole(1..=1_000);
-    count.and_then(|count| u32::try_from(count).ok()).unwrap_or(3)
+/// A number of consecutive readings.
+fn readings(field: &Field<'_>, default: u32) -> u32 {
+    let count = field.whole(1..=1_000);
+    count.and_then(|count| u32::try_from(count).ok()).unwrap_or(default)
 }
 
 /// `probes`. `max_probe_rate_hz` is what a responder lets through.
@@ -97,7 +116,7 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
         loss_threshold: section.get("loss_threshold").decimal(0.0..=1.0).unwrap_or(0.05),
         jitter_threshold_ms: section.get("jitter_threshold_ms").decimal(0.0..=MAX_RTT_MS).unwrap_or(25.0),
         window_size: section.get("window_size").count(1..=10_000).unwrap_or(50),
-        hysteresis_count: hysteresis(&section),
+        hysteresis_count: readings(&section.get("hysteresis_count"), 3),
         timeout_ms: section.get("timeout_ms").whole(1..=60_000).unwrap_or(500),
         request_topic: topic(&request, "/adaptive_bridge/probe_req"),
         response_topic: topic(&response, "/adaptive_bridge/probe_resp"),
@@ -125,11 +144,52 @@ fn topic(field: &Field<'_>, default: &str) -> TopicName {
 pub(super) fn safety(root: &Field<'_>) -> Safety {
     let section = root.section("safety");
     let flag = |name: &str| section.get(name).flag().unwrap_or(true);
+    let default = SafetyRules::default();
+    let queue = section.get("max_noncritical_queue").count(1..=MAX_QUEUE);
+    let silent = section.get("silent_ms");
+    let emergency_silent = section.get("emergency_silent_ms");
+    let pair = |what: &str, range: std::ops::RangeInclusive<f64>, defaults: (f64, f64)| {
+        let degraded = section.get(&format!("degraded_{what}"));
+        let emergency = section.get(&format!("emergency_{what}"));
+        let low = degraded.decimal(range.clone()).unwrap_or(defaults.0);
+        let high = emergency.decimal(range).unwrap_or(defaults.1);
+        check_below((&degraded, low), (&emergency, high));
+        (low, high)
+    };
+    let lag_ms = pair("lag_ms", 1.0..=MAX_RTT_MS, (default.degraded_lag_ms, default.emergency_lag_ms));
+    let occupancy = pair(
+        "queue_occupancy",
+        0.01..=1.0,
+        (default.degraded_queue_occupancy, default.emergency_queue_occupancy),
+    );
+    let errors_per_s = pair(
+        "errors_per_s",
+        0.1..=MAX_ERRORS_PER_S,
+        (default.degraded_errors_per_s, default.emergency_errors_per_s),
+    );
+    let silent_ms = silent.whole(MIN_SILENT_MS..=HOUR_MS).unwrap_or(default.silent_ms);
+    let emergency_silent_ms = emergency_silent.whole(0..=HOUR_MS).unwrap_or(default.emergency_silent_ms);
+    if emergency_silent_ms != 0 {
+        check_below((&silent, silent_ms as f64), (&emergency_silent, emergency_silent_ms as f64));
+    }
     Safety {
-        preserve_critical_path: flag("preserve_critical_path"),
-        allow_noncritical_degrade: flag("allow_noncritical_degrade"),
-        max_noncritical_queue: section.get("max_noncritical_queue").count(1..=MAX_QUEUE).unwrap_or(50),
-        overload_drop_noncritical_first: flag("overload_drop_noncritical_first"),
+        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(SAFETY_RATES_HZ).unwrap_or(2.0),
+        rules: SafetyRules {
+            preserve_critical_path: flag("preserve_critical_path"),
+            allow_noncritical_degrade: flag("allow_noncritical_degrade"),
+            max_noncritical_queue: queue.unwrap_or(default.max_noncritical_queue),
+            overload_drop_noncritical_first: flag("overload_drop_noncritical_first"),
+            degraded_lag_ms: lag_ms.0,
+            emergency_lag_ms: lag_ms.1,
+            degraded_queue_occupancy: occupancy.0,
+            emergency_queue_occupancy: occupancy.1,
+            degraded_errors_per_s: errors_per_s.0,
+            emergency_errors_per_s: errors_per_s.1,
+            silent_ms,
+            emergency_silent_ms,
+            hysteresis_count: readings(&section.get("hysteresis_count"), default.hysteresis_count),
+            recovery_count: readings(&section.get("recovery_count"), default.recovery_count),
+        },
     }
 }
 

@@ -135,7 +135,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let profiles = Profiles::read(root);
     let input = routes::input_network(root, environment);
     let safety = control::safety(root);
-    let drafts = lanes::read(root, &profiles, &input, environment, safety.max_noncritical_queue as u64);
+    let drafts = lanes::read(root, &profiles, &input, environment, safety.rules.max_noncritical_queue as u64);
 
     let memory = root.section("shared_memory");
     let max_sample_bytes = memory.get("max_sample_bytes").count(1..=MAX_SAMPLE_BYTES).unwrap_or(1 << 20);

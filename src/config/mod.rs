@@ -23,7 +23,7 @@ pub use keys::KEYS;
 pub use load::{DEFAULT_PATH, PATH_VARIABLE, inline_secret, load, parse};
 pub use problem::{ConfigError, Place, Problem};
 pub use settings::{
-    Classifier, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates, MetricsListener,
-    NetworkSelector, Output, Probes, RatePolicy, Route, Safety, Scheduling, SchedulingPolicy, SecretSource,
-    Security, Settings, SharedMemory, TrustMode, Verbosity,
+    Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates,
+    MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules, Scheduling,
+    SchedulingPolicy, SecretSource, Security, Settings, SharedMemory, TrustMode, Verbosity,
 };

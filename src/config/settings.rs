@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
-pub use crate::model::{DropPolicy, LaneRates, RatePolicy};
+pub use crate::model::{ClassifierThresholds, DropPolicy, LaneRates, RatePolicy, SafetyRules};
 use crate::model::{
     Durability, History, InstanceName, LaneName, QosProfile, Reliability, RouteId, SubscriberState,
     TopicName, TrafficClass, TypeName,
@@ -175,7 +175,7 @@ pub enum SchedulingPolicy {
     RoundRobin,
 }
 
-/// Thresholds and hysteresis of the classifier.
+/// The classifier.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Classifier {
     /// Whether subscribers are classified at all.
@@ -184,18 +184,8 @@ pub struct Classifier {
     pub subscriber_id: Option<String>,
     /// Evaluations per second.
     pub evaluate_rate_hz: f64,
-    /// Loss, 0 to 1, above which a reading speaks for demotion.
-    pub demote_loss_threshold: f64,
-    /// Loss, 0 to 1, below which a reading speaks for promotion.
-    pub promote_loss_threshold: f64,
-    /// Mean RTT above which a reading speaks for demotion.
-    pub demote_rtt_ms: f64,
-    /// Mean RTT below which a reading speaks for promotion.
-    pub promote_rtt_ms: f64,
-    /// Consecutive readings that it takes.
-    pub hysteresis_count: u32,
-    /// Whether UNKNOWN is a state of its own; otherwise it is treated as CRITICAL.
-    pub allow_unknown_state: bool,
+    /// What it decides by.
+    pub thresholds: ClassifierThresholds,
 }
 
 /// Active probing.
@@ -223,17 +213,13 @@ pub struct Probes {
     pub response_topic: TopicName,
 }
 
-/// What the safety supervisor preserves and gives up.
+/// The safety supervisor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Safety {
-    /// Whether the critical path is preserved in DEGRADED.
-    pub preserve_critical_path: bool,
-    /// Whether noncritical lanes may be degraded at all.
-    pub allow_noncritical_degrade: bool,
-    /// Samples waiting in a noncritical lane that count as an overflowing queue.
-    pub max_noncritical_queue: usize,
-    /// Whether overload takes the noncritical lanes first.
-    pub overload_drop_noncritical_first: bool,
+    /// Evaluations per second.
+    pub evaluate_rate_hz: f64,
+    /// What it decides by.
+    pub rules: SafetyRules,
 }
 
 /// What is done about control messages that do not authenticate.

@@ -490,3 +490,28 @@ fn a_wrong_environment_variable_is_named() {
         assert_eq!(found, [format!("environment: {name} = {value}: {message}")]);
     }
 }
+
+#[test]
+fn the_supervisors_thresholds_come_in_pairs_with_a_gap() {
+    let rules =
+        with("safety: {emergency_lag_ms: 900, silent_ms: 600, emergency_silent_ms: 0}\n").safety.rules;
+    assert_eq!((rules.degraded_lag_ms, rules.emergency_lag_ms), (500.0, 900.0));
+    assert_eq!((rules.silent_ms, rules.emergency_silent_ms), (600, 0));
+    for (text, message) in [
+        ("emergency_lag_ms: 500", "emergency_lag_ms = 500: must be above safety.degraded_lag_ms (500)"),
+        (
+            "degraded_errors_per_s: 200",
+            "degraded_errors_per_s = 200: must be below safety.emergency_errors_per_s (100)",
+        ),
+        (
+            "degraded_queue_occupancy: 0.96",
+            "degraded_queue_occupancy = 0.96: must be below safety.emergency_queue_occupancy (0.95)",
+        ),
+        ("silent_ms: 30000", "silent_ms = 30000: must be below safety.emergency_silent_ms (30000)"),
+        ("evaluate_rate_hz: 21", "evaluate_rate_hz = 21: must be a number from 0.1 to 20"),
+        ("recovery_count: 0", "recovery_count = 0: must be a whole number from 1 to 1000"),
+    ] {
+        let found = messages(&format!("{TOPIC}safety: {{{text}}}\n"));
+        assert!(matches!(&found[..], [only] if only.ends_with(message)), "{found:?}");
+    }
+}

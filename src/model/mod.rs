@@ -11,6 +11,7 @@ mod probe;
 mod qos;
 mod rates;
 mod sample;
+mod thresholds;
 mod time;
 
 pub use drops::{DropCounts, DropReason};
@@ -23,4 +24,5 @@ pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{Encapsulation, Guid, SampleHeader};
+pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};

@@ -8,19 +8,39 @@
 //! - [`RouteShaper`]: those three together, for one route on a noncritical lane.
 //! - [`critical_drop`] and [`effective_mode`]: what a mode does to a critical sample, and which mode applies.
 //! - [`SequenceTracker`]: what the number of a sample says about those that are missing.
+//! - [`ProbeWindow`]: what the probes say about the link to one subscriber.
+//! - [`SubscriberClassifier`]: the state of one subscriber.
+//! - [`lane_mode()`] and [`under_safety`]: the mode of a lane, and why.
+//! - [`SafetySupervisor`]: the mode of the whole bridge.
+//! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
+mod classifier;
 mod lane;
+mod lane_mode;
 mod lane_queue;
+mod probe_window;
+mod replay_guard;
 mod restart;
+mod safety;
 mod sequence;
 mod staleness;
 mod token_bucket;
 
+pub use classifier::{
+    FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
+};
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
+pub use lane_mode::{LaneDecision, LaneReason, lane_mode, under_safety};
 pub use lane_queue::{Allowance, LaneQueue, Stamps};
+pub use probe_window::{Answer, LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, STOPPED_NS};
+pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};
 pub use restart::{
     ChildExit, FIRST_BACKOFF_MS, GOOD_RUN_MS, GiveUpReason, MAX_BACKOFF_MS, RestartBackoff, RestartDecision,
+};
+pub use safety::{
+    ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetyInputs, SafetySupervisor,
+    SafetyTrouble, SourceLag,
 };
 pub use sequence::{SequenceTracker, Sighting};
 pub use staleness::{age_ns, is_stale};

@@ -1,0 +1,28 @@
+//! The control plane's policy in virtual time: random links, random overload, the paper's toggle, recorded
+//! probe traces, replays and floods. Pure; nothing sleeps.
+
+#[path = "control_policy/classifier.rs"]
+mod classifier;
+#[path = "control_policy/safety.rs"]
+mod safety;
+#[path = "control_policy/traces.rs"]
+mod traces;
+#[path = "control_policy/trust.rs"]
+mod trust;
+#[path = "control_policy/window.rs"]
+mod window;
+
+use adaptive_bridge::model::MonotonicNs;
+use proptest::prelude::ProptestConfig;
+use proptest::test_runner::FileFailurePersistence;
+
+const MS: u64 = 1_000_000;
+
+fn config(cases: u32) -> ProptestConfig {
+    let persistence = FileFailurePersistence::WithSource("proptest-regressions");
+    ProptestConfig { failure_persistence: Some(Box::new(persistence)), ..ProptestConfig::with_cases(cases) }
+}
+
+fn at_ms(ms: u64) -> MonotonicNs {
+    MonotonicNs(ms * MS)
+}
