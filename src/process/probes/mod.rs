@@ -1,7 +1,6 @@
 //! The probe protocol: its messages as they are on the wire, and who is believed (docs/probe-protocol.md).
 
 mod message;
-mod replays;
 mod secret;
 mod trust;
 
