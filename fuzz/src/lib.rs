@@ -9,10 +9,11 @@ use std::path::PathBuf;
 use adaptive_bridge::config::{self, Place};
 use adaptive_bridge::dds::encode_graph;
 use adaptive_bridge::model::{
-    DropReason, Guid, InstanceName, LaneName, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, RouteId,
-    TopicName, TrafficClass, TypeName,
+    DropReason, Encapsulation, Guid, InstanceName, LaneName, MAX_ID_BYTES, MAX_INTRUDERS, MAX_SUBSCRIBERS,
+    MonotonicNs, ProbeRefusal, RouteId, TopicName, TrafficClass, TypeName,
 };
 use adaptive_bridge::policy::effective_mode;
+use adaptive_bridge::process::probes::{MAX_MESSAGE_BYTES, ProbeRequest, ProbeResponse};
 use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
 use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing};
 
@@ -29,6 +30,7 @@ pub const TARGETS: &[Target] = &[
     ("rtps_message", rtps_message),
     ("rtps_receive", rtps_receive),
     ("rtps_discovery", rtps_discovery),
+    ("probe", probe),
 ];
 
 /// A configuration, and after the last NUL, if there is one, the environment as lines of `NAME=value`.
@@ -310,4 +312,29 @@ pub fn rtps_discovery(bytes: &[u8]) {
         false => RepresentationIdentifier::PL_CDR_LE,
     };
     fuzzing::read_discovery(parameters, encoding);
+}
+
+/// A probe request or a response: the low byte of its representation identifier, and its payload.
+pub fn probe(bytes: &[u8]) {
+    let Some((&representation, payload)) = bytes.split_first() else { return };
+    let encapsulation = Encapsulation([0, representation, 0, 0]);
+    let request = ProbeRequest::decode(payload, encapsulation);
+    let response = ProbeResponse::decode(payload, encapsulation);
+    let is_oversized = payload.len() > MAX_MESSAGE_BYTES;
+    assert_eq!(request == Err(ProbeRefusal::Oversized), is_oversized);
+    assert_eq!(response == Err(ProbeRefusal::Oversized), is_oversized);
+    if let Ok(request) = request {
+        assert!((1..=MAX_ID_BYTES).contains(&request.sender_id.len()) && !request.sender_id.contains('\n'));
+        assert!(request.probe_id.to_string().len() <= MAX_ID_BYTES);
+        let encoded = request.encode();
+        assert!(encoded.len() < 1024);
+        assert_eq!(ProbeRequest::decode(&encoded, Encapsulation::CDR_LE), Ok(request));
+    }
+    if let Ok(response) = response {
+        assert!((1..=MAX_ID_BYTES).contains(&response.responder_id.len()));
+        assert!(response.probe_id.to_string().len() <= MAX_ID_BYTES);
+        let encoded = response.encode();
+        assert!(encoded.len() < 1024);
+        assert_eq!(ProbeResponse::decode(&encoded, Encapsulation::CDR_LE), Ok(response));
+    }
 }

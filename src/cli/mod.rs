@@ -8,6 +8,7 @@ mod completions;
 mod demo;
 mod man;
 mod mode;
+mod responder;
 mod roles;
 mod status;
 mod tap;
@@ -45,6 +46,8 @@ enum Command {
     Ingress(ConfigArguments),
     /// Run the egress of one lane: out of shared memory to its own DDS writers
     Egress(roles::EgressArguments),
+    /// Answer a bridge's probes, beside a remote subscriber; needs no bridge on its machine
+    Responder(responder::Arguments),
     /// Run the whole bridge, all processes as children of this one
     Up(ConfigArguments),
     /// Show what the running bridge does: processes, rates, drops, latencies, and what is wrong
@@ -101,6 +104,7 @@ pub fn main() -> ExitCode {
         Command::Check(arguments) => check::run(&arguments),
         Command::Ingress(arguments) => roles::ingress(&arguments),
         Command::Egress(arguments) => roles::egress(&arguments),
+        Command::Responder(arguments) => responder::run(&arguments),
         Command::Up(arguments) => roles::up(&arguments),
         Command::Status(arguments) => status::run(&arguments),
         Command::Tap(arguments) => tap::run(&arguments),

@@ -48,7 +48,7 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
     run(|stop| process::up(&settings, &passed_on, stop))
 }
 
-fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {
+pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,
         Err(error) => return failed(&error),

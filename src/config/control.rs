@@ -11,7 +11,7 @@ use super::settings::{
     Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
     SecretSource, Security, TrustMode, Verbosity,
 };
-use crate::model::{LaneName, SubscriberState, TopicName};
+use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
 
 /// Slowest and fastest rate of something periodic in the control process.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
@@ -293,8 +293,8 @@ pub(super) fn subscribers(root: &Field<'_>, lanes: &[Lane]) -> BTreeMap<String, 
 
 /// A subscriber's id travels in every probe.
 fn check_id(id: &str, field: &Field<'_>) {
-    if !(1..=128).contains(&id.len()) || id.chars().any(char::is_control) {
-        field.report_key("must be a subscriber's id: 1 to 128 bytes without control characters");
+    if !is_probe_id(id) {
+        field.report_key("must be a subscriber's id: 1 to 127 bytes without control characters");
     }
 }
 

@@ -113,9 +113,8 @@ impl LaneReader<'_> {
 pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {
     let domain = section.get("domain_id").whole(0..=232).and_then(|id| u16::try_from(id).ok());
     let interfaces = section.get("networks").items().map(|items| {
-        let selectors = items.iter().filter_map(|item| {
-            item.parsed("the name of a network interface or an IPv4 address", network_selector)
-        });
+        let selectors =
+            items.iter().filter_map(|item| item.parsed(NetworkSelector::ALLOWED, NetworkSelector::parse));
         selectors.collect()
     });
     let interfaces = interfaces.unwrap_or_else(|| base.interfaces.clone());
@@ -123,18 +122,6 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
         domain_id: domain.unwrap_or(base.domain_id),
         interfaces: if interfaces.is_empty() { environment.default_interfaces() } else { interfaces },
     }
-}
-
-/// An interface name as Linux allows it (15 bytes, no `/`, no space), or an IPv4 address.
-fn network_selector(text: &str) -> Option<NetworkSelector> {
-    if let Ok(address) = text.parse() {
-        return Some(NetworkSelector::Address(address));
-    }
-    // 300.1.1.1 would do as a name, but is meant as an address; so is anything with a colon, of IPv6.
-    let meant_as_address = text.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
-    let is_name = (1..=15).contains(&text.len())
-        && text.bytes().all(|byte| byte.is_ascii_graphic() && !matches!(byte, b'/' | b':'));
-    (is_name && !meant_as_address).then(|| NetworkSelector::Name(text.to_owned()))
 }
 
 /// A `scheduling` section.

@@ -26,32 +26,65 @@ pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
 /// Every problem of the file and of the environment at once; one problem when there is no file or it cannot
 /// be read.
 pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<Settings, ConfigError> {
-    let path = find(path, env, Path::new(DEFAULT_PATH))?;
+    let path = find_or_fail(path, env)?;
     let name = path.display().to_string();
     let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
     parse(bytes, &name, env)
 }
 
-fn find(
+/// As [`load`], for a program that can do without a file: without one, the defaults, in this environment.
+/// They have one route, which means nothing.
+///
+/// # Errors
+/// As for [`load`], but for that no file need exist.
+pub fn load_or_default(
     path: Option<&Path>,
     env: &dyn Fn(&str) -> Option<String>,
-    default: &Path,
-) -> Result<PathBuf, ConfigError> {
+) -> Result<Settings, ConfigError> {
+    match find(path, env, Path::new(DEFAULT_PATH)) {
+        Some(path) => load(Some(&path), env),
+        None => parse("topics: [{id: none, input_topic: /none}]", "the defaults", env),
+    }
+}
+
+/// `security.hmac_secret` of the configuration file, found as [`load`] finds it. The settings never hold it.
+///
+/// # Errors
+/// There is no file, or it cannot be read.
+pub fn inline_secret(
+    path: Option<&Path>,
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Option<String>, ConfigError> {
+    let path = find_or_fail(path, env)?;
+    let name = path.display().to_string();
+    let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
+    let document = yaml::parse(&bytes)
+        .map_err(|error| failure(&name, error.line.map_or(Place::File, Place::Line), error.message))?;
+    let problems = Problems::default();
+    let root = Field::root(document.as_deref(), &problems);
+    let secret = root.section("security").get("hmac_secret").text().map(str::to_owned);
+    Ok(secret)
+}
+
+/// The file that is to be read; `None` where there is none at the default path and none is named.
+fn find(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>, default: &Path) -> Option<PathBuf> {
     if let Some(path) = path {
-        return Ok(path.to_owned());
+        return Some(path.to_owned());
     }
     if let Some(path) = env(PATH_VARIABLE).filter(|path| !path.is_empty()) {
-        return Ok(path.into());
+        return Some(path.into());
     }
-    if default.exists() {
-        return Ok(default.to_owned());
-    }
-    let name = default.display().to_string();
-    let what = format!(
-        "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with one that \
-         says `topics: [{{id: scan, input_topic: /scan}}]`"
-    );
-    Err(failure(&name, Place::File, what))
+    default.exists().then(|| default.to_owned())
+}
+
+fn find_or_fail(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<PathBuf, ConfigError> {
+    find(path, env, Path::new(DEFAULT_PATH)).ok_or_else(|| {
+        let what = format!(
+            "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with one \
+             that says `topics: [{{id: scan, input_topic: /scan}}]`"
+        );
+        failure(DEFAULT_PATH, Place::File, what)
+    })
 }
 
 /// The content of a regular file. Of a pipe or a device nobody knows whether it ever ends.

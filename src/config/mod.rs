@@ -20,7 +20,7 @@ mod tests;
 mod yaml;
 
 pub use keys::KEYS;
-pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, parse};
+pub use load::{DEFAULT_PATH, PATH_VARIABLE, inline_secret, load, load_or_default, parse};
 pub use problem::{ConfigError, Place, Problem};
 pub use settings::{
     Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates,

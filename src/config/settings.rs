@@ -74,6 +74,23 @@ pub enum NetworkSelector {
     Address(Ipv4Addr),
 }
 
+impl NetworkSelector {
+    /// What is allowed, as a phrase that completes "must be …".
+    pub const ALLOWED: &'static str = "the name of a network interface or an IPv4 address";
+
+    /// An interface name as Linux allows it (15 bytes, no `/`, no space), or an IPv4 address.
+    pub fn parse(text: &str) -> Option<Self> {
+        if let Ok(address) = text.parse() {
+            return Some(Self::Address(address));
+        }
+        // 300.1.1.1 would do as a name, but is meant as an address; so is anything with a colon, of IPv6.
+        let meant_as_address = text.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+        let is_name = (1..=15).contains(&text.len())
+            && text.bytes().all(|byte| byte.is_ascii_graphic() && !matches!(byte, b'/' | b':'));
+        (is_name && !meant_as_address).then(|| Self::Name(text.to_owned()))
+    }
+}
+
 /// One input topic.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Route {

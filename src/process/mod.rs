@@ -6,9 +6,11 @@
 
 mod arena;
 mod egress;
+mod inbox;
 mod ingress;
 mod manual;
 pub mod probes;
+mod responder;
 mod role;
 mod scheduling;
 mod stop;
@@ -18,6 +20,7 @@ mod watch;
 pub use egress::egress;
 pub use ingress::ingress;
 pub use manual::set_mode;
+pub use responder::{ResponderOptions, responder};
 pub use role::RoleError;
 pub use stop::Stop;
 pub use supervisor::{SupervisorError, end_with_supervisor, up};

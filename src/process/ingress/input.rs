@@ -1,18 +1,14 @@
 //! One route in ingress: its reader, its pool, its counters.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::task::{Wake, Waker};
-use std::thread::Thread;
-
 use tracing::{error, info, warn};
 
+use super::super::inbox::Inbox;
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
 use super::source::{Source, Wanted, label, still_suits};
 use crate::clock;
 use crate::config::{Route, Settings};
-use crate::dds::{Endpoint, Participant, RawReader, ReaderEvent, ReaderQos, SampleOrigin, Take};
+use crate::dds::{Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, RouteInfo, SampleHeader,
 };
@@ -24,23 +20,6 @@ const WRITERS_FOLLOWED: usize = 32;
 
 /// How often a route without a publisher says so.
 const REMIND_MS: u64 = 30_000;
-
-/// Rung by the DDS library's thread when a sample arrives; wakes the thread of ingress.
-struct Bell {
-    rung: AtomicBool,
-    thread: Thread,
-}
-
-impl Wake for Bell {
-    fn wake(self: Arc<Self>) {
-        self.wake_by_ref();
-    }
-
-    fn wake_by_ref(self: &Arc<Self>) {
-        self.rung.store(true, Ordering::Release);
-        self.thread.unpark();
-    }
-}
 
 /// One route in ingress.
 pub(super) struct Input {
@@ -59,15 +38,13 @@ pub(super) struct Input {
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
     followed: Followed,
-    bell: Arc<Bell>,
-    waker: Waker,
     watch: DropWatch,
     remind_at: MonotonicNs,
     conflict: Option<(String, String)>,
 }
 
 struct Connection {
-    reader: RawReader,
+    inbox: Inbox,
     qos: ReaderQos,
 }
 
@@ -76,7 +53,6 @@ impl Input {
         let route = settings.routes[index].clone();
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
-        let bell = Arc::new(Bell { rung: AtomicBool::new(true), thread: std::thread::current() });
         Ok(Self {
             id: route.id.to_string(),
             dds_topic: route.input_topic.to_dds(),
@@ -91,8 +67,6 @@ impl Input {
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             followed: Followed::default(),
-            waker: Waker::from(Arc::clone(&bell)),
-            bell,
             remind_at: MonotonicNs(0),
             conflict: None,
             route,
@@ -109,26 +83,15 @@ impl Input {
         let Some(connection) = &self.connection else {
             return false;
         };
-        if !self.bell.rung.load(Ordering::Acquire) {
-            return false;
-        }
         let publisher = &self.publisher;
         let mut lent: Option<(Result<Slot, LoanError>, Encapsulation, usize)> = None;
         let mut lend = |payload: &[u8], encapsulation: Encapsulation| {
             lent = Some((publisher.copy_in(payload), encapsulation, payload.len()));
         };
-        let mut take = connection.reader.take(&mut lend);
-        if take == Take::Empty {
-            // Nothing there, so ask to be rung, and look again in case something came in between.
-            self.bell.rung.store(false, Ordering::Release);
-            connection.reader.arm(&self.waker);
-            take = connection.reader.take(&mut lend);
-        }
-        match take {
+        match connection.inbox.take(&mut lend) {
             Take::Empty => return false,
             Take::Sample(origin) => match lent {
                 Some((slot, encapsulation, bytes)) => {
-                    self.bell.rung.store(true, Ordering::Release);
                     self.publish(slot, encapsulation, bytes, origin, wake);
                 }
                 // The library says that there was a sample and lent none; it has no such path today.
@@ -190,7 +153,6 @@ impl Input {
     }
 
     fn count_malformed(&mut self) {
-        self.bell.rung.store(true, Ordering::Release);
         self.counters.update(|counters| {
             counters.received += 1;
             counters.drops.add(DropReason::Malformed, 1);
@@ -224,7 +186,7 @@ impl Input {
     pub fn keep_house(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
         self.connect(participant, now)?;
         if let Some(connection) = &self.connection {
-            while let Some(event) = connection.reader.poll_event() {
+            while let Some(event) = connection.inbox.reader().poll_event() {
                 match event {
                     ReaderEvent::Matched { writers } => {
                         self.counters.update(|counters| counters.writers = writers);
@@ -305,15 +267,14 @@ impl Input {
             depth = qos.depth,
             "reading"
         );
-        self.bell.rung.store(true, Ordering::Release);
         self.settled_type = Some(dds_type);
-        self.connection = Some(Connection { reader, qos });
+        self.connection = Some(Connection { inbox: Inbox::new(reader), qos });
         Ok(())
     }
 
     fn disconnect(&mut self, participant: &mut Participant) {
         if let Some(former) = self.connection.take() {
-            let guid = former.reader.guid();
+            let guid = former.inbox.reader().guid();
             drop(former);
             participant.forget(guid);
             self.counters.update(|counters| counters.writers = 0);

@@ -1,4 +1,4 @@
-//! Requests and responses: JSON in a `std_msgs/String`, as in the original package, and its fields. `nonce` and
+//! Requests and responses: JSON in a `std_msgs/String`, with the fields of the original package. `nonce` and
 //! `hmac` are ours. Fields that a reader does not know are skipped, so that old and new sides work together.
 
 use bytes::Bytes;
@@ -285,8 +285,10 @@ mod tests {
 
     use super::*;
 
-    const REQUEST: &str = r#"{"v": 1, "seq": 7, "send_time_ns": 1763000000000000001, "sender_id": "bridge", "probe_id": "p-7"}"#;
-    const RESPONSE: &str = r#"{"v":1,"seq":7,"probe_id":"p-7","recv_time_ns":2,"reply_time_ns":3,"response_send_time_ns":4,"responder_id":"laptop"}"#;
+    const REQUEST: &str = r#"{"v": 1, "seq": 7, "send_time_ns": 1763000000000000001, "sender_id": "bridge",
+        "probe_id": "p-7"}"#;
+    const RESPONSE: &str = r#"{"v":1,"seq":7,"probe_id":"p-7","recv_time_ns":2,"reply_time_ns":3,
+        "response_send_time_ns":4,"responder_id":"laptop"}"#;
 
     fn cdr(json: &str) -> Vec<u8> {
         encode_string(json).to_vec()

@@ -1,0 +1,110 @@
+//! `responder`: answers probes, beside a remote subscriber.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Args;
+
+use super::{ConfigArguments, EXIT_CONFIG, failed, roles};
+use crate::config::{self, DdsNetwork, NetworkSelector, SecretSource, Settings};
+use crate::model::{LaneName, TopicName, is_probe_id};
+use crate::process::probes::Trust;
+use crate::process::{self, ResponderOptions};
+
+/// What `responder` is asked.
+///
+/// It needs no configuration file: without one there are the defaults, ROS_DOMAIN_ID and these options. With
+/// the bridge's own file it is in the domain of the subscriber's lane.
+#[derive(Args, Debug)]
+pub(super) struct Arguments {
+    /// The subscriber's name, as `subscribers:` of the bridge's configuration has it
+    #[arg(long, value_name = "ID", value_parser = id)]
+    id: String,
+    /// DDS domain [default: that of the subscriber's lane, else $ROS_DOMAIN_ID, else 0]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
+    domain: Option<u16>,
+    /// A network interface to use, by name or IPv4 address; repeatable [default: as configured, else all]
+    #[arg(long = "network", value_name = "INTERFACE", value_parser = network)]
+    networks: Vec<NetworkSelector>,
+    /// Topic of the requests [default: as configured, else /adaptive_bridge/probe_req]
+    #[arg(long, value_name = "TOPIC", value_parser = topic)]
+    request_topic: Option<TopicName>,
+    /// Topic of the responses [default: as configured, else /adaptive_bridge/probe_resp]
+    #[arg(long, value_name = "TOPIC", value_parser = topic)]
+    response_topic: Option<TopicName>,
+    /// A file whose first line is the bridge's secret; sign, and answer signed probes only
+    #[arg(long, value_name = "FILE")]
+    secret_file: Option<PathBuf>,
+    #[command(flatten)]
+    config: ConfigArguments,
+}
+
+pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    let settings = config::load_or_default(arguments.config.path(), &|name| std::env::var(name).ok());
+    let settings = match settings {
+        Ok(settings) => settings,
+        Err(error) => {
+            eprintln!("{error}");
+            return ExitCode::from(EXIT_CONFIG);
+        }
+    };
+    let request_topic = arguments.request_topic.as_ref().unwrap_or(&settings.probes.request_topic);
+    let response_topic = arguments.response_topic.as_ref().unwrap_or(&settings.probes.response_topic);
+    if request_topic == response_topic {
+        failed(&format!("requests and responses cannot be on the same topic, {request_topic}"));
+        return ExitCode::from(EXIT_CONFIG);
+    }
+    let mut security = settings.security.clone();
+    if let Some(path) = &arguments.secret_file {
+        security.enable_probe_hmac = true;
+        security.secret = Some(SecretSource::File(path.clone()));
+    }
+    let trust = match Trust::load(&security, arguments.config.path()) {
+        Ok(trust) => trust,
+        Err(error) => {
+            failed(&error);
+            return ExitCode::from(EXIT_CONFIG);
+        }
+    };
+    let network = arguments.network(&settings);
+    let options = ResponderOptions {
+        id: &arguments.id,
+        network: &network,
+        graph_gid_bytes: settings.graph_gid_bytes,
+        request_topic,
+        response_topic,
+        trust,
+        max_probe_rate_hz: security.max_probe_rate_hz,
+    };
+    roles::run(|stop| process::responder(options, stop))
+}
+
+impl Arguments {
+    /// Where the subscriber is: on the network of its lane, unless the command line says otherwise.
+    fn network(&self, settings: &Settings) -> DdsNetwork {
+        let lane = settings.subscribers.get(&self.id).cloned().unwrap_or_else(LaneName::noncritical);
+        let configured = settings.lane(&lane).map_or(&settings.input, |lane| &lane.network);
+        DdsNetwork {
+            domain_id: self.domain.unwrap_or(configured.domain_id),
+            interfaces: match self.networks.as_slice() {
+                [] => configured.interfaces.clone(),
+                given => given.to_vec(),
+            },
+        }
+    }
+}
+
+fn id(text: &str) -> Result<String, String> {
+    match is_probe_id(text) {
+        true => Ok(text.to_owned()),
+        false => Err("must be 1 to 127 bytes without control characters".to_owned()),
+    }
+}
+
+fn network(text: &str) -> Result<NetworkSelector, String> {
+    NetworkSelector::parse(text).ok_or_else(|| format!("must be {}", NetworkSelector::ALLOWED))
+}
+
+fn topic(text: &str) -> Result<TopicName, String> {
+    TopicName::try_from(text).map_err(|error| error.to_string())
+}

@@ -1,0 +1,222 @@
+//! The shared secret: where it comes from, and that it goes nowhere.
+
+use std::fmt;
+use std::fs::File;
+use std::io::Read;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use hmac::{Hmac, KeyInit, Mac};
+use sha2::Sha256;
+use tracing::warn;
+
+use crate::config::{self, ConfigError, SecretSource};
+
+/// The longest file of a secret. Its first line is all that is wanted.
+const MAX_FILE_BYTES: u64 = 4096;
+
+/// A shorter secret can be found by trying, from a single recorded message.
+const STRONG_BYTES: usize = 16;
+
+/// Why there is no secret. Nothing of it is repeated here, even where it is wrong.
+#[derive(Debug)]
+pub enum SecretError {
+    /// None is configured, and one is needed.
+    NotConfigured,
+    /// The file cannot be read.
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        what: String,
+    },
+    /// The file's first line is empty.
+    EmptyFile {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The environment variable is not set, or empty.
+    EmptyVariable {
+        /// Its name.
+        name: String,
+    },
+    /// The configuration file that held it cannot be read any more, or holds it no more.
+    Config(Option<ConfigError>),
+    /// The operating system has no random numbers for nonces.
+    NoRandomness(getrandom::Error),
+}
+
+impl fmt::Display for SecretError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NotConfigured => f.write_str(
+                "security.enable_probe_hmac is true, and there is no secret: name a file with \
+                 security.hmac_secret_file, or set enable_probe_hmac to false",
+            ),
+            Self::Unreadable { path, what } => write!(
+                f,
+                "the secret's file {} {what}; security.hmac_secret_file names it, and its first line is the \
+                 secret",
+                path.display()
+            ),
+            Self::EmptyFile { path } => write!(
+                f,
+                "the first line of the secret's file {0} is empty; make a secret with `openssl rand -hex 32 \
+                 > {0}`, the same one for the bridge and its responders",
+                path.display()
+            ),
+            Self::EmptyVariable { name } => write!(
+                f,
+                "the environment variable {name}, which security.hmac_secret_env names, is not set or \
+                 empty; set it to the secret"
+            ),
+            Self::Config(Some(error)) => error.fmt(f),
+            Self::Config(None) => f.write_str("security.hmac_secret is gone from the configuration file"),
+            Self::NoRandomness(error) => write!(f, "no random numbers to sign with: {error}"),
+        }
+    }
+}
+
+impl std::error::Error for SecretError {}
+
+/// A shared secret, ready to sign with. It cannot be printed, and the secret itself is not kept: only the
+/// state of the hash function that it leads to.
+#[derive(Clone)]
+pub struct Secret(Hmac<Sha256>);
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Secret")
+    }
+}
+
+impl Secret {
+    /// A secret of these bytes; `None` of none.
+    pub fn new(secret: &[u8]) -> Option<Self> {
+        if secret.is_empty() { None } else { Hmac::new_from_slice(secret).ok().map(Self) }
+    }
+
+    /// Fetches the secret. `config` is the configuration file as the command line names it.
+    ///
+    /// # Errors
+    /// It is not where it should be, or empty.
+    pub fn load(source: &SecretSource, config: Option<&Path>) -> Result<Self, SecretError> {
+        let (secret, empty) = match source {
+            SecretSource::File(path) => (first_line(path)?, SecretError::EmptyFile { path: path.to_owned() }),
+            SecretSource::Environment(name) => {
+                let value = std::env::var_os(name).unwrap_or_default();
+                (value.into_encoded_bytes(), SecretError::EmptyVariable { name: name.clone() })
+            }
+            SecretSource::ConfigFile => {
+                let secret = config::inline_secret(config, &|name| std::env::var(name).ok());
+                let secret = secret.map_err(|error| SecretError::Config(Some(error)))?;
+                (secret.unwrap_or_default().into_bytes(), SecretError::Config(None))
+            }
+        };
+        if (1..STRONG_BYTES).contains(&secret.len()) {
+            warn!("the secret of the probes has less than {STRONG_BYTES} bytes and can be guessed");
+        }
+        Self::new(&secret).ok_or(empty)
+    }
+
+    /// HMAC-SHA-256 of a text.
+    pub fn sign(&self, text: &str) -> [u8; 32] {
+        self.0.clone().chain_update(text).finalize().into_bytes().into()
+    }
+
+    /// Whether this is the HMAC-SHA-256 of that text. Takes the same time wherever they differ.
+    pub fn verify(&self, text: &str, hmac: &[u8; 32]) -> bool {
+        self.0.clone().chain_update(text).verify_slice(hmac).is_ok()
+    }
+}
+
+/// The first line of a file, without its end.
+fn first_line(path: &Path) -> Result<Vec<u8>, SecretError> {
+    let unreadable = |what: String| SecretError::Unreadable { path: path.to_owned(), what };
+    let cannot = |error: std::io::Error| unreadable(format!("cannot be read: {error}"));
+    let metadata = std::fs::metadata(path).map_err(cannot)?;
+    // Of a pipe or a device nobody knows whether it ever ends.
+    if !metadata.is_file() {
+        return Err(unreadable("is not a regular file".to_owned()));
+    }
+    if metadata.permissions().mode() & 0o007 != 0 {
+        warn!(
+            file = %path.display(),
+            "every user of this machine may read or change the secret; mend it with chmod o="
+        );
+    }
+    let mut bytes = Vec::new();
+    File::open(path)
+        .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(cannot)?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(unreadable(format!("is larger than {MAX_FILE_BYTES} bytes")));
+    }
+    let mut line = bytes.split(|&byte| byte == b'\n').next().unwrap_or_default();
+    line = line.strip_suffix(b"\r").unwrap_or(line);
+    Ok(line.to_vec())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// RFC 4231, test case 2.
+    #[test]
+    fn the_hmac_is_that_of_the_standard() {
+        let secret = Secret::new(b"Jefe").unwrap();
+        let hmac = secret.sign("what do ya want for nothing?");
+        assert_eq!(hmac[..4], [0x5b, 0xdc, 0xc1, 0x46]);
+        assert_eq!(hmac[28..], [0x64, 0xec, 0x38, 0x43]);
+        assert!(secret.verify("what do ya want for nothing?", &hmac));
+        assert!(!secret.verify("what do ya want for nothing", &hmac));
+        let mut other = hmac;
+        other[31] ^= 1;
+        assert!(!secret.verify("what do ya want for nothing?", &other));
+    }
+
+    #[test]
+    fn a_secret_is_the_first_line_of_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("secret");
+        let load = |content: &[u8]| {
+            std::fs::write(&path, content).unwrap();
+            Secret::load(&SecretSource::File(path.clone()), None)
+        };
+        let expected = Secret::new(b"sword fish ").unwrap().sign("x");
+        for content in ["sword fish ", "sword fish \n", "sword fish \r\n", "sword fish \nsecond\n"] {
+            assert_eq!(load(content.as_bytes()).unwrap().sign("x"), expected, "{content:?}");
+        }
+        for content in ["", "\n", "\r\n", "\nswordfish"] {
+            assert!(matches!(load(content.as_bytes()), Err(SecretError::EmptyFile { .. })), "{content:?}");
+        }
+        assert!(matches!(load(&[b'x'; 5000]), Err(SecretError::Unreadable { .. })));
+    }
+
+    #[test]
+    fn an_error_names_the_place_and_never_the_secret() {
+        let error = |source| Secret::load(&source, None).unwrap_err().to_string();
+        let missing = error(SecretSource::File("/nonexistent/secret".into()));
+        assert!(missing.contains("/nonexistent/secret") && missing.contains("hmac_secret_file"), "{missing}");
+        let folder = error(SecretSource::File("/".into()));
+        assert!(folder.contains("not a regular file"), "{folder}");
+        let variable = error(SecretSource::Environment("AB_NOT_SET".into()));
+        assert!(variable.contains("AB_NOT_SET"), "{variable}");
+        assert_eq!(format!("{:?}", Secret::new(b"swordfish")), "Some(Secret)");
+    }
+
+    #[test]
+    fn a_secret_in_the_configuration_file_is_read_from_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.yaml");
+        let topics = "topics: [{id: scan, input_topic: /scan}]\n";
+        std::fs::write(&path, format!("{topics}security: {{hmac_secret: swordfish}}\n")).unwrap();
+        let secret = Secret::load(&SecretSource::ConfigFile, Some(&path)).unwrap();
+        assert_eq!(secret.sign("x"), Secret::new(b"swordfish").unwrap().sign("x"));
+        std::fs::write(&path, topics).unwrap();
+        assert!(matches!(
+            Secret::load(&SecretSource::ConfigFile, Some(&path)),
+            Err(SecretError::Config(None))
+        ));
+    }
+}

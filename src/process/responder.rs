@@ -1,0 +1,214 @@
+//! The responder: answers the probes of bridges, beside a remote subscriber.
+//!
+//! It needs no bridge and no shared memory on its machine. Requests come from the network and cost little
+//! whatever they are: each is looked at once, and what is no good is counted.
+
+use std::time::Duration;
+
+use tracing::{debug, info, warn};
+
+use super::HOUSEKEEPING_MS;
+use super::inbox::Inbox;
+use super::probes::{
+    Answers, MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RefusalWatch, Trust,
+};
+use super::role::RoleError;
+use super::stop::Stop;
+use crate::clock;
+use crate::config::DdsNetwork;
+use crate::dds::{Participant, ParticipantOptions, RawWriter, Take};
+use crate::model::{Encapsulation, MonotonicNs, SourceTimestamp, TopicName};
+
+/// After so long without a probe the log says so.
+const SILENCE_MS: u64 = 10_000;
+
+/// Requests that are looked at before it is time to look at the rest.
+const REQUESTS_PER_TURN: usize = 64;
+
+/// Samples that the DDS library may hold of our BEST_EFFORT writer.
+const WINDOW_SAMPLES: usize = 16;
+
+/// What a responder is made of.
+#[derive(Debug)]
+pub struct ResponderOptions<'a> {
+    /// The subscriber's name, by which the bridge's configuration knows it; see
+    /// [`is_probe_id`](crate::model::is_probe_id).
+    pub id: &'a str,
+    /// Domain and interfaces.
+    pub network: &'a DdsNetwork,
+    /// Length of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
+    pub graph_gid_bytes: usize,
+    /// Topic of the requests.
+    pub request_topic: &'a TopicName,
+    /// Topic of the responses.
+    pub response_topic: &'a TopicName,
+    /// Who is believed.
+    pub trust: Trust,
+    /// Requests answered per second, of one sender.
+    pub max_probe_rate_hz: u32,
+}
+
+/// Answers probes until `stop` is requested.
+///
+/// # Errors
+/// DDS cannot be had.
+pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleError> {
+    let (id, topic) = (options.id.to_owned(), options.request_topic.to_string());
+    let domain_id = options.network.domain_id;
+    let signed = options.trust.signs();
+    let mut responder = Responder::open(options)?;
+    info!(id, domain_id, topic, signed, "responder is up");
+    while !stop.is_requested() {
+        if responder.turn() {
+            continue;
+        }
+        let wait_ns = responder.housekeeping_at.since(clock::monotonic());
+        if wait_ns > 0 {
+            std::thread::park_timeout(Duration::from_nanos(wait_ns));
+        }
+    }
+    info!(
+        answered = responder.answers.answered,
+        refused = responder.answers.refused.total(),
+        "responder is done"
+    );
+    Ok(())
+}
+
+struct Responder {
+    /// Before the participant: the DDS library wants its readers and writers gone first.
+    requests: Inbox,
+    responses: RawWriter,
+    _participant: Participant,
+    answers: Answers,
+    /// The request at hand, cut where it is longer than any can be.
+    request: Vec<u8>,
+    refused: RefusalWatch,
+    accepted: RefusalWatch,
+    housekeeping_at: MonotonicNs,
+    /// When the last probe was answered; before the first, when the responder came up.
+    heard_at: MonotonicNs,
+    said: Said,
+    where_to_look: String,
+}
+
+/// What the log said last about probes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Said {
+    Nothing,
+    Arriving,
+    Silent,
+}
+
+impl Responder {
+    fn open(options: ResponderOptions<'_>) -> Result<Self, RoleError> {
+        let mut participant = Participant::open(&ParticipantOptions {
+            network: options.network,
+            namespace: "/adaptive_bridge".to_owned(),
+            node_name: node_name(options.id),
+            graph_gid_bytes: options.graph_gid_bytes,
+        })?;
+        // First the writer, so that an answer can leave as soon as a request can come.
+        let responses = participant.create_writer(
+            &options.response_topic.to_dds(),
+            PROBE_TYPE,
+            &PROBE_WRITER_QOS,
+            WINDOW_SAMPLES,
+        )?;
+        let requests =
+            participant.create_reader(&options.request_topic.to_dds(), PROBE_TYPE, &PROBE_READER_QOS)?;
+        let now = clock::monotonic();
+        Ok(Self {
+            requests: Inbox::new(requests),
+            responses,
+            _participant: participant,
+            answers: Answers::new(options.id, options.trust, options.max_probe_rate_hz, now),
+            request: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
+            refused: RefusalWatch::of_refused(),
+            accepted: RefusalWatch::of_accepted(),
+            housekeeping_at: MonotonicNs(0),
+            heard_at: now,
+            said: Said::Nothing,
+            where_to_look: format!("domain {}, topic {}", options.network.domain_id, options.request_topic),
+        })
+    }
+
+    /// Handles what is there; whether there may be more.
+    fn turn(&mut self) -> bool {
+        let now = clock::monotonic();
+        if now >= self.housekeeping_at {
+            self.keep_house(now);
+        }
+        (0..REQUESTS_PER_TURN).all(|_| self.step())
+    }
+
+    /// Takes one request and answers it; whether there was one.
+    fn step(&mut self) -> bool {
+        let request = &mut self.request;
+        let mut lent = None;
+        let take = self.requests.take(&mut |payload: &[u8], encapsulation: Encapsulation| {
+            request.clear();
+            request.extend_from_slice(&payload[..payload.len().min(MAX_MESSAGE_BYTES + 1)]);
+            lent = Some(encapsulation);
+        });
+        let received = clock::wall();
+        let (origin, encapsulation) = match (take, lent) {
+            (Take::Empty, _) => return false,
+            (Take::Sample(origin), Some(encapsulation)) => (origin, encapsulation),
+            (Take::Sample(_) | Take::Malformed, _) => {
+                self.answers.count_malformed();
+                return true;
+            }
+        };
+        let now = clock::monotonic();
+        if !self.answers.is_within_rate(origin.writer, now) {
+            return true;
+        }
+        let Some(request) = self.answers.judge(&self.request, encapsulation, received) else {
+            return true;
+        };
+        let begun = clock::wall();
+        if self.said != Said::Arriving {
+            info!(sender_id = ?request.sender_id, "probes arrive");
+            self.said = Said::Arriving;
+        }
+        self.heard_at = now;
+        let sent = clock::wall();
+        let response = self.answers.respond(request, received, begun, sent).encode();
+        let timestamp = SourceTimestamp::from_wall(sent);
+        if let Err(error) = self.responses.write(response, Encapsulation::CDR_LE, timestamp) {
+            debug!(%error, "response not sent");
+        }
+        true
+    }
+
+    fn keep_house(&mut self, now: MonotonicNs) {
+        self.refused.look(&self.answers.refused, now);
+        self.accepted.look(&self.answers.accepted_anyway, now);
+        if self.said != Said::Silent && now.since(self.heard_at) >= SILENCE_MS * 1_000_000 {
+            self.said = Said::Silent;
+            warn!(
+                "no probes for {} s ({}); does the bridge run, and is it in reach?",
+                SILENCE_MS / 1_000,
+                self.where_to_look
+            );
+        }
+        self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
+    }
+}
+
+/// `responder_` and the id, with `_` for what a node name may not have.
+fn node_name(id: &str) -> String {
+    let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
+    format!("responder_{}", id.chars().map(allowed).collect::<String>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_name_has_letters_digits_and_underscores_only() {
+        assert_eq!(node_name("laptop-7/ß"), "responder_laptop_7__");
+    }
+}

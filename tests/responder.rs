@@ -1,0 +1,363 @@
+//! The responder from outside: the shipped binary on one host, and bridges on another that ask it, through
+//! our DDS edge. What they say is what the protocol's page says, or is hostile.
+
+mod support;
+
+use std::fs::{self, File};
+use std::path::Path;
+use std::process::{Command, Output};
+use std::time::{Duration, Instant};
+
+use adaptive_bridge::clock;
+use adaptive_bridge::config::{DdsNetwork, SecretSource, Security, TrustMode};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, Take, WriterEvent};
+use adaptive_bridge::model::{Encapsulation, SourceTimestamp, WallNs};
+use adaptive_bridge::process::probes::{
+    PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse, Trust,
+};
+use bytes::Bytes;
+use nix::sched::{CloneFlags, setns};
+use serde_json::{Value, json};
+use support::bridge::program;
+use support::netns::{Host, Net, requires_root};
+use support::process::Process;
+use support::{skip, wait_for, wait_until};
+
+const SECRET: &str = "an ill-kept secret of many bytes";
+
+/// Two hosts; `None` where they cannot be had, which is noted.
+fn net(test: &str) -> Option<Net> {
+    match requires_root() {
+        Some(reason) => {
+            skip(test, &reason);
+            None
+        }
+        None => Some(Net::new(&["bridge", "laptop"])),
+    }
+}
+
+/// A responder that is up.
+fn start(host: &Host, arguments: &[&str]) -> Process {
+    let mut command = host.command(program());
+    command.args(["responder", "--id", "laptop 1"]).args(arguments);
+    command.env_remove("ROS_DOMAIN_ID").env_remove("ADAPTIVE_BRIDGE_CONFIG").env("NO_COLOR", "1");
+    let responder = Process::spawn("responder", command);
+    responder.wait_for_log("responder is up");
+    responder
+}
+
+/// What a bridge has: a writer of requests and a reader of responses, matched with the responder's.
+struct Asker {
+    responses: RawReader,
+    requests: RawWriter,
+    _participant: Participant,
+    name: &'static str,
+    asked: u64,
+    heard: Vec<(Vec<u8>, Encapsulation)>,
+}
+
+impl Asker {
+    fn join(host: &Host, name: &'static str) -> Asker {
+        let namespace = format!("/run/netns/{}", host.namespace());
+        // The threads and sockets of the DDS library are where the thread was that made it.
+        let joined = std::thread::spawn(move || {
+            setns(File::open(namespace).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
+            let mut participant = Participant::open(&ParticipantOptions {
+                network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+                namespace: "/test".to_owned(),
+                node_name: name.to_owned(),
+                graph_gid_bytes: 16,
+            })
+            .unwrap();
+            let responses = participant
+                .create_reader("rt/adaptive_bridge/probe_resp", PROBE_TYPE, &PROBE_READER_QOS)
+                .unwrap();
+            let requests = participant
+                .create_writer("rt/adaptive_bridge/probe_req", PROBE_TYPE, &PROBE_WRITER_QOS, 16)
+                .unwrap();
+            Asker { responses, requests, _participant: participant, name, asked: 0, heard: Vec::new() }
+        });
+        let asker = joined.join().unwrap();
+        wait_until("a responder", || {
+            matches!(asker.requests.poll_event(), Some(WriterEvent::Matched { readers: 1, .. }))
+        });
+        asker
+    }
+
+    fn send_payload(&self, payload: impl Into<Bytes>) {
+        let _ = self.requests.write(payload.into(), Encapsulation::CDR_LE, SourceTimestamp::NONE);
+    }
+
+    fn send(&self, json: &str) {
+        self.send_payload(cdr(json));
+    }
+
+    /// The responses so far.
+    fn heard(&mut self) -> &[(Vec<u8>, Encapsulation)] {
+        let heard = &mut self.heard;
+        let mut keep = |payload: &[u8], encapsulation| heard.push((payload.to_vec(), encapsulation));
+        while self.responses.take(&mut keep) != Take::Empty {}
+        &self.heard
+    }
+
+    /// A request of this bridge, of a number that none had before.
+    fn request(&mut self) -> ProbeRequest {
+        self.asked += 1;
+        ProbeRequest {
+            seq: self.asked,
+            send_time: clock::wall(),
+            sender_id: self.name.to_owned(),
+            probe_id: ProbeId::Text(format!("{}-{}", self.name, self.asked)),
+            signature: None,
+        }
+    }
+
+    /// Sends requests that are to be answered until one is. BEST_EFFORT may lose some.
+    fn ask(&mut self, mut make: impl FnMut(ProbeRequest) -> ProbeRequest) -> (ProbeRequest, ProbeResponse) {
+        wait_for("a response", || {
+            let request = self.request();
+            let request = make(request);
+            self.send_payload(request.encode());
+            let until = Instant::now() + Duration::from_millis(300);
+            while Instant::now() < until {
+                let response = self.decoded().into_iter().find(|it| it.probe_id == request.probe_id);
+                if let Some(response) = response {
+                    return Some((request, response));
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            None
+        })
+    }
+
+    fn decoded(&mut self) -> Vec<ProbeResponse> {
+        let heard = self.heard().iter();
+        heard
+            .map(|(payload, encapsulation)| ProbeResponse::decode(payload, *encapsulation).unwrap())
+            .collect()
+    }
+
+    /// Asserts that nothing of these was answered.
+    fn assert_unanswered(&mut self, what: &str) {
+        let answered = self.decoded().into_iter().find(|it| it.probe_id.to_string().contains(what));
+        assert_eq!(answered, None);
+    }
+}
+
+/// A `std_msgs/String` in little-endian CDR, as any publisher has it.
+fn cdr(text: &str) -> Vec<u8> {
+    [&(text.len() as u32 + 1).to_le_bytes()[..], text.as_bytes(), &[0]].concat()
+}
+
+/// The text of one.
+fn text(payload: &[u8]) -> &str {
+    let length = u32::from_le_bytes(payload[..4].try_into().unwrap()) as usize;
+    std::str::from_utf8(&payload[4..4 + length - 1]).unwrap()
+}
+
+/// What a bridge and a responder with that secret believe.
+fn trust(secret: &Path) -> Trust {
+    let security = Security {
+        trust_mode: TrustMode::DefaultDeny,
+        enable_probe_hmac: true,
+        secret: Some(SecretSource::File(secret.to_owned())),
+        replay_window_ms: 30_000,
+        max_probe_rate_hz: 20,
+        allow_legacy_node_name_overrides: true,
+    };
+    Trust::load(&security, None).unwrap()
+}
+
+/// Memory that the process has in RAM, in bytes.
+fn resident_bytes(process: &Process) -> u64 {
+    let statm = fs::read_to_string(format!("/proc/{}/statm", process.pid())).unwrap();
+    statm.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
+}
+
+fn run(arguments: &[&str]) -> Output {
+    let mut command = Command::new(program());
+    command.arg("responder").args(arguments).env_remove("ADAPTIVE_BRIDGE_CONFIG").output().unwrap()
+}
+
+#[test]
+fn requests_of_the_original_are_answered_whoever_asks() {
+    let Some(net) = net("requests_of_the_original_are_answered_whoever_asks") else { return };
+    let mut responder = start(net.host("laptop"), &[]);
+    let mut first = Asker::join(net.host("bridge"), "first");
+
+    // Word for word what the original's control says.
+    let response: Value = wait_for("a response", || {
+        let request = json!({
+            "v": 1, "seq": 1, "send_time_ns": clock::wall().0, "sender_id": "original", "probe_id": "p-1"
+        });
+        first.send(&request.to_string());
+        std::thread::sleep(Duration::from_millis(100));
+        first.heard().first().map(|(payload, _)| serde_json::from_str(text(payload)).unwrap())
+    });
+    let mut keys: Vec<&str> = response.as_object().unwrap().keys().map(String::as_str).collect();
+    keys.sort_unstable();
+    let expected =
+        ["probe_id", "recv_time_ns", "reply_time_ns", "responder_id", "response_send_time_ns", "seq", "v"];
+    assert_eq!(keys, expected);
+    assert_eq!((&response["v"], &response["seq"]), (&json!(1), &json!(1)));
+    assert_eq!((&response["probe_id"], &response["responder_id"]), (&json!("p-1"), &json!("laptop 1")));
+    let times = ["recv_time_ns", "reply_time_ns", "response_send_time_ns"].map(|key| response[key].as_u64());
+    assert!(times.is_sorted() && times[0] > Some(1_700_000_000_000_000_000), "{times:?}");
+    responder.wait_for_log("probes arrive");
+
+    // Another bridge beside it, and one that numbers its probes.
+    let mut second = Asker::join(net.host("bridge"), "second");
+    let (request, response) = second.ask(|request| request);
+    assert_eq!(response.seq, request.seq);
+    let (_, response) =
+        first.ask(|request| ProbeRequest { probe_id: ProbeId::Number(request.seq), ..request });
+    assert!(matches!(response.probe_id, ProbeId::Number(_)));
+    second.ask(|request| request);
+
+    assert!(responder.terminate().success(), "{}", responder.log());
+    assert!(responder.log().contains("responder is done"), "{}", responder.log());
+    assert!(responder.stdout_lines().is_empty());
+}
+
+#[test]
+fn what_is_no_request_is_counted_by_its_name_and_disturbs_nothing() {
+    let Some(net) = net("what_is_no_request_is_counted_by_its_name_and_disturbs_nothing") else { return };
+    let mut responder = start(net.host("laptop"), &[]);
+    let mut good = Asker::join(net.host("bridge"), "good");
+    good.ask(|request| request);
+
+    let mut bad = Asker::join(net.host("bridge"), "bad");
+    let of_version = |v: u64| {
+        json!({"v": v, "seq": 1, "send_time_ns": 1, "sender_id": "bad", "probe_id": "bad-version"})
+            .to_string()
+    };
+    let long = of_version(1) + &" ".repeat(5_000);
+    let huge = of_version(1) + &" ".repeat(200_000);
+    for name in ["malformed", "oversized", "unsupported_version"] {
+        wait_until(name, || {
+            match name {
+                "malformed" => {
+                    bad.send_payload(vec![]);
+                    bad.send_payload(vec![0xff; 64]);
+                    bad.send("{}");
+                    bad.send(&"[".repeat(4_000));
+                    bad.send(r#"{"v":1,"seq":-1,"send_time_ns":1,"sender_id":"bad","probe_id":"bad"}"#);
+                }
+                "oversized" => {
+                    bad.send(&long);
+                    bad.send(&huge);
+                }
+                _ => bad.send(&of_version(2)),
+            }
+            // The limit of its rate would count all of them under its own name.
+            std::thread::sleep(Duration::from_millis(500));
+            responder.log().contains(&format!("reason=\"{name}\""))
+        });
+        good.ask(|request| request);
+    }
+    bad.assert_unanswered("bad");
+    assert!(responder.terminate().success(), "{}", responder.log());
+}
+
+#[test]
+fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
+    let Some(net) = net("with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (path, wrong) = (folder.path().join("secret"), folder.path().join("wrong"));
+    fs::write(&path, SECRET).unwrap();
+    fs::write(&wrong, "another secret of many bytes").unwrap();
+    let mut responder = start(net.host("laptop"), &["--secret-file", path.to_str().unwrap()]);
+
+    let mut bridge = trust(&path);
+    let mut forger = trust(&wrong);
+    let mut good = Asker::join(net.host("bridge"), "good");
+    let (request, response) = good.ask(|mut request| {
+        bridge.sign(&mut request);
+        request
+    });
+    assert_eq!(bridge.check(&response, clock::wall()), Ok(None));
+    let recorded = request.encode();
+
+    let mut bad = Asker::join(net.host("bridge"), "bad");
+    for name in ["unsigned", "bad_signature", "expired", "replayed"] {
+        wait_until(name, || {
+            let mut request = bad.request();
+            match name {
+                "unsigned" => {}
+                "bad_signature" => forger.sign(&mut request),
+                "expired" => {
+                    request.send_time = WallNs(request.send_time.0 - 60_000_000_000);
+                    bridge.sign(&mut request);
+                }
+                _ => {}
+            }
+            let payload = if name == "replayed" { recorded.clone() } else { request.encode() };
+            bad.send_payload(payload);
+            std::thread::sleep(Duration::from_millis(100));
+            responder.log().contains(&format!("reason=\"{name}\""))
+        });
+    }
+    bad.assert_unanswered("bad");
+
+    // A flood of all of them, while a bridge goes on asking.
+    let before = resident_bytes(&responder);
+    for round in 0..20 {
+        for _ in 0..500 {
+            let mut request = bad.request();
+            forger.sign(&mut request);
+            bad.send_payload(request.encode());
+            bad.send_payload(recorded.clone());
+        }
+        good.ask(|mut request| {
+            bridge.sign(&mut request);
+            request
+        });
+        assert!(responder.is_running(), "round {round}");
+    }
+    responder.wait_for_log("reason=\"rate_limited\"");
+    bad.assert_unanswered("bad");
+    let grown = resident_bytes(&responder).saturating_sub(before);
+    assert!(grown < 32 << 20, "{grown} bytes more");
+    // What was recorded was answered once.
+    let answers = good.decoded().into_iter().filter(|it| it.probe_id == request.probe_id).count();
+    assert_eq!(answers, 1);
+
+    assert!(responder.terminate().success());
+    assert!(!responder.log().contains(SECRET), "{}", responder.log());
+}
+
+#[test]
+fn a_responder_that_cannot_have_its_secret_says_what_to_do() {
+    let output = run(&["--id", "a", "--secret-file", "/nonexistent/secret"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(78), "{said}");
+    assert!(said.contains("/nonexistent/secret"), "{said}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bridge.yaml");
+    fs::write(&path, "topics: [{id: a, input_topic: /a}]\nsecurity: {enable_probe_hmac: true}\n").unwrap();
+    let output = run(&["--id", "a", "--config", path.to_str().unwrap()]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(78), "{said}");
+    assert!(said.contains("hmac_secret_file") && said.contains("enable_probe_hmac"), "{said}");
+}
+
+#[test]
+fn a_command_line_that_makes_no_sense_is_refused() {
+    let long = "x".repeat(128);
+    for arguments in [
+        &["--id", ""][..],
+        &["--id", &long],
+        &["--id", "a\nb"],
+        &["--id", "a", "--domain", "233"],
+        &["--id", "a", "--network", "300.1.1.1"],
+        &["--id", "a", "--request-topic", "relative"],
+        &[],
+    ] {
+        let output = run(arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+    }
+}
