@@ -17,6 +17,7 @@ mod writer;
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::encode_graph;
+pub use network::host_addresses;
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};

@@ -8,6 +8,7 @@
 //! - [`RouteShaper`]: those three together, for one route on a noncritical lane.
 //! - [`critical_drop`] and [`effective_mode`]: what a mode does to a critical sample, and which mode applies.
 //! - [`SequenceTracker`]: what the number of a sample says about those that are missing.
+//! - [`Location`]: whether a DDS endpoint is on this host.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
 mod lane;
@@ -16,6 +17,7 @@ mod restart;
 mod sequence;
 mod staleness;
 mod token_bucket;
+mod whereabouts;
 
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
 pub use lane_queue::{Allowance, LaneQueue, Stamps};
@@ -25,3 +27,4 @@ pub use restart::{
 pub use sequence::{SequenceTracker, Sighting};
 pub use staleness::{age_ns, is_stale};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
+pub use whereabouts::{Location, Whereabouts};
