@@ -8,9 +8,11 @@
 //! - [`RouteShaper`]: those three together, for one route on a noncritical lane.
 //! - [`critical_drop`] and [`effective_mode`]: what a mode does to a critical sample, and which mode applies.
 //! - [`SequenceTracker`]: what the number of a sample says about those that are missing.
+//! - [`IntruderWatch`]: which readers on other hosts reach past the bridge, and what to say of them.
 //! - [`Location`]: whether a DDS endpoint is on this host.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
+mod intruders;
 mod lane;
 mod lane_queue;
 mod restart;
@@ -19,6 +21,10 @@ mod staleness;
 mod token_bucket;
 mod whereabouts;
 
+pub use intruders::{
+    Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_INTRUDERS,
+    NODE_PATIENCE_MS, REMEMBER_MS,
+};
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
 pub use lane_queue::{Allowance, LaneQueue, Stamps};
 pub use restart::{
