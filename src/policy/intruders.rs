@@ -1,7 +1,7 @@
 //! Readers on other hosts that reach past the bridge.
 //!
-//! The bridge can't keep a laptop from subscribing to the publisher's own topic, or to a topic of the critical
-//! lane; that laptop's link then holds back what the bridge is there to protect. It can say so.
+//! The bridge can't keep a laptop from subscribing to the publisher's own topic, or to a topic of the
+//! critical lane; that laptop's link then holds back what the bridge is there to protect. It can say so.
 
 // Addresses only: `core::net` has no sockets.
 use core::net::IpAddr;
@@ -116,8 +116,8 @@ pub struct IntruderCounts {
     pub untold: u64,
 }
 
-/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_INTRUDERS`], and an event is given
-/// once.
+/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_INTRUDERS`], and an event is
+/// given once.
 #[derive(Clone, Debug)]
 pub struct IntruderWatch {
     guarded: Vec<GuardedTopic>,

@@ -27,18 +27,18 @@ pub enum Whereabouts {
 impl Location {
     /// Whether that is here, on the host whose interfaces have the addresses `own`.
     ///
-    /// The sender of the participant's datagrams decides if it is known: the kernel sends what stays on a host
-    /// from an address of that host, and nothing else can. What is announced decides otherwise, and is weaker
-    /// evidence:
+    /// The sender of the participant's datagrams decides if it is known: the kernel sends what stays on a
+    /// host from an address of that host, and lets nothing in that claims one. What is announced decides
+    /// otherwise, and is weaker evidence:
     /// - 127.0.0.1 says nothing beside other addresses, for some libraries announce it to all. Alone it means
     ///   that only this host is served.
-    /// - An address of ours means here, as long as it is not one that many hosts have, such as 172.17.0.1, the
-    ///   default of Docker's bridge. A robot and a laptop that both have it look alike by what they announce.
+    /// - An address of ours means here, as long as it is not one that many hosts have, such as 172.17.0.1,
+    ///   the default of Docker's bridge: a robot and a laptop that both have it look alike.
     /// - A node that announces an address which its host had once is not taken for another host's if it
     ///   announces a present one too.
     ///
-    /// A container that shares the host's network is this host. One with a network of its own is another:
-    /// what it receives crosses a virtual switch, and nothing tells that switch from a real one. Shared-memory
+    /// A container that shares the host's network is this host. One with a network of its own is another: what
+    /// it receives crosses a virtual switch, and nothing tells that switch from a real one. Shared-memory
     /// locators are no addresses: an endpoint with these alone is unknown, and can't be remote.
     pub fn whereabouts(&self, own: &[IpAddr]) -> Whereabouts {
         let is_here = |address: &IpAddr| {
