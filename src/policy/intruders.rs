@@ -15,11 +15,12 @@ use crate::model::{Guid, MonotonicNs, TopicName};
 /// either order and within a second of each other.
 pub const NODE_PATIENCE_MS: u64 = 2_000;
 
-/// Readers that are told one by one. More are only counted.
-pub const MAX_INTRUDERS: usize = 64;
+/// Readers that are remembered, those that were told and have left included. More are only counted. It is more
+/// than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)), as some of them have left.
+pub const MAX_REMEMBERED_INTRUDERS: usize = 64;
 
 /// A reader that comes back within this time after it was gone is the same intruder, which was told already:
-/// a laptop on bad Wi-Fi goes and comes all the time. Thus no more than [`MAX_INTRUDERS`] are told in it,
+/// a laptop on bad Wi-Fi goes and comes all the time. Thus no more than [`MAX_REMEMBERED_INTRUDERS`] are told in it,
 /// whatever the network makes up.
 pub const REMEMBER_MS: u64 = 600_000;
 
@@ -111,12 +112,12 @@ pub struct IntruderCounts {
     pub present: u64,
     /// Told since the beginning.
     pub told: u64,
-    /// Sightings of others while [`MAX_INTRUDERS`] were remembered; one that announces itself again counts
+    /// Sightings of others while [`MAX_REMEMBERED_INTRUDERS`] were remembered; one that announces itself again counts
     /// again.
     pub untold: u64,
 }
 
-/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_INTRUDERS`], and an event is
+/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_REMEMBERED_INTRUDERS`], and an event is
 /// given once.
 #[derive(Clone, Debug)]
 pub struct IntruderWatch {
@@ -186,7 +187,7 @@ impl IntruderWatch {
                 known.state = State::Present;
                 push(&mut self.events, IntruderEvent::Returned(known.intruder.clone()));
             }
-        } else if self.tracked.len() < MAX_INTRUDERS {
+        } else if self.tracked.len() < MAX_REMEMBERED_INTRUDERS {
             let topic = self.guarded[at].clone();
             let intruder = Intruder { reader, topic, host: location.host(), node: None };
             self.tracked.push(Tracked { intruder, state: State::Waiting { found_at: now } });
@@ -459,10 +460,13 @@ mod tests {
                 watch.gone(Guid(reader), now);
             }
             said += told(&mut watch, now, None).len();
-            assert!(watch.tracked.len() <= MAX_INTRUDERS && watch.events.len() <= MAX_INTRUDERS);
+            assert!(
+                watch.tracked.len() <= MAX_REMEMBERED_INTRUDERS
+                    && watch.events.len() <= MAX_REMEMBERED_INTRUDERS
+            );
         }
         // Each of those told appeared and left.
-        assert_eq!(said, 2 * MAX_INTRUDERS);
+        assert_eq!(said, 2 * MAX_REMEMBERED_INTRUDERS);
         let counts = watch.counts();
         assert_eq!(counts.told + counts.untold, 100_000);
     }

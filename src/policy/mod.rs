@@ -22,7 +22,7 @@ mod token_bucket;
 mod whereabouts;
 
 pub use intruders::{
-    Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_INTRUDERS,
+    Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
     NODE_PATIENCE_MS, REMEMBER_MS,
 };
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
