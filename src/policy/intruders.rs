@@ -15,13 +15,13 @@ use crate::model::{Guid, MonotonicNs, TopicName};
 /// either order and within a second of each other.
 pub const NODE_PATIENCE_MS: u64 = 2_000;
 
-/// Readers that are remembered, those that were told and have left included. More are only counted. It is more
-/// than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)), as some of them have left.
+/// Readers that are remembered, those that were told and have left included. More are only counted. That
+/// is more than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)), as some have left.
 pub const MAX_REMEMBERED_INTRUDERS: usize = 64;
 
 /// A reader that comes back within this time after it was gone is the same intruder, which was told already:
-/// a laptop on bad Wi-Fi goes and comes all the time. Thus no more than [`MAX_REMEMBERED_INTRUDERS`] are told in it,
-/// whatever the network makes up.
+/// a laptop on bad Wi-Fi goes and comes all the time. Thus no more than
+/// [`MAX_REMEMBERED_INTRUDERS`] are told in it, whatever the network makes up.
 pub const REMEMBER_MS: u64 = 600_000;
 
 /// Why no other host should read a topic.
@@ -55,6 +55,8 @@ pub struct Intruder {
     pub host: Option<IpAddr>,
     /// Its node, such as `/rviz`; `None` if its participant never said, as one that is no ROS 2 node.
     pub node: Option<String>,
+    /// When it was first seen.
+    pub since: MonotonicNs,
 }
 
 impl Intruder {
@@ -112,13 +114,13 @@ pub struct IntruderCounts {
     pub present: u64,
     /// Told since the beginning.
     pub told: u64,
-    /// Sightings of others while [`MAX_REMEMBERED_INTRUDERS`] were remembered; one that announces itself again counts
-    /// again.
+    /// Sightings of others while [`MAX_REMEMBERED_INTRUDERS`] were remembered; one that announces itself
+    /// again counts again.
     pub untold: u64,
 }
 
-/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_REMEMBERED_INTRUDERS`], and an event is
-/// given once.
+/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_REMEMBERED_INTRUDERS`], and
+/// an event is given once.
 #[derive(Clone, Debug)]
 pub struct IntruderWatch {
     guarded: Vec<GuardedTopic>,
@@ -189,7 +191,7 @@ impl IntruderWatch {
             }
         } else if self.tracked.len() < MAX_REMEMBERED_INTRUDERS {
             let topic = self.guarded[at].clone();
-            let intruder = Intruder { reader, topic, host: location.host(), node: None };
+            let intruder = Intruder { reader, topic, host: location.host(), node: None, since: now };
             self.tracked.push(Tracked { intruder, state: State::Waiting { found_at: now } });
         } else {
             self.untold += 1;

@@ -37,8 +37,8 @@ impl Location {
     /// - A node that announces an address which its host had once is not taken for another host's if it
     ///   announces a present one too.
     ///
-    /// A container that shares the host's network is this host. One with a network of its own is another: what
-    /// it receives crosses a virtual switch, and nothing tells that switch from a real one. Shared-memory
+    /// A container that shares the host's network is this host. One with a network of its own is another:
+    /// what it receives crosses a virtual switch, and nothing tells that from a real one. Shared-memory
     /// locators are no addresses: an endpoint with these alone is unknown, and can't be remote.
     pub fn whereabouts(&self, own: &[IpAddr]) -> Whereabouts {
         let is_here = |address: &IpAddr| {
