@@ -112,6 +112,46 @@ fn remote_subscribers_that_are_slow_stopped_or_cut_off_disturb_nobody() {
 }
 
 #[test]
+fn a_link_that_was_down_for_longer_than_the_lease_carries_samples_again() {
+    let test = "a_link_that_was_down_for_longer_than_the_lease_carries_samples_again";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let subscribers = [
+        bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL),
+        bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL),
+        bed.subscribe("slow", Peer::cyclone(), CRITICAL),
+        bed.subscribe("slow", Peer::fast(), CRITICAL),
+    ];
+    let publisher = bed.publish(Peer::cyclone().rate_hz(100.0), INPUT);
+    let all_receive = |what| {
+        let before: Vec<u64> = subscribers.iter().map(RunningPeer::received).collect();
+        support::wait_until(what, || {
+            subscribers.iter().zip(&before).all(|(subscriber, before)| subscriber.received() > before + 5)
+        });
+    };
+    all_receive("samples before");
+
+    // First the subscribers' cable, then the publisher's.
+    let readers =
+        |status: &Value| outputs(status).map(|output| output["readers"].as_u64()).sum::<Option<u64>>();
+    bed.host("slow").set_link(false);
+    bed.bridge.wait_status("the end of the readers", |status| readers(status) == Some(0));
+    bed.host("slow").set_link(true);
+    all_receive("samples after the subscribers are back");
+
+    let writers = |status: &Value| status["routes"][0]["writers"].as_u64();
+    bed.host("publisher").set_link(false);
+    bed.bridge.wait_status("the end of the publisher", |status| writers(status) == Some(0));
+    bed.host("publisher").set_link(true);
+    all_receive("samples after the publisher is back");
+
+    let _: Sent = publisher.end();
+    for subscriber in subscribers {
+        subscriber.end::<Received>().assert_sound();
+    }
+    bed.end();
+}
+
+#[test]
 fn a_killed_critical_egress_comes_back_and_states_what_was_lost() {
     let test = "a_killed_critical_egress_comes_back_and_states_what_was_lost";
     let Some(bed) = Bed::start(test, SCAN) else { return };

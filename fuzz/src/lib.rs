@@ -7,7 +7,7 @@ use std::os::unix::fs::{DirEntryExt, FileExt};
 use std::path::PathBuf;
 
 use adaptive_bridge::config::{self, Place};
-use adaptive_bridge::dds::encode_graph;
+use adaptive_bridge::dds::{decode_graph, encode_graph};
 use adaptive_bridge::model::{
     DropReason, Encapsulation, Guid, InstanceName, LaneName, MAX_ID_BYTES, MAX_INTRUDERS, MAX_SUBSCRIBERS,
     MonotonicNs, ProbeRefusal, RouteId, TopicName, TrafficClass, TypeName,
@@ -215,8 +215,24 @@ pub fn names(bytes: &[u8]) {
     }
 }
 
-/// A graph entry of arbitrary content, which must be read by the rules of CDR as it was written.
+/// A graph entry: one that another participant sent, and one of arbitrary content, which must be read by the
+/// rules of CDR as it was written.
 pub fn graph(bytes: &[u8]) {
+    for encapsulation in [Encapsulation::CDR_LE, Encapsulation([0, 0, 0, 0])] {
+        let Some(entry) = decode_graph(bytes, encapsulation) else { continue };
+        assert!(entry.nodes.len() <= 256);
+        let endpoints = entry.nodes.iter().map(|node| node.readers.len() + node.writers.len()).sum::<usize>();
+        // Nothing is kept that did not come.
+        assert!(endpoints <= 8_192 && endpoints * 16 <= bytes.len());
+        for node in &entry.nodes {
+            assert!(node.name.starts_with('/') && node.name.len() <= 2 * 255);
+            assert!(node.name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_/".contains(&byte)));
+        }
+    }
+    written_graph(bytes);
+}
+
+fn written_graph(bytes: &[u8]) {
     let mut left = bytes;
     let mut take = |most: usize| {
         let (taken, rest) = left.split_at(most.min(left.len()));
@@ -244,13 +260,25 @@ pub fn graph(bytes: &[u8]) {
     assert_eq!(reader.number(), 1);
     assert_eq!(reader.text(), namespace);
     assert_eq!(reader.text(), node);
-    for guids in [readers, writers] {
+    for guids in [&readers, &writers] {
         assert_eq!(reader.number() as usize, guids.len());
         for guid in guids {
-            assert_eq!(reader.gid(gid_bytes), guid);
+            assert_eq!(reader.gid(gid_bytes), *guid);
         }
     }
     assert_eq!(reader.at, cdr.len());
+
+    if let Some(entry) = decode_graph(&cdr, Encapsulation::CDR_LE) {
+        assert_eq!(entry.participant, participant);
+        let [read] = &entry.nodes[..] else { panic!("one node was written: {entry:?}") };
+        assert!(read.name.starts_with(&namespace) && read.name.ends_with(&node));
+        assert_eq!((&read.readers, &read.writers), (&readers, &writers));
+    } else {
+        let is_plain = |text: &str| {
+            !text.is_empty() && text.len() < 256 && text.bytes().all(|byte| byte.is_ascii_alphanumeric())
+        };
+        assert!(namespace != "/" || !is_plain(&node), "{node} is a name");
+    }
 }
 
 /// A reader of little-endian CDR.

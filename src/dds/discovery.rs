@@ -3,6 +3,10 @@
 use super::qos::{durability_of, reliability_of};
 use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription};
 use crate::model::{Durability, Guid, Reliability};
+use crate::policy::Location;
+
+/// Announced addresses of an endpoint that are looked at. A host has fewer.
+const MAX_ADDRESSES: usize = 64;
 
 /// A reader or writer that discovery has seen.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,6 +21,8 @@ pub struct Endpoint {
     pub reliability: Reliability,
     /// DURABILITY that it offers or requests.
     pub durability: Durability,
+    /// What is known of where it is.
+    pub location: Location,
 }
 
 /// A change in what other participants have.
@@ -30,6 +36,11 @@ pub enum Discovery {
     Reader(Endpoint),
     /// A reader is gone.
     ReaderGone(Guid),
+    /// A participant is gone, and with it its readers and writers, of which nothing else is said.
+    ParticipantGone {
+        /// The prefix that their GUIDs have in common.
+        prefix: [u8; 12],
+    },
     /// A reader of ours asks for more than a writer offers, or a reader for more than ours offers.
     Incompatible {
         /// The endpoint of ours.
@@ -51,6 +62,9 @@ pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery
         }
         Event::WriterLost { guid, .. } => Some(Discovery::WriterGone(Guid(guid.to_bytes()))),
         Event::ReaderLost { guid, .. } => Some(Discovery::ReaderGone(Guid(guid.to_bytes()))),
+        Event::ParticipantLost { id, .. } => {
+            Some(Discovery::ParticipantGone { prefix: id.as_ref().try_into().ok()? })
+        }
         Event::RemoteReaderQosIncompatible { local_writer, remote_reader, .. } => {
             Some(Discovery::Incompatible {
                 local: Guid(local_writer.to_bytes()),
@@ -72,6 +86,15 @@ fn endpoint(description: EndpointDescription, default_reliability: Reliability) 
         guid: Guid(description.guid.to_bytes()),
         reliability: reliability_of(&description.qos, default_reliability),
         durability: durability_of(&description.qos),
+        location: Location {
+            seen_from: description.seen_from.map(|source| source.ip()),
+            announced: description
+                .unicast_addresses
+                .iter()
+                .take(MAX_ADDRESSES)
+                .map(|address| address.ip())
+                .collect(),
+        },
         topic: description.topic_name,
         dds_type: description.type_name,
     }

@@ -6,6 +6,13 @@
 
 use crate::model::{Encapsulation, Guid};
 
+/// Nodes of one participant that are read; one container of components has tens of them.
+const MAX_NODES: usize = 256;
+/// Readers and writers of one participant that are read. A node has about fifteen.
+const MAX_ENDPOINTS: usize = 8_192;
+/// Bytes of a namespace or of a node's name: the limit of ROS 2 (`rmw_validate_node_name`).
+const MAX_NAME_BYTES: usize = 255;
+
 /// Topic of the graph entries.
 pub(super) const TOPIC: &str = "ros_discovery_info";
 /// Type of the graph entries.
@@ -41,6 +48,116 @@ pub fn encode_graph(
 /// The encapsulation of [`encode_graph`]'s result.
 pub(super) const ENCAPSULATION: Encapsulation = Encapsulation::CDR_LE;
 
+/// A graph entry that was read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GraphEntry {
+    /// The participant.
+    pub participant: Guid,
+    /// Its nodes.
+    pub nodes: Vec<GraphNode>,
+}
+
+/// A node of a graph entry.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GraphNode {
+    /// Its namespace and name, such as `/robot/rviz`.
+    pub name: String,
+    /// Its readers.
+    pub readers: Vec<Guid>,
+    /// Its writers.
+    pub writers: Vec<Guid>,
+}
+
+/// Reads an entry in plain CDR of either byte order, with identifiers of 16 or 24 bytes; `None` for anything
+/// else, for an entry of more than 256 nodes or 8,192 endpoints, and for names that ROS 2 does not allow.
+///
+/// The entry itself says how long its identifiers are: an entry with a node can't be read in both ways, for
+/// where the shorter ones have the number of nodes the longer ones have zeros, and one without a node is too
+/// short to be read with the longer ones.
+pub fn decode_graph(cdr: &[u8], encapsulation: Encapsulation) -> Option<GraphEntry> {
+    let big_endian = match encapsulation.representation() {
+        [0, 0] => true,
+        [0, 1] => false,
+        _ => return None,
+    };
+    [16, 24].into_iter().find_map(|gid_bytes| Cdr { cdr, at: 0, big_endian, gid_bytes }.entry())
+}
+
+/// A reader of plain CDR.
+struct Cdr<'a> {
+    cdr: &'a [u8],
+    at: usize,
+    big_endian: bool,
+    gid_bytes: usize,
+}
+
+impl Cdr<'_> {
+    fn entry(&mut self) -> Option<GraphEntry> {
+        let participant = self.gid()?;
+        let count = self.count(MAX_NODES)?;
+        let mut nodes = Vec::new();
+        let mut endpoints = 0;
+        for _ in 0..count {
+            let namespace = self.text()?;
+            let name = self.text()?;
+            let readers = self.gids(MAX_ENDPOINTS - endpoints)?;
+            endpoints += readers.len();
+            let writers = self.gids(MAX_ENDPOINTS - endpoints)?;
+            endpoints += writers.len();
+            nodes.push(GraphNode { name: full_name(namespace, name)?, readers, writers });
+        }
+        // RTPS fills a payload up to a whole word.
+        (self.cdr.len() - self.at < 4).then_some(GraphEntry { participant, nodes })
+    }
+
+    fn bytes(&mut self, count: usize) -> Option<&[u8]> {
+        let taken = self.cdr.get(self.at..)?.get(..count)?;
+        self.at += count;
+        Some(taken)
+    }
+
+    fn number(&mut self) -> Option<u32> {
+        self.at = self.at.next_multiple_of(4);
+        let big_endian = self.big_endian;
+        let bytes = self.bytes(4)?.try_into().ok()?;
+        Some(if big_endian { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) })
+    }
+
+    fn count(&mut self, max: usize) -> Option<usize> {
+        let count = usize::try_from(self.number()?).ok()?;
+        (count <= max).then_some(count)
+    }
+
+    fn gid(&mut self) -> Option<Guid> {
+        let (guid, rest) = self.bytes(self.gid_bytes)?.split_first_chunk::<16>()?;
+        rest.iter().all(|&byte| byte == 0).then_some(Guid(*guid))
+    }
+
+    fn gids(&mut self, max: usize) -> Option<Vec<Guid>> {
+        // Collected as they are read: the number claimed allocates nothing.
+        (0..self.count(max)?).map(|_| self.gid()).collect()
+    }
+
+    fn text(&mut self) -> Option<String> {
+        let length = self.count(MAX_NAME_BYTES + 1)?;
+        let (last, text) = self.bytes(length)?.split_last()?;
+        (*last == 0).then(|| String::from_utf8(text.to_vec()).ok())?
+    }
+}
+
+/// `/robot` and `rviz` are `/robot/rviz`. Names reach logs and terminals, so only those are read that ROS 2
+/// allows: tokens of A-Z, a-z, 0-9 and _.
+fn full_name(namespace: String, name: String) -> Option<String> {
+    let is_token = |token: &str| {
+        !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+    };
+    let tokens = namespace.strip_prefix('/')?;
+    if !is_token(&name) || !(tokens.is_empty() || tokens.split('/').all(is_token)) {
+        return None;
+    }
+    Some(if tokens.is_empty() { format!("/{name}") } else { format!("{namespace}/{name}") })
+}
+
 fn put_gid(cdr: &mut Vec<u8>, guid: Guid, gid_bytes: usize) {
     let end = cdr.len() + gid_bytes;
     cdr.extend_from_slice(&guid.0);
@@ -74,6 +191,99 @@ mod tests {
         expected.extend([2; 16]);
         expected.extend([0, 0, 0, 0]);
         assert_eq!(cdr, expected);
+    }
+
+    fn entry(nodes: &[(&str, u8)]) -> GraphEntry {
+        let node = |&(name, id): &(&str, u8)| GraphNode {
+            name: name.to_owned(),
+            readers: vec![Guid([id; 16]), Guid([id + 1; 16])],
+            writers: vec![Guid([id + 2; 16])],
+        };
+        GraphEntry { participant: Guid([1; 16]), nodes: nodes.iter().map(node).collect() }
+    }
+
+    fn encoded(namespace: &str, name: &str, gid_bytes: usize) -> Vec<u8> {
+        let (readers, writers) = ([Guid([2; 16]), Guid([3; 16])], [Guid([4; 16])]);
+        encode_graph(Guid([1; 16]), namespace, name, &readers, &writers, gid_bytes)
+    }
+
+    fn decoded(cdr: &[u8]) -> Option<GraphEntry> {
+        decode_graph(cdr, Encapsulation::CDR_LE)
+    }
+
+    #[test]
+    fn an_entry_says_how_long_its_identifiers_are() {
+        for gid_bytes in [16, 24] {
+            let cdr = encoded("/robot", "rviz", gid_bytes);
+            assert_eq!(decoded(&cdr), Some(entry(&[("/robot/rviz", 2)])));
+            // Filled up to a word.
+            assert_eq!(decoded(&[&cdr[..], &[0; 3]].concat()), Some(entry(&[("/robot/rviz", 2)])));
+            // Of no node, as of a participant that has just been made.
+            let mut none = vec![1; 16];
+            none.resize(gid_bytes + 4, 0);
+            assert_eq!(decoded(&none), Some(entry(&[])));
+        }
+        assert_eq!(decoded(&encoded("/", "rviz", 16)), Some(entry(&[("/rviz", 2)])));
+    }
+
+    #[test]
+    fn an_entry_of_several_nodes_and_of_the_other_byte_order_is_read() {
+        let mut cdr = vec![1; 16];
+        cdr.extend([0, 0, 0, 2]);
+        for (name, id) in [(b'a', 2), (b'b', 5)] {
+            cdr.extend([0, 0, 0, 3, b'/', b'n', 0, 0]);
+            cdr.extend([0, 0, 0, 2, name, 0, 0, 0]);
+            cdr.extend([0, 0, 0, 2]);
+            cdr.extend([id; 16]);
+            cdr.extend([id + 1; 16]);
+            cdr.extend([0, 0, 0, 1]);
+            cdr.extend([id + 2; 16]);
+        }
+        let read = decode_graph(&cdr, Encapsulation([0, 0, 0, 0]));
+        assert_eq!(read, Some(entry(&[("/n/a", 2), ("/n/b", 5)])));
+        assert_eq!(decoded(&cdr), None, "of the wrong byte order");
+        assert_eq!(decode_graph(&cdr, Encapsulation([0, 7, 0, 0])), None, "in XCDR2");
+    }
+
+    #[test]
+    fn whatever_is_cut_off_or_claims_too_much_is_no_entry() {
+        for gid_bytes in [16, 24] {
+            let cdr = encoded("/robot", "rviz", gid_bytes);
+            for length in 0..cdr.len() {
+                // A longer identifier cut off behind its first zeros is a shorter one without a node.
+                let read = decoded(&cdr[..length]);
+                assert!(read.is_none_or(|entry| entry.nodes.is_empty()), "{length} of {} bytes", cdr.len());
+            }
+            assert_eq!(decoded(&[&cdr[..], &[0; 4]].concat()), None);
+            // Each word in turn claims as much as it can.
+            for word in 0..cdr.len() / 4 {
+                let mut forged = cdr.clone();
+                forged[word * 4..][..4].fill(0xff);
+                let _ = decoded(&forged);
+            }
+            let mut many = cdr.clone();
+            many[gid_bytes..][..4].copy_from_slice(&u32::MAX.to_le_bytes());
+            assert_eq!(decoded(&many), None);
+        }
+    }
+
+    #[test]
+    fn what_ros_does_not_allow_in_a_name_reaches_no_log() {
+        for (namespace, name) in [
+            ("/", ""),
+            ("", "a"),
+            ("a", "b"),
+            ("//", "a"),
+            ("/a/", "b"),
+            ("/", "a/b"),
+            ("/", "a b"),
+            ("/", "a\n"),
+            ("/\u{1b}[2J", "a"),
+        ] {
+            assert_eq!(decoded(&encoded(namespace, name, 16)), None, "{namespace:?} {name:?}");
+        }
+        assert_eq!(decoded(&encoded("/", &"a".repeat(256), 16)), None);
+        assert!(decoded(&encoded("/", &"a".repeat(255), 24)).is_some());
     }
 
     #[test]

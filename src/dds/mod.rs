@@ -7,6 +7,7 @@
 mod discovery;
 mod error;
 mod graph;
+mod graph_watch;
 mod network;
 mod participant;
 mod payload;
@@ -16,7 +17,9 @@ mod writer;
 
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
-pub use graph::encode_graph;
+pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
+pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
+pub use network::host_addresses;
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};

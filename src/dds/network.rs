@@ -2,7 +2,7 @@
 
 use std::net::{IpAddr, Ipv4Addr};
 
-use nix::ifaddrs::getifaddrs;
+use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 
 use super::error::DdsError;
 use crate::config::NetworkSelector;
@@ -16,13 +16,32 @@ pub(super) fn addresses(asked: &[NetworkSelector]) -> Result<Vec<IpAddr>, DdsErr
 }
 
 fn host_interfaces() -> Result<Vec<(String, Ipv4Addr)>, DdsError> {
-    let all = getifaddrs().map_err(|errno| DdsError::Interfaces(errno.into()))?;
-    Ok(all
+    Ok(interface_addresses()?
         .filter_map(|interface| {
             let address = interface.address?.as_sockaddr_in()?.ip();
             Some((interface.interface_name, address))
         })
         .collect())
+}
+
+/// The addresses of this host at present, of both families: what
+/// [`Location::whereabouts`](crate::policy::Location::whereabouts) compares with. They change when a network
+/// is joined or left.
+///
+/// # Errors
+/// The kernel does not list them.
+pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
+    Ok(interface_addresses()?
+        .filter_map(|interface| {
+            let address = interface.address?;
+            let v4 = address.as_sockaddr_in().map(|v4| IpAddr::V4(v4.ip()));
+            v4.or_else(|| address.as_sockaddr_in6().map(|v6| IpAddr::V6(v6.ip())))
+        })
+        .collect())
+}
+
+fn interface_addresses() -> Result<impl Iterator<Item = InterfaceAddress>, DdsError> {
+    getifaddrs().map_err(|errno| DdsError::Interfaces(errno.into()))
 }
 
 fn select(asked: &[NetworkSelector], present: &[(String, Ipv4Addr)]) -> Result<Vec<IpAddr>, DdsError> {

@@ -7,6 +7,7 @@ use bytes::Bytes;
 use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
+use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
 use super::network;
 use super::qos::{self, ReaderQos};
 use super::reader::{RawReader, Take};
@@ -52,6 +53,15 @@ const GRAPH_QOS: QosProfile = QosProfile {
     history: History::KeepLast { depth: 1 },
     durability: Durability::TransientLocal,
     lifespan_ms: None,
+    deadline_ms: None,
+};
+
+/// Reads the last entry of each participant. The topic has no key, so the depth is that of all together; an
+/// entry that is pushed out by a burst comes again when its participant next changes.
+const GRAPH_READER_QOS: ReaderQos = ReaderQos {
+    reliability: Reliability::Reliable,
+    durability: Durability::TransientLocal,
+    depth: 2 * MAX_PARTICIPANTS as u32,
     deadline_ms: None,
 };
 
@@ -117,7 +127,7 @@ impl Participant {
 
     /// Whether an endpoint is one of this participant's own.
     pub fn owns(&self, endpoint: Guid) -> bool {
-        endpoint.0[..12] == self.guid().0[..12]
+        endpoint.prefix() == self.guid().prefix()
     }
 
     /// A reader of `topic`, a DDS topic name, and its place in the node's graph entry.
@@ -130,6 +140,30 @@ impl Participant {
         dds_type: &str,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
+        let reader = self.make_reader(topic, dds_type, reader_qos)?;
+        self.readers.push(reader.guid);
+        self.announce();
+        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them:
+        // what a former reader has taken would be taken once more.
+        while reader.take(&mut |_, _| {}) != Take::Empty {}
+        Ok(reader)
+    }
+
+    /// Learns from now on which nodes the other participants have. As in ROS 2 itself, the reader for that is
+    /// in no node's graph entry.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
+        self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS).map(GraphWatch::new)
+    }
+
+    fn make_reader(
+        &self,
+        topic: &str,
+        dds_type: &str,
+        reader_qos: &ReaderQos,
+    ) -> Result<RawReader, DdsError> {
         let policies = qos::of_reader(reader_qos);
         let what = || format!("a reader of {topic}");
         let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
@@ -138,13 +172,7 @@ impl Participant {
             .create_simple_datareader_no_key(&made_topic, Some(policies))
             .map_err(|error| DdsError::library(what(), error))?;
         let guid = Guid(inner.guid().to_bytes());
-        self.readers.push(guid);
-        self.announce();
-        let reader = RawReader { inner, guid };
-        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them:
-        // what a former reader has taken would be taken once more.
-        while reader.take(&mut |_, _| {}) != Take::Empty {}
-        Ok(reader)
+        Ok(RawReader { inner, guid })
     }
 
     /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has

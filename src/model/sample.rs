@@ -29,6 +29,14 @@ impl Encapsulation {
 #[repr(transparent)]
 pub struct Guid(pub [u8; 16]);
 
+impl Guid {
+    /// The prefix, which all entities of a participant share.
+    pub const fn prefix(self) -> [u8; 12] {
+        let [a, b, c, d, e, f, g, h, i, j, k, l, ..] = self.0;
+        [a, b, c, d, e, f, g, h, i, j, k, l]
+    }
+}
+
 /// The fixed header of one sample in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]

@@ -13,9 +13,12 @@
 //! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, and why; the mildest that safety leaves it.
 //! - [`SafetySupervisor`]: the mode of the whole bridge.
 //! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
+//! - [`IntruderWatch`]: which readers on other hosts reach past the bridge, and what to say of them.
+//! - [`Location`]: whether a DDS endpoint is on this host.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
 mod classifier;
+mod intruders;
 mod lane;
 mod lane_mode;
 mod lane_queue;
@@ -26,9 +29,14 @@ mod safety;
 mod sequence;
 mod staleness;
 mod token_bucket;
+mod whereabouts;
 
 pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
+};
+pub use intruders::{
+    Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
+    NODE_PATIENCE_MS, REMEMBER_MS,
 };
 pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
@@ -45,3 +53,4 @@ pub use safety::{
 pub use sequence::{SequenceTracker, Sighting};
 pub use staleness::{age_ns, is_stale};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
+pub use whereabouts::{Location, Whereabouts};

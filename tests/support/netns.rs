@@ -194,14 +194,38 @@ impl Host {
 
     /// A UDP socket of this host, bound to a port of its `eth0`, which this process uses from where it is.
     pub fn udp_socket(&self) -> UdpSocket {
-        let network = File::open(format!("{NAMESPACES}/{}", self.namespace)).unwrap();
-        let address = self.address;
-        // A namespace is a thread's, and stays with the sockets that it makes.
-        let made = std::thread::spawn(move || {
-            setns(network, CloneFlags::CLONE_NEWNET).unwrap();
-            UdpSocket::bind((address, 0)).unwrap()
-        });
-        made.join().unwrap()
+        self.within(|| UdpSocket::bind((self.address, 0)).unwrap())
+    }
+
+    /// Calls a function of this test on this host. Threads and sockets that it makes stay there.
+    pub fn within<T: Send>(&self, call: impl FnOnce() -> T + Send) -> T {
+        let enter = || {
+            let namespace = File::open(Path::new(NAMESPACES).join(&self.namespace)).unwrap();
+            setns(namespace, CloneFlags::CLONE_NEWNET).unwrap();
+            call()
+        };
+        let joined = std::thread::scope(|scope| scope.spawn(enter).join());
+        joined.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    }
+
+    /// A cable of its own to another host, beside the switch: an interface of this name and these addresses
+    /// (with the length of the prefix, such as `192.168.7.1/24`) on each.
+    pub fn connect(&self, interface: &str, own: &str, other: &Host, others: &str) {
+        let (here, there) = (&self.namespace, &other.namespace);
+        ip(&format!("link add {interface} netns {here} type veth peer name {interface} netns {there}"));
+        for (namespace, address) in [(here, own), (there, others)] {
+            ip(&format!("-n {namespace} addr add {address} dev {interface}"));
+            ip(&format!("-n {namespace} link set {interface} up"));
+        }
+    }
+
+    /// An interface of this host that leads nowhere, as the bridge of a container engine without containers.
+    pub fn add_interface(&self, name: &str, address: &str) {
+        let namespace = &self.namespace;
+        ip(&format!("-n {namespace} link add {name} type veth peer name {name}-end"));
+        ip(&format!("-n {namespace} addr add {address} dev {name}"));
+        ip(&format!("-n {namespace} link set {name}-end up"));
+        ip(&format!("-n {namespace} link set {name} up"));
     }
 
     /// Connects the host to the switch, or pulls its cable at the switch's end.

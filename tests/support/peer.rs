@@ -226,6 +226,12 @@ impl Peer {
         self.option("--stall-every", every_s).option("--stall-for", for_s)
     }
 
+    /// Fast DDS: with its shared-memory transport and data sharing too.
+    pub fn shared_memory(mut self) -> Peer {
+        self.arguments.push("--shm".to_owned());
+        self
+    }
+
     /// Uses the interface with that address only.
     pub fn interface(self, address: std::net::Ipv4Addr) -> Peer {
         self.option("--interface", address)

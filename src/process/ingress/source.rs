@@ -112,6 +112,7 @@ pub(super) const fn label(reliability: Reliability, durability: Durability) -> &
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::Location;
 
     fn writer(id: u8, dds_type: &str, reliability: Reliability, durability: Durability) -> Endpoint {
         Endpoint {
@@ -120,6 +121,7 @@ mod tests {
             dds_type: dds_type.into(),
             reliability,
             durability,
+            location: Location::default(),
         }
     }
 

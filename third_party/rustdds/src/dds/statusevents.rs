@@ -7,6 +7,7 @@
 // 2.2.4.1 in DDS Specification v1.4
 use std::{
   io,
+  net::SocketAddr,
   pin::Pin,
   sync::{Arc, Mutex},
   task::{Context, Poll, Waker},
@@ -471,6 +472,12 @@ pub struct EndpointDescription {
   pub type_name: String,
   pub qos: QosPolicies,
   pub user_data: Vec<u8>,
+  /// Where the endpoint says that it receives unicast, over UDP: its own
+  /// locators or else its participant's. May contain loopback addresses.
+  pub unicast_addresses: Vec<SocketAddr>,
+  /// Where the last datagram of its participant came from. `None`, if none has
+  /// come from the participant itself.
+  pub seen_from: Option<SocketAddr>,
 }
 
 #[derive(Debug, Clone)]

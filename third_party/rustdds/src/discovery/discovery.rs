@@ -927,7 +927,10 @@ impl Discovery {
           }
           SPDP_LIVENESS_TOKEN => {
             while let Ok(guid_prefix) = self.spdp_liveness_receiver.try_recv() {
-              discovery_db_write(&self.discovery_db).participant_is_alive(guid_prefix);
+              let lost = discovery_db_write(&self.discovery_db).participant_is_alive(guid_prefix);
+              if let Some(participant_data) = lost {
+                self.process_discovered_participant_data(&participant_data);
+              }
             }
           }
           P2P_PARTICIPANT_STATELESS_MESSAGE_TOKEN => {
@@ -1100,7 +1103,22 @@ impl Discovery {
       }
 
       // This may be a rediscovery of a previously seen participant that
-      // was temporarily lost due to network outage. Process the SEDP samples
+      // was temporarily lost due to network outage. The loss has unmatched its
+      // endpoints, and what it announced of them is not announced again, or if
+      // it is, was read before. So tell of what the database has restored.
+      let (readers, writers) = discovery_db_read(&self.discovery_db).endpoints_of(guid_prefix);
+      for discovered_reader_data in readers {
+        self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
+          discovered_reader_data,
+        });
+      }
+      for discovered_writer_data in writers {
+        self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
+          discovered_writer_data,
+        });
+      }
+
+      // Process the SEDP samples
       // (topics, readers, writers) that are already pending in our discovery
       // readers, so that we know what it has. Reading takes the samples out of
       // the readers, so this processes the pending samples of all participants,

@@ -45,6 +45,10 @@ const DEFAULT_PARTICIPANT_LEASE_DURATION: Duration = Duration::from_secs(60);
 // How much longer to wait than lease duration before pronouncing lost.
 const PARTICIPANT_LEASE_DURATION_TOLERANCE: Duration = Duration::from_secs(0);
 
+// How many participants whose lease has expired are remembered, with their
+// readers and writers. They may come back.
+const MAX_PARTICIPANTS_IN_ATTIC: usize = 256;
+
 // TODO: Let DiscoveryDB itself become thread-safe and support smaller-scope
 // lock
 pub(crate) struct DiscoveryDB {
@@ -69,6 +73,7 @@ pub(crate) struct DiscoveryDB {
   // was lost due to time-out. If we have a
   external_topic_readers_attic: BTreeMap<GUID, DiscoveredReaderData>,
   external_topic_writers_attic: BTreeMap<GUID, DiscoveredWriterData>,
+  participant_attic: BTreeMap<GuidPrefix, SpdpDiscoveredParticipantData>,
 
   // Database of topic updates:
   // Outer level key is topic name
@@ -137,6 +142,7 @@ impl DiscoveryDB {
       external_topic_writers: BTreeMap::new(),
       external_topic_readers_attic: BTreeMap::new(),
       external_topic_writers_attic: BTreeMap::new(),
+      participant_attic: BTreeMap::new(),
       topics: BTreeMap::new(),
       topic_updated_sender,
       participant_status_sender,
@@ -171,6 +177,8 @@ impl DiscoveryDB {
     //   debug!("DiscoveryDB discovered self. Skipping.");
     //   return
     // }
+
+    self.participant_attic.remove(&guid.prefix);
 
     let mut new_participant = false;
     if !self.participant_proxies.contains_key(&guid.prefix) {
@@ -207,18 +215,26 @@ impl DiscoveryDB {
     new_participant
   }
 
-  pub fn participant_is_alive(&mut self, guid_prefix: GuidPrefix) {
+  /// Whether it is one whose lease has expired: then its last announcement.
+  /// Participants repeat that with the same sequence number, and the reader
+  /// drops what it has seen before.
+  pub fn participant_is_alive(
+    &mut self,
+    guid_prefix: GuidPrefix,
+  ) -> Option<SpdpDiscoveredParticipantData> {
     if let Some(ts) = self.participant_last_life_signs.get_mut(&guid_prefix) {
       let now = Instant::now();
       if now.duration_since(*ts) > std::time::Duration::from_secs(1) {
         debug!("Participant alive update for {guid_prefix:?}, but no full update.");
       }
       *ts = now;
+      None
     } else {
       info!(
         "Participant alive update for unknown {guid_prefix:?}. This is normal, if the message \
          does not repeat."
       );
+      self.participant_attic.remove(&guid_prefix)
     }
   }
 
@@ -227,8 +243,9 @@ impl DiscoveryDB {
   // participant timed out.
   pub fn remove_participant(&mut self, guid_prefix: GuidPrefix, active_disposal: bool) {
     info!("removing participant {guid_prefix:?}");
-    self.participant_proxies.remove(&guid_prefix);
+    let participant_data = self.participant_proxies.remove(&guid_prefix);
     self.participant_last_life_signs.remove(&guid_prefix);
+    self.remove_from_attic(guid_prefix);
     #[cfg(feature = "security")]
     self.authentication_statuses.remove(&guid_prefix);
 
@@ -237,6 +254,14 @@ impl DiscoveryDB {
       self.remove_topic_writer_with_prefix(guid_prefix);
     } else {
       // move to attic
+      if let Some(participant_data) = participant_data {
+        if self.participant_attic.len() == MAX_PARTICIPANTS_IN_ATTIC {
+          if let Some((forgotten, _)) = self.participant_attic.pop_first() {
+            self.remove_from_attic(forgotten);
+          }
+        }
+        self.participant_attic.insert(guid_prefix, participant_data);
+      }
       move_by_guid_prefix(
         guid_prefix,
         &mut self.external_topic_readers,
@@ -248,6 +273,16 @@ impl DiscoveryDB {
         &mut self.external_topic_writers_attic,
       );
     }
+  }
+
+  fn remove_from_attic(&mut self, guid_prefix: GuidPrefix) {
+    self.participant_attic.remove(&guid_prefix);
+    self
+      .external_topic_readers_attic
+      .retain(|guid, _| guid.prefix != guid_prefix);
+    self
+      .external_topic_writers_attic
+      .retain(|guid, _| guid.prefix != guid_prefix);
   }
 
   pub fn find_participant_proxy(
@@ -708,6 +743,21 @@ impl DiscoveryDB {
 
   pub fn get_all_external_topic_writers(&self) -> impl Iterator<Item = &DiscoveredWriterData> {
     self.external_topic_writers.values()
+  }
+
+  /// What is known of the readers and writers of another participant.
+  pub fn endpoints_of(
+    &self,
+    guid_prefix: GuidPrefix,
+  ) -> (Vec<DiscoveredReaderData>, Vec<DiscoveredWriterData>) {
+    fn of<D: Clone>(endpoints: &BTreeMap<GUID, D>, guid_prefix: GuidPrefix) -> Vec<D> {
+      let range = endpoints.range(guid_prefix.range());
+      range.map(|(_, data)| data.clone()).collect()
+    }
+    (
+      of(&self.external_topic_readers, guid_prefix),
+      of(&self.external_topic_writers, guid_prefix),
+    )
   }
 
   // Note:

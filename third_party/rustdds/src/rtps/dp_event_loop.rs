@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-  net::IpAddr,
+  net::{IpAddr, SocketAddr},
   rc::Rc,
   sync::{Arc, RwLock},
   time::{Duration, Instant},
@@ -49,6 +49,7 @@ use crate::{
     dds_cache::DDSCache,
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, TokenDecode, GUID},
+    locator::Locator,
   },
   //QosPolicyBuilder,
   //QosPolicies,
@@ -878,6 +879,15 @@ impl DPEventLoop {
     }
   }
 
+  /// Where the last datagram of this endpoint's participant came from.
+  fn seen_from(&self, endpoint: GUID) -> Option<SocketAddr> {
+    self
+      .interface_observations
+      .borrow()
+      .get(endpoint.prefix)
+      .and_then(|routes| routes.last_source())
+  }
+
   fn remote_reader_discovered(&mut self, remote_reader: &DiscoveredReaderData) {
     debug!(
       "remote_reader_discovered on {:?}",
@@ -893,6 +903,8 @@ impl DPEventLoop {
           type_name: remote_reader.subscription_topic_data.type_name().clone(),
           qos: remote_reader.subscription_topic_data.qos(),
           user_data: remote_reader.user_data.clone(),
+          unicast_addresses: udp_addresses(&remote_reader.reader_proxy.unicast_locator_list),
+          seen_from: self.seen_from(remote_reader.reader_proxy.remote_reader_guid),
         },
       })
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
@@ -982,6 +994,8 @@ impl DPEventLoop {
           type_name: remote_writer.publication_topic_data.type_name.clone(),
           qos: remote_writer.publication_topic_data.qos(),
           user_data: remote_writer.user_data.clone(),
+          unicast_addresses: udp_addresses(&remote_writer.writer_proxy.unicast_locator_list),
+          seen_from: self.seen_from(remote_writer.writer_proxy.remote_writer_guid),
         },
       })
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
@@ -1211,6 +1225,14 @@ impl DPEventLoop {
       // inform discovery?
     }
   }
+}
+
+fn udp_addresses(locators: &[Locator]) -> Vec<SocketAddr> {
+  locators
+    .iter()
+    .filter(|locator| locator.is_udp())
+    .map(|locator| SocketAddr::from(*locator))
+    .collect()
 }
 
 #[cfg(feature = "security")]

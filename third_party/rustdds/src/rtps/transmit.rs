@@ -199,6 +199,9 @@ impl ObservedRoutes {
   }
 }
 
+/// Participants, real or made up, whose datagrams are remembered.
+const MAX_OBSERVED_PARTICIPANTS: usize = 1024;
+
 /// Per-remote-participant record of observed receive interfaces / source
 /// addresses. Populated by the message receiver, consumed by route resolution.
 #[derive(Debug, Default)]
@@ -219,6 +222,13 @@ impl InterfaceObservations {
     iface: Option<InterfaceSelector>,
     source: SocketAddr,
   ) {
+    // The prefix is whatever a datagram says. What is cleared here of real
+    // participants comes again with their next datagrams.
+    if self.by_participant.len() >= MAX_OBSERVED_PARTICIPANTS
+      && !self.by_participant.contains_key(&prefix)
+    {
+      self.by_participant.clear();
+    }
     self
       .by_participant
       .entry(prefix)

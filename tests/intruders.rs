@@ -1,0 +1,296 @@
+//! Readers on other hosts, as the RTPS edge sees them: hosts of their own (network namespaces), programs on
+//! Cyclone DDS, Fast DDS and RustDDS. Which of them is remote, and which node it is.
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::path::Path;
+
+use adaptive_bridge::clock;
+use adaptive_bridge::config::DdsNetwork;
+use adaptive_bridge::dds::{
+    Discovery, Endpoint, GraphWatch, Participant, ParticipantOptions, RawReader, ReaderQos, encode_graph,
+    host_addresses,
+};
+use adaptive_bridge::model::{Durability, Guid, Reliability, TopicName};
+use adaptive_bridge::policy::{
+    Guarded, GuardedTopic, IntruderCounts, IntruderEvent, IntruderWatch, Whereabouts,
+};
+use nix::sys::signal::Signal;
+
+use support::netns::{Host, Net};
+use support::peer::{Library, Peer, Received, Sent};
+
+const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
+const LIBRARIES: [Library; 2] = [Library::Cyclone, Library::Fast];
+
+/// A robot and a laptop, both with more than one interface, and each with a bridge for containers whose
+/// address is the same everywhere.
+fn robot_and_laptop(test: &str) -> Option<(Net, Host, Host)> {
+    if let Some(reason) = support::testbed_missing() {
+        support::skip(test, &reason);
+        return None;
+    }
+    let net = Net::new(&["robot", "laptop"]);
+    let (robot, laptop) = (net.host("robot").clone(), net.host("laptop").clone());
+    robot.connect("wlan0", "192.168.7.1/24", &laptop, "192.168.7.2/24");
+    for host in [&robot, &laptop] {
+        host.add_interface("docker0", "172.17.0.1/16");
+    }
+    Some((net, robot, laptop))
+}
+
+fn node_on(host: &Host, name: &str, graph_gid_bytes: usize) -> Participant {
+    let options = ParticipantOptions {
+        network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+        namespace: "/fleet".into(),
+        node_name: name.into(),
+        graph_gid_bytes,
+    };
+    host.within(|| Participant::open(&options).unwrap())
+}
+
+fn read(node: &mut Participant, topic: &str) -> RawReader {
+    let qos = ReaderQos {
+        reliability: Reliability::Reliable,
+        durability: Durability::Volatile,
+        depth: 16,
+        deadline_ms: None,
+    };
+    node.create_reader(topic, SCAN_TYPE, &qos).unwrap()
+}
+
+/// The readers that a participant has seen, by topic.
+fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) {
+    while let Some(change) = participant.poll_discovery() {
+        if let Discovery::Reader(reader) = change
+            && !participant.owns(reader.guid)
+        {
+            readers.insert(reader.topic.clone(), reader);
+        }
+    }
+}
+
+#[test]
+fn readers_of_every_library_are_told_by_their_host() {
+    let test = "readers_of_every_library_are_told_by_their_host";
+    let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
+    let bridge = node_on(&robot, "bridge", 16);
+    let mut peers = Vec::new();
+    let mut nodes = Vec::new();
+    let mut expected = BTreeMap::new();
+    for (host, place) in [(&robot, Whereabouts::Local), (&laptop, Whereabouts::Remote)] {
+        for library in LIBRARIES {
+            let topic = format!("rt/{library:?}_on_{}", host.name());
+            peers.push(Peer::on(library).subscriber().topic(&topic).start_on(host));
+            expected.insert(topic, place);
+        }
+        let topic = format!("rt/RustDDS_on_{}", host.name());
+        let mut node = node_on(host, "node", 16);
+        let reader = read(&mut node, &topic);
+        nodes.push((reader, node));
+        expected.insert(topic, place);
+    }
+    // Announces shared memory beside its addresses, or serves this host alone.
+    peers.push(Peer::fast().shared_memory().subscriber().topic("rt/shared_memory").start_on(&robot));
+    expected.insert("rt/shared_memory".to_owned(), Whereabouts::Local);
+    let loopback = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface address='127.0.0.1' \
+                    multicast='true'/></Interfaces></General></Domain></CycloneDDS>";
+    robot.run("ip", &["link", "set", "lo", "multicast", "on"]);
+    peers.push(
+        Peer::cyclone().env("CYCLONEDDS_URI", loopback).subscriber().topic("rt/loopback").start_on(&robot),
+    );
+
+    let mut readers = BTreeMap::new();
+    support::wait_until("all readers discovered", || {
+        take_in(&bridge, &mut readers);
+        expected.keys().all(|topic| readers.contains_key(topic))
+    });
+    let own = robot.within(|| host_addresses().unwrap());
+    assert!(own.contains(&IpAddr::V4(robot.address())) && own.contains(&"172.17.0.1".parse().unwrap()));
+    for (topic, place) in &expected {
+        let location = &readers[topic].location;
+        println!("{topic}: {location:?}");
+        assert_eq!(location.whereabouts(&own), *place, "{topic}: {location:?} of {own:?}");
+        if *place == Whereabouts::Remote {
+            let host = location.host().unwrap().to_string();
+            assert!([laptop.address().to_string(), "192.168.7.2".to_owned()].contains(&host), "{host}");
+        }
+    }
+    // One that only listens on loopback may not be heard here at all.
+    if let Some(reader) = readers.get("rt/loopback") {
+        println!("rt/loopback: {:?}", reader.location);
+        assert_eq!(reader.location.whereabouts(&own), Whereabouts::Local);
+    }
+    for peer in peers {
+        let _: Received = peer.end();
+    }
+}
+
+/// What a control process would do at each turn.
+struct Turn {
+    participant: Participant,
+    graph: GraphWatch,
+    watch: IntruderWatch,
+    own: Vec<IpAddr>,
+    events: Vec<IntruderEvent>,
+}
+
+impl Turn {
+    fn new(host: &Host) -> Self {
+        let participant = node_on(host, "bridge", 16);
+        let graph = participant.watch_graph().unwrap();
+        let topic = |name| TopicName::try_from(name).unwrap();
+        let instead = Some(topic("/adaptive_bridge/noncritical/scan"));
+        let guarded = |topic, guarded| GuardedTopic { topic, guarded, instead: instead.clone() };
+        let watch = IntruderWatch::new(vec![
+            guarded(topic("/scan"), Guarded::Input),
+            guarded(topic("/adaptive_bridge/critical/scan"), Guarded::CriticalOutput),
+        ]);
+        let own = host.within(|| host_addresses().unwrap());
+        Self { participant, graph, watch, own, events: Vec::new() }
+    }
+
+    fn take(&mut self) {
+        let now = clock::monotonic();
+        while let Some(change) = self.participant.poll_discovery() {
+            match change {
+                Discovery::Reader(reader) => {
+                    self.watch.found(reader.guid, &reader.topic, &reader.location, &self.own, now);
+                }
+                Discovery::ReaderGone(guid) => self.watch.gone(guid, now),
+                Discovery::ParticipantGone { prefix } => {
+                    self.graph.participant_gone(prefix);
+                    self.watch.participant_gone(prefix, now);
+                }
+                _ => {}
+            }
+        }
+        self.graph.poll();
+        while let Some(event) = self.watch.poll(now, |reader| self.graph.node_of(reader)) {
+            println!("{event:?}");
+            self.events.push(event);
+        }
+    }
+
+    fn wait_until(&mut self, what: &str, mut condition: impl FnMut(&Self) -> bool) {
+        support::wait_until(what, || {
+            self.take();
+            condition(self)
+        });
+    }
+
+    /// Waits for one event more, and yields it.
+    fn next(&mut self, what: &str) -> IntruderEvent {
+        let before = self.events.len();
+        self.wait_until(what, |turn| turn.events.len() > before);
+        self.events[before].clone()
+    }
+}
+
+#[test]
+fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
+    let test = "an_intruder_is_named_by_host_and_node_and_its_end_is_seen";
+    let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
+    let mut turn = Turn::new(&robot);
+
+    // On the robot it may: neither of these is told.
+    let mut planner = node_on(&robot, "planner", 16);
+    let _planner_reader = read(&mut planner, "rt/scan");
+    let local = Peer::fast().subscriber().start_on(&robot);
+
+    let mut told = 0;
+    for (gid_bytes, topic) in [(16, "rt/scan"), (24, "rt/adaptive_bridge/critical/scan")] {
+        let mut rviz = node_on(&laptop, &format!("rviz_{gid_bytes}"), gid_bytes);
+        let reader = read(&mut rviz, topic);
+        let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
+        told += 1;
+        assert_eq!(intruder.reader, reader.guid());
+        assert_eq!(intruder.topic.topic.to_dds(), topic);
+        assert_eq!(intruder.node.as_deref(), Some(format!("/fleet/rviz_{gid_bytes}").as_str()));
+        let text = intruder.to_string();
+        assert!(text.contains("point it at /adaptive_bridge/noncritical/scan"), "{text}");
+
+        // One that is taken away while its participant stays, then the participant.
+        let (guid, second) = (reader.guid(), read(&mut rviz, "rt/scan"));
+        let IntruderEvent::Appeared(_) = turn.next("a second warning") else { panic!("{:?}", turn.events) };
+        told += 1;
+        drop(reader);
+        rviz.forget(guid);
+        assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == guid));
+        let guid = second.guid();
+        drop((second, rviz));
+        assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == guid));
+        assert_eq!(turn.graph.node_of(guid), None);
+    }
+
+    // No node of ROS 2, and one that dies without a word: its lease has to end.
+    for library in LIBRARIES {
+        let mut peer = Peer::on(library).subscriber().start_on(&laptop);
+        let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
+        told += 1;
+        assert_eq!(intruder.node, None);
+        assert!(intruder.to_string().contains("a reader of no known node"), "{intruder}");
+        peer.signal(Signal::SIGKILL);
+        peer.wait();
+        assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == intruder.reader));
+    }
+    assert_eq!(turn.watch.counts(), IntruderCounts { present: 0, told, untold: 0 });
+    let _: Received = local.end();
+}
+
+#[test]
+fn one_whose_link_fails_for_a_while_is_warned_of_once() {
+    let test = "one_whose_link_fails_for_a_while_is_warned_of_once";
+    let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
+    laptop.run("ip", &["link", "set", "wlan0", "down"]);
+    let mut turn = Turn::new(&robot);
+    let mut rviz = node_on(&laptop, "rviz", 16);
+    let reader = read(&mut rviz, "rt/scan");
+    assert!(matches!(turn.next("a warning"), IntruderEvent::Appeared(_)));
+    laptop.set_link(false);
+    assert!(matches!(turn.next("the end of its lease"), IntruderEvent::Left(_)));
+    laptop.set_link(true);
+    let IntruderEvent::Returned(intruder) = turn.next("its return") else { panic!("{:?}", turn.events) };
+    assert_eq!((intruder.reader, intruder.node.as_deref()), (reader.guid(), Some("/fleet/rviz")));
+    assert_eq!(turn.watch.counts(), IntruderCounts { present: 1, told: 1, untold: 0 });
+}
+
+#[test]
+fn a_graph_entry_that_lies_or_is_garbage_is_counted_and_names_nobody() {
+    let test = "a_graph_entry_that_lies_or_is_garbage_is_counted_and_names_nobody";
+    let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
+    let mut turn = Turn::new(&robot);
+    let mut rviz = node_on(&laptop, "rviz", 16);
+    let reader = read(&mut rviz, "rt/scan");
+    // Another participant says that the reader is of its own node, and says so in the name of the first.
+    let lie = encode_graph(rviz.guid(), "/", "innocent", &[reader.guid()], &[], 16);
+    let thief = encode_graph(Guid([7; 16]), "/", "thief", &[reader.guid()], &[], 24);
+    let folder = tempfile::tempdir().unwrap();
+    let mut liars = Vec::new();
+    for (name, bytes) in [("lie", &lie[..]), ("thief", &thief[..]), ("garbage", &[0xff; 400][..])] {
+        let file = folder.path().join(name);
+        std::fs::write(&file, bytes).unwrap();
+        liars.push(say_on_the_graph(&file).start_on(&laptop));
+    }
+    turn.wait_until("three refusals", |turn| turn.graph.refusals().malformed == 3);
+    turn.wait_until("the node's name", |turn| turn.graph.node_of(reader.guid()) == Some("/fleet/rviz"));
+    assert_eq!(turn.graph.refusals().too_many, 0);
+    for liar in liars {
+        let _: Sent = liar.end();
+    }
+}
+
+/// A publisher on the graph's topic, once, of the bytes of a file.
+fn say_on_the_graph(file: &Path) -> Peer {
+    Peer::fast()
+        .publisher()
+        .topic("ros_discovery_info")
+        .type_name("rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_")
+        .transient_local()
+        .keep_last(1)
+        .payload_file(file)
+        .count(1)
+        .linger_s(600.0)
+}
