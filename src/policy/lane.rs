@@ -24,7 +24,7 @@ pub enum Decision<T> {
 /// One route on a noncritical lane: a token bucket and a queue, set by the mode.
 ///
 /// The caller takes all samples out of shared memory whenever it is awake, offers them, and then polls until
-/// the answer is not [`Decision::Send`]. It allocates when made and never afterwards.
+/// the answer is not [`Decision::Send`]. It allocates when made, when its rates are changed, and else never.
 #[derive(Debug)]
 pub struct RouteShaper<T> {
     rates: LaneRates,
@@ -36,12 +36,11 @@ pub struct RouteShaper<T> {
 impl<T> RouteShaper<T> {
     /// A route in normal mode with one token.
     pub fn new(rates: LaneRates, now: MonotonicNs) -> Self {
-        let capacity = rates.normal.queue_samples.max(rates.degraded.queue_samples);
         let mut shaper = Self {
             rates,
             mode: LaneMode::Normal,
             bucket: TokenBucket::new(0.0, 1.0, now),
-            queue: LaneQueue::new(rates.normal.drop_policy, capacity),
+            queue: LaneQueue::new(rates.normal.drop_policy, capacity_for(&rates)),
         };
         // Nothing waits yet that could be dropped.
         shaper.set_mode(LaneMode::Normal, now, |_, _, _| {});
@@ -73,6 +72,19 @@ impl<T> RouteShaper<T> {
                 self.queue.clear(reason, on_drop);
             }
         }
+    }
+
+    /// Applies other rates from the next sample on. Tokens already there stay, up to the new burst; what has no
+    /// place in the new queue gives way as [`RouteShaper::set_mode`] has it.
+    pub fn set_rates(
+        &mut self,
+        rates: LaneRates,
+        now: MonotonicNs,
+        on_drop: impl FnMut(T, Stamps, DropReason),
+    ) {
+        self.rates = rates;
+        self.queue.set_capacity(capacity_for(&rates));
+        self.set_mode(self.mode, now, on_drop);
     }
 
     /// Takes in a sample, in the order of the route's sequence.
@@ -134,6 +146,11 @@ impl<T> RouteShaper<T> {
             _ => Err(DropReason::Suspended),
         }
     }
+}
+
+/// Samples that may wait in one mode or the other.
+fn capacity_for(rates: &LaneRates) -> usize {
+    rates.normal.queue_samples.max(rates.degraded.queue_samples)
 }
 
 /// Whose turn it is among the routes of a lane that share a [`ByteBudget`]: the one after that which sent
