@@ -1,7 +1,7 @@
 //! What of a changed file a running bridge takes over, and what has to wait for a restart.
 //!
-//! Each structure of the settings is put together or taken apart here field by field, so that a new field does
-//! not compile until somebody has decided which of the two it is.
+//! Each structure of the settings is put together or taken apart here field by field, so that a new field
+//! does not compile until somebody has decided which of the two it is.
 
 use std::collections::BTreeMap;
 use std::fmt;

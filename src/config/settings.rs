@@ -131,8 +131,8 @@ pub struct Lane {
 }
 
 impl Lane {
-    /// Samples that the lane may hold in shared memory at once, for each route: a noncritical one also borrows
-    /// what waits in its own queue, the sample it takes next and the one that it sends.
+    /// Samples that the lane may hold in shared memory at once, for each route: a noncritical one also
+    /// borrows what waits in its own queue, the sample it takes next and the one that it sends.
     pub fn max_borrowed_in_all(&self) -> usize {
         let waiting = match self.class {
             TrafficClass::Critical => 0,

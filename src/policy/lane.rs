@@ -74,8 +74,8 @@ impl<T> RouteShaper<T> {
         }
     }
 
-    /// Applies other rates from the next sample on. Tokens already there stay, up to the new burst; what has no
-    /// place in the new queue gives way as [`RouteShaper::set_mode`] has it.
+    /// Applies other rates from the next sample on. Tokens already there stay, up to the new burst; what has
+    /// no place in the new queue gives way as [`RouteShaper::set_mode`] has it.
     pub fn set_rates(
         &mut self,
         rates: LaneRates,

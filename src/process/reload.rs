@@ -156,8 +156,8 @@ pub(super) enum Look {
 }
 
 impl Reloads {
-    /// Begins to serve the requests. The thread has the scheduling of the one that calls this. `note` is where
-    /// each outcome is left.
+    /// Begins to serve the requests. The thread has the scheduling of the one that calls this. `note` is
+    /// where each outcome is left.
     pub fn start(requests: ReloadRequests, settings: &Settings, note: Option<PathBuf>) -> io::Result<Self> {
         let in_force = settings.clone();
         let outcomes = requests.0.map(|request| {
