@@ -19,7 +19,7 @@ use adaptive_bridge::model::{
     Durability, Encapsulation, IngressCounters, LaneCounters, QosProfile, Reliability, SourceTimestamp,
     WallNs,
 };
-use adaptive_bridge::process::{self, Stop};
+use adaptive_bridge::process::{self, ReloadRequests, Stop};
 use adaptive_bridge::shm::{Boards, BridgeShape, ShmNode};
 use bytes::Bytes;
 
@@ -220,12 +220,12 @@ fn in_steady_state_no_step_of_ours_allocates_and_payloads_are_copied_once_or_twi
         let (settings, stop) = (&settings, &stop);
         scope.spawn(move || {
             ROLE.set(Some(0));
-            process::ingress(settings, stop).unwrap();
+            process::ingress(settings, ReloadRequests::never(), stop).unwrap();
         });
         for (index, lane) in LANES.into_iter().enumerate() {
             scope.spawn(move || {
                 ROLE.set(Some(1 + index));
-                process::egress(settings, lane, stop).unwrap();
+                process::egress(settings, lane, ReloadRequests::never(), stop).unwrap();
             });
         }
         // The roles stop also when an assertion fails, or the scope would wait for them for ever.

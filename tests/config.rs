@@ -395,6 +395,216 @@ fn what_is_no_ordinary_file_is_refused_and_never_waited_for() {
     assert_eq!(error, format!("{}: must be at most 1048576 bytes long", long.display()));
 }
 
+/// Keys with two values each; both are allowed whatever the others are. As JSON, which is YAML.
+const CHOICES: &[(&str, &str, &str)] = &[
+    ("policy_hold_s", "5", "4.5"),
+    ("ros.domain_id", "0", "7"),
+    ("ros.networks", "[]", r#"["lo"]"#),
+    ("ros.graph_gid_bytes", "16", "24"),
+    ("topics.0.input_topic", r#""/scan""#, r#""/scan_2""#),
+    ("topics.0.message_type", "null", r#""sensor_msgs/msg/LaserScan""#),
+    ("topics.0.lanes", "null", r#"["critical", "noncritical"]"#),
+    ("topics.0.outputs.critical", r#""/critical""#, r#""/critical_2""#),
+    ("topics.0.max_sample_bytes", "1000", "2000"),
+    ("topics.0.retained_samples", "8", "9"),
+    ("topics.0.qos_overrides.input.reliability", "null", r#""RELIABLE""#),
+    ("topics.0.qos_overrides.input.history", "null", r#""KEEP_ALL""#),
+    ("topics.0.qos_overrides.input.durability", "null", r#""VOLATILE""#),
+    ("topics.0.qos_overrides.input.deadline_ms", "null", "100"),
+    ("topics.0.qos_overrides.critical.reliability", r#""RELIABLE""#, r#""BEST_EFFORT""#),
+    ("topics.0.qos_overrides.critical.depth", "10", "11"),
+    ("topics.0.qos_overrides.critical.durability", r#""VOLATILE""#, r#""TRANSIENT_LOCAL""#),
+    ("topics.0.qos_overrides.critical.lifespan_ms", "null", "100"),
+    ("topics.0.qos_overrides.critical.deadline_ms", "null", "100"),
+    ("lanes.rviz.domain_id", "0", "9"),
+    ("lanes.rviz.networks", "[]", r#"["192.168.0.7"]"#),
+    ("lanes.rviz.queue_depth", "4", "5"),
+    ("lanes.rviz.max_borrowed", "8", "9"),
+    ("lanes.rviz.by_reference_min_bytes", "65536", "0"),
+    ("lanes.rviz.window_samples", "256", "255"),
+    ("lanes.rviz.scheduling.cpus", "[]", "[1]"),
+    ("lanes.rviz.scheduling.lock_memory", "false", "true"),
+    ("lanes.noncritical.max_rate_hz", "10", "20"),
+    ("lanes.noncritical.degraded_rate_hz", "3", "2"),
+    ("lanes.noncritical.max_bytes_per_s", "null", "1000000"),
+    ("lanes.noncritical.degraded_max_bytes_per_s", "200000", "100000"),
+    ("lanes.noncritical.stale_threshold_ms", "200", "100"),
+    ("lanes.noncritical.degraded_stale_threshold_ms", "200", "0"),
+    ("lanes.noncritical.drop_policy", r#""drop_oldest""#, r#""drop_stale""#),
+    ("lanes.noncritical.queue_samples", "5", "6"),
+    ("shared_memory.root_path", "null", r#""/run/elsewhere""#),
+    ("shared_memory.max_taps", "2", "3"),
+    ("processes.ingress.scheduling.cpus", "[]", "[1]"),
+    ("processes.control.scheduling.lock_memory", "false", "true"),
+    ("classifier.enabled", "true", "false"),
+    ("classifier.subscriber_id", r#""""#, r#""laptop""#),
+    ("classifier.evaluate_rate_hz", "2", "3"),
+    ("classifier.demote_loss_threshold", "0.015", "0.02"),
+    ("classifier.promote_loss_threshold", "0.005", "0.004"),
+    ("classifier.demote_rtt_ms", "50", "60"),
+    ("classifier.promote_rtt_ms", "35", "30"),
+    ("classifier.hysteresis_count", "3", "4"),
+    ("classifier.allow_unknown_state", "true", "false"),
+    ("probes.enabled", "true", "false"),
+    ("probes.rate_hz", "5", "6"),
+    ("probes.rtt_threshold_ms", "100", "90"),
+    ("probes.loss_threshold", "0.05", "0.04"),
+    ("probes.jitter_threshold_ms", "25", "24"),
+    ("probes.window_size", "50", "40"),
+    ("probes.hysteresis_count", "3", "4"),
+    ("probes.timeout_ms", "500", "400"),
+    ("probes.request_topic", r#""/request""#, r#""/request_2""#),
+    ("probes.response_topic", r#""/response""#, r#""/response_2""#),
+    ("subscribers.laptop", r#""noncritical""#, r#""rviz""#),
+    ("overrides.laptop", "null", r#""CRITICAL""#),
+    ("safety.preserve_critical_path", "true", "false"),
+    ("safety.allow_noncritical_degrade", "true", "false"),
+    ("safety.max_noncritical_queue", "50", "40"),
+    ("safety.overload_drop_noncritical_first", "true", "false"),
+    ("safety.evaluate_rate_hz", "2", "3"),
+    ("safety.degraded_lag_ms", "50", "60"),
+    ("safety.emergency_lag_ms", "500", "600"),
+    ("safety.degraded_queue_occupancy", "0.5", "0.6"),
+    ("safety.emergency_queue_occupancy", "0.9", "0.8"),
+    ("safety.degraded_errors_per_s", "1", "2"),
+    ("safety.emergency_errors_per_s", "10", "20"),
+    ("safety.silent_ms", "1000", "2000"),
+    ("safety.emergency_silent_ms", "5000", "6000"),
+    ("safety.hysteresis_count", "3", "4"),
+    ("safety.recovery_count", "6", "7"),
+    ("security.trust_mode", r#""default_deny""#, r#""off""#),
+    ("security.allow_legacy_node_name_overrides", "true", "false"),
+    ("security.enable_probe_hmac", "false", "true"),
+    ("security.max_probe_rate_hz", "20", "19"),
+    ("security.hmac_secret_file", "null", r#""/etc/secret""#),
+    ("security.replay_window_ms", "30000", "20000"),
+    ("diagnostics.enabled", "true", "false"),
+    ("diagnostics.publish_interval_s", "1", "0.5"),
+    ("diagnostics.topic", r#""/diagnostics""#, r#""/diagnostics_2""#),
+    ("diagnostics.verbosity", r#""info""#, r#""debug""#),
+    ("diagnostics.metrics", "null", r#""127.0.0.1:9464""#),
+];
+
+/// The settings in which each key has its first value, or where `second` says so its second.
+fn chosen(second: impl Fn(usize) -> bool) -> Settings {
+    let mut file = serde_json::json!({"topics": [{"id": "scan"}]});
+    for (index, (key, first, other)) in CHOICES.iter().enumerate() {
+        let place = key.split('.').fold(&mut file, |node, name| match name.parse::<usize>() {
+            Ok(item) => &mut node[item],
+            Err(_) => &mut node[name],
+        });
+        *place = serde_json::from_str(if second(index) { other } else { first }).unwrap();
+    }
+    settings(&file.to_string())
+}
+
+/// The keys of the README that have the sign for "without a restart".
+fn marked_keys() -> BTreeSet<&'static str> {
+    let rows = README.lines().filter(|line| line.starts_with("| `"));
+    let first_cells = rows.filter_map(|row| row.split('|').nth(1)).filter(|cell| cell.contains('↻'));
+    first_cells.flat_map(|cell| cell.split('`').skip(1).step_by(2)).collect()
+}
+
+/// A key of a change in the terms of [`KEYS`].
+fn pattern(key: &str) -> String {
+    let key = key.trim_end_matches(" in DEGRADED");
+    match key.split('.').collect::<Vec<_>>().as_slice() {
+        ["lanes", _, rest @ ..] => format!("lanes.<lane>.{}", rest.join(".")),
+        [of @ ("subscribers" | "overrides"), _] => format!("{of}.<subscriber>"),
+        _ => key.to_owned(),
+    }
+}
+
+#[test]
+fn what_is_documented_to_change_without_a_restart_does_and_nothing_else() {
+    let (_, reload) = chosen(|_| false).reloaded(chosen(|_| true));
+    let changed: BTreeSet<String> = reload.changed.iter().map(|change| pattern(&change.key)).collect();
+    // What these set is told under other keys: the lanes' rates, the secret.
+    let told_elsewhere = |key: &&str| {
+        key.starts_with("routing_policy.")
+            || ["subscribers.<subscriber>.lane", "security.hmac_secret_file", "security.hmac_secret_env"]
+                .contains(key)
+    };
+    let marked: BTreeSet<String> =
+        marked_keys().into_iter().filter(|key| !told_elsewhere(key)).map(str::to_owned).collect();
+    assert_eq!(changed, marked);
+    for left in &reload.needs_restart {
+        assert!(!marked.contains(&pattern(&left.change.key)), "{left}");
+    }
+    for index in 0..CHOICES.len() {
+        let (_, reload) = chosen(|_| false).reloaded(chosen(|other| other == index));
+        assert_ne!(reload, config::Reload::default(), "{} is not told of", CHOICES[index].0);
+    }
+}
+
+#[test]
+fn each_change_is_told_in_the_words_of_the_file() {
+    let (_, reload) = chosen(|_| false).reloaded(chosen(|_| true));
+    let mut told: Vec<String> = reload.changed.iter().map(ToString::to_string).collect();
+    told.extend(reload.needs_restart.iter().map(ToString::to_string));
+    for expected in [
+        "policy_hold_s: 5 -> 4.5",
+        "lanes.noncritical.max_rate_hz: 10 -> 20",
+        "lanes.noncritical.max_bytes_per_s: none -> 1000000",
+        "lanes.noncritical.drop_policy: drop_oldest -> drop_stale",
+        "lanes.noncritical.drop_policy in DEGRADED: drop_oldest -> drop_stale",
+        "security.trust_mode: default_deny -> off",
+        "security.hmac_secret: none -> the file /etc/secret",
+        "subscribers.laptop: noncritical -> rviz",
+        "overrides.laptop: none -> CRITICAL",
+        "ros.networks: [] -> [lo]; restart the whole bridge",
+        "topics[scan].lanes.rviz: true -> false; restart the whole bridge",
+        "topics[scan].qos_overrides.input.history: none -> KEEP_ALL; restart ingress",
+        "topics[scan].qos_overrides.critical.history: KEEP_LAST 10 -> KEEP_LAST 11; restart egress-critical",
+        "lanes.rviz.domain_id: 0 -> 9; restart egress-rviz",
+        "diagnostics.metrics: none -> 127.0.0.1:9464; restart control",
+    ] {
+        assert!(told.iter().any(|line| line == expected), "{expected} is not in:\n{}", told.join("\n"));
+    }
+}
+
+#[test]
+fn a_lane_that_came_or_went_needs_a_restart_and_so_does_a_subscriber_on_it() {
+    let base = "topics: [{id: scan, input_topic: /scan}]\n";
+    let old = settings(&format!("{base}lanes: {{old: {{}}}}\nsubscribers: {{a: old, b: critical}}"));
+    let new =
+        settings(&format!("{base}lanes: {{new: {{}}}}\nsubscribers: {{a: new, b: noncritical, c: new}}"));
+    let (reloaded, reload) = old.reloaded(new);
+    assert_eq!(reloaded.lanes, old.lanes);
+    let subscribers: Vec<_> = reloaded.subscribers.iter().map(|(id, lane)| format!("{id} {lane}")).collect();
+    assert_eq!(subscribers, ["a old", "b noncritical"]);
+    let left: Vec<String> = reload.needs_restart.iter().map(ToString::to_string).collect();
+    assert_eq!(
+        left,
+        [
+            "lanes: [critical, noncritical, old] -> [critical, noncritical, new]; restart the whole bridge",
+            "subscribers.a: old -> new; restart the whole bridge",
+            "subscribers.c: none -> new; restart the whole bridge",
+        ]
+    );
+    assert_eq!(reload.changed.len(), 1, "{reload:?}");
+}
+
+#[test]
+fn more_samples_may_wait_only_where_shared_memory_has_room_for_them() {
+    let with = |samples: usize| {
+        settings(&format!(
+            "topics: [{{id: scan, input_topic: /scan}}]\n\
+             lanes: {{noncritical: {{queue_samples: {samples}, max_rate_hz: {samples}}}}}"
+        ))
+    };
+    let rates = |settings: &Settings| settings.lanes[1].rates.normal;
+    let (reloaded, reload) = with(5).reloaded(with(6));
+    assert_eq!((rates(&reloaded).queue_samples, reload.needs_restart.len()), (6, 0));
+    for (old, new) in [(5, 50), (50, 5)] {
+        let (reloaded, reload) = with(old).reloaded(with(new));
+        assert_eq!((rates(&reloaded).queue_samples, rates(&reloaded).max_rate_hz), (old, new as f64));
+        let left: Vec<String> = reload.needs_restart.iter().map(ToString::to_string).collect();
+        let expected = format!("lanes.noncritical.queue_samples: {old} -> {new}; restart the whole bridge");
+        assert_eq!(left[0], expected);
+    }
+}
+
 /// Pieces that YAML is made of, and pieces of configurations, with `;` between them.
 const PIECES: &str = concat!(
     "\n;\n  ;\n    ;- ;: ;:;, ;[;];{;};\";';|\n;>-\n;&a ;*a;!!str ;!x ;#;",
@@ -466,5 +676,33 @@ proptest! {
     #[test]
     fn no_mutation_of_the_default_file_makes_the_loader_panic(text in mutated_default()) {
         check_any(text.as_bytes())?;
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_reload_takes_over_all_that_it_can_and_leaves_the_rest_as_it_is(
+        choices in prop::collection::vec(any::<(bool, bool)>(), CHOICES.len()),
+    ) {
+        let old = chosen(|index| choices[index].0);
+        let new = chosen(|index| choices[index].1);
+        let (reloaded, reload) = old.reloaded(new.clone());
+        prop_assert_eq!(reload.changed.is_empty() && reload.needs_restart.is_empty(), old == new);
+        prop_assert_eq!(reload.needs_restart.is_empty(), reloaded == new);
+        prop_assert_eq!(reload.changed.is_empty(), reloaded == old);
+        prop_assert_eq!(reloaded.fingerprint() == new.fingerprint(), reloaded == new);
+
+        // Nothing that can be taken over differs any more, and what was left is left again.
+        let (again, second) = reloaded.reloaded(new);
+        prop_assert_eq!(&again, &reloaded);
+        prop_assert_eq!(second.changed, Vec::new());
+        prop_assert_eq!(second.needs_restart, reload.needs_restart);
+
+        // The way back leads to where it began: what was left as it is was not touched.
+        let (back, third) = reloaded.reloaded(old.clone());
+        prop_assert_eq!(back, old);
+        prop_assert_eq!(third.needs_restart, Vec::new());
     }
 }

@@ -8,6 +8,7 @@ mod completions;
 mod demo;
 mod man;
 mod mode;
+mod reload;
 mod responder;
 mod roles;
 mod status;
@@ -56,6 +57,8 @@ enum Command {
     Tap(tap::Arguments),
     /// Set the mode of a lane by hand
     Mode(mode::Arguments),
+    /// Let the running bridge take over what was changed in its configuration file, without a restart
+    Reload(ConfigArguments),
     /// Print what a shell needs to complete command lines
     Completions(completions::Arguments),
     /// Write the manual pages to a folder
@@ -109,6 +112,7 @@ pub fn main() -> ExitCode {
         Command::Status(arguments) => status::run(&arguments),
         Command::Tap(arguments) => tap::run(&arguments),
         Command::Mode(arguments) => mode::run(&arguments),
+        Command::Reload(arguments) => reload::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => man::run(&arguments),
         Command::Demo(arguments) => demo::run(&arguments),

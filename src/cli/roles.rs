@@ -6,7 +6,8 @@ use std::process::ExitCode;
 use clap::Args;
 
 use super::{ConfigArguments, failed};
-use crate::process::{self, Stop};
+use crate::config::Settings;
+use crate::process::{self, HangUp, ReloadRequests, RoleError, Stop};
 
 /// What `egress` is asked.
 #[derive(Args, Debug)]
@@ -19,24 +20,20 @@ pub(super) struct EgressArguments {
 }
 
 pub(super) fn ingress(arguments: &ConfigArguments) -> ExitCode {
-    process::end_with_supervisor();
-    let settings = match arguments.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
-    run(|stop| process::ingress(&settings, stop))
+    role(arguments, process::ingress)
 }
 
 pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
-    process::end_with_supervisor();
-    let settings = match arguments.config.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
-    run(|stop| process::egress(&settings, &arguments.lane, stop))
+    role(&arguments.config, |settings, reloads, stop| {
+        process::egress(settings, &arguments.lane, reloads, stop)
+    })
 }
 
 pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
+    let hang_up = match HangUp::on_signal() {
+        Ok(hang_up) => hang_up,
+        Err(error) => return failed(&error),
+    };
     let settings = match arguments.load() {
         Ok(settings) => settings,
         Err(code) => return code,
@@ -45,7 +42,24 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
     };
-    run(|stop| process::up(&settings, &passed_on, stop))
+    run(|stop| process::up(&settings, &passed_on, &hang_up, stop))
+}
+
+fn role(
+    arguments: &ConfigArguments,
+    role: impl FnOnce(&Settings, ReloadRequests, &Stop) -> Result<(), RoleError>,
+) -> ExitCode {
+    let again = arguments.clone();
+    let reloads = match ReloadRequests::on_signal(move || again.try_load()) {
+        Ok(reloads) => reloads,
+        Err(error) => return failed(&error),
+    };
+    process::end_with_supervisor();
+    let settings = match arguments.load() {
+        Ok(settings) => settings,
+        Err(code) => return code,
+    };
+    run(|stop| role(&settings, reloads, stop))
 }
 
 pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {

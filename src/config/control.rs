@@ -32,13 +32,13 @@ const MIN_SILENT_MS: u64 = 500;
 /// More than any process could count.
 const MAX_ERRORS_PER_S: f64 = 1_000_000.0;
 
-const TRUST_MODES: &[(&str, TrustMode)] = &[
+pub(super) const TRUST_MODES: &[(&str, TrustMode)] = &[
     ("default_deny", TrustMode::DefaultDeny),
     ("permissive", TrustMode::Permissive),
     ("off", TrustMode::Off),
 ];
 
-const VERBOSITIES: &[(&str, Verbosity)] = &[
+pub(super) const VERBOSITIES: &[(&str, Verbosity)] = &[
     ("error", Verbosity::Error),
     ("warn", Verbosity::Warn),
     ("info", Verbosity::Info),

@@ -14,7 +14,7 @@ const MAX_LANES: usize = 32;
 /// The largest sample, in bytes.
 pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
-const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
+pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
     ("other", SchedulingPolicy::Other),
     ("fifo", SchedulingPolicy::Fifo),
     ("rr", SchedulingPolicy::RoundRobin),

@@ -13,8 +13,10 @@ mod load;
 mod problem;
 mod qos;
 mod rates;
+mod reload;
 mod routes;
 mod settings;
+mod shown;
 #[cfg(test)]
 mod tests;
 mod yaml;
@@ -22,6 +24,7 @@ mod yaml;
 pub use keys::KEYS;
 pub use load::{DEFAULT_PATH, PATH_VARIABLE, inline_secret, load, load_or_default, parse};
 pub use problem::{ConfigError, Place, Problem};
+pub use reload::{Change, LeftAsIs, Reload, Restart};
 pub use settings::{
     Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates,
     MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules, Scheduling,

@@ -16,9 +16,9 @@ pub(super) const DAY_MS: u64 = 86_400_000;
 /// KEEP_LAST without a depth: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
 
-const RELIABILITIES: &[(&str, Reliability)] =
+pub(super) const RELIABILITIES: &[(&str, Reliability)] =
     &[("RELIABLE", Reliability::Reliable), ("BEST_EFFORT", Reliability::BestEffort)];
-const DURABILITIES: &[(&str, Durability)] =
+pub(super) const DURABILITIES: &[(&str, Durability)] =
     &[("VOLATILE", Durability::Volatile), ("TRANSIENT_LOCAL", Durability::TransientLocal)];
 const HISTORIES: &[(&str, HistoryKind)] =
     &[("KEEP_LAST", HistoryKind::KeepLast), ("KEEP_ALL", HistoryKind::KeepAll)];

@@ -22,7 +22,7 @@ const STALE_THRESHOLD_MS: u64 = 200;
 const NORMAL_DEPTH: u64 = 5;
 const DEGRADED_DEPTH: u64 = 2;
 
-const DROP_POLICIES: &[(&str, DropPolicy)] = &[
+pub(super) const DROP_POLICIES: &[(&str, DropPolicy)] = &[
     ("drop_oldest", DropPolicy::DropOldest),
     ("drop_latest", DropPolicy::DropLatest),
     ("drop_stale", DropPolicy::DropStale),

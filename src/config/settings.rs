@@ -147,6 +147,20 @@ pub struct Lane {
     pub scheduling: Scheduling,
 }
 
+impl Lane {
+    /// Samples that the lane may hold in shared memory at once, for each route: a noncritical one also
+    /// borrows what waits in its own queue, the sample it takes next and the one that it sends.
+    pub fn max_borrowed_in_all(&self) -> usize {
+        let waiting = match self.class {
+            TrafficClass::Critical => 0,
+            TrafficClass::Noncritical => {
+                self.rates.normal.queue_samples.max(self.rates.degraded.queue_samples) + 2
+            }
+        };
+        self.max_borrowed.max(waiting)
+    }
+}
+
 /// One route on one lane.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Output {

@@ -5,6 +5,7 @@
 
 mod control;
 mod drops;
+mod hash;
 mod health;
 mod modes;
 mod names;
@@ -17,6 +18,7 @@ mod time;
 
 pub use control::{ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord};
 pub use drops::{DropCounts, DropReason};
+pub use hash::fnv1a;
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, ProcessHealth, RouteInfo,
 };

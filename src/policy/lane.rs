@@ -24,7 +24,7 @@ pub enum Decision<T> {
 /// One route on a noncritical lane: a token bucket and a queue, set by the mode.
 ///
 /// The caller takes all samples out of shared memory whenever it is awake, offers them, and then polls until
-/// the answer is not [`Decision::Send`]. It allocates when made and never afterwards.
+/// the answer is not [`Decision::Send`]. It allocates when made, when its rates are changed, and else never.
 #[derive(Debug)]
 pub struct RouteShaper<T> {
     rates: LaneRates,
@@ -36,12 +36,11 @@ pub struct RouteShaper<T> {
 impl<T> RouteShaper<T> {
     /// A route in normal mode with one token.
     pub fn new(rates: LaneRates, now: MonotonicNs) -> Self {
-        let capacity = rates.normal.queue_samples.max(rates.degraded.queue_samples);
         let mut shaper = Self {
             rates,
             mode: LaneMode::Normal,
             bucket: TokenBucket::new(0.0, 1.0, now),
-            queue: LaneQueue::new(rates.normal.drop_policy, capacity),
+            queue: LaneQueue::new(rates.normal.drop_policy, capacity_for(&rates)),
         };
         // Nothing waits yet that could be dropped.
         shaper.set_mode(LaneMode::Normal, now, |_, _, _| {});
@@ -73,6 +72,19 @@ impl<T> RouteShaper<T> {
                 self.queue.clear(reason, on_drop);
             }
         }
+    }
+
+    /// Applies other rates from the next sample on. Tokens already there stay, up to the new burst; what has
+    /// no place in the new queue gives way as [`RouteShaper::set_mode`] has it.
+    pub fn set_rates(
+        &mut self,
+        rates: LaneRates,
+        now: MonotonicNs,
+        on_drop: impl FnMut(T, Stamps, DropReason),
+    ) {
+        self.rates = rates;
+        self.queue.set_capacity(capacity_for(&rates));
+        self.set_mode(self.mode, now, on_drop);
     }
 
     /// Takes in a sample, in the order of the route's sequence.
@@ -134,6 +146,11 @@ impl<T> RouteShaper<T> {
             _ => Err(DropReason::Suspended),
         }
     }
+}
+
+/// Samples that may wait in one mode or the other.
+fn capacity_for(rates: &LaneRates) -> usize {
+    rates.normal.queue_samples.max(rates.degraded.queue_samples)
 }
 
 /// Whose turn it is among the routes of a lane that share a [`ByteBudget`]: the one after that which sent
@@ -267,6 +284,11 @@ mod tests {
             self.budget.set_mode(&RATES, mode, at_ms(ms));
             self.shaper.set_mode(mode, at_ms(ms), |item, _, reason| dropped.push((item, reason)));
         }
+
+        fn set_rates(&mut self, rates: LaneRates, ms: u64) {
+            let dropped = &mut self.dropped;
+            self.shaper.set_rates(rates, at_ms(ms), |item, _, reason| dropped.push((item, reason)));
+        }
     }
 
     fn sent(decision: Decision<u64>) -> Option<u64> {
@@ -358,6 +380,49 @@ mod tests {
         let reasons: Vec<_> = bench.dropped.iter().map(|&(_, reason)| reason).collect();
         let full = DropReason::QueueFull;
         assert_eq!(reasons, [full, full, full, DropReason::Stale]);
+    }
+
+    #[test]
+    fn other_rates_apply_at_once_and_what_waits_goes_on_waiting() {
+        let mut bench = Bench::new(RATES);
+        bench.offer(1, 0);
+        assert_eq!(sent(bench.poll(0)), Some(1));
+        for sequence in 2..=5 {
+            bench.offer(sequence, 10);
+        }
+        assert_eq!(bench.poll(10), Decision::SleepUntil(at_ms(100)));
+        let faster = RatePolicy { max_rate_hz: 20.0, queue_samples: 8, ..RATES.normal };
+        bench.set_rates(LaneRates { normal: faster, ..RATES }, 10);
+        assert_eq!((bench.shaper.waiting(), bench.dropped.len()), (4, 0));
+        // Half of the token had come in 50 ms at 10 Hz; the other half comes at 20 Hz.
+        assert_eq!(bench.poll(50), Decision::SleepUntil(at_ms(55)));
+        for sequence in 6..=9 {
+            bench.offer(sequence, 50);
+        }
+        assert_eq!((bench.shaper.waiting(), bench.dropped.len()), (8, 0), "there is room for more");
+        assert_eq!(sent(bench.poll(55)), Some(9));
+    }
+
+    #[test]
+    fn a_smaller_queue_names_what_gives_way_and_a_mode_that_forwards_nothing_stays_closed() {
+        let mut bench = Bench::new(RATES);
+        for sequence in 1..=5 {
+            bench.offer(sequence, 0);
+        }
+        let small = RatePolicy { queue_samples: 2, drop_policy: DropPolicy::DropStale, ..RATES.normal };
+        let rates = LaneRates { normal: small, degraded: small };
+        bench.set_rates(rates, 0);
+        let full = DropReason::QueueFull;
+        assert_eq!(bench.dropped, [(1, full), (2, full), (3, full)]);
+        assert_eq!(bench.shaper.waiting(), 2);
+        bench.set_mode(LaneMode::Suspended, 0);
+        bench.set_rates(RATES, 0);
+        assert_eq!(bench.poll(1_000), Decision::Closed);
+        bench.set_mode(LaneMode::Normal, 1_000);
+        for sequence in 6..=11 {
+            bench.offer(sequence, 1_000);
+        }
+        assert_eq!(bench.shaper.waiting(), 5, "the queue is as large as before");
     }
 
     #[test]

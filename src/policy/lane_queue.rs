@@ -56,7 +56,8 @@ impl Allowance {
 ///
 /// Samples are offered in the order of their sequence, and leave in that order: sent, or dropped and handed
 /// to the caller's `on_drop` with the reason. Nothing else removes a sample, so that
-/// offered = sent + dropped + waiting, always. It allocates when made and never afterwards.
+/// offered = sent + dropped + waiting, always. It allocates when made, when given another capacity, and else
+/// never.
 #[derive(Debug)]
 pub struct LaneQueue<T> {
     /// Oldest in front.
@@ -81,6 +82,13 @@ impl<T> LaneQueue<T> {
     /// Whether no sample waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
+    }
+
+    /// Makes room for `capacity` samples (at least 1). The limit stays until [`LaneQueue::set_policy`] sets
+    /// another; so what waits is not touched.
+    pub fn set_capacity(&mut self, capacity: usize) {
+        self.capacity = capacity.max(1);
+        self.waiting.reserve(self.capacity.saturating_sub(self.waiting.len()));
     }
 
     /// Applies another policy and lets at most `limit` samples wait, which is held to 1 to the capacity.

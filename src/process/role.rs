@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use tracing::info;
 
+use super::reload::{Look, ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
 use crate::config::{Scheduling, Settings};
@@ -92,6 +93,7 @@ pub(super) fn root(settings: &Settings) -> PathBuf {
 pub(super) struct Role {
     pub node: ShmNode,
     pub boards: Boards,
+    reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
     /// The participant of the process that served the role before; all zero for none.
     former_participant: Guid,
@@ -103,12 +105,15 @@ impl Role {
     /// Takes the role `name`, applies its scheduling and attaches to shared memory.
     pub fn open(
         settings: &Settings,
+        requests: ReloadRequests,
         role: ProcessRole,
         name: &str,
         how: &Scheduling,
     ) -> Result<Self, RoleError> {
         let root = root(settings);
         let lock = RoleLock::acquire(&root, &settings.instance, name)?;
+        // Before the scheduling, which is for the data path: a file is read at leisure.
+        let reloads = Reloads::start(requests, settings, lock.note_path())?;
         scheduling::apply(how);
         let node = ShmNode::open(&root, &settings.instance, name)?;
         let cleaned = node.cleaned_up();
@@ -130,10 +135,11 @@ impl Role {
                 started_at: now,
                 alive_at: now,
                 starts,
+                settings_fingerprint: reloads.fingerprint(),
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self { node, boards, health, former_participant, _lock: lock })
+        Ok(Self { node, boards, reloads, health, former_participant, _lock: lock })
     }
 
     /// Opens the role's DDS participant. If the process that served the role before was killed, the others
@@ -144,6 +150,21 @@ impl Role {
         let guid = participant.guid();
         self.health.update(|health| health.participant = guid);
         Ok(participant)
+    }
+
+    /// Takes over what was reloaded since the last look, if anything was, and shows it. What is yielded then
+    /// are the settings in force from now on, for the role to apply.
+    pub fn reload(&mut self) -> Option<&Settings> {
+        let look = self.reloads.look();
+        if look == Look::Nothing {
+            return None;
+        }
+        let (fingerprint, refused) = (self.reloads.fingerprint(), self.reloads.refused());
+        self.health.update(|health| {
+            health.settings_fingerprint = fingerprint;
+            health.refused_reloads = refused;
+        });
+        (look == Look::Reloaded).then(|| self.reloads.settings())
     }
 
     /// Shows that the data path turned, and what it applies.

@@ -16,6 +16,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, getppid};
 use tracing::{error, info, warn};
 
+use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
@@ -72,11 +73,17 @@ pub fn end_with_supervisor() {
 }
 
 /// Runs ingress and every lane as children until `stop` is requested. `arguments` are passed on to each,
-/// after its own (the configuration file, say).
+/// after its own (the configuration file, say). A hang-up is passed on, too: each child checks the file
+/// itself before it changes anything. Lanes that the file has got since are not started.
 ///
 /// # Errors
 /// The first start of a child failed, or all children gave up.
-pub fn up(settings: &Settings, arguments: &[OsString], stop: &Stop) -> Result<(), SupervisorError> {
+pub fn up(
+    settings: &Settings,
+    arguments: &[OsString],
+    hang_up: &HangUp,
+    stop: &Stop,
+) -> Result<(), SupervisorError> {
     let mut children = vec![Supervised::new("ingress", &["ingress"], arguments)];
     for lane in &settings.lanes {
         let name = format!("egress-{}", lane.name);
@@ -91,6 +98,17 @@ pub fn up(settings: &Settings, arguments: &[OsString], stop: &Stop) -> Result<()
     }
     while outcome.is_ok() && !stop.is_requested() {
         std::thread::sleep(Duration::from_millis(LOOK_MS));
+        match hang_up.take() {
+            Some(HangUpMeaning::Reload) => {
+                info!("reload: passed on to every child");
+                children.iter().for_each(Supervised::reload);
+            }
+            Some(HangUpMeaning::Stop) => {
+                info!("the terminal is gone");
+                break;
+            }
+            None => {}
+        }
         let now = clock::monotonic();
         for child in &mut children {
             child.look(now);
@@ -154,12 +172,10 @@ impl Supervised {
     }
 
     fn start(&mut self) -> io::Result<()> {
-        let mut process = Command::new(std::env::current_exe()?)
-            .args(&self.arguments)
-            .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
-            .stdin(Stdio::null())
-            .stderr(Stdio::piped())
-            .spawn()?;
+        let mut command = Command::new(std::env::current_exe()?);
+        command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
+        command.stdin(Stdio::null()).stderr(Stdio::piped());
+        let mut process = with_hang_up_blocked(|| command.spawn())?;
         if let Some(log) = process.stderr.take() {
             let name = self.name.clone();
             std::thread::spawn(move || pass_on(&name, log));
@@ -211,6 +227,15 @@ impl Supervised {
                 State::GaveUp
             }
         };
+    }
+
+    /// A stopped child reloads when it goes on.
+    fn reload(&self) {
+        if let Some(process) = &self.process
+            && let Ok(pid) = i32::try_from(process.id())
+        {
+            let _ = kill(Pid::from_raw(pid), Signal::SIGHUP);
+        }
     }
 
     fn signal(&self, signal: Signal) {

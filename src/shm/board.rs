@@ -18,14 +18,14 @@ use std::sync::atomic::{Ordering, fence};
 use nix::fcntl::FlockArg;
 
 use super::error::ShmError;
-use super::root::{FileLock, InstanceDir, SHM_DIR, fnv1a};
+use super::root::{FileLock, InstanceDir, SHM_DIR};
 use super::segment::Segment;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
     ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
     LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId,
-    RouteInfo, SubscriberRecord,
+    RouteInfo, SubscriberRecord, fnv1a,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.

@@ -27,7 +27,7 @@ use super::root::RoleLock;
 use super::sample_error::{LoanError, PublishError, TakeError};
 use super::service::Service;
 use crate::config::{Lane, Settings};
-use crate::model::{RouteId, SampleHeader, TrafficClass};
+use crate::model::{RouteId, SampleHeader, fnv1a};
 
 /// Slots that ingress may hold at once while it copies and has not published yet: the one that it fills, and
 /// one of a caller that keeps a slot while it looks at the next sample.
@@ -50,16 +50,9 @@ pub struct LaneQueue {
 }
 
 impl LaneQueue {
-    /// The share of a configured lane. A noncritical lane also borrows what waits in its own queue, the
-    /// sample it takes next and the one that it sends.
+    /// The share of a configured lane.
     pub fn of(lane: &Lane) -> Self {
-        let waiting = match lane.class {
-            TrafficClass::Critical => 0,
-            TrafficClass::Noncritical => {
-                lane.rates.normal.queue_samples.max(lane.rates.degraded.queue_samples) + 2
-            }
-        };
-        Self { queue_depth: lane.queue_depth, max_borrowed: lane.max_borrowed.max(waiting) }
+        Self { queue_depth: lane.queue_depth, max_borrowed: lane.max_borrowed_in_all() }
     }
 }
 
@@ -152,7 +145,7 @@ impl RouteChannel {
         let name = format!("ab1/samples/{}", self.route);
         let name = name.as_str().try_into().map_err(|error| say(&error))?;
         // An attribute has at most 255 bytes, which many lanes exceed.
-        let parameters = format!("{:016x}", super::root::fnv1a(self.parameters().as_bytes()));
+        let parameters = format!("{:016x}", fnv1a(self.parameters().as_bytes()));
         let key = "ab1".try_into().map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;
         let value = parameters.as_str().try_into();
         let value = value.map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;

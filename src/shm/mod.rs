@@ -6,7 +6,7 @@
 //!   fixed size (iceoryx2 publish-subscribe).
 //! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
-//! - [`RoleLock`]: at most one process for each role.
+//! - [`RoleLock`]: at most one process for each role; [`RoleHolder`]: which one.
 //!
 //! No type of iceoryx2 leaves this module. What may be killed, stopped or restarted at any moment is every
 //! process; `docs/decisions/0004-shared-memory.md` says how each primitive bears it.
@@ -15,6 +15,7 @@ mod board;
 mod channel;
 mod error;
 mod header;
+mod holders;
 mod node;
 mod root;
 mod sample_error;
@@ -28,6 +29,7 @@ pub use channel::{
 };
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
+pub use holders::RoleHolder;
 pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
 pub use sample_error::{LoanError, PublishError, TakeError};

@@ -14,7 +14,7 @@ use nix::unistd::{AccessFlags, access, geteuid};
 
 use super::error::ShmError;
 use crate::clock;
-use crate::model::InstanceName;
+use crate::model::{InstanceName, fnv1a};
 
 /// Where Linux keeps POSIX shared memory.
 pub(super) const SHM_DIR: &str = "/dev/shm";
@@ -189,14 +189,8 @@ fn check_owner(path: &Path) -> Result<(), ShmError> {
     }
 }
 
-/// FNV-1a, 64 bits: no secret, only a name that differs.
-pub(super) fn fnv1a(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
-}
-
-const LOCK_SUFFIX: &str = ".lock";
+pub(super) const LOCK_SUFFIX: &str = ".lock";
+pub(super) const ROLE_PREFIX: &str = "role-";
 const INSTANCE_LOCK: &str = "instance.lock";
 
 /// A file that is locked with `flock`. The kernel releases the lock when the process dies, however it dies.
@@ -283,7 +277,7 @@ fn lock_failed(path: &Path, error: &io::Error) -> ShmError {
     }
 }
 
-fn read_pid(path: &Path) -> u32 {
+pub(super) fn read_pid(path: &Path) -> u32 {
     let mut text = String::new();
     let read = File::open(path).and_then(|file| file.take(16).read_to_string(&mut text));
     read.ok().and_then(|_| text.trim().parse().ok()).unwrap_or(0)
@@ -390,6 +384,12 @@ impl RoleLock {
         })
     }
 
+    /// A file beside the lock, in which the holder may leave a note for whoever looks
+    /// ([`RoleHolder`](super::RoleHolder)). It is removed with the instance.
+    pub fn note_path(&self) -> Option<PathBuf> {
+        self.lock.as_ref().map(|lock| note_path(&lock.path))
+    }
+
     pub(super) fn try_acquire(dir: &InstanceDir, role: &str) -> io::Result<Option<Self>> {
         let taken = FileLock::take(&Self::path(dir, role), FlockArg::LockExclusiveNonblock)?;
         taken
@@ -403,8 +403,13 @@ impl RoleLock {
     fn path(dir: &InstanceDir, role: &str) -> PathBuf {
         let safe = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
         let name: String = role.chars().map(|c| if safe(c) { c } else { '_' }).collect();
-        dir.path.join(format!("role-{name}{LOCK_SUFFIX}"))
+        dir.path.join(format!("{ROLE_PREFIX}{name}{LOCK_SUFFIX}"))
     }
+}
+
+/// The note that belongs to the lock of a role.
+pub(super) fn note_path(lock: &Path) -> PathBuf {
+    lock.with_extension("reload")
 }
 
 impl Drop for RoleLock {

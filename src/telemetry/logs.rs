@@ -15,6 +15,8 @@ pub fn start_logs() {
     let outcome = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
+        // It would say on stderr that stderr is gone, a closed terminal say, and panic because it cannot.
+        .log_internal_errors(false)
         .with_ansi(std::io::stderr().is_terminal())
         .try_init();
     if let Err(error) = outcome {

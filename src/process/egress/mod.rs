@@ -16,6 +16,7 @@ use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::arena::CopyArena;
+use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
@@ -48,9 +49,14 @@ enum Turn {
 ///
 /// # Errors
 /// There is no such lane, it is served already, or shared memory or DDS cannot be had.
-pub fn egress(settings: &Settings, name: &str, stop: &Stop) -> Result<(), RoleError> {
+pub fn egress(
+    settings: &Settings,
+    name: &str,
+    reloads: ReloadRequests,
+    stop: &Stop,
+) -> Result<(), RoleError> {
     let index = lane_index(settings, name)?;
-    let mut egress = Egress::open(settings, index)?;
+    let mut egress = Egress::open(settings, index, reloads)?;
     let lane = &settings.lanes[index];
     info!(
         lane = name,
@@ -69,6 +75,8 @@ pub fn egress(settings: &Settings, name: &str, stop: &Stop) -> Result<(), RoleEr
 }
 
 struct Egress {
+    /// The lane's number.
+    index: usize,
     /// Before the participant: the DDS library wants its readers and writers gone first.
     outputs: Vec<Output>,
     participant: Participant,
@@ -88,10 +96,11 @@ enum Forwarder {
 }
 
 impl Egress {
-    fn open(settings: &Settings, index: usize) -> Result<Self, RoleError> {
+    fn open(settings: &Settings, index: usize, reloads: ReloadRequests) -> Result<Self, RoleError> {
         let lane = &settings.lanes[index];
         let role_name = format!("egress-{}", lane.name);
-        let mut role = Role::open(settings, ProcessRole::Egress(index), &role_name, &lane.scheduling)?;
+        let process = ProcessRole::Egress(index);
+        let mut role = Role::open(settings, reloads, process, &role_name, &lane.scheduling)?;
         let mut participant = role.join(&ParticipantOptions {
             network: &lane.network,
             namespace: namespace(settings),
@@ -109,6 +118,7 @@ impl Egress {
         };
         let sleeper = role.boards.sleeper(index);
         let mut egress = Self {
+            index,
             policy: PolicyWatch::new(settings, lane, index),
             role,
             participant,
@@ -169,8 +179,24 @@ impl Egress {
         for output in &mut self.outputs {
             output.keep_house(&mut self.participant, &self.role.boards, now);
         }
+        self.reload(now);
         self.role.turned(self.policy.mode as u8, self.policy.epoch);
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
+    }
+
+    /// Applies what was reloaded.
+    fn reload(&mut self, now: MonotonicNs) {
+        let Some(settings) = self.role.reload() else {
+            return;
+        };
+        self.policy.policy_hold_ms = settings.policy_hold_ms;
+        let rates = settings.lanes[self.index].rates;
+        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
+            lane.set_rates(rates, &mut self.outputs, now);
+            for output in &mut self.outputs {
+                output.set_drop_policy(rates.normal.drop_policy);
+            }
+        }
     }
 
     /// Forwards what still waits, as far as the lane's mode allows, and accounts for the rest.

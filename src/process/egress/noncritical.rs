@@ -36,6 +36,17 @@ impl Noncritical {
         }
     }
 
+    /// Applies other rates. What waits goes on waiting, but for what has no place any more.
+    pub fn set_rates(&mut self, rates: LaneRates, outputs: &mut [Output], now: MonotonicNs) {
+        self.rates = rates;
+        self.budget.set_mode(&rates, self.mode, now);
+        for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
+            let rates = rates_of(rates, output.durability());
+            shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
+            output.set_waiting(shaper.waiting());
+        }
+    }
+
     /// Takes in what is there and forwards what the tokens allow.
     pub fn step(
         &mut self,

@@ -36,6 +36,7 @@ pub(super) struct Output {
     overwritten: DropReason,
     /// What it means in the present mode.
     gap_reason: DropReason,
+    mode: LaneMode,
     /// Drops that are how the lane works.
     expected_drops: &'static [DropReason],
     subscriber: SampleSubscriber,
@@ -95,6 +96,7 @@ impl Output {
             by_reference_min_bytes: lane.by_reference_min_bytes,
             overwritten: overwritten(lane.class, lane.rates.normal.drop_policy),
             gap_reason: overwritten(lane.class, lane.rates.normal.drop_policy),
+            mode: LaneMode::Normal,
             expected_drops: expected_drops(lane.class),
             subscriber,
             writer: None,
@@ -119,6 +121,10 @@ impl Output {
 
     pub fn id(&self) -> &str {
         &self.id
+    }
+
+    pub fn durability(&self) -> Durability {
+        self.qos.durability
     }
 
     /// The next sample that is not accounted for yet. What is missing before it is counted here; what was
@@ -222,11 +228,18 @@ impl Output {
     /// The lane applies another mode. One that forwards nothing takes samples at leisure, so most are
     /// overwritten.
     pub fn set_mode(&mut self, mode: LaneMode) {
+        self.mode = mode;
         self.gap_reason = match (mode, self.class) {
             (LaneMode::Stopped, _) => DropReason::Stopped,
             (LaneMode::Suspended, TrafficClass::Noncritical) => DropReason::Suspended,
             _ => self.overwritten,
         };
+    }
+
+    /// The lane applies another drop policy.
+    pub fn set_drop_policy(&mut self, policy: DropPolicy) {
+        self.overwritten = overwritten(self.class, policy);
+        self.set_mode(self.mode);
     }
 
     /// Shows how many taken samples wait in the lane.

@@ -10,6 +10,7 @@ use std::time::Duration;
 use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
+use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
 use crate::clock;
@@ -29,12 +30,12 @@ const LAST_SAMPLES_MS: u64 = 200;
 /// before the reader exists is lost to a VOLATILE reader.
 const SEARCHING_MS: u64 = 10;
 
-/// Runs ingress until `stop` is requested.
+/// Runs ingress until `stop` is requested. Of what a reload changes, nothing concerns ingress.
 ///
 /// # Errors
 /// Ingress is served already, or shared memory or DDS cannot be had.
-pub fn ingress(settings: &Settings, stop: &Stop) -> Result<(), RoleError> {
-    let mut ingress = Ingress::open(settings)?;
+pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Result<(), RoleError> {
+    let mut ingress = Ingress::open(settings, reloads)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     while !stop.is_requested() {
         if ingress.turn() {
@@ -60,8 +61,9 @@ struct Ingress {
 }
 
 impl Ingress {
-    fn open(settings: &Settings) -> Result<Self, RoleError> {
-        let mut role = Role::open(settings, ProcessRole::Ingress, "ingress", &settings.ingress_scheduling)?;
+    fn open(settings: &Settings, reloads: ReloadRequests) -> Result<Self, RoleError> {
+        let how = &settings.ingress_scheduling;
+        let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", how)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
             inputs.push(Input::open(&role, settings, route)?);
@@ -142,6 +144,7 @@ impl Ingress {
             input.keep_house(&mut self.participant, now)?;
             searching |= !input.is_connected();
         }
+        self.role.reload();
         self.role.turned(LaneMode::Normal as u8, 0);
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
         Ok(())

@@ -1,0 +1,482 @@
+//! What of a changed file a running bridge takes over, and what has to wait for a restart.
+//!
+//! Each structure of the settings is put together or taken apart here field by field, so that a new field
+//! does not compile until somebody has decided which of the two it is.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::settings::{
+    Classifier, DdsNetwork, Diagnostics, InputQos, Lane, LaneRates, Output, Probes, RatePolicy, Route,
+    Safety, Scheduling, Security, Settings, SharedMemory,
+};
+use super::shown::Shown;
+use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, TrafficClass, fnv1a};
+
+/// One setting that differs between two files, in the words of the file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Change {
+    /// Its key path. Routes stand in it by their id, as in `topics[scan].max_sample_bytes`, and what
+    /// `routing_policy` sets stands in it under the lanes that it changes.
+    pub key: String,
+    /// What the bridge was told before; `none` for nothing.
+    pub old: String,
+    /// What the file says now.
+    pub new: String,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {} -> {}", self.key, self.old, self.new)
+    }
+}
+
+/// What must be started again for a setting to take effect.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Restart {
+    /// The whole bridge: its processes have to agree on it.
+    Bridge,
+    /// Ingress.
+    Ingress,
+    /// Control.
+    Control,
+    /// The egress of one lane.
+    Lane(String),
+}
+
+impl fmt::Display for Restart {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Bridge => f.write_str("the whole bridge"),
+            Self::Ingress => f.write_str("ingress"),
+            Self::Control => f.write_str("control"),
+            Self::Lane(lane) => write!(f, "egress-{lane}"),
+        }
+    }
+}
+
+/// A setting that was left as it is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LeftAsIs {
+    /// The setting; its `new` value is not in force.
+    pub change: Change,
+    /// What must be started again for it.
+    pub restart: Restart,
+}
+
+impl fmt::Display for LeftAsIs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}; restart {}", self.change, self.restart)
+    }
+}
+
+/// What a changed file came to.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Reload {
+    /// What is in force from now on.
+    pub changed: Vec<Change>,
+    /// What differs and was left as it is.
+    pub needs_restart: Vec<LeftAsIs>,
+}
+
+impl Settings {
+    /// A number that differs when settings differ, between processes of one version of the program. The
+    /// content of a secret is not in it.
+    pub fn fingerprint(&self) -> u64 {
+        fnv1a(format!("{self:?}").as_bytes())
+    }
+
+    /// These settings with all that a running bridge can take over from `new`, and what became of each
+    /// difference.
+    pub fn reloaded(&self, new: Self) -> (Self, Reload) {
+        let mut differ = Differ::default();
+        let d = &mut differ;
+        routes(d, self, &new);
+        let lanes = lanes(d, &self.lanes, &new.lanes);
+        d.take("policy_hold_s", &seconds(self.policy_hold_ms), seconds(new.policy_hold_ms));
+        let (ingress, control) = (Restart::Ingress, Restart::Control);
+        let settings = Self {
+            instance: d.keep("instance", Restart::Bridge, &self.instance, &new.instance),
+            input: network(d, "ros", Restart::Bridge, &self.input, &new.input),
+            graph_gid_bytes: d.keep(
+                "ros.graph_gid_bytes",
+                Restart::Bridge,
+                &self.graph_gid_bytes,
+                &new.graph_gid_bytes,
+            ),
+            routes: self.routes.clone(),
+            shared_memory: shared_memory(d, &self.shared_memory, &new.shared_memory),
+            policy_hold_ms: new.policy_hold_ms,
+            ingress_scheduling: scheduling(
+                d,
+                "processes.ingress",
+                ingress,
+                &self.ingress_scheduling,
+                &new.ingress_scheduling,
+            ),
+            control_scheduling: scheduling(
+                d,
+                "processes.control",
+                control,
+                &self.control_scheduling,
+                &new.control_scheduling,
+            ),
+            classifier: classifier(d, &self.classifier, new.classifier),
+            probes: probes(d, &self.probes, new.probes),
+            safety: safety(d, &self.safety, new.safety),
+            security: security(d, &self.security, new.security),
+            diagnostics: diagnostics(d, &self.diagnostics, new.diagnostics),
+            overrides: overrides(d, &self.overrides, new.overrides),
+            subscribers: subscribers(d, &lanes, &self.subscribers, new.subscribers),
+            lanes,
+        };
+        (settings, differ.0)
+    }
+}
+
+/// Collects the differences.
+#[derive(Default)]
+struct Differ(Reload);
+
+impl Differ {
+    /// A setting that is taken over.
+    fn take<T: PartialEq + Shown>(&mut self, key: &str, old: &T, new: T) -> T {
+        if *old != new {
+            self.0.changed.push(Change { key: key.to_owned(), old: old.shown(), new: new.shown() });
+        }
+        new
+    }
+
+    /// A setting that is left as it is.
+    fn keep<T: Clone + PartialEq + Shown>(&mut self, key: &str, restart: Restart, old: &T, new: &T) -> T {
+        if old != new {
+            let change = Change { key: key.to_owned(), old: old.shown(), new: new.shown() };
+            self.0.needs_restart.push(LeftAsIs { change, restart });
+        }
+        old.clone()
+    }
+}
+
+fn seconds(ms: u64) -> f64 {
+    ms as f64 / 1_000.0
+}
+
+fn network(d: &mut Differ, of: &str, restart: Restart, old: &DdsNetwork, new: &DdsNetwork) -> DdsNetwork {
+    DdsNetwork {
+        domain_id: d.keep(&format!("{of}.domain_id"), restart.clone(), &old.domain_id, &new.domain_id),
+        interfaces: d.keep(&format!("{of}.networks"), restart, &old.interfaces, &new.interfaces),
+    }
+}
+
+fn shared_memory(d: &mut Differ, old: &SharedMemory, new: &SharedMemory) -> SharedMemory {
+    SharedMemory {
+        root_path: d.keep("shared_memory.root_path", Restart::Bridge, &old.root_path, &new.root_path),
+        max_taps: d.keep("shared_memory.max_taps", Restart::Bridge, &old.max_taps, &new.max_taps),
+    }
+}
+
+fn scheduling(d: &mut Differ, of: &str, restart: Restart, old: &Scheduling, new: &Scheduling) -> Scheduling {
+    let key = |name: &str| format!("{of}.scheduling.{name}");
+    Scheduling {
+        policy: d.keep(&key("policy"), restart.clone(), &old.policy, &new.policy),
+        priority: d.keep(&key("priority"), restart.clone(), &old.priority, &new.priority),
+        cpus: d.keep(&key("cpus"), restart.clone(), &old.cpus, &new.cpus),
+        lock_memory: d.keep(&key("lock_memory"), restart, &old.lock_memory, &new.lock_memory),
+    }
+}
+
+/// The routes are left as they are, whatever differs.
+fn routes(d: &mut Differ, old: &Settings, new: &Settings) {
+    let ids = |settings: &Settings| -> Vec<String> {
+        settings.routes.iter().map(|route| route.id.to_string()).collect()
+    };
+    d.keep("topics", Restart::Bridge, &ids(old), &ids(new));
+    for (index, route) in old.routes.iter().enumerate() {
+        let same_id = |other: &&Route| other.id == route.id;
+        if let Some(other) = new.routes.iter().find(same_id) {
+            compare_route(d, route, other);
+            for lane in &old.lanes {
+                if let Some(other_lane) = new.lane(&lane.name) {
+                    let output = lane.outputs.iter().find(|output| output.route == index);
+                    let other = output_of(new, other_lane, &route.id);
+                    compare_output(d, &route.id, &lane.name, output, other);
+                }
+            }
+        }
+    }
+}
+
+fn output_of<'a>(settings: &Settings, lane: &'a Lane, id: &RouteId) -> Option<&'a Output> {
+    lane.outputs.iter().find(|output| settings.routes.get(output.route).is_some_and(|route| route.id == *id))
+}
+
+fn compare_route(d: &mut Differ, old: &Route, new: &Route) {
+    let Route { id, input_topic, message_type, input_qos, max_sample_bytes, retained_samples } = old;
+    let key = |name: &str| format!("topics[{id}].{name}");
+    d.keep(&key("input_topic"), Restart::Bridge, input_topic, &new.input_topic);
+    d.keep(&key("message_type"), Restart::Bridge, message_type, &new.message_type);
+    d.keep(&key("max_sample_bytes"), Restart::Bridge, max_sample_bytes, &new.max_sample_bytes);
+    d.keep(&key("retained_samples"), Restart::Bridge, retained_samples, &new.retained_samples);
+    let InputQos { reliability, durability, history, deadline_ms } = input_qos;
+    let key = |name: &str| format!("topics[{id}].qos_overrides.input.{name}");
+    d.keep(&key("reliability"), Restart::Ingress, reliability, &new.input_qos.reliability);
+    d.keep(&key("durability"), Restart::Ingress, durability, &new.input_qos.durability);
+    d.keep(&key("history"), Restart::Ingress, history, &new.input_qos.history);
+    d.keep(&key("deadline_ms"), Restart::Ingress, deadline_ms, &new.input_qos.deadline_ms);
+}
+
+fn compare_output(d: &mut Differ, id: &RouteId, lane: &LaneName, old: Option<&Output>, new: Option<&Output>) {
+    let (Some(old), Some(new)) = (old, new) else {
+        // Which lanes serve a route decides how its samples are shared out in memory.
+        let key = format!("topics[{id}].lanes.{lane}");
+        d.keep(&key, Restart::Bridge, &old.is_some(), &new.is_some());
+        return;
+    };
+    let Output { route: _, topic, qos } = old;
+    let restart = || Restart::Lane(lane.to_string());
+    d.keep(&format!("topics[{id}].outputs.{lane}"), restart(), topic, &new.topic);
+    let QosProfile { reliability, history, durability, lifespan_ms, deadline_ms } = qos;
+    let key = |name: &str| format!("topics[{id}].qos_overrides.{lane}.{name}");
+    d.keep(&key("reliability"), restart(), reliability, &new.qos.reliability);
+    d.keep(&key("history"), restart(), history, &new.qos.history);
+    d.keep(&key("durability"), restart(), durability, &new.qos.durability);
+    d.keep(&key("lifespan_ms"), restart(), lifespan_ms, &new.qos.lifespan_ms);
+    d.keep(&key("deadline_ms"), restart(), deadline_ms, &new.qos.deadline_ms);
+}
+
+fn lanes(d: &mut Differ, old: &[Lane], new: &[Lane]) -> Vec<Lane> {
+    let names = |lanes: &[Lane]| -> Vec<LaneName> { lanes.iter().map(|lane| lane.name.clone()).collect() };
+    d.keep("lanes", Restart::Bridge, &names(old), &names(new));
+    let reloaded = old.iter().map(|lane| match new.iter().find(|other| other.name == lane.name) {
+        Some(other) => reload_lane(d, lane, other),
+        None => lane.clone(),
+    });
+    reloaded.collect()
+}
+
+fn reload_lane(d: &mut Differ, old: &Lane, new: &Lane) -> Lane {
+    let of = format!("lanes.{}", old.name);
+    let key = |name: &str| format!("{of}.{name}");
+    let restart = || Restart::Lane(old.name.to_string());
+    let depth = d.keep(&key("queue_depth"), Restart::Bridge, &old.queue_depth, &new.queue_depth);
+    let borrowed = d.keep(&key("max_borrowed"), Restart::Bridge, &old.max_borrowed, &new.max_borrowed);
+    Lane {
+        name: old.name.clone(),
+        class: old.class,
+        network: network(d, &of, restart(), &old.network, &new.network),
+        outputs: old.outputs.clone(),
+        queue_depth: depth,
+        max_borrowed: borrowed,
+        by_reference_min_bytes: d.keep(
+            &key("by_reference_min_bytes"),
+            restart(),
+            &old.by_reference_min_bytes,
+            &new.by_reference_min_bytes,
+        ),
+        window_samples: d.keep(&key("window_samples"), restart(), &old.window_samples, &new.window_samples),
+        rates: lane_rates(d, old, new),
+        scheduling: scheduling(d, &of, restart(), &old.scheduling, &new.scheduling),
+    }
+}
+
+fn lane_rates(d: &mut Differ, old: &Lane, new: &Lane) -> LaneRates {
+    // What waits in the lane occupies shared memory, which was shared out at the start.
+    let would_borrow = Lane { rates: new.rates, ..old.clone() }.max_borrowed_in_all();
+    let has_room = old.class == TrafficClass::Critical || would_borrow == old.max_borrowed_in_all();
+    let LaneRates { normal, degraded } = &old.rates;
+    LaneRates {
+        normal: rate_policy(d, &old.name, ["", ""], has_room, normal, new.rates.normal),
+        degraded: rate_policy(
+            d,
+            &old.name,
+            ["degraded_", " in DEGRADED"],
+            has_room,
+            degraded,
+            new.rates.degraded,
+        ),
+    }
+}
+
+/// The rates of a mode, which is `[0]` before a key that there is for each mode, and `[1]` behind one that is
+/// for both.
+fn rate_policy(
+    d: &mut Differ,
+    lane: &LaneName,
+    mode: [&str; 2],
+    has_room: bool,
+    old: &RatePolicy,
+    new: RatePolicy,
+) -> RatePolicy {
+    let [before, behind] = mode;
+    let key = |name: &str| format!("lanes.{lane}.{before}{name}");
+    let common_key = |name: &str| format!("lanes.{lane}.{name}{behind}");
+    let rate_key = if before.is_empty() { key("max_rate_hz") } else { key("rate_hz") };
+    RatePolicy {
+        max_rate_hz: d.take(&rate_key, &old.max_rate_hz, new.max_rate_hz),
+        max_bytes_per_s: d.take(&key("max_bytes_per_s"), &old.max_bytes_per_s, new.max_bytes_per_s),
+        stale_threshold_ms: d.take(
+            &key("stale_threshold_ms"),
+            &old.stale_threshold_ms,
+            new.stale_threshold_ms,
+        ),
+        drop_policy: d.take(&common_key("drop_policy"), &old.drop_policy, new.drop_policy),
+        queue_samples: if has_room {
+            d.take(&common_key("queue_samples"), &old.queue_samples, new.queue_samples)
+        } else {
+            d.keep(&common_key("queue_samples"), Restart::Bridge, &old.queue_samples, &new.queue_samples)
+        },
+    }
+}
+
+/// A structure all of whose fields are taken over, each with the last part of its key.
+macro_rules! take_each {
+    ($d:ident, $of:literal, $old:expr, $new:expr, $type:ident { $($field:ident: $key:literal),+ $(,)? }) => {
+        $type { $($field: $d.take(concat!($of, ".", $key), &$old.$field, $new.$field)),+ }
+    };
+}
+
+fn classifier(d: &mut Differ, old: &Classifier, new: Classifier) -> Classifier {
+    Classifier {
+        enabled: d.take("classifier.enabled", &old.enabled, new.enabled),
+        subscriber_id: d.take("classifier.subscriber_id", &old.subscriber_id, new.subscriber_id),
+        evaluate_rate_hz: d.take("classifier.evaluate_rate_hz", &old.evaluate_rate_hz, new.evaluate_rate_hz),
+        thresholds: take_each!(
+            d,
+            "classifier",
+            old.thresholds,
+            new.thresholds,
+            ClassifierThresholds {
+                demote_loss: "demote_loss_threshold",
+                promote_loss: "promote_loss_threshold",
+                demote_rtt_ms: "demote_rtt_ms",
+                promote_rtt_ms: "promote_rtt_ms",
+                hysteresis_count: "hysteresis_count",
+                allow_unknown_state: "allow_unknown_state",
+            }
+        ),
+    }
+}
+
+fn probes(d: &mut Differ, old: &Probes, new: Probes) -> Probes {
+    let key = |name: &str| format!("probes.{name}");
+    let control = Restart::Control;
+    Probes {
+        enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
+        rate_hz: d.take(&key("rate_hz"), &old.rate_hz, new.rate_hz),
+        rtt_threshold_ms: d.take(&key("rtt_threshold_ms"), &old.rtt_threshold_ms, new.rtt_threshold_ms),
+        loss_threshold: d.take(&key("loss_threshold"), &old.loss_threshold, new.loss_threshold),
+        jitter_threshold_ms: d.take(
+            &key("jitter_threshold_ms"),
+            &old.jitter_threshold_ms,
+            new.jitter_threshold_ms,
+        ),
+        window_size: d.take(&key("window_size"), &old.window_size, new.window_size),
+        hysteresis_count: d.take(&key("hysteresis_count"), &old.hysteresis_count, new.hysteresis_count),
+        timeout_ms: d.take(&key("timeout_ms"), &old.timeout_ms, new.timeout_ms),
+        request_topic: d.keep(&key("request_topic"), control.clone(), &old.request_topic, &new.request_topic),
+        response_topic: d.keep(&key("response_topic"), control, &old.response_topic, &new.response_topic),
+    }
+}
+
+fn safety(d: &mut Differ, old: &Safety, new: Safety) -> Safety {
+    Safety {
+        evaluate_rate_hz: d.take("safety.evaluate_rate_hz", &old.evaluate_rate_hz, new.evaluate_rate_hz),
+        rules: take_each!(
+            d,
+            "safety",
+            old.rules,
+            new.rules,
+            SafetyRules {
+                preserve_critical_path: "preserve_critical_path",
+                allow_noncritical_degrade: "allow_noncritical_degrade",
+                max_noncritical_queue: "max_noncritical_queue",
+                overload_drop_noncritical_first: "overload_drop_noncritical_first",
+                degraded_lag_ms: "degraded_lag_ms",
+                emergency_lag_ms: "emergency_lag_ms",
+                degraded_queue_occupancy: "degraded_queue_occupancy",
+                emergency_queue_occupancy: "emergency_queue_occupancy",
+                degraded_errors_per_s: "degraded_errors_per_s",
+                emergency_errors_per_s: "emergency_errors_per_s",
+                silent_ms: "silent_ms",
+                emergency_silent_ms: "emergency_silent_ms",
+                hysteresis_count: "hysteresis_count",
+                recovery_count: "recovery_count",
+            }
+        ),
+    }
+}
+
+fn security(d: &mut Differ, old: &Security, new: Security) -> Security {
+    let key = |name: &str| format!("security.{name}");
+    Security {
+        trust_mode: d.take(&key("trust_mode"), &old.trust_mode, new.trust_mode),
+        enable_probe_hmac: d.take(&key("enable_probe_hmac"), &old.enable_probe_hmac, new.enable_probe_hmac),
+        secret: d.take(&key("hmac_secret"), &old.secret, new.secret),
+        replay_window_ms: d.take(&key("replay_window_ms"), &old.replay_window_ms, new.replay_window_ms),
+        max_probe_rate_hz: d.take(&key("max_probe_rate_hz"), &old.max_probe_rate_hz, new.max_probe_rate_hz),
+        allow_legacy_node_name_overrides: d.take(
+            &key("allow_legacy_node_name_overrides"),
+            &old.allow_legacy_node_name_overrides,
+            new.allow_legacy_node_name_overrides,
+        ),
+    }
+}
+
+fn diagnostics(d: &mut Differ, old: &Diagnostics, new: Diagnostics) -> Diagnostics {
+    let key = |name: &str| format!("diagnostics.{name}");
+    let interval_s = [old.publish_interval_ms, new.publish_interval_ms].map(seconds);
+    d.take(&key("publish_interval_s"), &interval_s[0], interval_s[1]);
+    Diagnostics {
+        enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
+        publish_interval_ms: new.publish_interval_ms,
+        topic: d.keep(&key("topic"), Restart::Control, &old.topic, &new.topic),
+        verbosity: d.take(&key("verbosity"), &old.verbosity, new.verbosity),
+        metrics: d.keep(&key("metrics"), Restart::Control, &old.metrics, &new.metrics),
+    }
+}
+
+type BySubscriber<T> = BTreeMap<String, T>;
+
+fn overrides<T: Clone + PartialEq + Shown>(
+    d: &mut Differ,
+    old: &BySubscriber<T>,
+    new: BySubscriber<T>,
+) -> BySubscriber<T> {
+    compare_entries(d, "overrides", old, &new);
+    new
+}
+
+/// A subscriber on a lane that the bridge gets only with a restart stays where it is.
+fn subscribers(
+    d: &mut Differ,
+    lanes: &[Lane],
+    old: &BySubscriber<LaneName>,
+    new: BySubscriber<LaneName>,
+) -> BySubscriber<LaneName> {
+    let mut reloaded = BTreeMap::new();
+    for (id, lane) in new {
+        if lanes.iter().any(|there| there.name == lane) {
+            reloaded.insert(id, lane);
+        } else {
+            let before = old.get(&id).cloned();
+            let kept = d.keep(&format!("subscribers.{id}"), Restart::Bridge, &before, &Some(lane));
+            reloaded.extend(kept.map(|lane| (id, lane)));
+        }
+    }
+    compare_entries(d, "subscribers", old, &reloaded);
+    reloaded
+}
+
+fn compare_entries<T: Clone + PartialEq + Shown>(
+    d: &mut Differ,
+    of: &str,
+    old: &BySubscriber<T>,
+    new: &BySubscriber<T>,
+) {
+    for id in old.keys().chain(new.keys().filter(|id| !old.contains_key(*id))) {
+        d.take(&format!("{of}.{id}"), &old.get(id).cloned(), new.get(id).cloned());
+    }
+}

@@ -1,0 +1,371 @@
+//! Reload on a bridge that really runs: the shipped binary, real shared memory, real signals, under a flow of
+//! 200 samples per second. Domains 110 to 114.
+
+mod support;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use adaptive_bridge::clock;
+use adaptive_bridge::config::{self, DdsNetwork, Settings};
+use adaptive_bridge::dds::{
+    Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take, WriterEvent,
+};
+use adaptive_bridge::model::{
+    Durability, Encapsulation, ProcessHealth, QosProfile, Reliability, SourceTimestamp,
+};
+use adaptive_bridge::shm::{Boards, BridgeShape, ProcessRole};
+use bytes::Bytes;
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use support::bridge::Bridge;
+use support::process::{self, Process};
+use support::{wait_for, wait_until};
+
+const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
+
+/// The file of a bridge of one route; `more` is what it says beside.
+fn file(domain_id: u16, more: &str) -> String {
+    format!(
+        "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
+         topics: [{{id: scan, input_topic: /scan, max_sample_bytes: 1024}}]\n\
+         shared_memory: {{root_path: {{folder}}/root}}\n{more}"
+    )
+}
+
+fn settings(bridge: &Bridge) -> Settings {
+    config::load(Some(&bridge.config()), &|name| std::env::var(name).ok()).unwrap()
+}
+
+/// What ingress and the two lanes show of themselves, of the bridge as these settings describe it.
+fn healths(settings: &Settings) -> Option<[ProcessHealth; 3]> {
+    let root = settings.shared_memory.root_path.as_deref().unwrap();
+    let boards = Boards::find(root, &settings.instance, &BridgeShape::of(settings)).ok()??;
+    let roles = [ProcessRole::Ingress, ProcessRole::Egress(0), ProcessRole::Egress(1)];
+    let healths = roles.map(|role| boards.health(role).unwrap());
+    healths.iter().all(|health| health.turns > 0).then_some(healths)
+}
+
+/// Starts the whole bridge; yields it when every process turns, with what the processes show then.
+fn up(bridge: &Bridge) -> (Process, [ProcessHealth; 3]) {
+    let settings = settings(bridge);
+    let process = bridge.start("up");
+    let healths = wait_for("all processes", || healths(&settings));
+    assert!(healths.iter().all(|health| health.settings_fingerprint == settings.fingerprint()));
+    (process, healths)
+}
+
+fn participant(name: &str, domain_id: u16) -> Participant {
+    Participant::open(&ParticipantOptions {
+        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
+        namespace: "/reload".into(),
+        node_name: name.into(),
+        graph_gid_bytes: 16,
+    })
+    .unwrap()
+}
+
+/// A subscriber of the critical lane, and a publisher of about 200 numbered samples per second that has begun
+/// when the bridge has matched both.
+struct Flow {
+    reader: RawReader,
+    received: Vec<u32>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<u32>>,
+    _participants: [Participant; 2],
+}
+
+impl Flow {
+    fn start(bridge: &Bridge, domain_id: u16) -> Self {
+        let mut publisher = participant("publisher", domain_id);
+        let writer: RawWriter =
+            publisher.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
+        wait_until("ingress to match the publisher", || {
+            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
+        });
+        let mut subscriber = participant("subscriber", domain_id);
+        let qos = ReaderQos {
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            depth: 100_000,
+            deadline_ms: None,
+        };
+        let reader = subscriber.create_reader("rt/adaptive_bridge/critical/scan", TYPE, &qos).unwrap();
+        bridge.wait_status("the subscriber", |status| lane(status, "critical")["readers"] == 1);
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let mut number = 0_u32;
+            while !asked.load(Ordering::Relaxed) {
+                let payload = [number.to_le_bytes(), [0; 4]].concat();
+                let stamp = SourceTimestamp::from_wall(clock::wall());
+                writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
+                number += 1;
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            // Until the last one has been acknowledged, the writer must stay.
+            writer.wait_acknowledged(support::patience());
+            number
+        });
+        let participants = [publisher, subscriber];
+        Self { reader, received: Vec::new(), stop, thread: Some(thread), _participants: participants }
+    }
+
+    fn receive(&mut self) {
+        let received = &mut self.received;
+        let mut lend = |payload: &[u8], _| {
+            received.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
+        };
+        while self.reader.take(&mut lend) != Take::Empty {}
+    }
+
+    /// Ends the flow: every sample has reached the critical subscriber, in order, and the bridge can account
+    /// for each on both lanes.
+    fn end_whole(mut self, bridge: &Bridge) {
+        self.stop.store(true, Ordering::Relaxed);
+        let sent = self.thread.take().unwrap().join().unwrap();
+        wait_until("every sample at the critical subscriber", || {
+            self.receive();
+            self.received.len() >= sent as usize
+        });
+        assert_eq!(self.received, (0..sent).collect::<Vec<_>>());
+        let status = bridge.wait_status("every sample accounted for", |status| {
+            let settled = |name| {
+                let lane = lane(status, name);
+                lane["received"] == sent && lane["waiting"] == 0
+            };
+            settled("critical") && settled("noncritical")
+        });
+        assert_eq!(status["routes"][0]["whole"], true, "{status}");
+        for name in ["critical", "noncritical"] {
+            assert_eq!(lane(&status, name)["whole"], true, "{status}");
+        }
+        assert_eq!(lane(&status, "critical")["forwarded"], sent, "{status}");
+    }
+}
+
+impl Drop for Flow {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
+    let lanes = status["routes"][0]["lanes"].as_array().unwrap();
+    lanes.iter().find(|lane| lane["lane"] == name).unwrap()
+}
+
+/// Waits until the noncritical lane forwards at about that rate.
+fn wait_rate(bridge: &Bridge, hz: f64) {
+    wait_for(&format!("{hz} Hz"), || {
+        let output = bridge.run("status --json --interval-ms 2000");
+        let status: Value = serde_json::from_slice(&output.stdout).ok()?;
+        let rate_hz = lane(&status, "noncritical")["rate_hz"].as_f64()?;
+        (rate_hz > 0.85 * hz && rate_hz < 1.15 * hz).then_some(())
+    });
+}
+
+/// Runs `reload`: its exit code, and all that it said.
+fn reload(bridge: &Bridge) -> (Option<i32>, String) {
+    let output = bridge.run("reload");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout) + &text(&output.stderr))
+}
+
+fn assert_says(said: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(said.contains(part), "{part:?} is not in:\n{said}");
+    }
+}
+
+/// The processes are the same as before, and were not restarted.
+fn assert_same_processes(before: &[ProcessHealth; 3], now: &[ProcessHealth; 3]) {
+    for (before, now) in before.iter().zip(now) {
+        assert_eq!((now.pid, now.starts), (before.pid, before.starts));
+    }
+}
+
+#[test]
+fn rates_and_staleness_change_under_flow_and_no_sample_is_lost() {
+    let bridge = Bridge::new(&file(110, ""));
+    let (_up, before) = up(&bridge);
+    let flow = Flow::start(&bridge, 110);
+    wait_rate(&bridge, 10.0);
+
+    bridge.write_config(&file(
+        110,
+        "lanes: {noncritical: {max_rate_hz: 20, stale_threshold_ms: 100, queue_samples: 2}}\npolicy_hold_s: 9",
+    ));
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(0), "{said}");
+    assert_says(
+        &said,
+        &[
+            "changed: lanes.noncritical.max_rate_hz: 10 -> 20\n",
+            "changed: lanes.noncritical.stale_threshold_ms: 200 -> 100\n",
+            "changed: lanes.noncritical.queue_samples: 5 -> 2\n",
+            "changed: policy_hold_s: 5 -> 9\n",
+            &format!("egress-noncritical (pid {}): reloaded\n", before[2].pid),
+            &format!("ingress (pid {}): reloaded\n", before[0].pid),
+        ],
+    );
+    assert!(!said.contains("restarted"), "{said}");
+    wait_rate(&bridge, 20.0);
+    let after = healths(&settings(&bridge)).unwrap();
+    assert_same_processes(&before, &after);
+    let fingerprint = settings(&bridge).fingerprint();
+    assert!(after.iter().all(|health| health.settings_fingerprint == fingerprint), "{after:?}");
+
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(0), "{said}");
+    assert_says(&said, &["): nothing differs\n"]);
+    flow.end_whole(&bridge);
+}
+
+#[test]
+fn a_bad_file_changes_nothing_and_is_reported() {
+    let bridge = Bridge::new(&file(111, ""));
+    let good = settings(&bridge);
+    let (up, before) = up(&bridge);
+    let flow = Flow::start(&bridge, 111);
+    bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: -1}}\nclassifyer: {}"));
+
+    // The command asks nobody.
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(78), "{said}");
+    assert_says(&said, &["lanes.noncritical.max_rate_hz = -1: must be", "did you mean `classifier`?"]);
+    assert!(healths(&good).unwrap().iter().all(|health| health.refused_reloads == 0));
+
+    // A signal does, and each process refuses, names all problems and counts.
+    up.signal(Signal::SIGHUP);
+    wait_until("every process to refuse", || {
+        healths(&good).unwrap().iter().all(|health| health.refused_reloads == 1)
+    });
+    for part in ["max_rate_hz = -1", "did you mean `classifier`?", "nothing is changed"] {
+        up.wait_for_log(part);
+    }
+    let after = healths(&good).unwrap();
+    assert_same_processes(&before, &after);
+    assert!(after.iter().all(|health| health.settings_fingerprint == good.fingerprint()), "{after:?}");
+    // `status` needs a good file, too; nobody is told of this one.
+    bridge.write_config(&file(111, ""));
+    wait_rate(&bridge, 10.0);
+
+    bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: 5}}"));
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(0), "{said}");
+    wait_rate(&bridge, 5.0);
+    assert!(healths(&good).unwrap().iter().all(|health| health.refused_reloads == 1));
+    flow.end_whole(&bridge);
+}
+
+#[test]
+fn what_needs_a_restart_is_named_and_left_as_it_is() {
+    let bridge = Bridge::new(&file(112, ""));
+    let old = settings(&bridge);
+    let (_up, before) = up(&bridge);
+    let flow = Flow::start(&bridge, 112);
+    bridge.write_config(&file(
+        112,
+        "lanes: {rviz: {}, noncritical: {domain_id: 113, max_rate_hz: 20}}\n\
+         subscribers: {laptop: rviz, tablet: noncritical}",
+    ));
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(0), "{said}");
+    assert_says(
+        &said,
+        &[
+            "changed: lanes.noncritical.max_rate_hz: 10 -> 20\n",
+            "changed: subscribers.tablet: none -> noncritical\n",
+            "left as it is until egress-noncritical is restarted: lanes.noncritical.domain_id: 112 -> 113\n",
+            "left as it is until the whole bridge is restarted: lanes: [critical, noncritical] -> \
+             [critical, noncritical, rviz]\n",
+            "left as it is until the whole bridge is restarted: subscribers.laptop: none -> rviz\n",
+        ],
+    );
+    let (in_force, _) = old.reloaded(settings(&bridge));
+    let after = healths(&old).unwrap();
+    assert_same_processes(&before, &after);
+    assert!(after.iter().all(|health| health.settings_fingerprint == in_force.fingerprint()), "{after:?}");
+    // The command line reads the old shape of the bridge only with the old file.
+    bridge.write_config(&file(112, "lanes: {noncritical: {max_rate_hz: 20}}"));
+    wait_rate(&bridge, 20.0);
+    flow.end_whole(&bridge);
+}
+
+#[test]
+fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
+    let bridge = Bridge::new(&file(113, ""));
+    let started = settings(&bridge);
+    let mut up_process = bridge.start("up");
+    // From the first child on, while it starts.
+    up_process.wait_for_log("started");
+    let before = wait_for("all processes", || {
+        up_process.signal(Signal::SIGHUP);
+        healths(&started)
+    });
+    assert!(before.iter().all(|health| health.starts == 1), "{before:?}\n{}", up_process.log());
+    let flow = Flow::start(&bridge, 113);
+    let storm = || {
+        for round in 0..100 {
+            let rate_hz = 10 + round % 2 * 10;
+            bridge.write_config(&file(113, &format!("lanes: {{noncritical: {{max_rate_hz: {rate_hz}}}}}")));
+            up_process.signal(Signal::SIGHUP);
+            for health in &before {
+                process::signal(health.pid as i32, Signal::SIGHUP);
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    };
+    storm();
+    let last = settings(&bridge);
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(0), "{said}");
+    let after = healths(&last).unwrap();
+    assert_same_processes(&before, &after);
+    assert!(after.iter().all(|health| health.settings_fingerprint == last.fingerprint()), "{after:?}");
+    flow.end_whole(&bridge);
+
+    // Also while they stop.
+    up_process.signal(Signal::SIGTERM);
+    for _ in 0..50 {
+        if up_process.is_running() {
+            up_process.signal(Signal::SIGHUP);
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert_eq!(up_process.wait().code(), Some(0));
+}
+
+#[test]
+fn a_process_that_does_not_answer_is_named_and_nobody_else_is_signalled() {
+    let bridge = Bridge::new(&file(114, ""));
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(1), "{said}");
+    assert_says(&said, &["no bridge runs as instance"]);
+
+    let ingress = bridge.start("ingress");
+    let mut critical = bridge.start("egress --lane critical");
+    bridge.wait_status("both processes", |status| {
+        let processes = status["processes"].as_array().unwrap();
+        processes.iter().filter(|process| process["state"] == "running").count() == 2
+    });
+    // One that died leaves its number behind, and somebody else may have it by now.
+    let lock = bridge.folder().join("root").join(bridge.instance()).join("role-egress-critical.lock");
+    critical.kill9();
+    let mut stranger = std::process::Command::new("sleep").arg("1000").spawn().unwrap();
+    std::fs::write(&lock, format!("{}\n", stranger.id())).unwrap();
+    ingress.stop();
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(1), "{said}");
+    assert_says(&said, &[&format!("ingress (pid {}): no answer", ingress.pid())]);
+    assert!(!said.contains("egress-critical"), "{said}");
+    assert!(stranger.try_wait().unwrap().is_none(), "a stranger was signalled");
+    stranger.kill().unwrap();
+    stranger.wait().unwrap();
+
+    ingress.cont();
+    wait_until("ingress to go on", || reload(&bridge).0 == Some(0));
+}
