@@ -15,7 +15,9 @@ mod sample;
 mod thresholds;
 mod time;
 
-pub use control::{ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord, SubscriberWarning};
+pub use control::{
+    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord, SubscriberWarning,
+};
 pub use drops::{DropCounts, DropReason};
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, ProcessHealth, RouteInfo,

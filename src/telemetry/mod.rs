@@ -5,11 +5,20 @@ mod liveness;
 mod logs;
 mod problems;
 mod report;
+#[cfg(test)]
+mod samples;
 mod snapshot;
 mod table;
+mod text;
 
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use liveness::ProcessState;
 pub use logs::start_logs;
-pub use report::{Drops, LaneReport, Latency, OutputReport, ProcessReport, Report, RouteReport};
-pub use snapshot::{LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot};
+pub use problems::{Level, Problem};
+pub use report::{
+    Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
+    Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+};
+pub use snapshot::{
+    LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
+};

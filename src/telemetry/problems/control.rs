@@ -1,0 +1,150 @@
+//! What control found to be wrong, and what is wrong with control and the settings.
+
+use super::{Level, Problem};
+use crate::model::{MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
+use crate::shm::ProcessRole;
+use crate::telemetry::report::SubscriberReport;
+use crate::telemetry::snapshot::Snapshot;
+use crate::telemetry::text::printable;
+
+/// Control is asked for and never ran. One that ran and is gone is named among the processes.
+pub(super) fn missing(now: &Snapshot) -> Option<Problem> {
+    let ran = now.processes.iter().any(|process| process.role == ProcessRole::Control);
+    (now.needs_control && !ran).then(|| {
+        let text = "control was never started: nobody is probed, and lanes stay in their default modes";
+        Problem::new("control", Level::Warn, text.to_owned())
+    })
+}
+
+/// The safety supervisor has taken something away.
+pub(super) fn safety(now: &Snapshot) -> Option<Problem> {
+    let mode = now.control.safety();
+    let (level, consequence) = match mode {
+        SafetyMode::Normal => return None,
+        SafetyMode::Degraded => (Level::Warn, "the noncritical lanes are suspended"),
+        SafetyMode::Emergency => (Level::Error, "all forwarding is stopped"),
+    };
+    let why = match now.control.safety_reason.as_str() {
+        "" => String::new(),
+        reason => format!(": {}", printable(reason)),
+    };
+    Some(Problem::new("safety", level, format!("safety is {mode}, {consequence}{why}")))
+}
+
+/// Processes that apply different settings, and files that were refused.
+pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
+    let mut problems = Vec::new();
+    let mut groups: Vec<(u64, Vec<&str>)> = Vec::new();
+    for process in now.processes.iter().filter(|process| process.state.exists()) {
+        let fingerprint = process.health.settings_fingerprint;
+        match groups.iter_mut().find(|(known, _)| *known == fingerprint) {
+            _ if fingerprint == 0 => {}
+            Some((_, names)) => names.push(&process.name),
+            None => groups.push((fingerprint, vec![&process.name])),
+        }
+    }
+    if groups.len() > 1 {
+        let groups: Vec<String> = groups.iter().map(|(_, names)| names.join(" and ")).collect();
+        let text = format!(
+            "the processes apply different settings: {}; reload or restart those that are behind",
+            groups.join(" other ones than ")
+        );
+        problems.push(Problem::new("bridge", Level::Warn, text));
+    }
+    for process in &now.processes {
+        let Some(former) = before.processes.iter().find(|former| former.name == process.name) else {
+            continue;
+        };
+        let grown = |now: u64, before: u64| now.checked_sub(before).filter(|&count| count > 0);
+        let about = match process.role {
+            ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), super::about_lane),
+            ProcessRole::Ingress | ProcessRole::Control => process.name.clone(),
+        };
+        if grown(process.health.refused_reloads, former.health.refused_reloads).is_some() {
+            let text = format!(
+                "{} refused a reload just now and goes on with its former settings; `adaptive-bridge check` \
+                 says what is wrong with the file",
+                process.name
+            );
+            problems.push(Problem::new(about.clone(), Level::Warn, text));
+        }
+        if let Some(errors) = grown(process.health.errors, former.health.errors) {
+            let text = format!("{}: {errors} errors just now; its log names them", process.name);
+            problems.push(Problem::new(about, Level::Warn, text));
+        }
+    }
+    problems
+}
+
+/// Subscribers whose link is bad, or of whom nothing is heard.
+pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
+    now.subscribers.iter().filter_map(|subscriber| {
+        let record = &subscriber.record;
+        let report = now.subscriber_report(subscriber);
+        let degraded = record.state() == SubscriberState::Noncritical && record.forced == 0;
+        let (level, what) = if record.settled > 0 && record.lost >= record.settled {
+            let heard = match report.last_response_age_ms {
+                Some(age_ms) => format!("does not answer for {:.0} s", age_ms / 1e3),
+                None => "has never answered".to_owned(),
+            };
+            (Level::Stale, format!("{heard}; does `adaptive-bridge responder --id {}` run there?", report.id))
+        } else if degraded {
+            (Level::Warn, format!("is NONCRITICAL: {}", report.figures()))
+        } else if report.warnings.is_empty() {
+            return None;
+        } else {
+            (
+                Level::Warn,
+                format!(
+                    "is above its warning threshold of {}: {}",
+                    report.warnings.join(", "),
+                    full_figures(&report)
+                ),
+            )
+        };
+        let on_lane = report.lane.as_ref().map_or(String::new(), |lane| format!(" on lane {lane}"));
+        let text = format!("subscriber {}{on_lane} {what}", report.id);
+        Some(Problem::new(format!("subscriber {}", report.id), level, text))
+    })
+}
+
+fn full_figures(report: &SubscriberReport) -> String {
+    let jitter = report.jitter_ms.map_or(String::new(), |ms| format!(", jitter {ms:.1} ms"));
+    format!("{}{jitter}", report.figures())
+}
+
+/// Remote readers that take samples past the bridge, each with what mends it.
+pub(super) fn intruders(now: &Snapshot) -> Vec<Problem> {
+    let warn = |text| Problem::new("intruders", Level::Warn, text);
+    let mut problems: Vec<Problem> = now
+        .intruders
+        .iter()
+        .map(|intruder| {
+            let text = |text: &str| printable(text);
+            let node = match intruder.node.as_str() {
+                "" => "a node without a name".to_owned(),
+                node => text(node),
+            };
+            let (topic, host) = (text(intruder.topic.as_str()), text(intruder.host.as_str()));
+            let remedy = text(intruder.remedy.as_str());
+            warn(format!("{node} on {host} reads {topic} past the bridge: {remedy}"))
+        })
+        .collect();
+    let seen = now.control.intruders_seen;
+    if now.intruders.len() == MAX_INTRUDERS && seen > MAX_INTRUDERS as u64 {
+        problems.push(warn(format!("{seen} remote readers were seen past the bridge; no more are listed")));
+    }
+    problems
+}
+
+/// Messages on the probe topics that were not believed. Late responses are the link's and show as loss.
+pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
+    let refused = now.control.responses_refused.since(&before.control.responses_refused);
+    let refused = refused.iter().filter(|(reason, _)| *reason != ProbeRefusal::Late);
+    refused
+        .map(|(reason, count)| {
+            let text = format!("{count} probe messages refused just now: {} ({reason})", reason.meaning());
+            Problem::new("probes", Level::Warn, text)
+        })
+        .collect()
+}
