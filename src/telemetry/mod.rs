@@ -1,6 +1,8 @@
 //! What the processes show: readings of the boards, what they mean, and logs.
 
+mod diagnostics;
 mod intervals;
+mod json;
 mod liveness;
 mod logs;
 mod problems;
@@ -11,7 +13,9 @@ mod snapshot;
 mod table;
 mod text;
 
+pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
+pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};
 pub use liveness::ProcessState;
 pub use logs::start_logs;
 pub use problems::{Level, Problem};

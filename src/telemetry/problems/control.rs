@@ -139,7 +139,7 @@ pub(super) fn intruders(now: &Snapshot) -> Vec<Problem> {
 
 /// Messages on the probe topics that were not believed. Late responses are the link's and show as loss.
 pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
-    let refused = now.control.responses_refused.since(&before.control.responses_refused);
+    let refused = now.control.refused.since(&before.control.refused);
     let refused = refused.iter().filter(|(reason, _)| *reason != ProbeRefusal::Late);
     refused
         .map(|(reason, count)| {

@@ -124,7 +124,7 @@ impl Snapshot {
     }
 
     pub(super) fn probes_report(&self, earlier: &Self) -> ProbesReport {
-        let (now, before) = (&self.control.responses_refused, &earlier.control.responses_refused);
+        let (now, before) = (&self.control.refused, &earlier.control.refused);
         ProbesReport {
             sent: self.control.probes_sent,
             accepted: self.control.responses_accepted,
