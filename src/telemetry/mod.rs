@@ -5,6 +5,7 @@ mod intervals;
 mod json;
 mod liveness;
 mod logs;
+mod metrics;
 mod problems;
 mod report;
 #[cfg(test)]
@@ -18,6 +19,7 @@ pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};
 pub use liveness::ProcessState;
 pub use logs::start_logs;
+pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problems::{Level, Problem};
 pub use report::{
     Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
