@@ -13,6 +13,7 @@
 //! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, and why; the mildest that safety leaves it.
 //! - [`SafetySupervisor`]: the mode of the whole bridge.
 //! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
+//! - [`SubscriberWarnings`]: which figures of a subscriber are worth a warning.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
 mod classifier;
@@ -26,6 +27,7 @@ mod safety;
 mod sequence;
 mod staleness;
 mod token_bucket;
+mod warnings;
 
 pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
@@ -45,3 +47,4 @@ pub use safety::{
 pub use sequence::{SequenceTracker, Sighting};
 pub use staleness::{age_ns, is_stale};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
+pub use warnings::{SubscriberWarnings, WarningThresholds};
