@@ -1,7 +1,7 @@
 //! The metrics page: the report in the text format of Prometheus, and the server that hands it out.
 //!
 //! Names begin with `adaptive_bridge_`; counters end in `_total` and begin anew when the bridge does, times
-//! are in seconds. `docs/metrics.md` lists them.
+//! are in seconds. `docs/diagnostics.md` lists them.
 
 mod page;
 mod server;
@@ -179,29 +179,27 @@ fn outputs(page: &mut Page, report: &Report) {
             page.sample(&labels, Some(output.drops.0.get(*reason)));
         }
     }
-    let stages: [(&str, &str, fn(&OutputReport) -> &Latency); 3] = [
-        (
-            "adaptive_bridge_lane_shm_latency_seconds",
-            "From ingress to the lane, the wait for a token included. The sum is within 3.2 percent.",
-            |output| &output.shm,
-        ),
-        (
-            "adaptive_bridge_lane_dds_out_latency_seconds",
-            "Within the lane, up to its DDS writer. The sum is within 3.2 percent.",
-            |output| &output.dds_out,
-        ),
-        (
-            "adaptive_bridge_lane_sample_age_seconds",
-            "Age by the source timestamp when given to DDS. The sum is within 3.2 percent.",
-            |output| &output.age,
-        ),
-    ];
-    for (name, help, stage) in stages {
+    let mut each = |name, help: &str, stage: fn(&OutputReport) -> &Latency| {
         page.family(name, Histogram, help);
         for (route, output) in all() {
             page.histogram(&[("lane", &output.lane), ("route", &route.id)], &stage(output).total);
         }
-    }
+    };
+    each(
+        "adaptive_bridge_lane_shm_latency_seconds",
+        "From ingress to the lane, the wait for a token included. The sum is within 3.2 percent.",
+        |output| &output.shm,
+    );
+    each(
+        "adaptive_bridge_lane_dds_out_latency_seconds",
+        "Within the lane, up to its DDS writer. The sum is within 3.2 percent.",
+        |output| &output.dds_out,
+    );
+    each(
+        "adaptive_bridge_lane_sample_age_seconds",
+        "Age by the source timestamp when given to DDS. The sum is within 3.2 percent.",
+        |output| &output.age,
+    );
 }
 
 fn control(page: &mut Page, report: &Report) {
@@ -270,4 +268,36 @@ fn subscribers(page: &mut Page, report: &Report) {
 
 fn seconds(ms: Option<f64>) -> Option<Value> {
     ms.map(|ms| Value::from(ms / 1e3))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+    use crate::telemetry::samples::wide;
+
+    #[test]
+    fn every_metric_is_documented_with_its_type_and_labels() {
+        let documented: BTreeSet<String> = include_str!("../../../docs/diagnostics.md")
+            .lines()
+            .filter(|line| line.starts_with("| `adaptive_bridge_"))
+            .map(|line| line.rsplit_once(" | ").map_or(line, |(row, _meaning)| row).to_owned())
+            .collect();
+        let page = metrics_page(&wide());
+        let labels = |name: &str| -> String {
+            let sample = page.lines().find(|line| !line.starts_with('#') && line.starts_with(name));
+            let Some((_, labels)) = sample.and_then(|line| line.split_once('{')) else {
+                return String::new();
+            };
+            let names = labels.split("\",").filter_map(|label| label.split_once('=')).map(|(name, _)| name);
+            names.filter(|name| *name != "le").map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ")
+        };
+        let families = page.lines().filter_map(|line| line.strip_prefix("# TYPE "));
+        let found: BTreeSet<String> = families
+            .filter_map(|family| family.split_once(' '))
+            .map(|(name, kind)| format!("| `{name}` | {kind} | {}", labels(name)))
+            .collect();
+        assert_eq!(found, documented);
+    }
 }

@@ -148,3 +148,141 @@ pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{after, sound};
+    use super::*;
+    use crate::model::{FixedText, IntruderRecord, ProcessHealth, SubscriberRecord, SubscriberWarning};
+    use crate::telemetry::liveness::ProcessState;
+    use crate::telemetry::snapshot::{ProcessReading, SubscriberReading};
+
+    fn subscriber(change: impl FnOnce(&mut SubscriberRecord)) -> Vec<String> {
+        let mut record = SubscriberRecord {
+            id: FixedText::new("laptop"),
+            settled: 50,
+            lost: 1,
+            rtt_mean_us: 81_250,
+            jitter_us: 30_000,
+            state: SubscriberState::Critical as u8,
+            last_response_at: sound().at,
+            ..SubscriberRecord::default()
+        };
+        change(&mut record);
+        after(|now| now.subscribers = vec![SubscriberReading { lane: Some(1), record }])
+    }
+
+    fn control() -> ProcessReading {
+        let health = ProcessHealth { pid: 9, starts: 1, ..ProcessHealth::default() };
+        ProcessReading {
+            name: "control".into(),
+            role: ProcessRole::Control,
+            health,
+            state: ProcessState::Running,
+        }
+    }
+
+    #[test]
+    fn control_is_missed_where_it_is_asked_for_and_never_ran() {
+        let said = after(|now| now.needs_control = true);
+        assert_eq!(said.len(), 1);
+        assert!(said[0].starts_with("control was never started: nobody is probed"), "{said:?}");
+        let said = after(|now| {
+            now.needs_control = true;
+            now.processes.insert(1, control());
+        });
+        assert_eq!(said, [""; 0]);
+    }
+
+    #[test]
+    fn what_safety_takes_away_is_said_with_its_reason() {
+        let said = after(|now| {
+            now.control.safety = SafetyMode::Degraded as u8;
+            now.control.safety_reason = FixedText::new("lane critical lags by 120.0 ms");
+        });
+        let expected =
+            "safety is degraded, the noncritical lanes are suspended: lane critical lags by 120.0 ms";
+        assert_eq!(said, [expected]);
+        let said = after(|now| now.control.safety = SafetyMode::Emergency as u8);
+        assert_eq!(said, ["safety is emergency, all forwarding is stopped"]);
+    }
+
+    #[test]
+    fn a_subscriber_is_named_for_what_is_wrong_with_its_link() {
+        assert_eq!(subscriber(|_| {}), [""; 0]);
+        let said = subscriber(|record| record.state = SubscriberState::Noncritical as u8);
+        assert_eq!(said, ["subscriber laptop on lane noncritical is NONCRITICAL: RTT 81.2 ms, loss 2.0 %"]);
+        let forced = |record: &mut SubscriberRecord| {
+            record.state = SubscriberState::Noncritical as u8;
+            record.forced = 1;
+        };
+        assert_eq!(subscriber(forced), [""; 0]);
+        let warnings = SubscriberWarning::Rtt as u8 | SubscriberWarning::Jitter as u8;
+        let said = subscriber(|record| record.warnings = warnings);
+        let expected = "subscriber laptop on lane noncritical is above its warning threshold of rtt, jitter: \
+                        RTT 81.2 ms, loss 2.0 %, jitter 30.0 ms";
+        assert_eq!(said, [expected]);
+    }
+
+    #[test]
+    fn a_subscriber_that_does_not_answer_is_named_with_the_program_to_start() {
+        let said = subscriber(|record| record.lost = 50);
+        let program = "does `adaptive-bridge responder --id laptop` run there?";
+        assert_eq!(
+            said,
+            [format!("subscriber laptop on lane noncritical does not answer for 1 s; {program}")]
+        );
+        let said = subscriber(|record| {
+            record.lost = 50;
+            record.last_response_at = crate::model::MonotonicNs(0);
+        });
+        assert_eq!(said, [format!("subscriber laptop on lane noncritical has never answered; {program}")]);
+    }
+
+    #[test]
+    fn an_intruder_is_named_with_its_remedy_and_steers_no_terminal() {
+        let said = after(|now| {
+            now.intruders = vec![IntruderRecord {
+                topic: FixedText::new("/scan"),
+                node: FixedText::new("/rviz\x1b[2J"),
+                host: FixedText::new("192.168.0.7"),
+                remedy: FixedText::new("subscribe to /n/scan"),
+                ..IntruderRecord::default()
+            }];
+        });
+        assert_eq!(
+            said,
+            ["/rviz\u{fffd}[2J on 192.168.0.7 reads /scan past the bridge: subscribe to /n/scan"]
+        );
+    }
+
+    #[test]
+    fn settings_that_differ_and_reloads_that_were_refused_are_named() {
+        let said = after(|now| {
+            for (process, fingerprint) in now.processes.iter_mut().zip([1, 2, 1]) {
+                process.health.settings_fingerprint = fingerprint;
+            }
+            now.processes[1].health.refused_reloads = 1;
+            now.processes[2].health.errors = 3;
+        });
+        assert_eq!(
+            said[0],
+            "the processes apply different settings: ingress and egress-noncritical other ones than \
+             egress-critical; reload or restart those that are behind"
+        );
+        assert!(said[1].starts_with("egress-critical refused a reload just now"), "{said:?}");
+        assert_eq!(said[2], "egress-noncritical: 3 errors just now; its log names them");
+        assert_eq!(said.len(), 3);
+    }
+
+    #[test]
+    fn refused_probe_messages_are_named_but_for_late_ones() {
+        let said = after(|now| {
+            for refusal in [ProbeRefusal::Late, ProbeRefusal::Replayed, ProbeRefusal::Replayed] {
+                now.control.refused.add(refusal);
+            }
+        });
+        assert_eq!(said.len(), 1);
+        assert!(said[0].starts_with("2 probe messages refused just now: seen before"), "{said:?}");
+    }
+}

@@ -293,7 +293,7 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::snapshot::ModeReason;
     use super::*;
     use crate::model::{
@@ -302,7 +302,7 @@ mod tests {
     };
 
     /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
-    fn sound() -> Snapshot {
+    pub(in crate::telemetry) fn sound() -> Snapshot {
         let at = MonotonicNs(100_000_000_000);
         let health = ProcessHealth { pid: 7, alive_at: at, starts: 1, ..ProcessHealth::default() };
         let process = |name: &str, role| ProcessReading {
@@ -362,7 +362,7 @@ mod tests {
     }
 
     /// What is said of a bridge that was sound and then changed.
-    fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
+    pub(in crate::telemetry) fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
         let before = sound();
         let mut now = before.clone();
         now.at = now.at.plus_ms(1_000);

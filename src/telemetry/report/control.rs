@@ -220,3 +220,64 @@ fn age_s(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
 fn some_text(text: &str) -> Option<String> {
     (!text.is_empty()).then(|| printable(text))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{FixedText, SafetyMode, SubscriberRecord};
+    use crate::telemetry::problems::tests::sound;
+
+    fn subscriber(id: &str, state: SubscriberState, lost: u64) -> SubscriberReading {
+        let record = SubscriberRecord {
+            id: FixedText::new(id),
+            state: state as u8,
+            settled: 50,
+            lost,
+            rtt_mean_us: 20_000,
+            ..SubscriberRecord::default()
+        };
+        SubscriberReading { lane: Some(1), record }
+    }
+
+    fn detail(reason: ModeReason, change: impl FnOnce(&mut Snapshot)) -> String {
+        let mut snapshot = sound();
+        snapshot.lanes[1].reason = reason;
+        change(&mut snapshot);
+        snapshot.mode_detail(1, &snapshot.lanes[1])
+    }
+
+    #[test]
+    fn a_mode_of_control_is_explained_by_the_worst_subscriber_of_the_lane() {
+        let none = detail(ModeReason::Control, |_| {});
+        assert_eq!(none, "the lane has no subscriber that answers probes");
+        let worst = detail(ModeReason::Control, |now| {
+            let mut elsewhere = subscriber("robot", SubscriberState::Noncritical, 50);
+            elsewhere.lane = Some(0);
+            now.subscribers = vec![
+                subscriber("desk", SubscriberState::Critical, 0),
+                subscriber("laptop", SubscriberState::Noncritical, 1),
+                subscriber("tablet", SubscriberState::Unknown, 9),
+                elsewhere,
+            ];
+        });
+        let expected = "the worst of 3 subscribers, laptop is NONCRITICAL: RTT 20.0 ms, loss 2.0 %";
+        assert_eq!(worst, expected);
+    }
+
+    #[test]
+    fn a_mode_of_safety_is_explained_by_the_fault() {
+        let said = detail(ModeReason::Safety, |now| {
+            now.control.safety = SafetyMode::Emergency as u8;
+            now.control.safety_reason = FixedText::new("ingress is dead");
+        });
+        assert_eq!(said, "the safety mode is emergency: ingress is dead");
+    }
+
+    #[test]
+    fn round_trips_are_unknown_where_no_probe_was_answered() {
+        let now = sound();
+        let report = now.subscriber_report(&subscriber("laptop", SubscriberState::Noncritical, 50));
+        assert_eq!((report.rtt_mean_ms, report.loss), (None, Some(1.0)));
+        assert_eq!(report.figures(), "none of 50 probes answered");
+    }
+}

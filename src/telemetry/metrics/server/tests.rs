@@ -91,7 +91,7 @@ fn clients_that_say_nothing_hold_nobody_up_for_long() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
     server.show(Arc::new(wide()));
-    // Twice as many as are served at once: half of them wait in the kernel's queue.
+    // All places are taken: who comes later waits in the kernel's queue.
     let silent: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| client(&path)).collect();
     let mut slow = client(&path);
     slow.write_all(b"GET /metrics").unwrap();
