@@ -1,5 +1,6 @@
 //! When a figure of a subscriber is worth a warning. A warning is shown and decides nothing.
 
+use super::probe_window::LinkReading;
 use crate::model::SubscriberWarning;
 
 /// Above what a figure is worth a warning (`probes.*_threshold`).
@@ -30,15 +31,11 @@ struct Gate {
 }
 
 impl SubscriberWarnings {
-    /// Takes a reading of the figures, `None` for one that cannot be told: that leaves its warning as it is.
-    /// Returns the warnings that are shown, as [`SubscriberWarning`]'s bits.
-    pub fn read(
-        &mut self,
-        thresholds: &WarningThresholds,
-        rtt_ms: Option<f64>,
-        loss: Option<f64>,
-        jitter_ms: Option<f64>,
-    ) -> u8 {
+    /// Takes a reading; a figure that cannot be told leaves its warning as it is. Returns the warnings that are
+    /// shown, as [`SubscriberWarning`]'s bits.
+    pub fn read(&mut self, thresholds: &WarningThresholds, link: &LinkReading) -> u8 {
+        let loss = (link.settled > 0).then_some(link.loss);
+        let (rtt_ms, jitter_ms) = (link.rtt_mean_ms, link.jitter_ms);
         let figures =
             [(rtt_ms, thresholds.rtt_ms), (loss, thresholds.loss), (jitter_ms, thresholds.jitter_ms)];
         let mut bits = 0;
@@ -73,10 +70,24 @@ mod tests {
     const THRESHOLDS: WarningThresholds =
         WarningThresholds { rtt_ms: 100.0, loss: 0.05, jitter_ms: 25.0, readings: 3 };
 
+    fn link(rtt_ms: Option<f64>, loss: Option<f64>, jitter_ms: Option<f64>) -> LinkReading {
+        let settled = if loss.is_some() { 50 } else { 0 };
+        LinkReading {
+            settled,
+            answered: settled,
+            lost: 0,
+            full: false,
+            loss: loss.unwrap_or(0.0),
+            rtt_mean_ms: rtt_ms,
+            rtt_p95_ms: rtt_ms,
+            jitter_ms,
+        }
+    }
+
     /// What is shown after each of these round trips.
     fn shown(rtt_ms: &[f64]) -> Vec<u8> {
         let mut warnings = SubscriberWarnings::default();
-        let read = |rtt_ms: &f64| warnings.read(&THRESHOLDS, Some(*rtt_ms), Some(0.0), Some(0.0));
+        let read = |rtt_ms: &f64| warnings.read(&THRESHOLDS, &link(Some(*rtt_ms), Some(0.0), Some(0.0)));
         rtt_ms.iter().map(read).collect()
     }
 
@@ -91,9 +102,10 @@ mod tests {
     fn each_figure_has_a_warning_of_its_own() {
         let mut warnings = SubscriberWarnings::default();
         let once = WarningThresholds { readings: 1, ..THRESHOLDS };
-        assert_eq!(warnings.read(&once, Some(200.0), Some(0.06), Some(30.0)), 7);
-        assert_eq!(warnings.read(&once, Some(10.0), Some(0.06), Some(10.0)), SubscriberWarning::Loss as u8);
-        assert_eq!(warnings.read(&once, None, None, None), SubscriberWarning::Loss as u8);
-        assert_eq!(warnings.read(&WarningThresholds { readings: 0, ..once }, None, Some(0.0), None), 0);
+        let loss = SubscriberWarning::Loss as u8;
+        assert_eq!(warnings.read(&once, &link(Some(200.0), Some(0.06), Some(30.0))), 7);
+        assert_eq!(warnings.read(&once, &link(Some(10.0), Some(0.06), Some(10.0))), loss);
+        assert_eq!(warnings.read(&once, &link(None, None, None)), loss);
+        assert_eq!(warnings.read(&once, &link(None, Some(0.0), None)), 0);
     }
 }
