@@ -4,7 +4,7 @@ use super::{Level, Problem};
 use crate::model::{MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
 use crate::shm::ProcessRole;
 use crate::telemetry::report::SubscriberReport;
-use crate::telemetry::snapshot::Snapshot;
+use crate::telemetry::snapshot::{ModeReason, Snapshot};
 use crate::telemetry::text::printable;
 
 /// Control is asked for and never ran. One that ran and is gone is named among the processes.
@@ -21,14 +21,21 @@ pub(super) fn safety(now: &Snapshot) -> Option<Problem> {
     let mode = now.control.safety();
     let (level, consequence) = match mode {
         SafetyMode::Normal => return None,
-        SafetyMode::Degraded => (Level::Warn, "the noncritical lanes are suspended"),
-        SafetyMode::Emergency => (Level::Error, "all forwarding is stopped"),
+        SafetyMode::Degraded => (Level::Warn, limited_lanes(now)),
+        SafetyMode::Emergency => (Level::Error, "all forwarding is stopped".to_owned()),
     };
     let why = match now.control.safety_reason.as_str() {
         "" => String::new(),
         reason => format!(": {}", printable(reason)),
     };
     Some(Problem::new("safety", level, format!("safety is {mode}, {consequence}{why}")))
+}
+
+/// The lanes that the safety mode takes something from; the configuration may forbid it.
+fn limited_lanes(now: &Snapshot) -> String {
+    let limited = now.lanes.iter().filter(|lane| lane.reason == ModeReason::Safety);
+    let limited: Vec<String> = limited.map(|lane| format!("lane {} is {}", lane.name, lane.mode)).collect();
+    if limited.is_empty() { "all lanes go on".to_owned() } else { limited.join(", ") }
 }
 
 /// Processes that apply different settings, and files that were refused.
@@ -153,7 +160,9 @@ pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
 mod tests {
     use super::super::tests::{after, sound};
     use super::*;
-    use crate::model::{FixedText, IntruderRecord, ProcessHealth, SubscriberRecord, SubscriberWarning};
+    use crate::model::{
+        FixedText, IntruderRecord, LaneMode, ProcessHealth, SubscriberRecord, SubscriberWarning,
+    };
     use crate::telemetry::liveness::ProcessState;
     use crate::telemetry::snapshot::{ProcessReading, SubscriberReading};
 
@@ -199,9 +208,10 @@ mod tests {
         let said = after(|now| {
             now.control.safety = SafetyMode::Degraded as u8;
             now.control.safety_reason = FixedText::new("lane critical lags by 120.0 ms");
+            now.lanes[1].reason = ModeReason::Safety;
+            now.lanes[1].mode = LaneMode::Suspended;
         });
-        let expected =
-            "safety is degraded, the noncritical lanes are suspended: lane critical lags by 120.0 ms";
+        let expected = "safety is degraded, lane noncritical is suspended: lane critical lags by 120.0 ms";
         assert_eq!(said, [expected]);
         let said = after(|now| now.control.safety = SafetyMode::Emergency as u8);
         assert_eq!(said, ["safety is emergency, all forwarding is stopped"]);

@@ -4,7 +4,8 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use super::age_ms;
 use crate::model::{
-    IntruderRecord, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState, SubscriberWarning,
+    IntruderRecord, LaneMode, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState, SubscriberWarning,
+    TrafficClass,
 };
 use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
@@ -178,16 +179,22 @@ impl Snapshot {
                 "" => format!("the safety mode is {}", self.control.safety()),
                 reason => format!("the safety mode is {}: {}", self.control.safety(), printable(reason)),
             },
-            ModeReason::Control => self.subscribers_detail(number),
+            ModeReason::Control => self.control_detail(number, lane),
             ModeReason::Held => {
-                format!("control does not run; its last word holds: {}", self.subscribers_detail(number))
+                format!("control does not run; its last word holds: {}", self.control_detail(number, lane))
             }
             ModeReason::Expired => "control is gone for longer than policy_hold_s".to_owned(),
         }
     }
 
-    /// The worst subscriber of a lane decides; this names it.
-    fn subscribers_detail(&self, number: usize) -> String {
+    /// What control went by: the worst subscriber of a noncritical lane, by name.
+    fn control_detail(&self, number: usize, lane: &LaneReading) -> String {
+        if lane.class == TrafficClass::Critical {
+            return "a critical lane forwards every sample, whatever the links are like".to_owned();
+        }
+        if self.control.classifies == 0 {
+            return "subscribers are not classified".to_owned();
+        }
         let of_lane = self.subscribers.iter().filter(|subscriber| subscriber.lane == Some(number));
         let badness = |subscriber: &SubscriberReading| {
             let record = &subscriber.record;
@@ -202,6 +209,8 @@ impl Snapshot {
         let Some(worst) = of_lane.max_by_key(|subscriber| badness(subscriber)) else {
             return "the lane has no subscriber that answers probes".to_owned();
         };
+        let kept = lane.mode == LaneMode::Normal && worst.record.state() == SubscriberState::Noncritical;
+        let kept = if kept { "; safety.allow_noncritical_degrade forbids to degrade it" } else { "" };
         let worst = self.subscriber_report(worst);
         let forced = if worst.forced { ", forced" } else { "" };
         let of = if count == 1 {
@@ -209,7 +218,7 @@ impl Snapshot {
         } else {
             format!("the worst of {count} subscribers,")
         };
-        format!("{of} {} is {}{forced}: {}", worst.id, worst.state, worst.figures())
+        format!("{of} {} is {}{forced}: {}{kept}", worst.id, worst.state, worst.figures())
     }
 }
 
@@ -241,7 +250,9 @@ mod tests {
 
     fn detail(reason: ModeReason, change: impl FnOnce(&mut Snapshot)) -> String {
         let mut snapshot = sound();
+        snapshot.control.classifies = 1;
         snapshot.lanes[1].reason = reason;
+        snapshot.lanes[1].mode = LaneMode::Degraded;
         change(&mut snapshot);
         snapshot.mode_detail(1, &snapshot.lanes[1])
     }
@@ -262,6 +273,25 @@ mod tests {
         });
         let expected = "the worst of 3 subscribers, laptop is NONCRITICAL: RTT 20.0 ms, loss 2.0 %";
         assert_eq!(worst, expected);
+    }
+
+    #[test]
+    fn a_lane_that_no_subscriber_degrades_says_why() {
+        let noncritical = |now: &mut Snapshot| {
+            now.subscribers = vec![subscriber("laptop", SubscriberState::Noncritical, 1)];
+        };
+        let said = detail(ModeReason::Control, |now| {
+            noncritical(now);
+            now.lanes[1].mode = LaneMode::Normal;
+        });
+        assert!(said.ends_with("; safety.allow_noncritical_degrade forbids to degrade it"), "{said}");
+        let said = detail(ModeReason::Control, |now| {
+            noncritical(now);
+            now.lanes[1].class = TrafficClass::Critical;
+        });
+        assert_eq!(said, "a critical lane forwards every sample, whatever the links are like");
+        let said = detail(ModeReason::Control, |now| now.control.classifies = 0);
+        assert_eq!(said, "subscribers are not classified");
     }
 
     #[test]
