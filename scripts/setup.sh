@@ -12,6 +12,14 @@ PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin:${CARGO_HOME:-$HOME/.cargo}/bin"
 
 has_header() { [ -e "/usr/include/$1" ] || [ -e "/usr/local/include/$1" ]; }
 
+# In the Python of the system, which is not always the first in the path.
+has_python() {
+    for python in python3 /usr/bin/python3; do
+        if "$python" -c "import $1" >/dev/null 2>&1; then return 0; fi
+    done
+    return 1
+}
+
 # Each line: whether it is there, the packages that bring it (the first that exists is taken), what needs it.
 missing=""
 lacking=""
@@ -37,6 +45,7 @@ check_all() {
     need "has nsenter" util-linux "tests between hosts (network namespaces)"
     need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
     need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
+    need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
 }
 
 # The first of 'a|b' that the package lists know.

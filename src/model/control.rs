@@ -78,8 +78,10 @@ pub struct SubscriberRecord {
     pub forced: u8,
     /// 1 when the configuration lists the subscriber.
     pub listed: u8,
+    /// The figures that are above their warning threshold, as [`SubscriberWarning`]'s bits.
+    pub warnings: u8,
     /// Always 0.
-    pub reserved: [u8; 5],
+    pub reserved: [u8; 4],
     /// Why it is in its state.
     pub reason: FixedText,
 }
@@ -90,9 +92,42 @@ impl SubscriberRecord {
         SubscriberState::from_u8(self.state).unwrap_or_default()
     }
 
+    /// The figures that are above their warning threshold.
+    pub fn warnings(&self) -> impl Iterator<Item = SubscriberWarning> {
+        let bits = self.warnings;
+        SubscriberWarning::ALL.into_iter().filter(move |&warning| bits & warning as u8 != 0)
+    }
+
     /// Share of the settled probes that were lost, 0 to 1; `None` when none is settled.
     pub fn loss(&self) -> Option<f64> {
         (self.settled > 0).then(|| (self.lost as f64 / self.settled as f64).min(1.0))
+    }
+}
+
+/// A figure of a subscriber that may be above the warning threshold which the configuration sets for it
+/// (`probes.*_threshold`). A warning decides nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum SubscriberWarning {
+    /// The mean round trip.
+    Rtt = 1,
+    /// The share of probes lost.
+    Loss = 2,
+    /// The jitter.
+    Jitter = 4,
+}
+
+impl SubscriberWarning {
+    /// Every warning.
+    pub const ALL: [Self; 3] = [Self::Rtt, Self::Loss, Self::Jitter];
+
+    /// `rtt`, `loss` or `jitter`.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Rtt => "rtt",
+            Self::Loss => "loss",
+            Self::Jitter => "jitter",
+        }
     }
 }
 

@@ -16,7 +16,9 @@ mod sample;
 mod thresholds;
 mod time;
 
-pub use control::{ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord};
+pub use control::{
+    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord, SubscriberWarning,
+};
 pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{

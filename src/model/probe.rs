@@ -100,6 +100,15 @@ impl RefusalCounts {
         self.0.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
+    /// What was counted since `earlier`, a former reading of the same counts.
+    pub fn since(&self, earlier: &Self) -> Self {
+        let mut difference = *self;
+        for (count, before) in difference.0.iter_mut().zip(earlier.0.iter()) {
+            *count = count.saturating_sub(*before);
+        }
+        difference
+    }
+
     /// The reasons that occurred, with their counts.
     pub fn iter(&self) -> impl Iterator<Item = (ProbeRefusal, u64)> + '_ {
         ProbeRefusal::ALL.iter().map(|&reason| (reason, self.get(reason))).filter(|&(_, n)| n > 0)

@@ -13,6 +13,7 @@
 //! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, and why; the mildest that safety leaves it.
 //! - [`SafetySupervisor`]: the mode of the whole bridge.
 //! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
+//! - [`SubscriberWarnings`]: which figures of a subscriber are worth a warning.
 //! - [`IntruderWatch`]: which readers on other hosts reach past the bridge, and what to say of them.
 //! - [`Location`]: whether a DDS endpoint is on this host.
 //! - [`RestartBackoff`]: when a supervised child is started again.
@@ -29,6 +30,7 @@ mod safety;
 mod sequence;
 mod staleness;
 mod token_bucket;
+mod warnings;
 mod whereabouts;
 
 pub use classifier::{
@@ -53,4 +55,5 @@ pub use safety::{
 pub use sequence::{SequenceTracker, Sighting};
 pub use staleness::{age_ns, is_stale};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
+pub use warnings::{SubscriberWarnings, WarningThresholds};
 pub use whereabouts::{Location, Whereabouts};

@@ -8,8 +8,9 @@ use super::liveness::ProcessState;
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{
-    IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName, LanePolicy, LatencyHistogram,
-    MonotonicNs, ProcessHealth, RouteId, TopicName, TrafficClass, TypeName, WallNs,
+    ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneMode, LaneName,
+    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProcessHealth, RouteId,
+    SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
 };
 use crate::policy::effective_mode;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -35,6 +36,23 @@ pub struct Snapshot {
     pub lanes: Vec<LaneReading>,
     /// The routes, in the order of the configuration.
     pub routes: Vec<RouteReading>,
+    /// Whether the configuration asks for what only the control process does: probes or classification.
+    pub needs_control: bool,
+    /// What control found and decided for the bridge as a whole.
+    pub control: ControlRecord,
+    /// The subscribers that control follows.
+    pub subscribers: Vec<SubscriberReading>,
+    /// The remote readers that reach past the bridge, as control found them.
+    pub intruders: Vec<IntruderRecord>,
+}
+
+/// One subscriber, as control sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct SubscriberReading {
+    /// Its lane, as an index into [`Snapshot::lanes`]; `None` when control named none that there is.
+    pub lane: Option<usize>,
+    /// What control shows of it.
+    pub record: SubscriberRecord,
 }
 
 /// One process.
@@ -177,13 +195,18 @@ impl Snapshot {
         let routes = (0..settings.routes.len())
             .map(|route| read_route(boards, settings, route))
             .collect::<Result<_, _>>()?;
+        let control = steady(boards.control())?;
         Ok(Self {
             instance: settings.instance.clone(),
             at: now,
             at_wall: clock::wall(),
             processes,
-            lanes,
             routes,
+            needs_control: settings.probes.enabled || settings.classifier.enabled,
+            subscribers: read_subscribers(boards, &control, lanes.len())?,
+            intruders: read_intruders(boards, &control)?,
+            control,
+            lanes,
         })
     }
 
@@ -191,6 +214,38 @@ impl Snapshot {
     pub fn is_running(&self) -> bool {
         self.processes.iter().any(|process| process.state.exists())
     }
+}
+
+fn read_subscribers(
+    boards: &Boards,
+    control: &ControlRecord,
+    lanes: usize,
+) -> Result<Vec<SubscriberReading>, ShmError> {
+    let mut subscribers = Vec::new();
+    for place in places(control.subscribers, MAX_SUBSCRIBERS) {
+        let record = steady(boards.subscriber(place))?;
+        if !record.id.as_str().is_empty() {
+            let lane = usize::try_from(record.lane).ok().filter(|lane| *lane < lanes);
+            subscribers.push(SubscriberReading { lane, record });
+        }
+    }
+    Ok(subscribers)
+}
+
+fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<IntruderRecord>, ShmError> {
+    let mut intruders = Vec::new();
+    for place in places(control.intruders, MAX_INTRUDERS) {
+        let record = steady(boards.intruder(place))?;
+        if !record.topic.as_str().is_empty() {
+            intruders.push(record);
+        }
+    }
+    Ok(intruders)
+}
+
+/// The places of a table that are taken; the board may say any number.
+fn places(taken: u64, size: usize) -> std::ops::Range<usize> {
+    0..usize::try_from(taken).unwrap_or(size).min(size)
 }
 
 fn process(

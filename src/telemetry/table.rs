@@ -3,7 +3,10 @@
 use std::fmt::{self, Write};
 
 use super::liveness::ProcessState;
-use super::report::{Drops, LaneReport, Latency, OutputReport, ProcessReport, Report, RouteReport};
+use super::report::{
+    Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, Report,
+    RouteReport, SafetyReport, SubscriberReport,
+};
 
 /// No line is longer, but for a sentence that says what is wrong, where names may be of any length.
 const COLUMNS: usize = 100;
@@ -25,14 +28,18 @@ impl fmt::Display for Report {
             count => writeln!(f, "{count} things are wrong:")?,
         }
         for problem in &self.problems {
-            f.write_str(&wrapped("  ! ", "    ", problem.split(' '), " "))?;
+            f.write_str(&wrapped("  ! ", "    ", problem.text.split(' '), " "))?;
         }
         let process = |name: &str| self.processes.iter().find(|process| process.name == name);
         if let Some(control) = process("control") {
-            writeln!(f, "\ncontrol: {}", process_text(control))?;
+            write!(f, "\n{}", process_line("control", control))?;
+            f.write_str(&safety_text(&self.safety))?;
+            f.write_str(&probes_text(&self.probes))?;
+            f.write_str(&subscribers_text(&self.subscribers))?;
+            f.write_str(&intruders_text(&self.intruders, self.intruders_seen))?;
         }
         if let Some(ingress) = process("ingress") {
-            writeln!(f, "\ningress: {}", process_text(ingress))?;
+            write!(f, "\n{}", process_line("ingress", ingress))?;
         }
         f.write_str(&row(["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST BEFORE"]))?;
         for route in &self.routes {
@@ -43,6 +50,9 @@ impl fmt::Display for Report {
             let title = format!("lane {}: {};", lane.name, mode_text(lane));
             let process = process.map(process_text).unwrap_or_default();
             write!(f, "\n{}", wrapped("", "  ", [title.as_str(), &process].into_iter(), " "))?;
+            if matches!(lane.mode_reason, "control" | "safety" | "held") {
+                f.write_str(&wrapped("  why: ", "    ", lane.mode_detail.split(' '), " "))?;
+            }
             f.write_str(&row(["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"]))?;
             let outputs = self.routes.iter().flat_map(|route| &route.lanes);
             for output in outputs.filter(|output| output.lane == lane.name) {
@@ -87,6 +97,78 @@ fn output_text(output: &OutputReport) -> String {
     ]);
     text.push_str(&drops_text(&output.drops, &output.drops_in_window));
     text
+}
+
+fn safety_text(safety: &SafetyReport) -> String {
+    let since = safety.since_s.map_or(String::new(), |since_s| format!(" for {}", duration_text(since_s)));
+    let changes = counted(safety.transitions, "change");
+    let reason = safety.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
+    let text = format!("{}{since}, {changes}{reason}", safety.mode);
+    wrapped("  safety: ", "    ", text.split(' '), " ")
+}
+
+fn probes_text(probes: &ProbesReport) -> String {
+    let mut text = format!("{} sent, {} answered", probes.sent, probes.accepted);
+    for (reason, count) in probes.refused.0.iter() {
+        let _ = write!(text, ", {reason} {count}");
+    }
+    wrapped("  probes: ", "    ", text.split_inclusive(", "), "")
+}
+
+fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
+    let mut text = String::new();
+    let row = |[id, lane, state, rtt, jitter, loss, heard]: [&str; 7]| {
+        let line = format!("  {id:<24} {lane:<13} {state:<12} {rtt:>13} {jitter:>7} {loss:>7} {heard:>15}");
+        format!("{}\n", line.trim_end())
+    };
+    if !subscribers.is_empty() {
+        text += &row(["SUBSCRIBER", "LANE", "STATE", "RTT MEAN/P95", "JITTER", "LOSS", "LAST RESPONSE"]);
+    }
+    for subscriber in subscribers {
+        let ms = |ms: Option<f64>| ms.map_or("-".to_owned(), |ms| latency_text(ms * 1e3));
+        let heard = subscriber.last_response_age_ms;
+        text += &row([
+            &end_of(&subscriber.id, 24),
+            &end_of(subscriber.lane.as_deref().unwrap_or("-"), 13),
+            subscriber.state,
+            &format!("{}/{}", ms(subscriber.rtt_mean_ms), ms(subscriber.rtt_p95_ms)),
+            &ms(subscriber.jitter_ms),
+            &subscriber.loss.map_or("-".to_owned(), |loss| format!("{:.1} %", loss * 100.0)),
+            &heard.map_or("never".to_owned(), |age_ms| format!("{} ago", latency_text(age_ms * 1e3))),
+        ]);
+        let since = subscriber
+            .state_since_s
+            .map_or(String::new(), |since_s| format!("for {}, ", duration_text(since_s)));
+        let mut why = format!("{since}{}", counted(subscriber.transitions, "change"));
+        if subscriber.forced {
+            why += ", forced by the configuration";
+        } else if !subscriber.reason.is_empty() {
+            let _ = write!(why, ": {}", subscriber.reason);
+        }
+        if !subscriber.listed {
+            why += "; not listed under subscribers";
+        }
+        text += &wrapped("    ", "      ", why.split(' '), " ");
+    }
+    text
+}
+
+fn intruders_text(intruders: &[IntruderReport], seen: u64) -> String {
+    let mut text = String::new();
+    if seen > 0 {
+        let _ =
+            writeln!(text, "  past the bridge: {} remote readers at present, {seen} ever", intruders.len());
+    }
+    for intruder in intruders {
+        let node = intruder.node.as_deref().unwrap_or("a node without a name");
+        let line = format!("{node} on {} reads {}: {}", intruder.host, intruder.topic, intruder.remedy);
+        text += &wrapped("    ", "      ", line.split(' '), " ");
+    }
+    text
+}
+
+fn counted(count: u64, what: &str) -> String {
+    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 fn drops_text(drops: &Drops, in_window: &Drops) -> String {
@@ -143,25 +225,38 @@ fn mode_text(lane: &LaneReport) -> String {
     }
 }
 
+fn process_line(name: &str, process: &ProcessReport) -> String {
+    let text = process_text(process);
+    wrapped(&format!("{name}: "), "  ", text.split_inclusive(", "), "")
+}
+
 fn process_text(process: &ProcessReport) -> String {
     if process.state == ProcessState::NotStarted {
         return process.state.label().to_owned();
     }
-    let restarts = match process.starts.saturating_sub(1) {
-        1 => "1 restart".to_owned(),
-        restarts => format!("{restarts} restarts"),
-    };
+    let restarts = counted(process.starts.saturating_sub(1), "restart");
+    let mut news = String::new();
+    if process.errors > 0 {
+        let _ = write!(news, ", {}", counted(process.errors, "error"));
+    }
+    if process.refused_reloads > 0 {
+        let _ = write!(news, ", {} refused", counted(process.refused_reloads, "reload"));
+    }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
-    format!("process {} {}{up}, {restarts}", process.pid, process.state.label())
+    format!("process {} {}{up}, {restarts}{news}", process.pid, process.state.label())
 }
 
-/// The end of a long topic tells more than its beginning.
 fn topic_text(topic: &str) -> String {
-    let length = topic.chars().count();
-    if length <= TOPIC_COLUMNS {
-        return topic.to_owned();
+    end_of(topic, TOPIC_COLUMNS)
+}
+
+/// The end of a long name tells more than its beginning.
+fn end_of(name: &str, columns: usize) -> String {
+    let length = name.chars().count();
+    if length <= columns {
+        return name.to_owned();
     }
-    let end: String = topic.chars().skip(length + 1 - TOPIC_COLUMNS).collect();
+    let end: String = name.chars().skip(length + 1 - columns).collect();
     format!("…{end}")
 }
 
@@ -208,87 +303,10 @@ fn duration_text(seconds: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::problems::{Level, Problem};
+    use super::super::samples::wide;
     use super::*;
-    use crate::model::{DropCounts, DropReason};
-
-    fn drops(each: u64) -> Drops {
-        let mut counts = DropCounts::default();
-        for &reason in DropReason::ALL {
-            counts.add(reason, each);
-        }
-        Drops(counts)
-    }
-
-    /// Figures as long as they come.
-    fn wide() -> Report {
-        let latency =
-            Latency { count: 1, p50_us: Some(99_940.0), p99_us: Some(137_000_000.0), max_us: Some(1e9) };
-        let topic = format!("/{}", "long_name/".repeat(20));
-        let output = OutputReport {
-            lane: "a_lane_of_24_characters_".into(),
-            topic: topic.clone(),
-            readers: 99_999,
-            received: u64::MAX,
-            forwarded: u64::MAX,
-            forwarded_bytes: u64::MAX,
-            by_reference: 0,
-            caught_up: 0,
-            waiting: 0,
-            drops: drops(u64::MAX / 100),
-            drops_in_window: drops(u64::MAX / 100),
-            whole: true,
-            received_hz: Some(99_999.9),
-            rate_hz: Some(99_999.9),
-            bytes_per_s: Some(1e10),
-            last_forwarded_age_ms: None,
-            shm: latency,
-            dds_out: latency,
-            age: latency,
-        };
-        Report {
-            instance: "an_instance_of_24_chars_".into(),
-            time_unix_ms: 0,
-            window_ms: 1_000.0,
-            problems: vec!["many words ".repeat(30)],
-            processes: vec![ProcessReport {
-                name: "egress-a_lane_of_24_characters_".into(),
-                pid: 4_194_304,
-                state: ProcessState::Running,
-                uptime_s: Some(86_399.0),
-                starts: 100_001,
-                turns: 0,
-                last_turn_age_ms: None,
-            }],
-            lanes: vec![LaneReport {
-                name: output.lane.clone(),
-                class: "noncritical",
-                mode: "suspended",
-                mode_reason: "by_hand",
-                mode_ends_in_s: Some(3_600.0),
-                policy_epoch: 1,
-                applied_mode: None,
-                applied_policy_epoch: 1,
-            }],
-            routes: vec![RouteReport {
-                id: "scan".into(),
-                input_topic: topic,
-                message_type: None,
-                writers: 99_999,
-                received: 0,
-                received_bytes: 0,
-                published: 0,
-                lost_upstream: 9_999_999_999_999,
-                drops: drops(u64::MAX / 100),
-                drops_in_window: drops(0),
-                whole: true,
-                rate_hz: Some(99_999.9),
-                bytes_per_s: Some(1e11),
-                last_received_age_ms: None,
-                dds_in: latency,
-                lanes: vec![output],
-            }],
-        }
-    }
+    use crate::model::DropReason;
 
     #[test]
     fn no_line_is_longer_than_100_columns() {
@@ -304,7 +322,8 @@ mod tests {
     #[test]
     fn what_is_wrong_comes_first() {
         let mut report = wide();
-        report.problems = vec!["ingress is dead".into(), "lane critical is not whole".into()];
+        let problem = |text: &str| Problem { about: "bridge".into(), level: Level::Error, text: text.into() };
+        report.problems = vec![problem("ingress is dead"), problem("lane critical is not whole")];
         let text = report.to_string();
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(

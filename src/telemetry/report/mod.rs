@@ -2,12 +2,19 @@
 //!
 //! The types here are the JSON of `status --json`; `docs/status-json.md` documents every key.
 
+mod control;
+mod latency;
+
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+pub use control::{IntruderReport, ProbesReport, Refusals, SafetyReport, SubscriberReport};
+pub use latency::{Latency, LatencyTotal};
+
 use super::liveness::ProcessState;
-use super::problems;
+use super::problems::{self, Problem};
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
-use crate::model::{DropCounts, DropReason, LatencyHistogram, MonotonicNs};
+use super::text::printable;
+use crate::model::{DropCounts, DropReason, LaneMode, MonotonicNs};
 
 /// The state of a bridge. Keys that end in a unit are in that unit; what cannot be told is null.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -19,13 +26,23 @@ pub struct Report {
     /// The time between the two readings: rates, latencies and `drops_in_window` are of it.
     pub window_ms: f64,
     /// What is wrong, a sentence each, the gravest first.
-    pub problems: Vec<String>,
+    pub problems: Vec<Problem>,
+    /// The safety supervisor.
+    pub safety: SafetyReport,
     /// The processes.
     pub processes: Vec<ProcessReport>,
     /// The lanes.
     pub lanes: Vec<LaneReport>,
     /// The routes.
     pub routes: Vec<RouteReport>,
+    /// The probes.
+    pub probes: ProbesReport,
+    /// The subscribers that control follows.
+    pub subscribers: Vec<SubscriberReport>,
+    /// The remote readers that reach past the bridge.
+    pub intruders: Vec<IntruderReport>,
+    /// Such readers ever seen since control came up, those not shown included.
+    pub intruders_seen: u64,
 }
 
 /// One process.
@@ -45,6 +62,12 @@ pub struct ProcessReport {
     pub turns: u64,
     /// How long ago it turned last.
     pub last_turn_age_ms: Option<f64>,
+    /// What failed in it, samples apart.
+    pub errors: u64,
+    /// Reloads that it refused because the file was bad.
+    pub refused_reloads: u64,
+    /// Tells the settings that it applies from others, in hexadecimal; null when it has not said.
+    pub settings_fingerprint: Option<String>,
 }
 
 /// One lane.
@@ -56,8 +79,10 @@ pub struct LaneReport {
     pub class: &'static str,
     /// The mode that the policy board gives it.
     pub mode: &'static str,
-    /// Why: `default`, `by_hand`, `control`, `held` or `expired`.
+    /// Why: `default`, `by_hand`, `control`, `safety`, `held` or `expired`.
     pub mode_reason: &'static str,
+    /// The same in a sentence with what lies behind it. For people: wording may change.
+    pub mode_detail: String,
     /// When the policy ends, unless it is confirmed or set anew.
     pub mode_ends_in_s: Option<f64>,
     /// The epoch of the policy on the board; 0 when nobody has set one.
@@ -148,19 +173,6 @@ pub struct OutputReport {
     pub age: Latency,
 }
 
-/// A latency within the window; at most 6.3 % too large, for it is the upper edge of a bucket.
-#[derive(Clone, Copy, Debug, serde::Serialize)]
-pub struct Latency {
-    /// Samples measured.
-    pub count: u64,
-    /// Median.
-    pub p50_us: Option<f64>,
-    /// 99th percentile.
-    pub p99_us: Option<f64>,
-    /// The largest.
-    pub max_us: Option<f64>,
-}
-
 /// Drops, by name. In JSON every reason is there, so that a key that is missing is a mistake in its name.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Drops(pub DropCounts);
@@ -186,12 +198,22 @@ impl Snapshot {
             window_ms,
             problems: problems::of(self, earlier),
             processes: self.processes.iter().map(|process| process_report(process, self.at)).collect(),
-            lanes: self.lanes.iter().map(|lane| lane_report(lane, self.at)).collect(),
+            safety: self.safety_report(),
+            lanes: self
+                .lanes
+                .iter()
+                .enumerate()
+                .map(|(number, lane)| self.lane_report(number, lane))
+                .collect(),
             routes: self
                 .routes
                 .iter()
                 .map(|route| self.route_report(route, earlier.route(route), window_ms))
                 .collect(),
+            probes: self.probes_report(earlier),
+            subscribers: self.subscribers.iter().map(|one| self.subscriber_report(one)).collect(),
+            intruders: self.intruders.iter().map(|one| self.intruder_report(one)).collect(),
+            intruders_seen: self.control.intruders_seen,
         }
     }
 
@@ -200,12 +222,27 @@ impl Snapshot {
         self.routes.iter().find(|route| route.id == other.id)
     }
 
+    fn lane_report(&self, number: usize, lane: &LaneReading) -> LaneReport {
+        let applied = LaneMode::from_u8(lane.health.mode);
+        LaneReport {
+            name: lane.name.to_string(),
+            class: lane.class.label(),
+            mode: lane.mode.label(),
+            mode_reason: lane.reason.label(),
+            mode_detail: self.mode_detail(number, lane),
+            mode_ends_in_s: lane.ends_at.map(|at| at.since(self.at) as f64 / 1e9),
+            policy_epoch: lane.policy.epoch,
+            applied_mode: applied.filter(|_| lane.health.pid != 0).map(|mode| mode.label()),
+            applied_policy_epoch: lane.health.policy_epoch,
+        }
+    }
+
     fn route_report(&self, now: &RouteReading, before: Option<&RouteReading>, window_ms: f64) -> RouteReport {
         let (counters, former) = (&now.counters, before.map(|before| before.counters));
         RouteReport {
             id: now.id.to_string(),
             input_topic: now.input_topic.to_string(),
-            message_type: now.message_type.clone(),
+            message_type: now.message_type.as_deref().map(printable),
             writers: counters.writers,
             received: counters.received,
             received_bytes: counters.received_bytes,
@@ -221,7 +258,7 @@ impl Snapshot {
                 window_ms,
             ),
             last_received_age_ms: age_ms(counters.last_received_at, self.at),
-            dds_in: latency(&now.dds_in, before.map(|before| &before.dds_in)),
+            dds_in: Latency::of(&now.dds_in, before.map(|before| &before.dds_in)),
             lanes: now
                 .outputs
                 .iter()
@@ -258,9 +295,9 @@ impl Snapshot {
             rate_hz: rate(counters.forwarded, former.map(|former| former.forwarded)),
             bytes_per_s: rate(counters.forwarded_bytes, former.map(|former| former.forwarded_bytes)),
             last_forwarded_age_ms: age_ms(counters.last_forwarded_at, self.at),
-            shm: latency(&now.shm, before.map(|before| &before.shm)),
-            dds_out: latency(&now.dds_out, before.map(|before| &before.dds_out)),
-            age: latency(&now.age, before.map(|before| &before.age)),
+            shm: Latency::of(&now.shm, before.map(|before| &before.shm)),
+            dds_out: Latency::of(&now.dds_out, before.map(|before| &before.dds_out)),
+            age: Latency::of(&now.age, before.map(|before| &before.age)),
         }
     }
 }
@@ -298,20 +335,10 @@ fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
         starts: health.starts,
         turns: health.turns,
         last_turn_age_ms: age_ms(health.alive_at, now),
-    }
-}
-
-fn lane_report(lane: &LaneReading, now: MonotonicNs) -> LaneReport {
-    let applied = crate::model::LaneMode::from_u8(lane.health.mode);
-    LaneReport {
-        name: lane.name.to_string(),
-        class: lane.class.label(),
-        mode: lane.mode.label(),
-        mode_reason: lane.reason.label(),
-        mode_ends_in_s: lane.ends_at.map(|at| at.since(now) as f64 / 1e9),
-        policy_epoch: lane.policy.epoch,
-        applied_mode: applied.filter(|_| lane.health.pid != 0).map(|mode| mode.label()),
-        applied_policy_epoch: lane.health.policy_epoch,
+        errors: health.errors,
+        refused_reloads: health.refused_reloads,
+        settings_fingerprint: (health.settings_fingerprint != 0)
+            .then(|| format!("{:016x}", health.settings_fingerprint)),
     }
 }
 
@@ -324,12 +351,6 @@ fn age_ms(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
 fn per_s(now: u64, before: Option<u64>, window_ms: f64) -> Option<f64> {
     let grown = now.checked_sub(before?)?;
     (window_ms > 0.0).then(|| grown as f64 * 1e3 / window_ms)
-}
-
-fn latency(now: &LatencyHistogram, before: Option<&LatencyHistogram>) -> Latency {
-    let window = before.map_or_else(LatencyHistogram::default, |before| now.since(before));
-    let us = |quantile| window.quantile_ns(quantile).map(|ns| ns as f64 / 1e3);
-    Latency { count: window.count(), p50_us: us(0.5), p99_us: us(0.99), max_us: us(1.0) }
 }
 
 #[cfg(test)]
@@ -350,22 +371,6 @@ mod tests {
     }
 
     #[test]
-    fn latencies_are_those_of_the_window_also_the_largest() {
-        let mut histogram = LatencyHistogram::default();
-        histogram.record(90_000_000);
-        let before = histogram;
-        for _ in 0..100 {
-            histogram.record(100_000);
-        }
-        let found = latency(&histogram, Some(&before));
-        assert_eq!(found.count, 100);
-        for us in [found.p50_us, found.p99_us, found.max_us] {
-            assert!(us.is_some_and(|us| (100.0..=106.3).contains(&us)), "{us:?}");
-        }
-        assert_eq!(latency(&histogram, None).p50_us, None);
-    }
-
-    #[test]
     fn drops_of_another_bridge_are_not_news() {
         let mut now = DropCounts::default();
         now.add(DropReason::Stale, 3);
@@ -375,5 +380,21 @@ mod tests {
         before.add(DropReason::WindowFull, 9);
         let since: Vec<_> = drops_since(&now, Some(before)).iter().collect();
         assert_eq!(since, [(DropReason::Stale, 2)]);
+    }
+    /// The other keys are compared with what a real bridge prints (tests/cli.rs).
+    #[test]
+    fn every_key_of_a_subscriber_and_of_an_intruder_is_documented() {
+        let report = serde_json::to_value(crate::telemetry::samples::wide()).unwrap();
+        let page = include_str!("../../../docs/status-json.md");
+        for list in ["subscribers", "intruders"] {
+            let item = report[list][0].as_object().unwrap();
+            let documented = page.matches(&format!("\n| `{list}[].")).count();
+            assert_eq!(documented, item.len(), "{list}");
+            for (key, value) in item {
+                let list_mark = if value.is_array() { "[]" } else { "" };
+                let row = format!("\n| `{list}[].{key}{list_mark}` |");
+                assert!(page.contains(&row), "{row}");
+            }
+        }
     }
 }

@@ -1,5 +1,7 @@
 //! What is wrong with a bridge, in words.
 
+mod control;
+
 use super::liveness::ProcessState;
 use super::report::drops_since;
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
@@ -12,66 +14,94 @@ const APPLY_MS: u64 = 1_000;
 /// Fewer samples may be on their way at the moment of the reading.
 const SILENT_LANE_SAMPLES: u64 = 5;
 
-/// What is wrong, the gravest first: processes, accounts that do not add up, lanes that forward nothing,
-/// drops, then what is only missing.
-pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<String> {
+/// How grave something is: the levels of `diagnostic_msgs/DiagnosticStatus`, with their numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Level {
+    /// Nothing is wrong.
+    Ok = 0,
+    /// Something is wrong and the bridge does its work.
+    Warn = 1,
+    /// Something does not do its work.
+    Error = 2,
+    /// Nothing is heard of it.
+    Stale = 3,
+}
+
+impl Level {
+    /// `ok`, `warn`, `error` or `stale`.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Warn => "warn",
+            Self::Error => "error",
+            Self::Stale => "stale",
+        }
+    }
+
+    /// The graver of two. An error is graver than silence, which is no more than a suspicion.
+    pub const fn worse(self, other: Self) -> Self {
+        const fn rank(level: Level) -> u8 {
+            match level {
+                Level::Ok => 0,
+                Level::Warn => 1,
+                Level::Stale => 2,
+                Level::Error => 3,
+            }
+        }
+        if rank(other) > rank(self) { other } else { self }
+    }
+}
+
+/// Something that is wrong. Its JSON is the sentence.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `intruders`, `lane NAME`,
+    /// `route ID` or `subscriber ID`.
+    pub about: String,
+    /// How grave.
+    pub level: Level,
+    /// A sentence for people.
+    pub text: String,
+}
+
+impl Problem {
+    fn new(about: impl Into<String>, level: Level, text: String) -> Self {
+        Self { about: about.into(), level, text }
+    }
+}
+
+impl serde::Serialize for Problem {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&self.text)
+    }
+}
+
+/// What is wrong, the gravest first: processes, accounts that do not add up, safety, lanes that forward
+/// nothing, drops, subscribers, intruders, then what is only missing.
+pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     let mut problems = Vec::new();
     for process in &now.processes {
         let former = before.processes.iter().find(|former| former.name == process.name);
         problems.extend(process_problem(process, former, now));
     }
+    problems.extend(control::missing(now));
     for (route, output) in outputs(now) {
         problems.extend(unaccounted(route, output, &now.lanes[output.lane]));
     }
-    for route in now.routes.iter().filter(|route| !route.is_whole()) {
-        let counters = &route.counters;
-        problems.push(format!(
-            "ingress, route {}: does not add up: {} received, {} published, {} dropped",
-            route.id,
-            counters.received,
-            counters.published,
-            counters.drops.total()
-        ));
-    }
+    problems.extend(now.routes.iter().filter_map(unaccounted_by_ingress));
+    problems.extend(control::safety(now));
     for (route, output) in outputs(now) {
-        let former = before.route(route);
-        problems.extend(silent(now, route, output, former));
+        problems.extend(silent(now, route, output, before.route(route)));
     }
-    for lane in &now.lanes {
-        problems.extend(not_applied(lane, now));
-    }
+    problems.extend(now.lanes.iter().filter_map(|lane| not_applied(lane, now)));
     for route in &now.routes {
-        let former = before.route(route);
-        let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
-        for (reason, count) in dropped.iter() {
-            let what = reason.meaning();
-            problems.push(format!(
-                "ingress, route {}: {count} samples dropped just now: {what} ({reason})",
-                route.id
-            ));
-        }
-        for output in &route.outputs {
-            let lane = &now.lanes[output.lane];
-            let former = former.and_then(|former| former.output(output));
-            let dropped = drops_since(&output.counters.drops, former.map(|former| former.counters.drops));
-            for (reason, count) in dropped.iter().filter(|(reason, _)| !is_expected(*reason, lane.class)) {
-                problems.push(format!(
-                    "lane {}, {}: {count} samples dropped just now: {} ({reason})",
-                    lane.name,
-                    output.topic,
-                    reason.meaning()
-                ));
-            }
-        }
-        if let Some(former) = former
-            && let Some(lost @ 1..) = route.counters.lost_upstream.checked_sub(former.counters.lost_upstream)
-        {
-            problems.push(format!(
-                "route {}: {lost} samples lost just now on their way from the publisher to the bridge",
-                route.id
-            ));
-        }
+        dropped(now, route, before.route(route), &mut problems);
     }
+    problems.extend(control::settings(now, before));
+    problems.extend(control::subscribers(now));
+    problems.extend(control::intruders(now));
+    problems.extend(control::refusals(now, before));
     problems.extend(now.routes.iter().filter_map(no_publisher));
     problems
 }
@@ -84,7 +114,7 @@ fn process_problem(
     process: &ProcessReading,
     former: Option<&ProcessReading>,
     now: &Snapshot,
-) -> Option<String> {
+) -> Option<Problem> {
     let (name, pid) = (&process.name, process.health.pid);
     let consequence = match process.role {
         ProcessRole::Ingress => "nothing is taken in".to_owned(),
@@ -94,28 +124,37 @@ fn process_problem(
             None => "its lane forwards nothing".to_owned(),
         },
     };
-    match process.state {
-        ProcessState::Dead => Some(format!("{name} (pid {pid}) is dead: {consequence}")),
+    let about = match process.role {
+        ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), about_lane),
+        ProcessRole::Ingress | ProcessRole::Control => name.clone(),
+    };
+    let text = match process.state {
+        ProcessState::Dead => format!("{name} (pid {pid}) is dead: {consequence}"),
         ProcessState::Stopped => {
-            Some(format!("{name} (pid {pid}) is stopped: {consequence}; `kill -CONT {pid}` lets it go on"))
+            format!("{name} (pid {pid}) is stopped: {consequence}; `kill -CONT {pid}` lets it go on")
         }
         ProcessState::Silent => {
             let silent_s = now.at.since(process.health.alive_at) as f64 / 1e9;
-            Some(format!("{name} (pid {pid}) has not turned for {silent_s:.1} s: {consequence}"))
+            format!("{name} (pid {pid}) has not turned for {silent_s:.1} s: {consequence}")
         }
-        ProcessState::NotStarted => Some(format!("{name} was never started: {consequence}")),
+        ProcessState::NotStarted => format!("{name} was never started: {consequence}"),
         ProcessState::Running => {
             let restarts = process.health.starts.checked_sub(former?.health.starts).filter(|&n| n > 0)?;
             let times = if restarts == 1 { "once".to_owned() } else { format!("{restarts} times") };
-            Some(format!("{name} was restarted just now, {times}"))
+            return Some(Problem::new(about, Level::Warn, format!("{name} was restarted just now, {times}")));
         }
-    }
+    };
+    Some(Problem::new(about, Level::Error, text))
 }
 
-fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<String> {
+fn about_lane(lane: &LaneReading) -> String {
+    format!("lane {}", lane.name)
+}
+
+fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<Problem> {
     let counters = &output.counters;
     (!counters.is_whole()).then(|| {
-        format!(
+        let text = format!(
             "lane {}, route {}: does not add up: {} received, {} forwarded, {} waiting, {} dropped",
             lane.name,
             route.id,
@@ -123,7 +162,22 @@ fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading)
             counters.forwarded,
             counters.waiting,
             counters.drops.total()
-        )
+        );
+        Problem::new(about_lane(lane), Level::Error, text)
+    })
+}
+
+fn unaccounted_by_ingress(route: &RouteReading) -> Option<Problem> {
+    let counters = &route.counters;
+    (!route.is_whole()).then(|| {
+        let text = format!(
+            "ingress, route {}: does not add up: {} received, {} published, {} dropped",
+            route.id,
+            counters.received,
+            counters.published,
+            counters.drops.total()
+        );
+        Problem::new(format!("route {}", route.id), Level::Error, text)
     })
 }
 
@@ -133,7 +187,7 @@ fn silent(
     route: &RouteReading,
     output: &OutputReading,
     former: Option<&RouteReading>,
-) -> Option<String> {
+) -> Option<Problem> {
     let lane = &now.lanes[output.lane];
     let process = now.processes.iter().find(|process| process.role == ProcessRole::Egress(output.lane))?;
     let former = former?;
@@ -145,25 +199,84 @@ fn silent(
         && published >= SILENT_LANE_SAMPLES
         && forwarded == 0)
         .then(|| {
-            format!(
+            let text = format!(
                 "lane {}, {}: {published} samples came in just now and none was forwarded",
                 lane.name, output.topic
-            )
+            );
+            Problem::new(about_lane(lane), Level::Error, text)
         })
 }
 
-fn not_applied(lane: &LaneReading, now: &Snapshot) -> Option<String> {
+fn not_applied(lane: &LaneReading, now: &Snapshot) -> Option<Problem> {
     let waited = now.at.since(lane.policy.changed_at) > APPLY_MS * 1_000_000;
     let applies = lane.health.policy_epoch == lane.policy.epoch;
     (lane.health.pid != 0 && waited && !applies && lane.policy.epoch != 0).then(|| {
-        format!("lane {}: mode {} was set and the lane's process has not applied it", lane.name, lane.mode)
+        let text = format!(
+            "lane {}: mode {} was set and the lane's process has not applied it",
+            lane.name, lane.mode
+        );
+        Problem::new(about_lane(lane), Level::Warn, text)
     })
 }
 
-fn no_publisher(route: &RouteReading) -> Option<String> {
-    (route.counters.writers == 0).then(|| match route.counters.received {
-        0 => format!("route {}: waits for a publisher of {}", route.id, route.input_topic),
-        _ => format!("route {}: the publisher of {} is gone", route.id, route.input_topic),
+/// What was dropped or lost on a route within the window.
+fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, problems: &mut Vec<Problem>) {
+    let about = format!("route {}", route.id);
+    let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
+    for (reason, count) in dropped.iter() {
+        let what = reason.meaning();
+        let text =
+            format!("ingress, route {}: {count} samples dropped just now: {what} ({reason})", route.id);
+        problems.push(Problem::new(about.clone(), Level::Error, text));
+    }
+    for output in &route.outputs {
+        let lane = &now.lanes[output.lane];
+        let former = former.and_then(|former| former.output(output));
+        let dropped = drops_since(&output.counters.drops, former.map(|former| former.counters.drops));
+        for (reason, count) in dropped.iter().filter(|(reason, _)| !is_expected(*reason, lane.class)) {
+            let level = match lane.class {
+                TrafficClass::Critical => Level::Error,
+                TrafficClass::Noncritical => Level::Warn,
+            };
+            let text = format!(
+                "lane {}, {}: {count} samples dropped just now: {} ({reason}){}",
+                lane.name,
+                output.topic,
+                reason.meaning(),
+                matched_readers(reason, output)
+            );
+            problems.push(Problem::new(about_lane(lane), level, text));
+        }
+    }
+    if let Some(former) = former
+        && let Some(lost @ 1..) = route.counters.lost_upstream.checked_sub(former.counters.lost_upstream)
+    {
+        let text = format!(
+            "route {}: {lost} samples lost just now on their way from the publisher to the bridge",
+            route.id
+        );
+        problems.push(Problem::new(about, Level::Warn, text));
+    }
+}
+
+/// Who may be to blame for a write that failed: one of the matched readers, and not always a remote one.
+fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
+    match (reason, output.counters.readers) {
+        (DropReason::WindowFull | DropReason::WriteFailed, 1) => "; 1 reader is matched".to_owned(),
+        (DropReason::WindowFull | DropReason::WriteFailed, readers) => {
+            format!("; {readers} readers are matched")
+        }
+        _ => String::new(),
+    }
+}
+
+fn no_publisher(route: &RouteReading) -> Option<Problem> {
+    (route.counters.writers == 0).then(|| {
+        let text = match route.counters.received {
+            0 => format!("route {}: waits for a publisher of {}", route.id, route.input_topic),
+            _ => format!("route {}: the publisher of {} is gone", route.id, route.input_topic),
+        };
+        Problem::new(format!("route {}", route.id), Level::Stale, text)
     })
 }
 
@@ -180,16 +293,16 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::snapshot::ModeReason;
     use super::*;
     use crate::model::{
-        IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram, MonotonicNs,
-        ProcessHealth, RouteId, TopicName, WallNs,
+        ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
+        MonotonicNs, ProcessHealth, RouteId, TopicName, WallNs,
     };
 
     /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
-    fn sound() -> Snapshot {
+    pub(in crate::telemetry) fn sound() -> Snapshot {
         let at = MonotonicNs(100_000_000_000);
         let health = ProcessHealth { pid: 7, alive_at: at, starts: 1, ..ProcessHealth::default() };
         let process = |name: &str, role| ProcessReading {
@@ -241,16 +354,20 @@ mod tests {
                 dds_in: LatencyHistogram::default(),
                 outputs: vec![output(0, "/c/scan"), output(1, "/n/scan")],
             }],
+            needs_control: false,
+            control: ControlRecord::default(),
+            subscribers: Vec::new(),
+            intruders: Vec::new(),
         }
     }
 
     /// What is said of a bridge that was sound and then changed.
-    fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
+    pub(in crate::telemetry) fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
         let before = sound();
         let mut now = before.clone();
         now.at = now.at.plus_ms(1_000);
         change(&mut now);
-        of(&now, &before)
+        of(&now, &before).into_iter().map(|problem| problem.text).collect()
     }
 
     fn drop_on(now: &mut Snapshot, output: usize, reason: DropReason, count: u64) {
@@ -319,6 +436,7 @@ mod tests {
             now.routes[0].counters.received += 1;
             now.routes[0].counters.drops.add(DropReason::TooLarge, 1);
             now.routes[0].counters.lost_upstream += 4;
+            now.routes[0].outputs[0].counters.readers = 2;
             drop_on(now, 0, DropReason::WindowFull, 3);
             drop_on(now, 0, DropReason::Superseded, 1);
         });
@@ -327,12 +445,13 @@ mod tests {
             said[0].starts_with("ingress, route scan: 1 samples dropped just now: larger than"),
             "{said:?}"
         );
-        assert!(said[1].contains("lane critical, /c/scan: 3 samples") && said[1].ends_with("(window_full)"));
+        assert!(said[1].contains("lane critical, /c/scan: 3 samples"), "{said:?}");
+        assert!(said[1].ends_with("(window_full); 2 readers are matched"), "{said:?}");
         assert!(said[2].ends_with("(superseded)"), "{said:?}");
         assert!(said[3].contains("4 samples lost just now on their way"), "{said:?}");
         let mut before = sound();
         drop_on(&mut before, 0, DropReason::WindowFull, 3);
-        assert_eq!(of(&before, &before), [""; 0]);
+        assert_eq!(of(&before, &before), []);
     }
 
     #[test]

@@ -1,0 +1,146 @@
+//! The report as `diagnostic_msgs/DiagnosticArray`, for `/diagnostics` and its aggregator.
+//!
+//! Each part of the bridge has a status, named as diagnostic_updater does it: the node, a colon, the part. So
+//! `startswith: ["adaptive_bridge"]` finds all of them, and a part that is no longer reported becomes stale by
+//! itself. The keys of a status are those of `status --json`.
+
+mod parts;
+
+use bytes::Bytes;
+use serde::Serialize;
+
+use super::json::cdr;
+use super::problems::Level;
+use super::report::Report;
+use super::text::{printable, shortened};
+use parts::Part;
+
+/// Where diagnostics are published.
+pub const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
+
+/// The DDS type of `diagnostic_msgs/DiagnosticArray`.
+pub const DIAGNOSTIC_ARRAY_TYPE: &str = "diagnostic_msgs::msg::dds_::DiagnosticArray_";
+
+/// No array is larger, so that each fits in one UDP datagram. A bridge with more to say sends several: an
+/// aggregator goes by the names of the statuses.
+pub const MAX_ARRAY_BYTES: usize = 48 * 1024;
+
+/// The node in the names of the statuses; an instance of another name than this default has it appended.
+const NODE: &str = "adaptive_bridge";
+const DEFAULT_INSTANCE: &str = "default";
+
+/// The longest name, message, key and value in bytes, and the most values: 128 values of 256 bytes with their
+/// keys fill an array only in part.
+const MAX_NAME_BYTES: usize = 256;
+const MAX_MESSAGE_BYTES: usize = 1024;
+const MAX_KEY_BYTES: usize = 96;
+const MAX_VALUE_BYTES: usize = 192;
+const MAX_VALUES: usize = 128;
+
+/// `diagnostic_msgs/msg/DiagnosticArray`.
+#[derive(Serialize)]
+struct DiagnosticArray<'a> {
+    header: &'a Header,
+    status: &'a [DiagnosticStatus],
+}
+
+/// `std_msgs/msg/Header`; its first two fields are `builtin_interfaces/msg/Time`.
+#[derive(Serialize)]
+struct Header {
+    stamp_sec: i32,
+    stamp_nanosec: u32,
+    frame_id: &'static str,
+}
+
+/// `diagnostic_msgs/msg/DiagnosticStatus`.
+#[derive(Serialize)]
+struct DiagnosticStatus {
+    level: u8,
+    name: String,
+    message: String,
+    hardware_id: String,
+    values: Vec<KeyValue>,
+}
+
+/// `diagnostic_msgs/msg/KeyValue`.
+#[derive(Serialize)]
+struct KeyValue {
+    key: String,
+    value: String,
+}
+
+/// The report as messages for [`DIAGNOSTICS_TOPIC`], each of at most [`MAX_ARRAY_BYTES`], in plain
+/// little-endian CDR without the encapsulation header. One for most bridges.
+pub fn diagnostic_arrays(report: &Report) -> Vec<Bytes> {
+    let header = Header {
+        stamp_sec: i32::try_from(report.time_unix_ms / 1_000).unwrap_or(i32::MAX),
+        stamp_nanosec: (report.time_unix_ms % 1_000) as u32 * 1_000_000,
+        frame_id: "",
+    };
+    let statuses: Vec<DiagnosticStatus> =
+        parts::of(report).into_iter().map(|part| DiagnosticStatus::of(part, report)).collect();
+    let mut arrays = Vec::new();
+    let mut rest = statuses.as_slice();
+    while !rest.is_empty() {
+        let mut bytes = HEADER_BYTES;
+        let fitting = rest.iter().take_while(|status| {
+            bytes += status.max_encoded_bytes();
+            bytes <= MAX_ARRAY_BYTES
+        });
+        // One always fits, as its limits have it.
+        let (now, later) = rest.split_at(fitting.count().max(1));
+        arrays.push(cdr(&DiagnosticArray { header: &header, status: now }, bytes));
+        rest = later;
+    }
+    arrays
+}
+
+/// Stamp, an empty string with its padding, and the number of statuses.
+const HEADER_BYTES: usize = 8 + 8 + 4;
+
+impl DiagnosticStatus {
+    fn of(part: Part, report: &Report) -> Self {
+        let about = || report.problems.iter().filter(|problem| problem.about == part.name);
+        let level = about().fold(part.level, |level, problem| level.worse(problem.level));
+        let said: Vec<&str> = about().map(|problem| problem.text.as_str()).collect();
+        let message = if said.is_empty() { part.message } else { said.join("; ") };
+        let node = match report.instance.as_str() {
+            DEFAULT_INSTANCE => NODE.to_owned(),
+            instance => format!("{NODE}_{instance}"),
+        };
+        let mut values: Vec<KeyValue> = part
+            .values
+            .iter()
+            .take(MAX_VALUES)
+            .map(|(key, value)| KeyValue {
+                key: bounded(key, MAX_KEY_BYTES),
+                value: bounded(value, MAX_VALUE_BYTES),
+            })
+            .collect();
+        if let Some(omitted @ 1..) = part.values.len().checked_sub(MAX_VALUES) {
+            values.push(KeyValue { key: "values_omitted".to_owned(), value: omitted.to_string() });
+        }
+        Self {
+            level: level as u8,
+            name: bounded(&format!("{node}: {}", part.name), MAX_NAME_BYTES),
+            message: bounded(&message, MAX_MESSAGE_BYTES),
+            hardware_id: report.instance.clone(),
+            values,
+        }
+    }
+
+    /// What it takes at most: each string has a length, a zero and up to three bytes of padding.
+    fn max_encoded_bytes(&self) -> usize {
+        let string = |text: &str| 4 + text.len() + 1 + 3;
+        let values: usize = self.values.iter().map(|pair| string(&pair.key) + string(&pair.value)).sum();
+        4 + string(&self.name) + string(&self.message) + string(&self.hardware_id) + 4 + values
+    }
+}
+
+/// A zero within a string ends it early in C and C++, and a line break spoils their consoles.
+fn bounded(text: &str, max_bytes: usize) -> String {
+    shortened(&printable(text), max_bytes)
+}
+
+#[cfg(test)]
+mod tests;

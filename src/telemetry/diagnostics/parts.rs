@@ -1,0 +1,184 @@
+//! The parts of the bridge that have a status of their own, and what is said of each while nothing is wrong.
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::Level;
+use crate::telemetry::liveness::ProcessState;
+use crate::telemetry::report::{LaneReport, ProcessReport, Report, RouteReport, SubscriberReport};
+
+/// A part of the bridge.
+pub(super) struct Part {
+    /// As [`Problem::about`](crate::telemetry::Problem) names it.
+    pub(super) name: String,
+    /// How it is when no problem is about it.
+    pub(super) level: Level,
+    /// The same in words.
+    pub(super) message: String,
+    /// Its figures.
+    pub(super) values: Vec<(String, String)>,
+}
+
+/// Every part, in an order that does not change from one report to the next.
+pub(super) fn of(report: &Report) -> Vec<Part> {
+    let mut parts = vec![bridge(report)];
+    for name in ["ingress", "control"] {
+        parts.extend(report.processes.iter().find(|process| process.name == name).map(process));
+    }
+    parts.push(safety(report));
+    parts.extend(report.lanes.iter().map(|one| lane(one, report)));
+    parts.extend(report.routes.iter().map(route));
+    parts.push(probes(report));
+    parts.extend(report.subscribers.iter().map(subscriber));
+    parts.push(intruders(report));
+    parts
+}
+
+fn part(name: impl Into<String>, message: String, values: Vec<(String, String)>) -> Part {
+    Part { name: name.into(), level: Level::Ok, message, values }
+}
+
+fn bridge(report: &Report) -> Part {
+    let values = vec![
+        ("instance".to_owned(), report.instance.clone()),
+        ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ("problems".to_owned(), report.problems.len().to_string()),
+        ("window_ms".to_owned(), number(report.window_ms)),
+    ];
+    part("bridge", format!("{} lanes, {} routes", report.lanes.len(), report.routes.len()), values)
+}
+
+fn process(process: &ProcessReport) -> Part {
+    part(&*process.name, process.state.label().to_owned(), flat(process))
+}
+
+fn safety(report: &Report) -> Part {
+    part("safety", report.safety.mode.to_owned(), flat(&report.safety))
+}
+
+fn lane(lane: &LaneReport, report: &Report) -> Part {
+    let mut values = flat(lane);
+    let process = report.processes.iter().find(|process| process.name == format!("egress-{}", lane.name));
+    let is_up = process.is_some_and(|process| process.state == ProcessState::Running);
+    if let Some(process) = process {
+        put(&mut values, "process", process);
+    }
+    let message = format!("{} ({}): {}", lane.mode, lane.mode_reason, lane.mode_detail);
+    let level = if is_up { Level::Ok } else { Level::Stale };
+    Part { name: format!("lane {}", lane.name), level, message, values }
+}
+
+fn route(route: &RouteReport) -> Part {
+    let mut values = Vec::new();
+    if let Ok(Value::Object(mut fields)) = serde_json::to_value(route) {
+        fields.remove("lanes");
+        flatten("", &Value::Object(fields), &mut values);
+    }
+    for output in &route.lanes {
+        put(&mut values, &output.lane, output);
+    }
+    let message = match route.rate_hz {
+        Some(rate_hz) => format!("{} Hz from {} publishers", number(rate_hz), route.writers),
+        None => format!("{} publishers", route.writers),
+    };
+    part(format!("route {}", route.id), message, values)
+}
+
+fn probes(report: &Report) -> Part {
+    let message = format!("{} sent, {} answered", report.probes.sent, report.probes.accepted);
+    part("probes", message, flat(&report.probes))
+}
+
+fn subscriber(subscriber: &SubscriberReport) -> Part {
+    let forced = if subscriber.forced { ", forced" } else { "" };
+    let message = format!("{}{forced}: {}", subscriber.state, subscriber.figures());
+    part(format!("subscriber {}", subscriber.id), message, flat(subscriber))
+}
+
+fn intruders(report: &Report) -> Part {
+    let mut values = vec![
+        ("intruders".to_owned(), report.intruders.len().to_string()),
+        ("intruders_seen".to_owned(), report.intruders_seen.to_string()),
+    ];
+    for intruder in &report.intruders {
+        let node = intruder.node.as_deref().unwrap_or("a node without a name");
+        values.push((intruder.topic.clone(), format!("{node} on {}: {}", intruder.host, intruder.remedy)));
+    }
+    part("intruders", "no remote reader reaches past the bridge".to_owned(), values)
+}
+
+fn flat(value: &impl Serialize) -> Vec<(String, String)> {
+    let mut values = Vec::new();
+    put(&mut values, "", value);
+    values
+}
+
+fn put(values: &mut Vec<(String, String)>, path: &str, value: &impl Serialize) {
+    // The types of the report always have a JSON.
+    if let Ok(value) = serde_json::to_value(value) {
+        flatten(path, &value, values);
+    }
+}
+
+/// The leaves of a JSON value by their paths. Drops and refusals are listed where there were any, and not for
+/// the window once more: whoever looks has the last value to compare with.
+fn flatten(path: &str, value: &Value, values: &mut Vec<(String, String)>) {
+    let text = match value {
+        Value::Object(fields) => {
+            let named_counts = ["drops", "refused"].iter().any(|name| path.ends_with(name));
+            for (key, field) in fields {
+                if key.ends_with("_in_window") || (named_counts && field.as_u64() == Some(0)) {
+                    continue;
+                }
+                let below = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                flatten(&below, field, values);
+            }
+            return;
+        }
+        Value::Array(items) => items.iter().filter_map(Value::as_str).collect::<Vec<_>>().join(", "),
+        Value::Null => "unknown".to_owned(),
+        Value::Bool(flag) => if *flag { "yes" } else { "no" }.to_owned(),
+        Value::Number(count) if !count.is_f64() => count.to_string(),
+        Value::Number(figure) => figure.as_f64().map_or_else(|| figure.to_string(), number),
+        Value::String(text) => text.clone(),
+    };
+    values.push((path.to_owned(), text));
+}
+
+/// At most three decimals, none of them for nothing.
+fn number(value: f64) -> String {
+    let text = format!("{value:.3}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_short() {
+        for (value, text) in [(10.0, "10"), (9.9996, "10"), (0.015, "0.015"), (100.0, "100"), (0.0, "0")] {
+            assert_eq!(number(value), text);
+        }
+    }
+
+    #[test]
+    fn leaves_are_named_by_their_path() {
+        let json = serde_json::json!({
+            "drops": {"stale": 3, "stopped": 0}, "drops_in_window": {"stale": 1}, "rtt": null, "up": true,
+            "dds_in": {"p50_us": 12.5}, "warnings": ["rtt", "loss"], "count": 0
+        });
+        let mut found = Vec::new();
+        flatten("", &json, &mut found);
+        found.sort();
+        let expected = [
+            ("count", "0"),
+            ("dds_in.p50_us", "12.5"),
+            ("drops.stale", "3"),
+            ("rtt", "unknown"),
+            ("up", "yes"),
+            ("warnings", "rtt, loss"),
+        ];
+        assert_eq!(found, expected.map(|(key, value)| (key.to_owned(), value.to_owned())));
+    }
+}

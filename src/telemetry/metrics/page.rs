@@ -1,0 +1,182 @@
+//! The text that Prometheus reads: its exposition format, version 0.0.4.
+
+use std::fmt::Write;
+
+use crate::telemetry::report::LatencyTotal;
+
+/// The media type of the format.
+pub const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
+
+/// The labels of a sample: names, which are ours, and values, which may be anything.
+pub(super) type Labels<'a> = &'a [(&'static str, &'a str)];
+
+/// The page, while it is written.
+#[derive(Debug, Default)]
+pub(super) struct Page {
+    text: String,
+    /// The head of the family whose first sample has not come: one without samples is left out.
+    head: Option<String>,
+    name: &'static str,
+}
+
+/// What a family is.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Kind {
+    Counter,
+    Gauge,
+    Histogram,
+}
+
+/// A value: a count, which is written out in full, or a figure.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Value {
+    Count(u64),
+    Figure(f64),
+}
+
+impl From<u64> for Value {
+    fn from(count: u64) -> Self {
+        Self::Count(count)
+    }
+}
+
+impl From<f64> for Value {
+    fn from(figure: f64) -> Self {
+        Self::Figure(figure)
+    }
+}
+
+impl From<bool> for Value {
+    fn from(flag: bool) -> Self {
+        Self::Count(u64::from(flag))
+    }
+}
+
+impl Page {
+    /// Begins a family; its samples follow. `help` is of ours and has neither line breaks nor backslashes.
+    pub(super) fn family(&mut self, name: &'static str, kind: Kind, help: &str) {
+        let kind = match kind {
+            Kind::Counter => "counter",
+            Kind::Gauge => "gauge",
+            Kind::Histogram => "histogram",
+        };
+        self.head = Some(format!("# HELP {name} {help}\n# TYPE {name} {kind}\n"));
+        self.name = name;
+    }
+
+    /// A sample of the family; `None` is left out.
+    pub(super) fn sample(&mut self, labels: Labels<'_>, value: Option<impl Into<Value>>) {
+        if let Some(value) = value {
+            self.put("", labels, None, value.into());
+        }
+    }
+
+    /// One sample of each state there is, 1 for the one that it is in.
+    pub(super) fn states(&mut self, labels: Labels<'_>, name: &'static str, all: &[&str], present: &str) {
+        for state in all {
+            let mut labels = labels.to_vec();
+            labels.push((name, state));
+            self.put("", &labels, None, (*state == present).into());
+        }
+    }
+
+    /// A histogram of the family.
+    pub(super) fn histogram(&mut self, labels: Labels<'_>, total: &LatencyTotal) {
+        for (edge_ns, below) in LatencyTotal::EDGES_NS.iter().zip(total.below) {
+            let edge = (*edge_ns as f64 / 1e9).to_string();
+            self.put("_bucket", labels, Some(&edge), below.into());
+        }
+        self.put("_bucket", labels, Some("+Inf"), total.count.into());
+        self.put("_sum", labels, None, (total.sum_ns as f64 / 1e9).into());
+        self.put("_count", labels, None, total.count.into());
+    }
+
+    pub(super) fn into_text(self) -> String {
+        self.text
+    }
+
+    fn put(&mut self, suffix: &str, labels: Labels<'_>, edge: Option<&str>, value: Value) {
+        self.text.push_str(&self.head.take().unwrap_or_default());
+        self.text.push_str(self.name);
+        self.text.push_str(suffix);
+        let labels = labels.iter().copied().chain(edge.map(|edge| ("le", edge)));
+        let mut open = '{';
+        for (name, value) in labels {
+            self.text.push(open);
+            open = ',';
+            self.text.push_str(name);
+            self.text.push_str("=\"");
+            escape(value, &mut self.text);
+            self.text.push('"');
+        }
+        if open == ',' {
+            self.text.push('}');
+        }
+        // Writing to a string does not fail.
+        let _ = match value {
+            Value::Count(count) => writeln!(self.text, " {count}"),
+            Value::Figure(figure) if figure.is_nan() => writeln!(self.text, " NaN"),
+            Value::Figure(f64::INFINITY) => writeln!(self.text, " +Inf"),
+            Value::Figure(f64::NEG_INFINITY) => writeln!(self.text, " -Inf"),
+            Value::Figure(figure) => writeln!(self.text, " {figure}"),
+        };
+    }
+}
+
+/// In the value of a label, backslash, quote and line feed are escaped; all else stands for itself.
+fn escape(value: &str, text: &mut String) {
+    for char in value.chars() {
+        match char {
+            '\\' => text.push_str("\\\\"),
+            '"' => text.push_str("\\\""),
+            '\n' => text.push_str("\\n"),
+            other => text.push(other),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_family_has_one_head_and_a_line_for_each_sample() {
+        let mut page = Page::default();
+        page.family("a_total", Kind::Counter, "What a is.");
+        page.sample(&[("route", "scan")], Some(u64::MAX));
+        page.sample(&[], Some(0.5));
+        page.family("b", Kind::Gauge, "Never there.");
+        page.sample(&[], None::<u64>);
+        page.family("c", Kind::Gauge, "States.");
+        page.states(&[("lane", "x")], "mode", &["on", "off"], "off");
+        let expected = "# HELP a_total What a is.\n# TYPE a_total counter\n\
+                        a_total{route=\"scan\"} 18446744073709551615\na_total 0.5\n\
+                        # HELP c States.\n# TYPE c gauge\nc{lane=\"x\",mode=\"on\"} 0\nc{lane=\"x\",mode=\"off\"} 1\n";
+        assert_eq!(page.into_text(), expected);
+    }
+
+    #[test]
+    fn a_label_of_any_value_stays_one_label_of_one_line() {
+        let mut page = Page::default();
+        page.family("a", Kind::Gauge, "A.");
+        page.sample(&[("id", "x\"} 1\nb{c=\"\\")], Some(f64::NAN));
+        let line = page.into_text().lines().last().unwrap().to_owned();
+        assert_eq!(line, r#"a{id="x\"} 1\nb{c=\"\\"} NaN"#);
+    }
+
+    #[test]
+    fn a_histogram_grows_up_to_infinity() {
+        let mut total = LatencyTotal { count: 9, sum_ns: 1_500_000_000, ..LatencyTotal::default() };
+        total.below[20] = 7;
+        let mut page = Page::default();
+        page.family("h_seconds", Kind::Histogram, "H.");
+        page.histogram(&[("lane", "x")], &total);
+        let text = page.into_text();
+        assert_eq!(text.matches("h_seconds_bucket").count(), 22);
+        let first = "\nh_seconds_bucket{lane=\"x\",le=\"0.000016384\"} 0\n";
+        assert!(text.contains(first), "{text}");
+        let end = "le=\"17.179869184\"} 7\nh_seconds_bucket{lane=\"x\",le=\"+Inf\"} 9\n\
+                   h_seconds_sum{lane=\"x\"} 1.5\nh_seconds_count{lane=\"x\"} 9\n";
+        assert!(text.ends_with(end), "{text}");
+    }
+}

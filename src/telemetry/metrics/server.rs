@@ -1,0 +1,421 @@
+//! Hands the page out over HTTP: TCP on a loopback address, or a unix socket.
+//!
+//! One thread of its own serves all connections, none of which it waits for: a slow client costs a place until
+//! its time is over, and nothing else. Whoever has the report hands it over under a lock that is held for a
+//! copy of a pointer; the page is written when it is asked for.
+//!
+//! The server is our own because it is this small: HTTP/1.1 with one method, one page, and a connection that
+//! ends after the answer. tiny_http, the one small library without an asynchronous runtime, has no timeouts
+//! (its issue 143) and no release since 2022.
+
+use std::fmt;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+use std::{fs, thread};
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr, bind, listen, socket};
+use nix::sys::stat::{Mode, fchmod};
+
+use super::metrics_page;
+use super::page::CONTENT_TYPE;
+use crate::clock;
+use crate::config::MetricsListener;
+use crate::model::MonotonicNs;
+use crate::telemetry::report::Report;
+
+/// Clients that are served at once; further ones wait in the kernel's queue.
+const MAX_CLIENTS: usize = 8;
+/// A client has so long to ask and to read the answer.
+const CLIENT_MS: u64 = 5_000;
+/// No request of a scraper is longer.
+const MAX_REQUEST_BYTES: usize = 8 * 1024;
+/// Before what failed for want of resources is tried again.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Reads and writes of one client in one turn, so that one which is fast does not keep the others waiting.
+const MAX_STEPS: usize = 16;
+
+/// Why there is no metrics page.
+#[derive(Debug)]
+pub struct MetricsError {
+    address: String,
+    cause: io::Error,
+}
+
+impl fmt::Display for MetricsError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "no metrics page on {} (diagnostics.metrics): {}", self.address, self.cause)
+    }
+}
+
+impl std::error::Error for MetricsError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        Some(&self.cause)
+    }
+}
+
+/// The server. Dropping it ends it, and removes the file of a unix socket.
+#[derive(Debug)]
+pub struct MetricsServer {
+    latest: Arc<Mutex<Option<Arc<Report>>>>,
+    /// Closed to end the thread.
+    stop: Option<UnixStream>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl MetricsServer {
+    /// Listens and serves. Before the first report it answers 503.
+    ///
+    /// # Errors
+    /// The address is in use or cannot be listened on, or there is no thread to be had. The file of a unix
+    /// socket that nobody listens on any more is replaced; another kind of file is not.
+    pub fn start(listener: &MetricsListener) -> Result<Self, MetricsError> {
+        let address = match listener {
+            MetricsListener::Tcp(ip, port) => std::net::SocketAddr::new(*ip, *port).to_string(),
+            MetricsListener::Unix(path) => path.display().to_string(),
+        };
+        Self::try_start(listener).map_err(|cause| MetricsError { address, cause })
+    }
+
+    fn try_start(listener: &MetricsListener) -> io::Result<Self> {
+        let door = match listener {
+            MetricsListener::Tcp(ip, port) => Door::Tcp(TcpListener::bind((*ip, *port))?),
+            MetricsListener::Unix(path) => Door::Unix(SocketFile::listen(path)?),
+        };
+        door.set_nonblocking()?;
+        let (stop, stopped) = UnixStream::pair()?;
+        let latest = Arc::new(Mutex::new(None));
+        let reports = latest.clone();
+        let serve = move || serve(&door, &stopped, &reports);
+        let thread = thread::Builder::new().name("metrics".to_owned()).spawn(serve)?;
+        Ok(Self { latest, stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Shows this report from now on. Waits for nothing but another thread's copy of a pointer.
+    pub fn show(&self, report: Arc<Report>) {
+        let former = self.latest.lock().unwrap_or_else(PoisonError::into_inner).replace(report);
+        // Freed after the lock is.
+        drop(former);
+    }
+}
+
+impl Drop for MetricsServer {
+    fn drop(&mut self) {
+        self.stop = None;
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("the metrics page ended in a panic");
+        }
+    }
+}
+
+/// What clients come in by.
+enum Door {
+    Tcp(TcpListener),
+    Unix(SocketFile),
+}
+
+impl Door {
+    fn set_nonblocking(&self) -> io::Result<()> {
+        match self {
+            Self::Tcp(listener) => listener.set_nonblocking(true),
+            Self::Unix(file) => file.listener.set_nonblocking(true),
+        }
+    }
+
+    fn accept(&self) -> io::Result<Stream> {
+        let stream = match self {
+            Self::Tcp(listener) => Stream::Tcp(listener.accept()?.0),
+            Self::Unix(file) => Stream::Unix(file.listener.accept()?.0),
+        };
+        match &stream {
+            Stream::Tcp(stream) => stream.set_nonblocking(true)?,
+            Stream::Unix(stream) => stream.set_nonblocking(true)?,
+        }
+        Ok(stream)
+    }
+}
+
+impl AsFd for Door {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            Self::Tcp(listener) => listener.as_fd(),
+            Self::Unix(file) => file.listener.as_fd(),
+        }
+    }
+}
+
+/// A listening unix socket, whose file goes with it.
+struct SocketFile {
+    listener: UnixListener,
+    path: PathBuf,
+    /// Device and inode of the file that is ours.
+    identity: (u64, u64),
+}
+
+impl SocketFile {
+    fn listen(path: &Path) -> io::Result<Self> {
+        Self::remove_stale(path)?;
+        let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
+        let fd = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
+        // The file gets the mode of the socket, less the umask: nobody else can come in before it is changed.
+        fchmod(&fd, Mode::S_IRUSR | Mode::S_IWUSR)?;
+        bind(fd.as_raw_fd(), &UnixAddr::new(path)?)?;
+        listen(&fd, Backlog::new(MAX_CLIENTS as i32)?)?;
+        let file = fs::symlink_metadata(path)?;
+        let identity = (file.dev(), file.ino());
+        let bound = Self { listener: UnixListener::from(fd), path: path.to_owned(), identity };
+        fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
+        Ok(bound)
+    }
+
+    /// What a process left that was killed.
+    fn remove_stale(path: &Path) -> io::Result<()> {
+        match fs::symlink_metadata(path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+            Err(error) => Err(error),
+            Ok(file) if !file.file_type().is_socket() => {
+                Err(io::Error::new(ErrorKind::AlreadyExists, "there is a file of that name"))
+            }
+            Ok(_) => match UnixStream::connect(path) {
+                Ok(_) => Err(ErrorKind::AddrInUse.into()),
+                Err(error) if error.kind() == ErrorKind::ConnectionRefused => fs::remove_file(path),
+                Err(error) => Err(error),
+            },
+        }
+    }
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        let file = fs::symlink_metadata(&self.path);
+        if file.is_ok_and(|file| (file.dev(), file.ino()) == self.identity) {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+enum Stream {
+    Tcp(TcpStream),
+    Unix(UnixStream),
+}
+
+impl Stream {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        match self {
+            Self::Tcp(stream) => stream.read(buffer),
+            Self::Unix(stream) => stream.read(buffer),
+        }
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Self::Tcp(stream) => stream.write(bytes),
+            Self::Unix(stream) => stream.write(bytes),
+        }
+    }
+
+    fn end_output(&self) -> io::Result<()> {
+        match self {
+            Self::Tcp(stream) => stream.shutdown(Shutdown::Write),
+            Self::Unix(stream) => stream.shutdown(Shutdown::Write),
+        }
+    }
+}
+
+impl AsFd for Stream {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            Self::Tcp(stream) => stream.as_fd(),
+            Self::Unix(stream) => stream.as_fd(),
+        }
+    }
+}
+
+/// Serves until `stopped` is closed at its other end.
+fn serve(door: &Door, stopped: &UnixStream, reports: &Mutex<Option<Arc<Report>>>) {
+    let latest = || reports.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let mut clients: Vec<Client> = Vec::with_capacity(MAX_CLIENTS);
+    loop {
+        let now = clock::monotonic();
+        clients.retain(|client| now < client.until);
+        let Some(ready) = wait(door, stopped, &clients, now) else { continue };
+        if ready[0] {
+            return;
+        }
+        let mut turns = ready[2..].iter();
+        clients.retain_mut(|client| turns.next() != Some(&true) || client.turn(&latest));
+        if ready[1] {
+            accept(door, &mut clients);
+        }
+    }
+}
+
+/// What is ready: the end, the door, then each client. `None` when the time of a client is over.
+fn wait(door: &Door, stopped: &UnixStream, clients: &[Client], now: MonotonicNs) -> Option<Vec<bool>> {
+    let at_door = if clients.len() < MAX_CLIENTS { PollFlags::POLLIN } else { PollFlags::empty() };
+    let mut fds = vec![PollFd::new(stopped.as_fd(), PollFlags::POLLIN), PollFd::new(door.as_fd(), at_door)];
+    fds.extend(clients.iter().map(|client| PollFd::new(client.stream.as_fd(), client.waits_for())));
+    let left_ms = clients.iter().map(|client| client.until.since(now) / 1_000_000 + 1).min();
+    let timeout =
+        left_ms.map_or(PollTimeout::NONE, |ms| PollTimeout::try_from(ms).unwrap_or(PollTimeout::MAX));
+    match poll(&mut fds, timeout) {
+        Ok(1..) => Some(fds.iter().map(|fd| fd.any().unwrap_or(true)).collect()),
+        Ok(_) | Err(nix::errno::Errno::EINTR) => None,
+        Err(error) => {
+            tracing::error!(%error, "the metrics page cannot wait for clients");
+            thread::sleep(PAUSE);
+            None
+        }
+    }
+}
+
+fn accept(door: &Door, clients: &mut Vec<Client>) {
+    while clients.len() < MAX_CLIENTS {
+        match door.accept() {
+            Ok(stream) => clients.push(Client {
+                stream,
+                until: clock::monotonic().plus_ms(CLIENT_MS),
+                request: Vec::new(),
+                state: State::Asks,
+            }),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => return,
+            // One that has gone again.
+            Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::Interrupted) => {}
+            Err(error) => {
+                // No file descriptor, for example; it will be tried again.
+                tracing::warn!(%error, "a client of the metrics page was not let in");
+                thread::sleep(PAUSE);
+                return;
+            }
+        }
+    }
+}
+
+/// One connection.
+struct Client {
+    stream: Stream,
+    until: MonotonicNs,
+    request: Vec<u8>,
+    state: State,
+}
+
+enum State {
+    Asks,
+    Reads {
+        answer: Vec<u8>,
+        written: usize,
+    },
+    /// It has the answer. A connection that is closed while bytes of the client are unread is reset, and the
+    /// answer may be lost with it; so they are read up to its end.
+    Leaves,
+}
+
+impl Client {
+    fn waits_for(&self) -> PollFlags {
+        match self.state {
+            State::Asks | State::Leaves => PollFlags::POLLIN,
+            State::Reads { .. } => PollFlags::POLLOUT,
+        }
+    }
+
+    /// Goes on as far as it can without waiting; whether the client stays.
+    fn turn(&mut self, latest: &dyn Fn() -> Option<Arc<Report>>) -> bool {
+        for _ in 0..MAX_STEPS {
+            match self.step(latest) {
+                Ok(true) => {}
+                Ok(false) => return false,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return true,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(_) => return false,
+            }
+        }
+        true
+    }
+
+    fn step(&mut self, latest: &dyn Fn() -> Option<Arc<Report>>) -> io::Result<bool> {
+        let mut buffer = [0; 2048];
+        match &mut self.state {
+            State::Asks => {
+                let count = self.stream.read(&mut buffer)?;
+                self.request.extend_from_slice(&buffer[..count]);
+                let is_whole = self.request.windows(4).any(|bytes| bytes == b"\r\n\r\n");
+                if is_whole || self.request.len() > MAX_REQUEST_BYTES {
+                    let answer = if is_whole { answer(&self.request, latest) } else { refusal(TOO_LARGE) };
+                    self.state = State::Reads { answer, written: 0 };
+                    self.request = Vec::new();
+                }
+                Ok(count > 0)
+            }
+            State::Reads { answer, written } => {
+                *written += self.stream.write(&answer[*written..])?;
+                if *written == answer.len() {
+                    self.stream.end_output()?;
+                    self.state = State::Leaves;
+                }
+                Ok(true)
+            }
+            State::Leaves => Ok(self.stream.read(&mut buffer)? > 0),
+        }
+    }
+}
+
+const NOT_HTTP: &str = "400 Bad Request";
+const NOT_FOUND: &str = "404 Not Found";
+const NOT_ALLOWED: &str = "405 Method Not Allowed";
+const TOO_LARGE: &str = "431 Request Header Fields Too Large";
+const NOT_YET: &str = "503 Service Unavailable";
+
+/// The answer to a request whose head is whole (RFC 9112).
+fn answer(request: &[u8], latest: &dyn Fn() -> Option<Arc<Report>>) -> Vec<u8> {
+    let line = request.split(|&byte| byte == b'\r').next().unwrap_or_default();
+    let words: Vec<&str> = std::str::from_utf8(line).unwrap_or_default().split(' ').collect();
+    let (method, target) = match words[..] {
+        [method, target, "HTTP/1.0" | "HTTP/1.1"] => (method, target),
+        _ => return refusal(NOT_HTTP),
+    };
+    if !matches!(method, "GET" | "HEAD") {
+        return refusal(NOT_ALLOWED);
+    }
+    if target.split('?').next() != Some("/metrics") {
+        return refusal(NOT_FOUND);
+    }
+    match latest() {
+        Some(report) => response("200 OK", CONTENT_TYPE, &metrics_page(&report), method == "HEAD"),
+        None => refusal(NOT_YET),
+    }
+}
+
+fn refusal(status: &str) -> Vec<u8> {
+    let body = match status {
+        NOT_FOUND => "the page is /metrics\n",
+        NOT_ALLOWED => "GET and HEAD only\n",
+        NOT_YET => "the bridge has no figures yet\n",
+        _ => "",
+    };
+    response(status, "text/plain; charset=utf-8", body, false)
+}
+
+fn response(status: &str, content_type: &str, body: &str, head_only: bool) -> Vec<u8> {
+    let allow = if status == NOT_ALLOWED { "Allow: GET, HEAD\r\n" } else { "" };
+    let mut text = format!(
+        "HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\nContent-Length: {}\r\n{allow}\
+         Connection: close\r\n\r\n",
+        body.len()
+    );
+    if !head_only {
+        text.push_str(body);
+    }
+    text.into_bytes()
+}
+
+#[cfg(test)]
+mod tests;

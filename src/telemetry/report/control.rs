@@ -1,0 +1,313 @@
+//! What control found and decided, as the report has it.
+
+use serde::ser::{Serialize, SerializeMap, Serializer};
+
+use super::age_ms;
+use crate::model::{
+    IntruderRecord, LaneMode, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState, SubscriberWarning,
+    TrafficClass,
+};
+use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
+use crate::telemetry::text::printable;
+
+/// The safety supervisor.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct SafetyReport {
+    /// `normal`, `degraded` or `emergency`.
+    pub mode: &'static str,
+    /// What brought the mode about; null in normal mode.
+    pub reason: Option<String>,
+    /// For how long it has been in force; null when control never ran.
+    pub since_s: Option<f64>,
+    /// Changes of the mode since control came up.
+    pub transitions: u64,
+}
+
+/// The probes of all subscribers together.
+#[derive(Clone, Copy, Debug, Default, serde::Serialize)]
+pub struct ProbesReport {
+    /// Probes sent.
+    pub sent: u64,
+    /// Responses that were taken for what they claim to be.
+    pub accepted: u64,
+    /// Messages refused, by reason.
+    pub refused: Refusals,
+    /// Of those, the ones within the window.
+    pub refused_in_window: Refusals,
+}
+
+/// Refusals, by name; in JSON every reason is there.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Refusals(pub RefusalCounts);
+
+impl Serialize for Refusals {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(ProbeRefusal::COUNT))?;
+        for reason in ProbeRefusal::ALL {
+            map.serialize_entry(reason.label(), &self.0.get(*reason))?;
+        }
+        map.end()
+    }
+}
+
+/// One subscriber.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct SubscriberReport {
+    /// The id of its responder.
+    pub id: String,
+    /// Its lane; null when control named none that there is.
+    pub lane: Option<String>,
+    /// Whether the configuration lists it.
+    pub listed: bool,
+    /// `UNKNOWN`, `CRITICAL` or `NONCRITICAL`.
+    pub state: &'static str,
+    /// Whether the configuration forces the state.
+    pub forced: bool,
+    /// Why it is in its state.
+    pub reason: String,
+    /// For how long it has been.
+    pub state_since_s: Option<f64>,
+    /// Changes of its state since control came up.
+    pub transitions: u64,
+    /// Probes of the sliding window whose fate is known.
+    pub settled: u64,
+    /// Of those, the ones without a response in time.
+    pub lost: u64,
+    /// The share of those, 0 to 1.
+    pub loss: Option<f64>,
+    /// Mean round trip within the sliding window.
+    pub rtt_mean_ms: Option<f64>,
+    /// 95th percentile of the round trips.
+    pub rtt_p95_ms: Option<f64>,
+    /// Jitter of the round trips.
+    pub jitter_ms: Option<f64>,
+    /// How long ago its last response came.
+    pub last_response_age_ms: Option<f64>,
+    /// The figures above their warning threshold: `rtt`, `loss`, `jitter`.
+    pub warnings: Vec<&'static str>,
+}
+
+impl SubscriberReport {
+    /// The figures in words, such as `RTT 81.2 ms, loss 2.0 %`.
+    pub fn figures(&self) -> String {
+        match (self.rtt_mean_ms, self.loss) {
+            (Some(rtt_ms), Some(loss)) => format!("RTT {rtt_ms:.1} ms, loss {:.1} %", loss * 100.0),
+            (None, Some(_)) => format!("none of {} probes answered", self.settled),
+            (_, None) => "no probe settled yet".to_owned(),
+        }
+    }
+}
+
+/// A remote reader that reaches past the bridge.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct IntruderReport {
+    /// The topic that it reads.
+    pub topic: String,
+    /// Its node; null when it has not said.
+    pub node: Option<String>,
+    /// The addresses of its host.
+    pub host: String,
+    /// What to do about it.
+    pub remedy: String,
+    /// For how long it has been known.
+    pub since_s: Option<f64>,
+}
+
+impl Snapshot {
+    pub(super) fn safety_report(&self) -> SafetyReport {
+        let control = &self.control;
+        SafetyReport {
+            mode: control.safety().label(),
+            reason: some_text(control.safety_reason.as_str()),
+            since_s: age_s(control.safety_since, self.at),
+            transitions: control.safety_transitions,
+        }
+    }
+
+    pub(super) fn probes_report(&self, earlier: &Self) -> ProbesReport {
+        let (now, before) = (&self.control.refused, &earlier.control.refused);
+        ProbesReport {
+            sent: self.control.probes_sent,
+            accepted: self.control.responses_accepted,
+            refused: Refusals(*now),
+            refused_in_window: Refusals(now.since(before)),
+        }
+    }
+
+    pub(in crate::telemetry) fn subscriber_report(
+        &self,
+        SubscriberReading { lane, record }: &SubscriberReading,
+    ) -> SubscriberReport {
+        let answered = record.settled > record.lost;
+        let ms = |us: u64| answered.then_some(us as f64 / 1e3);
+        SubscriberReport {
+            id: printable(record.id.as_str()),
+            lane: lane.map(|lane| self.lanes[lane].name.to_string()),
+            listed: record.listed != 0,
+            state: record.state().label(),
+            forced: record.forced != 0,
+            reason: printable(record.reason.as_str()),
+            state_since_s: age_s(record.state_since, self.at),
+            transitions: record.transitions,
+            settled: record.settled,
+            lost: record.lost,
+            loss: record.loss(),
+            rtt_mean_ms: ms(record.rtt_mean_us),
+            rtt_p95_ms: ms(record.rtt_p95_us),
+            jitter_ms: ms(record.jitter_us),
+            last_response_age_ms: age_ms(record.last_response_at, self.at),
+            warnings: record.warnings().map(SubscriberWarning::label).collect(),
+        }
+    }
+
+    pub(super) fn intruder_report(&self, intruder: &IntruderRecord) -> IntruderReport {
+        IntruderReport {
+            topic: printable(intruder.topic.as_str()),
+            node: some_text(intruder.node.as_str()),
+            host: printable(intruder.host.as_str()),
+            remedy: printable(intruder.remedy.as_str()),
+            since_s: age_s(intruder.since, self.at),
+        }
+    }
+
+    /// Why a lane is in its mode, in a sentence.
+    pub(super) fn mode_detail(&self, number: usize, lane: &LaneReading) -> String {
+        match lane.reason {
+            ModeReason::Default => "nobody has set a mode".to_owned(),
+            ModeReason::ByHand => "an operator has set it".to_owned(),
+            ModeReason::Safety => match self.control.safety_reason.as_str() {
+                "" => format!("the safety mode is {}", self.control.safety()),
+                reason => format!("the safety mode is {}: {}", self.control.safety(), printable(reason)),
+            },
+            ModeReason::Control => self.control_detail(number, lane),
+            ModeReason::Held => {
+                format!("control does not run; its last word holds: {}", self.control_detail(number, lane))
+            }
+            ModeReason::Expired => "control is gone for longer than policy_hold_s".to_owned(),
+        }
+    }
+
+    /// What control went by: the worst subscriber of a noncritical lane, by name.
+    fn control_detail(&self, number: usize, lane: &LaneReading) -> String {
+        if lane.class == TrafficClass::Critical {
+            return "a critical lane forwards every sample, whatever the links are like".to_owned();
+        }
+        if self.control.classifies == 0 {
+            return "subscribers are not classified".to_owned();
+        }
+        let of_lane = self.subscribers.iter().filter(|subscriber| subscriber.lane == Some(number));
+        let badness = |subscriber: &SubscriberReading| {
+            let record = &subscriber.record;
+            let state = match record.state() {
+                SubscriberState::Critical => 0,
+                SubscriberState::Unknown => 1,
+                SubscriberState::Noncritical => 2,
+            };
+            (state, record.lost, record.rtt_mean_us)
+        };
+        let count = of_lane.clone().count();
+        let Some(worst) = of_lane.max_by_key(|subscriber| badness(subscriber)) else {
+            return "the lane has no subscriber that answers probes".to_owned();
+        };
+        let kept = lane.mode == LaneMode::Normal && worst.record.state() == SubscriberState::Noncritical;
+        let kept = if kept { "; safety.allow_noncritical_degrade forbids to degrade it" } else { "" };
+        let worst = self.subscriber_report(worst);
+        let forced = if worst.forced { ", forced" } else { "" };
+        let of = if count == 1 {
+            "its subscriber".to_owned()
+        } else {
+            format!("the worst of {count} subscribers,")
+        };
+        format!("{of} {} is {}{forced}: {}{kept}", worst.id, worst.state, worst.figures())
+    }
+}
+
+fn age_s(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
+    age_ms(at, now).map(|ms| ms / 1e3)
+}
+
+fn some_text(text: &str) -> Option<String> {
+    (!text.is_empty()).then(|| printable(text))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{FixedText, SafetyMode, SubscriberRecord};
+    use crate::telemetry::problems::tests::sound;
+
+    fn subscriber(id: &str, state: SubscriberState, lost: u64) -> SubscriberReading {
+        let record = SubscriberRecord {
+            id: FixedText::new(id),
+            state: state as u8,
+            settled: 50,
+            lost,
+            rtt_mean_us: 20_000,
+            ..SubscriberRecord::default()
+        };
+        SubscriberReading { lane: Some(1), record }
+    }
+
+    fn detail(reason: ModeReason, change: impl FnOnce(&mut Snapshot)) -> String {
+        let mut snapshot = sound();
+        snapshot.control.classifies = 1;
+        snapshot.lanes[1].reason = reason;
+        snapshot.lanes[1].mode = LaneMode::Degraded;
+        change(&mut snapshot);
+        snapshot.mode_detail(1, &snapshot.lanes[1])
+    }
+
+    #[test]
+    fn a_mode_of_control_is_explained_by_the_worst_subscriber_of_the_lane() {
+        let none = detail(ModeReason::Control, |_| {});
+        assert_eq!(none, "the lane has no subscriber that answers probes");
+        let worst = detail(ModeReason::Control, |now| {
+            let mut elsewhere = subscriber("robot", SubscriberState::Noncritical, 50);
+            elsewhere.lane = Some(0);
+            now.subscribers = vec![
+                subscriber("desk", SubscriberState::Critical, 0),
+                subscriber("laptop", SubscriberState::Noncritical, 1),
+                subscriber("tablet", SubscriberState::Unknown, 9),
+                elsewhere,
+            ];
+        });
+        let expected = "the worst of 3 subscribers, laptop is NONCRITICAL: RTT 20.0 ms, loss 2.0 %";
+        assert_eq!(worst, expected);
+    }
+
+    #[test]
+    fn a_lane_that_no_subscriber_degrades_says_why() {
+        let noncritical = |now: &mut Snapshot| {
+            now.subscribers = vec![subscriber("laptop", SubscriberState::Noncritical, 1)];
+        };
+        let said = detail(ModeReason::Control, |now| {
+            noncritical(now);
+            now.lanes[1].mode = LaneMode::Normal;
+        });
+        assert!(said.ends_with("; safety.allow_noncritical_degrade forbids to degrade it"), "{said}");
+        let said = detail(ModeReason::Control, |now| {
+            noncritical(now);
+            now.lanes[1].class = TrafficClass::Critical;
+        });
+        assert_eq!(said, "a critical lane forwards every sample, whatever the links are like");
+        let said = detail(ModeReason::Control, |now| now.control.classifies = 0);
+        assert_eq!(said, "subscribers are not classified");
+    }
+
+    #[test]
+    fn a_mode_of_safety_is_explained_by_the_fault() {
+        let said = detail(ModeReason::Safety, |now| {
+            now.control.safety = SafetyMode::Emergency as u8;
+            now.control.safety_reason = FixedText::new("ingress is dead");
+        });
+        assert_eq!(said, "the safety mode is emergency: ingress is dead");
+    }
+
+    #[test]
+    fn round_trips_are_unknown_where_no_probe_was_answered() {
+        let now = sound();
+        let report = now.subscriber_report(&subscriber("laptop", SubscriberState::Noncritical, 50));
+        assert_eq!((report.rtt_mean_ms, report.loss), (None, Some(1.0)));
+        assert_eq!(report.figures(), "none of 50 probes answered");
+    }
+}

@@ -1,0 +1,153 @@
+//! A report for the tests of what is made of one.
+
+use super::liveness::ProcessState;
+use super::problems::{Level, Problem};
+use super::report::{
+    Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
+    Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+};
+use crate::model::{DropCounts, DropReason, ProbeRefusal, RefusalCounts};
+
+fn drops(each: u64) -> Drops {
+    let mut counts = DropCounts::default();
+    for &reason in DropReason::ALL {
+        counts.add(reason, each);
+    }
+    Drops(counts)
+}
+
+/// Every list has an item, and figures and names are as long as they come.
+pub(super) fn wide() -> Report {
+    let latency = Latency {
+        count: 1,
+        p50_us: Some(99_940.0),
+        p99_us: Some(137_000_000.0),
+        max_us: Some(1e9),
+        total: LatencyTotal::default(),
+    };
+    let topic = format!("/{}", "long_name/".repeat(20));
+    let output = OutputReport {
+        lane: "a_lane_of_24_characters_".into(),
+        topic: topic.clone(),
+        readers: 99_999,
+        received: u64::MAX,
+        forwarded: u64::MAX,
+        forwarded_bytes: u64::MAX,
+        by_reference: 0,
+        caught_up: 0,
+        waiting: 0,
+        drops: drops(u64::MAX / 100),
+        drops_in_window: drops(u64::MAX / 100),
+        whole: true,
+        received_hz: Some(99_999.9),
+        rate_hz: Some(99_999.9),
+        bytes_per_s: Some(1e10),
+        last_forwarded_age_ms: None,
+        shm: latency,
+        dds_out: latency,
+        age: latency,
+    };
+    Report {
+        instance: "an_instance_of_24_chars_".into(),
+        time_unix_ms: 0,
+        window_ms: 1_000.0,
+        problems: vec![Problem {
+            about: "lane a_lane_of_24_characters_".into(),
+            level: Level::Error,
+            text: "many words ".repeat(30),
+        }],
+        processes: vec![process("control"), process("egress-a_lane_of_24_characters_")],
+        safety: SafetyReport {
+            mode: "emergency",
+            reason: Some("the lag of lane noncritical is 1200.0 ms ".repeat(3)),
+            since_s: Some(86_399.0),
+            transitions: u64::MAX,
+        },
+        lanes: vec![LaneReport {
+            name: output.lane.clone(),
+            class: "noncritical",
+            mode: "suspended",
+            mode_reason: "control",
+            mode_detail: "a subscriber of many words ".repeat(9),
+            mode_ends_in_s: Some(3_600.0),
+            policy_epoch: 1,
+            applied_mode: None,
+            applied_policy_epoch: 1,
+        }],
+        routes: vec![RouteReport {
+            id: "scan".into(),
+            input_topic: topic,
+            message_type: None,
+            writers: 99_999,
+            received: 0,
+            received_bytes: 0,
+            published: 0,
+            lost_upstream: 9_999_999_999_999,
+            drops: drops(u64::MAX / 100),
+            drops_in_window: drops(0),
+            whole: true,
+            rate_hz: Some(99_999.9),
+            bytes_per_s: Some(1e11),
+            last_received_age_ms: None,
+            dds_in: latency,
+            lanes: vec![output],
+        }],
+        probes: ProbesReport {
+            sent: u64::MAX,
+            accepted: u64::MAX,
+            refused: refusals(99_999_999),
+            refused_in_window: refusals(1),
+        },
+        subscribers: vec![SubscriberReport {
+            id: "x".repeat(127),
+            lane: Some("a_lane_of_24_characters_".into()),
+            listed: false,
+            state: "NONCRITICAL",
+            forced: false,
+            reason: "RTT 1234.5 ms above 50 ms three times in a row ".repeat(3),
+            state_since_s: Some(86_399.0),
+            transitions: u64::MAX,
+            settled: 50,
+            lost: 10,
+            loss: Some(0.2),
+            rtt_mean_ms: Some(99_940.0),
+            rtt_p95_ms: Some(137_000_000.0),
+            jitter_ms: Some(99_940.0),
+            last_response_age_ms: Some(137_000_000.0),
+            warnings: vec!["rtt", "loss", "jitter"],
+        }],
+        intruders: vec![IntruderReport {
+            topic: "/scan".into(),
+            node: None,
+            host: "192.168.100.100, 10.100.100.100, 172.16.100.100".into(),
+            remedy: "subscribe to /adaptive_bridge/noncritical/scan instead".into(),
+            since_s: Some(3.0),
+        }],
+        intruders_seen: u64::MAX,
+    }
+}
+
+fn process(name: &str) -> ProcessReport {
+    ProcessReport {
+        name: name.into(),
+        pid: 4_194_304,
+        state: ProcessState::Running,
+        uptime_s: Some(86_399.0),
+        starts: 100_001,
+        turns: 0,
+        last_turn_age_ms: None,
+        errors: 99_999,
+        refused_reloads: 99_999,
+        settings_fingerprint: None,
+    }
+}
+
+fn refusals(each: u64) -> Refusals {
+    let mut counts = RefusalCounts::default();
+    for &reason in ProbeRefusal::ALL {
+        for _ in 0..each.min(3) {
+            counts.add(reason);
+        }
+    }
+    Refusals(counts)
+}

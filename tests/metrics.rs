@@ -1,0 +1,184 @@
+//! The metrics page as a scraper sees it: over HTTP, through the parser of Prometheus' own Python client.
+
+mod support;
+
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use adaptive_bridge::config::MetricsListener;
+use adaptive_bridge::model::{
+    ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
+    LanePolicy, LatencyHistogram, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, SubscriberRecord,
+    SubscriberState, TopicName, TrafficClass, WallNs,
+};
+use adaptive_bridge::shm::ProcessRole;
+use adaptive_bridge::telemetry::{
+    LaneReading, MetricsServer, ModeReason, OutputReading, ProcessReading, ProcessState, Report,
+    RouteReading, Snapshot, SubscriberReading,
+};
+use serde_json::Value;
+
+/// Would end its label, its line and its name, if it were not escaped.
+const HOSTILE: &str = "x\"} 1\nadaptive_bridge_info{a=\"\\";
+
+/// Reads a page from standard input and prints each family: name, type, samples as [name, labels, value].
+const PARSER: &str = "
+import json, sys
+from prometheus_client.parser import text_string_to_metric_families
+text = sys.stdin.buffer.read().decode()
+families = text_string_to_metric_families(text)
+print(json.dumps([[f.name, f.type, [[s.name, s.labels, str(s.value)] for s in f.samples]] for f in families]))
+";
+
+/// A bridge of one route, its critical lane and one subscriber.
+fn report() -> Report {
+    let at = MonotonicNs(100_000_000_000);
+    let health = ProcessHealth { pid: 7, alive_at: at, starts: 3, ..ProcessHealth::default() };
+    let mut ingress = IngressCounters { received: 103, published: 100, writers: 1, ..Default::default() };
+    ingress.drops.add(DropReason::TooLarge, 3);
+    let mut latency = LatencyHistogram::default();
+    for latency_us in 1..=100 {
+        latency.record(latency_us * 10_000);
+    }
+    let mut control = ControlRecord { probes_sent: 50, subscribers: 1, ..ControlRecord::default() };
+    control.refused.add(ProbeRefusal::Replayed);
+    let subscriber = SubscriberRecord {
+        id: FixedText::new("laptop"),
+        settled: 50,
+        lost: 1,
+        rtt_mean_us: 81_250,
+        state: SubscriberState::Noncritical as u8,
+        ..SubscriberRecord::default()
+    };
+    let snapshot = Snapshot {
+        instance: InstanceName::try_from("default").unwrap(),
+        at,
+        at_wall: WallNs(1_763_000_000_123_000_000),
+        processes: vec![ProcessReading {
+            name: "ingress".into(),
+            role: ProcessRole::Ingress,
+            health,
+            state: ProcessState::Running,
+        }],
+        lanes: vec![LaneReading {
+            name: LaneName::critical(),
+            class: TrafficClass::Critical,
+            policy: LanePolicy::default(),
+            mode: LaneMode::Degraded,
+            reason: ModeReason::Default,
+            ends_at: None,
+            health,
+        }],
+        routes: vec![RouteReading {
+            id: RouteId::try_from("scan").unwrap(),
+            input_topic: TopicName::try_from("/scan").unwrap(),
+            message_type: None,
+            counters: ingress,
+            dds_in: latency,
+            outputs: vec![OutputReading {
+                lane: 0,
+                topic: TopicName::try_from("/critical/scan").unwrap(),
+                counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
+                shm: latency,
+                dds_out: LatencyHistogram::default(),
+                age: latency,
+            }],
+        }],
+        needs_control: true,
+        control,
+        subscribers: vec![SubscriberReading { lane: Some(0), record: subscriber }],
+        intruders: Vec::new(),
+    };
+    let mut report = snapshot.since(&snapshot);
+    report.subscribers[0].id = HOSTILE.to_owned();
+    report
+}
+
+/// The page that a server hands out.
+fn scrape(report: Report) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.sock");
+    let server = MetricsServer::start(&MetricsListener::Unix(path.clone())).unwrap();
+    server.show(Arc::new(report));
+    let mut client = UnixStream::connect(&path).unwrap();
+    client.set_read_timeout(Some(Duration::from_secs(120))).unwrap();
+    client.write_all(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    let mut answer = String::new();
+    client.read_to_string(&mut answer).unwrap();
+    answer.split_once("\r\n\r\n").expect(&answer).1.to_owned()
+}
+
+/// A Python that has the parser. That of the system is not always the first in the path.
+fn python() -> Option<&'static str> {
+    let has_parser = |python: &&str| {
+        let import = Command::new(python).args(["-c", "import prometheus_client.parser"]).output();
+        import.is_ok_and(|import| import.status.success())
+    };
+    ["python3", "/usr/bin/python3"].into_iter().find(has_parser)
+}
+
+fn parse(python: &str, page: &str) -> Vec<(String, String, Vec<Value>)> {
+    let mut parser = Command::new(python)
+        .args(["-c", PARSER])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    parser.stdin.take().unwrap().write_all(page.as_bytes()).unwrap();
+    let output = parser.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}\n{page}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn the_parser_of_prometheus_reads_the_page() {
+    let Some(python) = python() else {
+        support::skip("the_parser_of_prometheus_reads_the_page", "no python3-prometheus-client");
+        return;
+    };
+    let families = parse(python, &scrape(report()));
+    let mut names: Vec<&str> = families.iter().map(|(name, _, _)| name.as_str()).collect();
+    assert!(names.len() > 40, "{names:?}");
+    assert!(names.iter().all(|name| name.starts_with("adaptive_bridge_")), "{names:?}");
+    names.sort_unstable();
+    names.dedup();
+    assert_eq!(names.len(), families.len(), "a family twice");
+    for (name, kind, samples) in &families {
+        assert!(["counter", "gauge", "histogram"].contains(&kind.as_str()), "{name} is {kind}");
+        let mut series: Vec<String> = samples.iter().map(|one| format!("{}{}", one[0], one[1])).collect();
+        series.sort_unstable();
+        series.dedup();
+        assert!(!series.is_empty() && series.len() == samples.len(), "{name}: a series twice");
+        let is_total = |one: &Value| one[0].as_str().is_some_and(|name| name.ends_with("_total"));
+        assert_eq!(samples.iter().all(is_total), kind == "counter", "{name}");
+    }
+
+    let value = |name: &str, labels: &[(&str, &str)]| -> f64 {
+        let has = |one: &Value| labels.iter().all(|(label, value)| one[1][label] == *value);
+        let mut all = families.iter().flat_map(|(_, _, samples)| samples);
+        let sample = all.find(|one| one[0] == name && has(one));
+        sample.unwrap_or_else(|| panic!("{name} {labels:?}"))[2].as_str().unwrap().parse().unwrap()
+    };
+    assert_eq!(value("adaptive_bridge_route_received_samples_total", &[("route", "scan")]), 103.0);
+    let too_large = [("route", "scan"), ("reason", "too_large")];
+    assert_eq!(value("adaptive_bridge_route_dropped_samples_total", &too_large), 3.0);
+    assert_eq!(value("adaptive_bridge_lane_mode", &[("lane", "critical"), ("mode", "degraded")]), 1.0);
+    assert_eq!(value("adaptive_bridge_probe_refusals_total", &[("reason", "replayed")]), 1.0);
+    assert_eq!(value("adaptive_bridge_process_up", &[("process", "ingress")]), 1.0);
+    assert_eq!(value("adaptive_bridge_report_timestamp_seconds", &[]), 1_763_000_000.123);
+    let hostile = [("subscriber", HOSTILE), ("lane", "critical")];
+    assert_eq!(value("adaptive_bridge_subscriber_rtt_mean_seconds", &hostile), 0.08125);
+    assert_eq!(value("adaptive_bridge_subscriber_loss_ratio", &hostile), 0.02);
+
+    let stage = "adaptive_bridge_lane_shm_latency_seconds";
+    let bucket = |edge: &str| value(&format!("{stage}_bucket"), &[("route", "scan"), ("le", edge)]);
+    // 10 µs to 1 ms in steps of 10 µs.
+    assert_eq!(["0.000016384", "0.000131072", "0.001048576", "+Inf"].map(bucket), [1.0, 13.0, 100.0, 100.0]);
+    assert_eq!(value(&format!("{stage}_count"), &[("lane", "critical")]), 100.0);
+    let sum_s = value(&format!("{stage}_sum"), &[("lane", "critical")]);
+    assert!((sum_s / 0.0505 - 1.0).abs() < 0.032, "{sum_s}");
+}
