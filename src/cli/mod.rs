@@ -49,6 +49,8 @@ enum Command {
     Egress(roles::EgressArguments),
     /// Answer a bridge's probes, beside a remote subscriber; needs no bridge on its machine
     Responder(responder::Arguments),
+    /// Run control: probe and classify subscribers, decide the lanes' modes, watch over the bridge
+    Control(ConfigArguments),
     /// Run the whole bridge, all processes as children of this one
     Up(ConfigArguments),
     /// Show what the running bridge does: processes, rates, drops, latencies, and what is wrong
@@ -108,6 +110,7 @@ pub fn main() -> ExitCode {
         Command::Ingress(arguments) => roles::ingress(&arguments),
         Command::Egress(arguments) => roles::egress(&arguments),
         Command::Responder(arguments) => responder::run(&arguments),
+        Command::Control(arguments) => roles::control(&arguments),
         Command::Up(arguments) => roles::up(&arguments),
         Command::Status(arguments) => status::run(&arguments),
         Command::Tap(arguments) => tap::run(&arguments),

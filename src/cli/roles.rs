@@ -1,4 +1,4 @@
-//! `ingress`, `egress` and `up`.
+//! `ingress`, `egress`, `control` and `up`.
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -27,6 +27,10 @@ pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
     role(&arguments.config, |settings, reloads, stop| {
         process::egress(settings, &arguments.lane, reloads, stop)
     })
+}
+
+pub(super) fn control(arguments: &ConfigArguments) -> ExitCode {
+    role(arguments, |settings, reloads, stop| process::control(settings, arguments.path(), reloads, stop))
 }
 
 pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {

@@ -91,8 +91,10 @@ pub struct ProcessHealth {
     pub starts: u64,
     /// The mode that the process applies, as [`LaneMode`]'s number.
     pub mode: u8,
+    /// 1 when it ended as it was told to. A process that died could not say so.
+    pub ended: u8,
     /// Always 0.
-    pub reserved: [u8; 7],
+    pub reserved: [u8; 6],
     /// The epoch of the policy that the process applies.
     pub policy_epoch: u64,
     /// The process' DDS participant, for its successor to say goodbye for it should it be killed.

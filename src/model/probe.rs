@@ -95,6 +95,13 @@ impl RefusalCounts {
         self.0[reason as usize]
     }
 
+    /// Counts all of `other` as well.
+    pub fn merge(&mut self, other: &Self) {
+        for (count, more) in self.0.iter_mut().zip(other.0) {
+            *count = count.saturating_add(more);
+        }
+    }
+
     /// Refusals for all reasons together.
     pub fn total(&self) -> u64 {
         self.0.iter().fold(0, |total, count| total.saturating_add(*count))

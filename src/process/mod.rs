@@ -5,6 +5,7 @@
 //! next housekeeping, which is all that need not happen for each sample: discovery, matching, logs, health.
 
 mod arena;
+mod control;
 mod egress;
 mod inbox;
 mod ingress;
@@ -18,6 +19,7 @@ mod stop;
 mod supervisor;
 mod watch;
 
+pub use control::control;
 pub use egress::egress;
 pub use ingress::ingress;
 pub use manual::set_mode;

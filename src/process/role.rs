@@ -167,6 +167,11 @@ impl Role {
         (look == Look::Reloaded).then(|| self.reloads.settings())
     }
 
+    /// Counts a failure that cost no sample.
+    pub fn failed(&mut self) {
+        self.health.update(|health| health.errors += 1);
+    }
+
     /// Shows that the data path turned, and what it applies.
     pub fn turned(&mut self, mode: u8, policy_epoch: u64) {
         let now = clock::monotonic();
@@ -176,6 +181,14 @@ impl Role {
             health.mode = mode;
             health.policy_epoch = policy_epoch;
         });
+    }
+}
+
+impl Drop for Role {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.health.update(|health| health.ended = 1);
+        }
     }
 }
 

@@ -72,7 +72,7 @@ pub fn end_with_supervisor() {
     }
 }
 
-/// Runs ingress and every lane as children until `stop` is requested. `arguments` are passed on to each,
+/// Runs ingress, every lane and control as children until `stop` is requested. `arguments` are passed on to each,
 /// after its own (the configuration file, say). A hang-up is passed on, too: each child checks the file
 /// itself before it changes anything. Lanes that the file has got since are not started.
 ///
@@ -89,6 +89,7 @@ pub fn up(
         let name = format!("egress-{}", lane.name);
         children.push(Supervised::new(&name, &["egress", "--lane", lane.name.as_str()], arguments));
     }
+    children.push(Supervised::new("control", &["control"], arguments));
     let mut outcome = Ok(());
     for child in &mut children {
         if let Err(error) = child.start() {

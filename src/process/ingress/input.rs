@@ -176,6 +176,11 @@ impl Input {
         }
     }
 
+    /// A participant is gone, and with it its writers.
+    pub fn participant_gone(&mut self, prefix: [u8; 12]) {
+        self.source_changed |= self.source.participant_gone(prefix);
+    }
+
     /// A writer is gone; whatever its topic.
     pub fn writer_gone(&mut self, guid: Guid) {
         self.source.gone(guid);

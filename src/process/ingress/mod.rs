@@ -133,6 +133,11 @@ impl Ingress {
                         input.writer_gone(guid);
                     }
                 }
+                Discovery::ParticipantGone { prefix } => {
+                    for input in &mut self.inputs {
+                        input.participant_gone(prefix);
+                    }
+                }
                 Discovery::Incompatible { local, remote } => {
                     debug!(?local, ?remote, "endpoints are not compatible");
                 }

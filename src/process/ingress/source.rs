@@ -50,6 +50,13 @@ impl Source {
         self.writers.retain(|writer| writer.guid != guid);
     }
 
+    /// A participant is gone; whether it had publishers of the route.
+    pub fn participant_gone(&mut self, prefix: [u8; 12]) -> bool {
+        let before = self.writers.len();
+        self.writers.retain(|writer| writer.guid.prefix() != prefix);
+        self.writers.len() < before
+    }
+
     /// A publisher of another type than `dds_type`.
     pub fn of_other_type(&self, dds_type: &str) -> Option<&Endpoint> {
         self.writers.iter().find(|writer| writer.dds_type != dds_type)
@@ -159,6 +166,16 @@ mod tests {
         source.gone(Guid([2; 16]));
         let Wanted::Reader { qos: stronger, .. } = wanted(&source, None) else { panic!() };
         assert!(still_suits(&weaker, &stronger));
+    }
+
+    #[test]
+    fn publishers_leave_with_their_participant() {
+        let mut source = Source::default();
+        source.found(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
+        source.found(&writer(2, "U", Reliability::Reliable, Durability::Volatile));
+        assert!(!source.participant_gone([3; 12]));
+        assert!(source.participant_gone([1; 12]));
+        assert!(source.of_other_type("U").is_none());
     }
 
     #[test]

@@ -1,0 +1,275 @@
+//! What the safety supervisor goes by, read off the boards.
+
+use tracing::{info, warn};
+
+use crate::config::{Lane, Settings};
+use crate::model::{DropReason, LaneCounters, LatencyHistogram, MonotonicNs, SafetyMode, TrafficClass};
+use crate::policy::{
+    ErrorCounts, ProcessLoad, SafetyCause, SafetyInputs, SafetySupervisor, SafetyTrouble, SourceLag,
+};
+use crate::shm::{Boards, ProcessRole, Stage};
+
+/// What was read of one process at the last evaluation.
+#[derive(Default)]
+struct Former {
+    /// Whether it was there.
+    seen: bool,
+    starts: u64,
+    errors: ErrorCounts,
+    caught_up: u64,
+}
+
+/// The supervisor and what it compares with.
+pub(super) struct Supervision {
+    supervisor: SafetySupervisor,
+    since: MonotonicNs,
+    reason: String,
+    critical_trouble: bool,
+    ingress: Former,
+    lanes: Vec<Former>,
+    source_lags: Vec<SourceLag>,
+    dds_in: Vec<LatencyHistogram>,
+    /// Of each lane and route: from ingress to the lane, and within the lane.
+    on_the_way: Vec<Vec<(LatencyHistogram, LatencyHistogram)>>,
+}
+
+impl Supervision {
+    /// Begins with what the boards show now: what was before is not judged.
+    pub fn new(boards: &Boards, settings: &Settings, now: MonotonicNs) -> Self {
+        let routes = settings.routes.len();
+        let mut supervision = Self {
+            supervisor: SafetySupervisor::new(),
+            since: now,
+            reason: String::new(),
+            critical_trouble: false,
+            ingress: Former::default(),
+            lanes: settings.lanes.iter().map(|_| Former::default()).collect(),
+            source_lags: vec![SourceLag::new(); routes],
+            dds_in: vec![LatencyHistogram::default(); routes],
+            on_the_way: vec![vec![Default::default(); routes]; settings.lanes.len()],
+        };
+        supervision.load(boards, settings, now);
+        supervision
+    }
+
+    /// The mode.
+    pub fn mode(&self) -> SafetyMode {
+        self.supervisor.mode()
+    }
+
+    /// When it was entered.
+    pub fn since(&self) -> MonotonicNs {
+        self.since
+    }
+
+    /// Changes of the mode.
+    pub fn transitions(&self) -> u64 {
+        self.supervisor.transitions()
+    }
+
+    /// What brought it about, or what is wrong though the mode has not changed; empty when nothing is.
+    pub fn reason(&self) -> &str {
+        &self.reason
+    }
+
+    /// Whether the critical path has trouble of its own.
+    pub fn critical_trouble(&self) -> bool {
+        self.critical_trouble
+    }
+
+    /// One evaluation.
+    pub fn evaluate(&mut self, boards: &Boards, settings: &Settings, now: MonotonicNs) {
+        let loads = self.load(boards, settings, now);
+        let inputs = SafetyInputs { processes: &loads };
+        let decision = self.supervisor.evaluate(&inputs, &settings.safety.rules, now);
+        self.critical_trouble = decision.critical_trouble;
+        self.reason = decision.cause.as_ref().map(cause_text).unwrap_or_default();
+        let Some(from) = decision.changed_from else { return };
+        self.since = now;
+        let (from, to) = (from.label(), decision.mode.label());
+        if decision.mode as u8 > SafetyMode::Normal as u8 {
+            let what = match decision.mode {
+                SafetyMode::Emergency => "all forwarding stops",
+                _ => "noncritical lanes are suspended",
+            };
+            warn!(from, to, reason = self.reason, "safety mode changed: {what}");
+        } else {
+            info!(from, to, "safety mode changed: every lane goes on");
+        }
+    }
+
+    fn load<'a>(
+        &mut self,
+        boards: &Boards,
+        settings: &'a Settings,
+        now: MonotonicNs,
+    ) -> Vec<ProcessLoad<'a>> {
+        let mut loads = Vec::with_capacity(1 + settings.lanes.len());
+        let published: Vec<u64> = (0..settings.routes.len())
+            .map(|route| boards.ingress(route).map_or(0, |counters| counters.published))
+            .collect();
+        loads.extend(self.ingress(boards, settings, now));
+        for (lane, configured) in settings.lanes.iter().enumerate() {
+            loads.extend(self.lane(boards, lane, configured, &published, now));
+        }
+        loads
+    }
+
+    fn ingress<'a>(
+        &mut self,
+        boards: &Boards,
+        settings: &Settings,
+        now: MonotonicNs,
+    ) -> Option<ProcessLoad<'a>> {
+        let mut source_lag_ms: Option<f64> = None;
+        for route in 0..settings.routes.len() {
+            let read = boards.histogram(Stage::DdsIn, route);
+            let window = read.since(&self.dds_in[route]);
+            self.dds_in[route] = read;
+            if let Some(p99_ns) = window.quantile_ns(0.99)
+                && let Some(excess_ms) = self.source_lags[route].excess_ms(p99_ns as f64 / 1e6, now)
+            {
+                source_lag_ms = Some(source_lag_ms.map_or(excess_ms, |lag_ms| lag_ms.max(excess_ms)));
+            }
+        }
+        let mut pool_exhausted = 0;
+        for route in 0..settings.routes.len() {
+            if let Some(counters) = boards.ingress(route) {
+                pool_exhausted += counters.drops.get(DropReason::PoolExhausted);
+            }
+        }
+        let total = ErrorCounts { pool_exhausted, ..ErrorCounts::default() };
+        let (silent_ms, errors) = self.ingress.look(boards, ProcessRole::Ingress, total, now)?;
+        let load = ProcessLoad::idle("ingress", TrafficClass::Critical);
+        Some(ProcessLoad { silent_ms, errors, source_lag_ms, ..load })
+    }
+
+    fn lane<'a>(
+        &mut self,
+        boards: &Boards,
+        lane: usize,
+        configured: &'a Lane,
+        published: &[u64],
+        now: MonotonicNs,
+    ) -> Option<ProcessLoad<'a>> {
+        let mut total = ErrorCounts::default();
+        let (mut queued, mut waiting, mut caught_up) = (0, 0, 0);
+        let mut writer_lag_ms: Option<f64> = None;
+        for output in &configured.outputs {
+            let counters = boards.lane(lane, output.route).unwrap_or_default();
+            let drops = |reason| counters.drops.get(reason);
+            total.window_full += drops(DropReason::WindowFull);
+            total.write_failed += drops(DropReason::WriteFailed);
+            total.queue_overflow += drops(DropReason::QueueOverflow);
+            queued = queued.max(in_queue(&counters, published[output.route]));
+            waiting = waiting.max(counters.waiting);
+            caught_up += counters.caught_up;
+            let lag_ms = self.writer_lag_ms(boards, lane, output.route, configured.class);
+            writer_lag_ms = match (writer_lag_ms, lag_ms) {
+                (Some(one), Some(other)) => Some(one.max(other)),
+                (one, other) => one.or(other),
+            };
+        }
+        let former = &mut self.lanes[lane];
+        // What a lane catches up with has waited for it, and says nothing about how fast it is now.
+        if std::mem::replace(&mut former.caught_up, caught_up) != caught_up {
+            writer_lag_ms = None;
+        }
+        let (silent_ms, errors) = former.look(boards, ProcessRole::Egress(lane), total, now)?;
+        let is_critical = configured.class == TrafficClass::Critical;
+        Some(ProcessLoad {
+            silent_ms,
+            errors,
+            queued: if is_critical { queued } else { 0 },
+            queue_capacity: if is_critical { configured.queue_depth as u64 } else { 0 },
+            waiting: if is_critical { 0 } else { waiting },
+            writer_lag_ms,
+            ..ProcessLoad::idle(configured.name.as_str(), configured.class)
+        })
+    }
+
+    /// p99 from shared memory to the writer since the last evaluation. What a sample waits in shared memory
+    /// for a noncritical lane is its wait for a token, and no lag.
+    fn writer_lag_ms(
+        &mut self,
+        boards: &Boards,
+        lane: usize,
+        route: usize,
+        class: TrafficClass,
+    ) -> Option<f64> {
+        let read = (boards.histogram(Stage::Shm(lane), route), boards.histogram(Stage::DdsOut(lane), route));
+        let former = &mut self.on_the_way[lane][route];
+        let (shm, dds_out) = (read.0.since(&former.0), read.1.since(&former.1));
+        *former = read;
+        let ms = |window: &LatencyHistogram| window.quantile_ns(0.99).map(|ns| ns as f64 / 1e6);
+        match class {
+            TrafficClass::Critical => Some(ms(&shm)? + ms(&dds_out)?),
+            TrafficClass::Noncritical => ms(&dds_out),
+        }
+    }
+}
+
+impl Former {
+    /// Since when a process is silent, and its errors since the last look; `None` while it is not there: it
+    /// never was, or has ended in good order.
+    fn look(
+        &mut self,
+        boards: &Boards,
+        role: ProcessRole,
+        total: ErrorCounts,
+        now: MonotonicNs,
+    ) -> Option<(u64, ErrorCounts)> {
+        let health = boards.health(role)?;
+        let there = health.pid != 0 && health.ended == 0;
+        let grown = |now: u64, before: u64| now.saturating_sub(before);
+        let before = std::mem::replace(&mut self.errors, total);
+        let starts = std::mem::replace(&mut self.starts, health.starts);
+        if !there || !std::mem::replace(&mut self.seen, there) {
+            self.seen = there;
+            // The first look: what was before is not judged.
+            return there.then(|| (now.since(health.alive_at) / 1_000_000, ErrorCounts::default()));
+        }
+        let errors = ErrorCounts {
+            window_full: grown(total.window_full, before.window_full),
+            write_failed: grown(total.write_failed, before.write_failed),
+            pool_exhausted: grown(total.pool_exhausted, before.pool_exhausted),
+            queue_overflow: grown(total.queue_overflow, before.queue_overflow),
+            restarts: grown(health.starts, starts),
+        };
+        Some((now.since(health.alive_at) / 1_000_000, errors))
+    }
+}
+
+/// Samples that ingress has published and the lane has not taken.
+fn in_queue(counters: &LaneCounters, published: u64) -> u64 {
+    if counters.last_sequence == 0 { 0 } else { published.saturating_sub(counters.last_sequence) }
+}
+
+/// What is wrong, in a sentence that fits the board.
+fn cause_text(cause: &SafetyCause) -> String {
+    let who = cause.who.as_str();
+    match cause.trouble {
+        SafetyTrouble::Queue { queued, capacity } => {
+            format!("{who}: {queued} of {capacity} samples wait in shared memory")
+        }
+        SafetyTrouble::Waiting { samples, limit } => {
+            format!("{who}: {samples} samples wait, more than {limit}")
+        }
+        SafetyTrouble::SourceLag { lag_ms, limit_ms } => {
+            format!("{who}: {lag_ms:.0} ms from source to shared memory (limit {limit_ms:.0})")
+        }
+        SafetyTrouble::WriterLag { lag_ms, limit_ms } => {
+            format!("{who}: {lag_ms:.0} ms from shared memory to the writer (limit {limit_ms:.0})")
+        }
+        SafetyTrouble::Errors { per_s, limit_per_s } => {
+            format!("{who}: {per_s:.1} errors per second (limit {limit_per_s})")
+        }
+        SafetyTrouble::Silent { silent_ms, limit_ms } => {
+            format!(
+                "{who}: has not turned for {:.1} s (limit {:.1})",
+                silent_ms as f64 / 1e3,
+                limit_ms as f64 / 1e3
+            )
+        }
+    }
+}
