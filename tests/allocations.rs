@@ -211,6 +211,12 @@ fn culprits() -> String {
     CULPRITS.lock().map(|culprits| culprits.join("\n")).unwrap_or_default()
 }
 
+/// As the program has them; none comes here.
+fn reloads(settings: &Settings) -> ReloadRequests {
+    let settings = settings.clone();
+    ReloadRequests::on_signal(move || Ok(settings.clone())).unwrap()
+}
+
 #[test]
 fn in_steady_state_no_step_of_ours_allocates_and_payloads_are_copied_once_or_twice() {
     let folder = tempfile::tempdir().unwrap();
@@ -220,12 +226,12 @@ fn in_steady_state_no_step_of_ours_allocates_and_payloads_are_copied_once_or_twi
         let (settings, stop) = (&settings, &stop);
         scope.spawn(move || {
             ROLE.set(Some(0));
-            process::ingress(settings, ReloadRequests::never(), stop).unwrap();
+            process::ingress(settings, reloads(settings), stop).unwrap();
         });
         for (index, lane) in LANES.into_iter().enumerate() {
             scope.spawn(move || {
                 ROLE.set(Some(1 + index));
-                process::egress(settings, lane, ReloadRequests::never(), stop).unwrap();
+                process::egress(settings, lane, reloads(settings), stop).unwrap();
             });
         }
         // The roles stop also when an assertion fails, or the scope would wait for them for ever.

@@ -531,9 +531,9 @@ fn what_is_documented_to_change_without_a_restart_does_and_nothing_else() {
     for left in &reload.needs_restart {
         assert!(!marked.contains(&pattern(&left.change.key)), "{left}");
     }
-    for index in 0..CHOICES.len() {
+    for (index, (key, ..)) in CHOICES.iter().enumerate() {
         let (_, reload) = chosen(|_| false).reloaded(chosen(|other| other == index));
-        assert_ne!(reload, config::Reload::default(), "{} is not told of", CHOICES[index].0);
+        assert_ne!(reload, config::Reload::default(), "{key} is not told of");
     }
 }
 
