@@ -71,7 +71,7 @@ pub(super) fn wide() -> Report {
             mode_detail: "a subscriber of many words ".repeat(9),
             mode_ends_in_s: Some(3_600.0),
             policy_epoch: 1,
-            applied_mode: None,
+            applied_mode: Some("degraded"),
             applied_policy_epoch: 1,
         }],
         routes: vec![RouteReport {
@@ -135,7 +135,7 @@ fn process(name: &str) -> ProcessReport {
         uptime_s: Some(86_399.0),
         starts: 100_001,
         turns: 0,
-        last_turn_age_ms: None,
+        last_turn_age_ms: Some(99_999.0),
         errors: 99_999,
         refused_reloads: 99_999,
         settings_fingerprint: None,
