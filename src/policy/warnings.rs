@@ -31,8 +31,8 @@ struct Gate {
 }
 
 impl SubscriberWarnings {
-    /// Takes a reading; a figure that cannot be told leaves its warning as it is. Returns the warnings that are
-    /// shown, as [`SubscriberWarning`]'s bits.
+    /// Takes a reading; a figure that cannot be told leaves its warning as it is. Returns the warnings that
+    /// are shown, as [`SubscriberWarning`]'s bits.
     pub fn read(&mut self, thresholds: &WarningThresholds, link: &LinkReading) -> u8 {
         let loss = (link.settled > 0).then_some(link.loss);
         let (rtt_ms, jitter_ms) = (link.rtt_mean_ms, link.jitter_ms);

@@ -1,8 +1,8 @@
 //! The report as `diagnostic_msgs/DiagnosticArray`, for `/diagnostics` and its aggregator.
 //!
-//! Each part of the bridge has a status, named as diagnostic_updater does it: the node, a colon, the part. So
-//! `startswith: ["adaptive_bridge"]` finds all of them, and a part that is no longer reported becomes stale by
-//! itself. The keys of a status are those of `status --json`.
+//! Each part of the bridge has a status, named as diagnostic_updater does it: the node, a colon, the part.
+//! So `startswith: ["adaptive_bridge"]` finds all of them, and a part that is no longer reported becomes
+//! stale by itself. The keys of a status are those of `status --json`.
 
 mod parts;
 
@@ -29,13 +29,18 @@ pub const MAX_ARRAY_BYTES: usize = 48 * 1024;
 const NODE: &str = "adaptive_bridge";
 const DEFAULT_INSTANCE: &str = "default";
 
-/// The longest name, message, key and value in bytes, and the most values: 128 values of 256 bytes with their
-/// keys fill an array only in part.
+/// The longest name, message, key and value in bytes, and the most values of a status.
 const MAX_NAME_BYTES: usize = 256;
 const MAX_MESSAGE_BYTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 96;
 const MAX_VALUE_BYTES: usize = 192;
 const MAX_VALUES: usize = 128;
+
+// A status of the largest size fits in an array.
+const _: () = {
+    let values = (MAX_VALUES + 1) * (MAX_KEY_BYTES + MAX_VALUE_BYTES + 16);
+    assert!(HEADER_BYTES + MAX_NAME_BYTES + MAX_MESSAGE_BYTES + 256 + values <= MAX_ARRAY_BYTES);
+};
 
 /// `diagnostic_msgs/msg/DiagnosticArray`.
 #[derive(Serialize)]

@@ -61,9 +61,10 @@ fn read(arrays: &[Bytes]) -> BTreeMap<String, Status> {
     found
 }
 
-/// diagnostic_msgs/DiagnosticArray: `Header header, DiagnosticStatus[] status`. Header: `Time stamp` of `int32
-/// sec, uint32 nanosec`, `string frame_id`. DiagnosticStatus: `byte level, string name, string message, string
-/// hardware_id, KeyValue[] values`. KeyValue: `string key, string value`. Multiples of 4 are aligned to 4.
+/// diagnostic_msgs/DiagnosticArray: `Header header, DiagnosticStatus[] status`. Header: `Time stamp` of
+/// `int32 sec, uint32 nanosec`, `string frame_id`. DiagnosticStatus: `byte level, string name, string
+/// message, string hardware_id, KeyValue[] values`. KeyValue: `string key, string value`. What has 4 bytes
+/// begins at a multiple of 4.
 #[test]
 fn an_array_is_laid_out_as_the_message_definitions_say() {
     let header = Header { stamp_sec: 0x0102_0304, stamp_nanosec: 5, frame_id: "" };

@@ -1,8 +1,8 @@
 //! Hands the page out over HTTP: TCP on a loopback address, or a unix socket.
 //!
-//! One thread of its own serves all connections, none of which it waits for: a slow client costs a place until
-//! its time is over, and nothing else. Whoever has the report hands it over under a lock that is held for a
-//! copy of a pointer; the page is written when it is asked for.
+//! One thread of its own serves all connections, none of which it waits for: a slow client costs a place
+//! until its time is over, and nothing else. Whoever has the report hands it over under a lock that is held
+//! for a copy of a pointer; the page is written when it is asked for.
 //!
 //! The server is our own because it is this small: HTTP/1.1 with one method, one page, and a connection that
 //! ends after the answer. tiny_http, the one small library without an asynchronous runtime, has no timeouts
