@@ -72,8 +72,8 @@ pub fn end_with_supervisor() {
     }
 }
 
-/// Runs ingress, every lane and control as children until `stop` is requested. `arguments` are passed on to each,
-/// after its own (the configuration file, say). A hang-up is passed on, too: each child checks the file
+/// Runs ingress, every lane and control as children until `stop` is requested. `arguments` are passed on to
+/// each, after its own (the configuration file, say). A hang-up is passed on, too: each child checks the file
 /// itself before it changes anything. Lanes that the file has got since are not started.
 ///
 /// # Errors

@@ -9,8 +9,8 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter, ReaderQos, Take};
 use crate::model::{
-    Durability, Encapsulation, History, MonotonicNs, ProbeRefusal, QosProfile, RefusalCounts, Reliability,
-    SourceTimestamp,
+    Durability, Encapsulation, FixedText, History, MonotonicNs, ProbeRefusal, QosProfile, RefusalCounts,
+    Reliability, SourceTimestamp,
 };
 
 /// Probes are worth nothing when they are late: lost ones are what is counted.
@@ -177,6 +177,5 @@ impl Link {
 fn sender_id(settings: &Settings) -> String {
     let host = nix::unistd::gethostname().ok().and_then(|name| name.into_string().ok()).unwrap_or_default();
     let id: String = format!("{}@{host}", settings.instance).chars().filter(|c| !c.is_control()).collect();
-    let end = id.floor_char_boundary(crate::model::MAX_ID_BYTES);
-    id[..end].to_owned()
+    FixedText::new(&id).as_str().to_owned()
 }

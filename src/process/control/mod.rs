@@ -1,5 +1,5 @@
-//! Control: probes every subscriber's host, classifies it, decides each lane's mode, watches the health of all
-//! the others, publishes diagnostics.
+//! Control: probes every subscriber's host, classifies it, decides each lane's mode, watches the health of
+//! all the others, publishes diagnostics.
 //!
 //! Nothing of the data plane waits for it. What it decides stands on the policy board, which it confirms ten
 //! times a second; when it no longer does, the lanes fall back to safe modes by themselves.

@@ -6,9 +6,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::model::{Encapsulation, ProbeRefusal, WallNs, is_probe_id};
+use crate::telemetry::{STRING_TYPE, string_message};
 
 /// The DDS type of both topics.
-pub const PROBE_TYPE: &str = "std_msgs::msg::dds_::String_";
+pub const PROBE_TYPE: &str = STRING_TYPE;
 
 /// The largest message that is read, in bytes of its serialized payload.
 pub const MAX_MESSAGE_BYTES: usize = 4096;
@@ -217,7 +218,7 @@ fn read<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation)
 
 fn write(fields: &impl Serialize) -> Bytes {
     // Numbers and texts under keys that are texts: none of this can fail.
-    encode_string(&serde_json::to_string(fields).unwrap_or_default())
+    string_message(&serde_json::to_string(fields).unwrap_or_default())
 }
 
 /// The text of a `std_msgs/String`, in any encapsulation in which a final type is plain (RTPS 2.5 table 10.3,
@@ -232,16 +233,6 @@ fn decode_string(payload: &[u8], encapsulation: Encapsulation) -> Option<&str> {
     let (text, padding) = rest.split_at_checked(usize::try_from(length).ok()?)?;
     let text = text.strip_suffix(&[0])?;
     if padding.len() > 3 { None } else { std::str::from_utf8(text).ok() }
-}
-
-/// A `std_msgs/String` in plain little-endian CDR: its length with the terminating zero, its bytes, the zero.
-fn encode_string(text: &str) -> Bytes {
-    let mut cdr = Vec::with_capacity(text.len() + 5);
-    // A message of ours has less than 1 KiB, see `MAX_ID_BYTES`.
-    cdr.extend_from_slice(&(text.len() as u32 + 1).to_le_bytes());
-    cdr.extend_from_slice(text.as_bytes());
-    cdr.push(0);
-    Bytes::from(cdr)
 }
 
 /// Where signatures are not looked at, one of another making does no harm: it counts as none.
@@ -291,7 +282,7 @@ mod tests {
         "response_send_time_ns":4,"responder_id":"laptop"}"#;
 
     fn cdr(json: &str) -> Vec<u8> {
-        encode_string(json).to_vec()
+        string_message(json).to_vec()
     }
 
     fn request(json: &str) -> Result<ProbeRequest, ProbeRefusal> {
