@@ -1,6 +1,6 @@
 //! The subscribers that control follows: one window and one classifier each, and what the boards show of it.
 
-use tracing::{info, warn};
+use tracing::{info, trace, warn};
 
 use super::link::{Link, Response};
 use crate::config::Settings;
@@ -99,6 +99,8 @@ impl Subscribers {
 
     /// A probe was sent on a link.
     pub fn sent(&mut self, link: usize, seq: u64, at: MonotonicNs) {
+        // With the answers, a recording of the link: `RUST_LOG=adaptive_bridge::process::control=trace`.
+        trace!(link, seq, sent_at_ms = at.0 / 1_000_000, "probe sent");
         for subscriber in self.list.iter_mut().filter(|subscriber| subscriber.link == link) {
             subscriber.window.sent(seq, at);
         }
@@ -129,7 +131,15 @@ impl Subscribers {
             return Ok(());
         }
         match subscriber.window.answered(response.seq, response.arrived_at) {
-            Answer::Counted { .. } => Ok(()),
+            Answer::Counted { rtt_ns } => {
+                trace!(
+                    subscriber = subscriber.id,
+                    seq = response.seq,
+                    rtt_us = rtt_ns / 1_000,
+                    "probe answered"
+                );
+                Ok(())
+            }
             Answer::Late => Err(ProbeRefusal::Late),
             Answer::Repeated => Err(ProbeRefusal::Replayed),
             Answer::Unknown => Err(ProbeRefusal::Unsolicited),
