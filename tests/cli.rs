@@ -148,7 +148,7 @@ fn up(bridge: &Bridge) -> Process {
     let process = bridge.start("up");
     wait_status(bridge, "all processes", |status| {
         let processes = status["processes"].as_array().unwrap();
-        processes.len() == 3 && processes.iter().all(|process| process["state"] == "running")
+        processes.len() == 4 && processes.iter().all(|process| process["state"] == "running")
     });
     process
 }
@@ -343,7 +343,7 @@ fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
     let _up = up(&bridge);
     let _publisher = Publisher::new(104).run();
     let before = status(&bridge);
-    assert_eq!(before["lanes"][1]["mode_reason"], "default");
+    assert_eq!(before["lanes"][1]["mode_reason"], "control");
     assert!(bridge.run("mode noncritical suspended --for 90s").status.success());
     let after = wait_status(&bridge, "suspended samples", |status| {
         lane(status, "noncritical")["drops_in_window"]["suspended"].as_u64() > Some(0)
