@@ -269,6 +269,7 @@ fn each_sample_is_an_event_when_asked_for() {
     let publisher = publisher.publisher().hold().prime().heartbeat_ms(200).each_sample().start_on(&here);
     go_when_matched(&publisher, &subscriber);
     subscriber.wait_received(5);
+    publisher.wait_for("the last write", |event| event["seq"] == 104);
     let written: Vec<u64> = publisher.events().iter().filter_map(|event| event["seq"].as_u64()).collect();
     assert_eq!(written, [100, 101, 102, 103, 104]);
     let sample = subscriber.wait_for("sample 103", |event| event["seq"] == 103);
