@@ -10,6 +10,7 @@ setup:
 # The DDS peers of the integration tests.
 peers:
 	$(MAKE) --no-print-directory -C tests/peers
+	cargo build --locked --all-features --example rust_peer
 
 # Sets up, builds and runs everything: lints, unit, property and integration tests, and a bounded fuzz run.
 test:

@@ -37,7 +37,7 @@ check_all() {
     need "has make" build-essential "make"
     need "has pkg-config" pkg-config "building"
     need "has_header dds/ddsi/ddsi_serdata.h" cyclonedds-dev "tests between hosts (Cyclone DDS peer)"
-    need "has ddsperf" cyclonedds-tools "measuring Cyclone DDS by itself"
+    need "has idlc" cyclonedds-tools "tests between hosts (Cyclone DDS peer)"
     need "has_header fastdds/dds/topic/TopicDataType.hpp" "libfastrtps-dev|libfastdds-dev" \
         "tests between hosts (Fast DDS peer)"
     need "has_header fastcdr/Cdr.h" libfastcdr-dev "tests between hosts (Fast DDS peer)"

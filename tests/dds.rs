@@ -97,6 +97,35 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
 }
 
 #[test]
+fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
+    let mut here = participant("here", 79);
+    let mut there = participant("there", 79);
+    let writer = there.create_writer("rt/many", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    let give_up = Instant::now() + Duration::from_secs(20);
+    let mut present = None;
+    for _ in 0..16 {
+        drop(present.take());
+        let reader = here.create_reader("rt/many", TYPE, &qos).unwrap();
+        while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
+            assert!(Instant::now() < give_up, "no writer was matched");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        present = Some(reader);
+    }
+    // Nobody has asked the writer until now.
+    let present = present.map(|reader| reader.guid()).unwrap();
+    loop {
+        match writer.poll_event() {
+            Some(WriterEvent::Matched { reader, joined: true, readers: 1 }) if reader == present => return,
+            Some(_) => {}
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+        assert!(Instant::now() < give_up, "the present reader was not announced");
+    }
+}
+
+#[test]
 fn a_full_window_is_reported_at_once_and_the_sample_is_not_kept() {
     let mut here = participant("here", 71);
     let mut there = participant("there", 71);

@@ -7,10 +7,18 @@ use std::path::Path;
 use std::process::Command;
 
 use support::netns::{Host, Net};
-use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::peer::{Library, Peer, Received, RunningPeer, Said, Sent};
 use support::process::Process;
 
-const LIBRARIES: [Library; 2] = [Library::Cyclone, Library::Fast];
+const LIBRARIES: [Library; 3] = [Library::Cyclone, Library::Fast, Library::Rust];
+
+/// Publisher and subscriber on libraries that are not the same: each library in both places.
+const STRANGERS: [(Library, Library); 4] = [
+    (Library::Fast, Library::Cyclone),
+    (Library::Cyclone, Library::Fast),
+    (Library::Rust, Library::Cyclone),
+    (Library::Fast, Library::Rust),
+];
 
 /// A publisher and a subscriber host; `None` where they can't be made, which has then been recorded.
 fn two_hosts(test: &str) -> Option<(Net, Host, Host)> {
@@ -48,7 +56,7 @@ fn reliable_samples_arrive_whole_and_once_between_the_libraries() {
     else {
         return;
     };
-    for (from, to) in [(Library::Fast, Library::Cyclone), (Library::Cyclone, Library::Fast)] {
+    for (from, to) in STRANGERS {
         let peer = |library| Peer::on(library).keep_all().seed(7);
         let (sent, received) =
             transfer((peer(from).count(400).rate_hz(200.0), &here), (peer(to).size(2948), &there), 400);
@@ -124,13 +132,16 @@ fn a_subscriber_says_when_a_sample_has_the_wrong_bytes_or_the_wrong_size() {
         return;
     };
     let publisher = || Peer::fast().keep_all().seed(1).size(1000).count(10);
-    let subscriber = || Peer::cyclone().keep_all();
-    let (_, other_bytes) = transfer((publisher(), &here), (subscriber().seed(2), &there), 10);
-    assert_eq!(other_bytes.bad, 10);
-    let (_, other_size) = transfer((publisher(), &here), (subscriber().seed(1).size(1004), &there), 10);
-    assert_eq!(other_size.bad, 10);
-    let (_, right) = transfer((publisher(), &here), (subscriber().seed(1).size(1000), &there), 10);
-    assert_eq!(right.bad, 0);
+    // Each of the two programs that check: the C++ peers share one.
+    for library in [Library::Cyclone, Library::Rust] {
+        let subscriber = || Peer::on(library).keep_all();
+        let (_, other_bytes) = transfer((publisher(), &here), (subscriber().seed(2), &there), 10);
+        assert_eq!(other_bytes.bad, 10, "{library:?}");
+        let (_, other_size) = transfer((publisher(), &here), (subscriber().seed(1).size(1004), &there), 10);
+        assert_eq!(other_size.bad, 10, "{library:?}");
+        let (_, right) = transfer((publisher(), &here), (subscriber().seed(1).size(1000), &there), 10);
+        assert_eq!(right.bad, 0, "{library:?}");
+    }
 }
 
 #[test]
@@ -143,6 +154,8 @@ fn encapsulation_kind_and_options_pass_unchanged() {
         ("00000002", Library::Fast, Library::Fast),
         ("00030000", Library::Fast, Library::Cyclone),
         ("00070001", Library::Cyclone, Library::Fast),
+        ("00000002", Library::Cyclone, Library::Rust),
+        ("00070001", Library::Rust, Library::Fast),
     ] {
         let peer = |library| Peer::on(library).keep_all().size(102);
         let (sent, received) =
@@ -162,32 +175,35 @@ fn a_transient_local_late_joiner_gets_what_the_writer_keeps() {
     };
     for from in LIBRARIES {
         let peer = |library| Peer::on(library).transient_local().keep_last(5).size(100);
-        let publisher = peer(from).publisher().count(20).linger_s(600.0).start_on(&here);
-        publisher.wait_sent();
+        // A publisher for each: Debian's Fast DDS 2.9 fails an assertion of its own (OutputTrafficManager)
+        // when a reader of RustDDS comes while it takes one of Cyclone DDS for present.
         for to in LIBRARIES {
+            let publisher = peer(from).publisher().count(20).linger_s(600.0).start_on(&here);
+            publisher.wait_sent();
             let late = peer(to).subscriber().start_on(&there);
-            late.wait_received(5);
+            late.wait_for("the latest sample", |event| event["last"] == 19);
             let received: Received = late.end();
             received.assert_sound();
-            assert_eq!(
-                (received.received, received.first, received.last),
-                (5, Some(15), Some(19)),
-                "{from:?} to {to:?}"
-            );
+            let whole = received.first <= Some(15) && received.missing.iter().all(|(_, last)| *last < 15);
+            assert!(whole && received.last == Some(19), "{from:?} to {to:?}: {received:?}");
+            // RustDDS lets go of what is beyond the depth at its cache cleaning only: some of it may come too.
+            assert!(received.received == 5 || from == Library::Rust, "{from:?} to {to:?}: {received:?}");
+            assert_eq!(publisher.end::<Sent>().ok, 20);
         }
-        assert_eq!(publisher.end::<Sent>().ok, 20);
     }
 }
 
 #[test]
 fn incompatible_qos_is_reported_on_both_sides() {
     let Some((_net, here, there)) = two_hosts("incompatible_qos_is_reported_on_both_sides") else { return };
-    for (from, to) in [(Library::Fast, Library::Cyclone), (Library::Cyclone, Library::Fast)] {
+    for (from, to) in STRANGERS {
         let publisher = Peer::on(from).best_effort().publisher().start_on(&here);
         let subscriber = Peer::on(to).subscriber().start_on(&there);
-        for peer in [&publisher, &subscriber] {
+        for (peer, library) in [(&publisher, from), (&subscriber, to)] {
             let event = peer.wait_for("incompatible QoS", |event| event["event"] == "incompatible_qos");
-            assert_eq!(event["policy_id"], 11, "RELIABILITY_QOS_POLICY_ID (DDS 1.4, 2.3.3)");
+            if library != Library::Rust {
+                assert_eq!(event["policy_id"], 11, "RELIABILITY_QOS_POLICY_ID (DDS 1.4, 2.3.3)");
+            }
             assert_eq!(peer.matched(), 0);
         }
     }
@@ -253,6 +269,7 @@ fn each_sample_is_an_event_when_asked_for() {
     let publisher = publisher.publisher().hold().prime().heartbeat_ms(200).each_sample().start_on(&here);
     go_when_matched(&publisher, &subscriber);
     subscriber.wait_received(5);
+    publisher.wait_for("the last write", |event| event["seq"] == 104);
     let written: Vec<u64> = publisher.events().iter().filter_map(|event| event["seq"].as_u64()).collect();
     assert_eq!(written, [100, 101, 102, 103, 104]);
     let sample = subscriber.wait_for("sample 103", |event| event["seq"] == 103);
@@ -266,17 +283,21 @@ fn each_sample_is_an_event_when_asked_for() {
     received.assert_all_of(&sent);
 }
 
+/// Appends a number to CDR, little endian.
+fn number(cdr: &mut Vec<u8>, value: usize) {
+    cdr.resize(cdr.len().next_multiple_of(4), 0);
+    cdr.extend((value as u32).to_le_bytes());
+}
+
+/// Appends a string to CDR, little endian.
+fn text(cdr: &mut Vec<u8>, value: &str) {
+    number(cdr, value.len() + 1);
+    cdr.extend(value.as_bytes());
+    cdr.push(0);
+}
+
 /// CDR of `rmw_dds_common/msg/ParticipantEntitiesInfo`, little endian, without its header.
 fn participant_entities(gid_bytes: usize) -> Vec<u8> {
-    fn number(cdr: &mut Vec<u8>, value: usize) {
-        cdr.resize(cdr.len().next_multiple_of(4), 0);
-        cdr.extend((value as u32).to_le_bytes());
-    }
-    fn text(cdr: &mut Vec<u8>, value: &str) {
-        number(cdr, value.len() + 1);
-        cdr.extend(value.as_bytes());
-        cdr.push(0);
-    }
     let gid = |fill: u8| vec![fill; gid_bytes];
     let mut cdr = gid(0x11);
     number(&mut cdr, 2);
@@ -331,6 +352,85 @@ fn the_ros_graph_and_its_endpoints_are_shown() {
         publisher.end::<Sent>();
         support::wait_until("the writer is gone", || of_publisher(&graph.graph()).is_none());
     }
+}
+
+#[test]
+fn what_one_peer_says_another_decodes_by_the_definition_alone() {
+    let test = "what_one_peer_says_another_decodes_by_the_definition_alone";
+    let Some((_net, here, there)) = two_hosts(test) else { return };
+    let peer = || Peer::cyclone().keep_all().topic("rt/adaptive_bridge/test");
+    let listener = peer().decode_string().start_on(&there);
+    let mut speaker = peer().say().start_on(&here);
+    speaker.wait_matched(1);
+    listener.wait_matched(1);
+    let long = "x".repeat(1 << 20);
+    let lines = ["", "{\"id\":\"läptop\",\"seq\":1}", "back\\slash\t\u{1}", &long];
+    for line in lines {
+        speaker.say(line);
+    }
+    speaker.say(b"no \xff UTF-8");
+    listener.wait_decoded("the last line", |message| message["data"] == "no \u{fffd} UTF-8");
+    let decoded = listener.decoded();
+    let heard: Vec<&str> = decoded.iter().filter_map(|message| message["data"].as_str()).collect();
+    assert_eq!(heard[..4], lines);
+    assert_eq!(heard.len(), 5);
+    let said: Said = speaker.finish();
+    assert_eq!((said.attempted, said.ok, said.failed, said.acknowledged), (5, 5, 0, true));
+}
+
+/// CDR of `diagnostic_msgs/msg/DiagnosticArray`, little endian, without its header.
+fn diagnostics() -> Vec<u8> {
+    let mut cdr = Vec::new();
+    number(&mut cdr, 1_700_000_000);
+    number(&mut cdr, 999_999_999);
+    text(&mut cdr, "base");
+    number(&mut cdr, 2);
+    for (level, name) in [(0u8, "bridge: ingress"), (2, "bridge: lane")] {
+        cdr.push(level);
+        text(&mut cdr, name);
+        text(&mut cdr, "a message");
+        text(&mut cdr, "");
+        number(&mut cdr, 1);
+        text(&mut cdr, "rate_hz");
+        text(&mut cdr, "3.0");
+    }
+    cdr
+}
+
+#[test]
+fn diagnostics_are_decoded_by_their_definition_and_cut_off_ones_are_not() {
+    let test = "diagnostics_are_decoded_by_their_definition_and_cut_off_ones_are_not";
+    let Some((_net, here, there)) = two_hosts(test) else { return };
+    let listener = Peer::cyclone().transient_local().keep_all().decode_diagnostics().start_on(&there);
+    let folder = tempfile::tempdir().unwrap();
+    let whole = diagnostics();
+    for (name, cdr) in [("cut_off", &whole[..whole.len() - 4]), ("whole", &whole)] {
+        let file = folder.path().join(name);
+        fs::write(&file, cdr).unwrap();
+        let publisher = Peer::fast()
+            .transient_local()
+            .keep_last(1)
+            .topic("rt/diagnostics")
+            .type_name("diagnostic_msgs::msg::dds_::DiagnosticArray_")
+            .payload_file(&file)
+            .wait_match(1)
+            .count(1)
+            .publisher()
+            .start_on(&here);
+        assert!(publisher.wait_sent(), "the listener has acknowledged it");
+        publisher.finish::<Sent>();
+    }
+    let values = serde_json::json!([{"key": "rate_hz", "value": "3.0"}]);
+    let status = |level: u8, name: &str| {
+        serde_json::json!({"level": level, "name": name, "message": "a message", "hardware_id": "",
+                           "values": values})
+    };
+    let expected = serde_json::json!({
+        "header": {"stamp": {"sec": 1_700_000_000, "nanosec": 999_999_999}, "frame_id": "base"},
+        "status": [status(0, "bridge: ingress"), status(2, "bridge: lane")],
+    });
+    listener.wait_decoded("both statuses", |message| *message == expected);
+    assert_eq!(listener.decoded(), [expected], "{}", listener.log());
 }
 
 #[test]

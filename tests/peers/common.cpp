@@ -141,6 +141,30 @@ std::string distribution(std::vector<int64_t> ns) {
          ",\"max\":" + microseconds(ns.back()) + "}";
 }
 
+// How many bytes the UTF-8 character at that place has; 0 when there is none (Unicode 15, table 3-7).
+size_t character_bytes(const std::string& text, size_t at) {
+  const auto byte = [&](size_t offset) {
+    return at + offset < text.size() ? static_cast<unsigned char>(text[at + offset]) : 0u;
+  };
+  const auto in = [](unsigned value, unsigned low, unsigned high) { return value >= low && value <= high; };
+  const unsigned lead = byte(0);
+  if (lead < 0x80) return 1;
+  size_t length = 0;
+  unsigned low = 0x80, high = 0xbf;  // of the second byte
+  if (in(lead, 0xc2, 0xdf)) length = 2;
+  if (in(lead, 0xe0, 0xef)) length = 3;
+  if (in(lead, 0xf0, 0xf4)) length = 4;
+  if (lead == 0xe0) low = 0xa0;
+  if (lead == 0xed) high = 0x9f;
+  if (lead == 0xf0) low = 0x90;
+  if (lead == 0xf4) high = 0x8f;
+  for (size_t offset = 1; offset < length; ++offset) {
+    if (!in(byte(offset), low, high)) return 0;
+    low = 0x80, high = 0xbf;
+  }
+  return length;
+}
+
 void on_signal(int signal) { (signal == SIGUSR1 ? go_requested : stop_requested) = 1; }
 
 int64_t clock_ns(clockid_t clock) {
@@ -160,6 +184,7 @@ Options parse_options(int argc, char** argv) {
     if (name == "--hold") { options.hold = true; continue; }
     if (name == "--prime") { options.prime = true; continue; }
     if (name == "--shm") { options.shared_memory = true; continue; }
+    if (name == "--say") { options.say = true; continue; }
     if (at + 1 == argc) usage(name + ": unknown, or its value is missing");
     const std::string value = argv[++at];
     if (name == "--role") options.role = value;
@@ -186,6 +211,7 @@ Options parse_options(int argc, char** argv) {
     else if (name == "--wait-match") options.wait_match = static_cast<int32_t>(number(name, value, 1e6));
     else if (name == "--heartbeat-ms") options.heartbeat_s = number(name, value, 1e6) / 1e3;
     else if (name == "--linger") options.linger_s = number(name, value, 1e6);
+    else if (name == "--decode") options.decode = value;
     else if (name == "--stall-every") options.stall_every_s = number(name, value, 1e6);
     else if (name == "--stall-for") options.stall_for_s = number(name, value, 1e6);
     else if (name == "--gid-bytes") options.gid_bytes = choose(name, value, "16", "24") ? 24 : 16;
@@ -194,6 +220,8 @@ Options parse_options(int argc, char** argv) {
   if (options.role != "pub" && options.role != "sub" && options.role != "graph") {
     usage("--role: expected pub, sub or graph");
   }
+  if (options.say && options.role != "pub") usage("--say: only of role pub");
+  if (!options.decode.empty() && options.role != "sub") usage("--decode: only of role sub");
   if (options.role == "pub" && options.sizes.empty()) options.sizes = {2948};
   return options;
 }
@@ -234,18 +262,22 @@ void emit_error(const std::string& message) {
 
 std::string json_string(const std::string& text) {
   std::string json = "\"";
-  for (const char letter : text) {
-    const auto code = static_cast<unsigned char>(letter);
-    if (letter == '"' || letter == '\\') {
+  for (size_t at = 0; at < text.size();) {
+    const size_t length = character_bytes(text, at);
+    const auto code = static_cast<unsigned char>(text[at]);
+    if (length == 0) {
+      json += "\\ufffd";
+    } else if (code == '"' || code == '\\') {
       json += '\\';
-      json += letter;
-    } else if (code < 0x20 || code >= 0x7f) {
+      json += text[at];
+    } else if (code < 0x20 || code == 0x7f) {
       char escape[8];
       std::snprintf(escape, sizeof escape, "\\u%04x", code);
       json += escape;
     } else {
-      json += letter;
+      json.append(text, at, length);
     }
+    at += std::max<size_t>(length, 1);
   }
   return json + "\"";
 }

@@ -37,7 +37,9 @@ struct Options {
   bool prime = false;
   double heartbeat_s = 0;      // 0 is the library's default
   double linger_s = 0;
+  bool say = false;            // a publisher sends the lines of stdin as std_msgs/msg/String
 
+  std::string decode;          // a subscriber decodes this message by its definition
   bool opaque = false;         // the payload is not a peer's: no sequence, no check
   bool summary = false;        // no line per sample
   double stall_every_s = 0;
@@ -62,6 +64,7 @@ void sleep_until(int64_t at_ns);
 // One line of JSON to stdout, at once.
 void emit(const std::string& json);
 void emit_error(const std::string& message);
+// Text in UTF-8 as a JSON string; bytes that are none become U+FFFD.
 std::string json_string(const std::string& text);
 std::string hex(const uint8_t* bytes, size_t count);
 

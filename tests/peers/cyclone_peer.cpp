@@ -1,14 +1,19 @@
-// A DDS peer on Cyclone DDS 0.10: publishes and subscribes serialized samples of any type, and shows the ROS graph.
+// A DDS peer on Cyclone DDS 0.10: publishes and subscribes serialized samples of any type, says and decodes messages
+// of a few types that it knows, and shows the ROS graph.
 #include <dds/dds.h>
 #include <dds/ddsi/ddsi_serdata.h>
 #include <dds/ddsi/ddsi_sertype.h>
 #include <dds/ddsi/q_radmin.h>
+#include <poll.h>
+#include <unistd.h>
 
+#include <cerrno>
 #include <cstdlib>
 #include <cstring>
 #include <new>
 
 #include "common.hpp"
+#include "messages.hpp"
 
 namespace {
 
@@ -205,17 +210,21 @@ dds_listener_t* listener() {
   return listener;
 }
 
-int publish(const Options& options, dds_entity_t participant) {
-  dds_qos_t* qos = qos_of(options);
-  const dds_entity_t topic = raw_topic(participant, options.topic, options.type);
-  const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos, listener()));
-  emit("{\"event\":\"ready\"}");
+void wait_for_readers(const Options& options, dds_entity_t writer) {
   while (!stop_requested && options.wait_match > 0) {
     dds_publication_matched_status_t status{};
     dds_get_publication_matched_status(writer, &status);
     if (status.current_count >= static_cast<uint32_t>(options.wait_match)) break;
     sleep_until(monotonic_ns() + 10'000'000);
   }
+}
+
+int publish(const Options& options, dds_entity_t participant) {
+  dds_qos_t* qos = qos_of(options);
+  const dds_entity_t topic = raw_topic(participant, options.topic, options.type);
+  const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos, listener()));
+  emit("{\"event\":\"ready\"}");
+  wait_for_readers(options, writer);
   Publisher publisher(options);
   const auto write = [&](const Bytes& bytes, int64_t source_ns) {
     return dds_write_ts(writer, &bytes, source_ns) == DDS_RETCODE_OK;
@@ -225,6 +234,53 @@ int publish(const Options& options, dds_entity_t participant) {
   publisher.run(write);
   publisher.linger(acknowledged);
   publisher.print_summary();
+  return 0;
+}
+
+// Calls `take(line)` for each line of stdin, until its end or a signal.
+template <typename Take>
+void read_lines(Take take) {
+  std::string text;
+  std::vector<char> buffer(1 << 16);
+  while (!stop_requested) {
+    pollfd input{STDIN_FILENO, POLLIN, 0};
+    if (poll(&input, 1, 100) <= 0) continue;
+    const ssize_t count = read(STDIN_FILENO, buffer.data(), buffer.size());
+    if (count < 0 && errno == EINTR) continue;
+    if (count <= 0) break;
+    size_t begin = 0;
+    size_t end = text.size();
+    text.append(buffer.data(), static_cast<size_t>(count));
+    while ((end = text.find('\n', end)) != std::string::npos) {
+      take(text.substr(begin, end - begin));
+      begin = ++end;
+    }
+    text.erase(0, begin);
+  }
+}
+
+// Publishes each line of stdin.
+int say(const Options& options, dds_entity_t participant) {
+  const Message& message = *message_named("string");
+  const dds_entity_t topic =
+      check("topic", dds_create_topic(participant, message.descriptor, options.topic.c_str(), nullptr, nullptr));
+  const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos_of(options), listener()));
+  emit("{\"event\":\"ready\"}");
+  wait_for_readers(options, writer);
+  uint64_t attempted = 0;
+  uint64_t failed = 0;
+  read_lines([&](const std::string& line) {
+    const bool ok = write_string(writer, line) == DDS_RETCODE_OK;
+    ++attempted;
+    if (!ok) ++failed;
+    if (!options.summary) emit(std::string("{\"event\":\"write\",\"ok\":") + (ok ? "true}" : "false}"));
+  });
+  const bool acknowledged = dds_wait_for_acks(writer, DDS_SECS(10)) == DDS_RETCODE_OK;
+  emit(std::string("{\"event\":\"sent\",\"acknowledged\":") + (acknowledged ? "true}" : "false}"));
+  sleep_until(monotonic_ns() + static_cast<int64_t>(options.linger_s * 1e9));
+  emit("{\"event\":\"summary\",\"role\":\"pub\",\"attempted\":" + std::to_string(attempted) +
+       ",\"ok\":" + std::to_string(attempted - failed) + ",\"failed\":" + std::to_string(failed) +
+       ",\"acknowledged\":" + (acknowledged ? "true" : "false") + "}");
   return 0;
 }
 
@@ -264,6 +320,39 @@ int subscribe(const Options& options, dds_entity_t participant) {
     subscriber.housekeeping();
   }
   subscriber.print_summary();
+  return 0;
+}
+
+// Subscribes a message by its definition, and shows each sample that Cyclone DDS could decode.
+int decode(const Options& options, dds_entity_t participant) {
+  const Message* message = message_named(options.decode);
+  if (message == nullptr) {
+    emit_error("--decode " + options.decode + ": expected diagnostics or string");
+    return 2;
+  }
+  const dds_entity_t topic =
+      check("topic", dds_create_topic(participant, message->descriptor, options.topic.c_str(), nullptr, nullptr));
+  const dds_entity_t reader = check("reader", dds_create_reader(participant, topic, qos_of(options), listener()));
+  const dds_entity_t waitset = check("waitset", dds_create_waitset(participant));
+  check("attach", dds_waitset_attach(waitset, check("condition", dds_create_readcondition(reader, DDS_ANY_STATE)), 0));
+  emit("{\"event\":\"ready\"}");
+  const int64_t end_ns = monotonic_ns() + static_cast<int64_t>(options.duration_s * 1e9);
+  uint64_t decoded = 0;
+  while (!stop_requested && (options.duration_s == 0 || monotonic_ns() < end_ns) &&
+         (options.count == 0 || decoded < options.count)) {
+    dds_waitset_wait(waitset, nullptr, 0, DDS_MSECS(100));
+    void* samples[1] = {nullptr};
+    dds_sample_info_t info{};
+    while (!stop_requested && dds_take(reader, samples, &info, 1, 1) == 1) {
+      if (info.valid_data) {
+        ++decoded;
+        emit("{\"event\":\"decoded\",\"source_ns\":" + std::to_string(info.source_timestamp) +
+             ",\"message\":" + message->json(samples[0]) + "}");
+      }
+      dds_return_loan(reader, samples, 1);
+    }
+  }
+  emit("{\"event\":\"summary\",\"role\":\"sub\",\"decoded\":" + std::to_string(decoded) + "}");
   return 0;
 }
 
@@ -471,7 +560,9 @@ int main(int argc, char** argv) {
   setenv("CYCLONEDDS_URI", configuration(options).c_str(), 0);
   const dds_entity_t participant = check("participant", dds_create_participant(options.domain, nullptr, nullptr));
   int code = 0;
-  if (options.role == "pub") code = publish(options, participant);
+  if (options.say) code = say(options, participant);
+  else if (!options.decode.empty()) code = decode(options, participant);
+  else if (options.role == "pub") code = publish(options, participant);
   else if (options.role == "sub") code = subscribe(options, participant);
   else code = show_graph(options, participant);
   dds_delete(participant);

@@ -55,19 +55,31 @@ impl Bed {
     /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is
     /// written before the writer knows of a reader is not for that reader.
     pub fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
-        let before = self.readers(topic);
+        let (route, lane) = self.output(topic);
+        // Not by the number of readers: one that has just ended may still be counted.
+        let joined = || {
+            let log = self.up.log();
+            let of_output = format!("readers changed route={route} lane={lane} ");
+            log.lines().filter(|line| line.contains(&of_output) && line.contains("joined=true")).count()
+        };
+        let before = joined();
         let subscriber = peer.subscriber().topic(topic).start_on(self.host(host));
         subscriber.wait_matched(1);
-        super::wait_until("a reader matched by the bridge", || self.readers(topic) > before);
+        super::wait_until("a reader matched by the bridge", || joined() > before);
         subscriber
     }
 
-    /// Readers that the bridge's writer of a DDS topic is matched with.
-    fn readers(&self, topic: &str) -> u64 {
+    /// Route and lane of a DDS topic of the bridge, in quotes.
+    fn output(&self, topic: &str) -> (Value, Value) {
         let status = self.bridge.status();
-        let found =
-            outputs(&status).find(|output| topic == format!("rt{}", output["topic"].as_str().unwrap_or("")));
-        found.and_then(|output| output["readers"].as_u64()).unwrap_or_else(|| panic!("{topic} in {status}"))
+        for route in status["routes"].as_array().into_iter().flatten() {
+            for output in route["lanes"].as_array().into_iter().flatten() {
+                if output["topic"].as_str().is_some_and(|name| topic == format!("rt{name}")) {
+                    return (route["id"].clone(), output["lane"].clone());
+                }
+            }
+        }
+        panic!("{topic} in {status}")
     }
 
     /// A publisher that begins when ingress reads it.

@@ -1,8 +1,6 @@
 //! An impaired link at a host, as `adaptive-bridge-eval impair` makes it.
 
-use std::io::Write;
 use std::path::Path;
-use std::process::ChildStdin;
 
 use serde_json::Value;
 
@@ -18,7 +16,6 @@ pub fn program() -> &'static Path {
 /// the [`Net`](super::netns::Net).
 pub struct Impairment {
     process: Process,
-    stdin: ChildStdin,
     /// Lines of output that have been read.
     read: usize,
 }
@@ -32,8 +29,8 @@ impl Impairment {
         command.args(["impair", "--json", "--backend", "nfqueue", "--source", &source.address().to_string()]);
         command.args(arguments.split_whitespace());
         let name = format!("impair {arguments} at {}", host.name());
-        let (process, stdin) = Process::spawn_with_stdin(&name, command);
-        let mut impairment = Self { process, stdin, read: 0 };
+        let process = Process::spawn_fed(&name, command);
+        let mut impairment = Self { process, read: 0 };
         impairment.wait_for("ready");
         impairment
     }
@@ -84,7 +81,7 @@ impl Impairment {
     }
 
     fn command(&mut self, command: &str, event: &str) -> Value {
-        writeln!(self.stdin, "{command}").unwrap();
+        self.process.feed(format!("{command}\n").as_bytes());
         self.wait_for(event)
     }
 

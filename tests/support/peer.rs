@@ -1,4 +1,4 @@
-//! The peers of `tests/peers`: publishers and subscribers on Cyclone DDS and Fast DDS.
+//! The peers of `tests/peers`: publishers and subscribers on Cyclone DDS, Fast DDS and RustDDS.
 
 use std::collections::BTreeMap;
 use std::ops::{Deref, DerefMut};
@@ -13,9 +13,9 @@ use serde_json::Value;
 use super::netns::Host;
 use super::process::Process;
 
-/// Why a peer can't be started: it is not built. `None` when both are.
+/// Why a peer can't be started: it is not built. `None` when all are.
 pub fn missing() -> Option<String> {
-    let peers = [Library::Cyclone, Library::Fast];
+    let peers = [Library::Cyclone, Library::Fast, Library::Rust];
     let lacking = peers.into_iter().find(|library| !library.program().exists())?;
     Some(format!("{} is not built: run `make peers`, and see what it says", lacking.program().display()))
 }
@@ -27,15 +27,21 @@ pub enum Library {
     Cyclone,
     /// Fast DDS.
     Fast,
+    /// RustDDS, by the bridge's own RTPS edge.
+    Rust,
 }
 
 impl Library {
     fn program(self) -> PathBuf {
-        let name = match self {
-            Library::Cyclone => "cyclone_peer",
-            Library::Fast => "fast_peer",
-        };
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers/build").join(name)
+        let built_by_make = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers/build");
+        match self {
+            Library::Cyclone => built_by_make.join("cyclone_peer"),
+            Library::Fast => built_by_make.join("fast_peer"),
+            // An example of this package: where Cargo puts those of the profile that the bridge is built in.
+            Library::Rust => {
+                Path::new(env!("CARGO_BIN_EXE_adaptive-bridge")).with_file_name("examples").join("rust_peer")
+            }
+        }
     }
 }
 
@@ -47,6 +53,7 @@ pub struct Peer {
     library: Library,
     role: String,
     each_sample: bool,
+    says: bool,
     arguments: Vec<String>,
     environment: Vec<(String, String)>,
 }
@@ -58,6 +65,7 @@ impl Peer {
             library,
             role: String::new(),
             each_sample: false,
+            says: false,
             arguments: Vec::new(),
             environment: Vec::new(),
         }
@@ -71,6 +79,11 @@ impl Peer {
     /// A peer on Fast DDS.
     pub fn fast() -> Peer {
         Peer::on(Library::Fast)
+    }
+
+    /// A peer on RustDDS.
+    pub fn rust() -> Peer {
+        Peer::on(Library::Rust)
     }
 
     /// It publishes.
@@ -87,6 +100,23 @@ impl Peer {
     /// since Iron.
     pub fn graph(self, gid_bytes: usize) -> Peer {
         Peer { role: "graph".to_owned(), ..self }.option("--gid-bytes", gid_bytes)
+    }
+
+    /// It publishes `std_msgs/msg/String` by its definition, one sample for each [`RunningPeer::say`];
+    /// Cyclone DDS only. It ends at [`RunningPeer::finish`], when all of it is sent.
+    pub fn say(mut self) -> Peer {
+        self.arguments.push("--say".to_owned());
+        Peer { role: "pub".to_owned(), says: true, ..self }
+    }
+
+    /// It subscribes `std_msgs/msg/String` by its definition; Cyclone DDS only.
+    pub fn decode_string(self) -> Peer {
+        self.subscriber().option("--decode", "string")
+    }
+
+    /// It subscribes `diagnostic_msgs/msg/DiagnosticArray` by its definition; Cyclone DDS only.
+    pub fn decode_diagnostics(self) -> Peer {
+        self.subscriber().option("--decode", "diagnostics").topic("rt/diagnostics")
     }
 
     /// Any option of the command line, with its value; a later one wins.
@@ -266,7 +296,8 @@ impl Peer {
             command.arg("--summary");
         }
         let name = format!("{:?} {}{place}", self.library, self.role);
-        let peer = RunningPeer { process: Process::spawn(&name, command) };
+        let spawn = if self.says { Process::spawn_fed } else { Process::spawn };
+        let peer = RunningPeer { process: spawn(&name, command) };
         peer.wait_for("ready", |event| event["event"] == "ready");
         peer
     }
@@ -295,6 +326,11 @@ fn event_of(line: &str) -> Value {
     serde_json::from_str(line).unwrap_or(Value::Null)
 }
 
+/// What a `decoded` event carries.
+fn message_of(event: &mut Value) -> Option<Value> {
+    (event["event"] == "decoded").then(|| event["message"].take())
+}
+
 impl RunningPeer {
     /// All events so far.
     pub fn events(&self) -> Vec<Value> {
@@ -316,6 +352,23 @@ impl RunningPeer {
     /// Waits until so many endpoints match it.
     pub fn wait_matched(&self, endpoints: u64) {
         super::wait_until(&format!("{endpoints} matched endpoints"), || self.matched() == endpoints);
+    }
+
+    /// Publishes a line, which has no line break in it and need not be UTF-8; see [`Peer::say`].
+    pub fn say(&mut self, line: impl AsRef<[u8]>) {
+        self.process.feed(&[line.as_ref(), b"\n"].concat());
+    }
+
+    /// What a peer of [`Peer::decode_string`] or [`Peer::decode_diagnostics`] has decoded so far, oldest
+    /// first: the fields by the names of the definition. What is not to be decoded is in its log.
+    pub fn decoded(&self) -> Vec<Value> {
+        self.events().iter_mut().filter_map(message_of).collect()
+    }
+
+    /// Waits for a decoded message, among those so far and those to come.
+    pub fn wait_decoded(&self, what: &str, mut found: impl FnMut(&Value) -> bool) -> Value {
+        let find = |line: &str| message_of(&mut event_of(line)).filter(|message| found(message));
+        self.process.wait_for_line(what, 0, find).0
     }
 
     /// Lets a publisher begin that was held back by [`Peer::hold`].
@@ -364,6 +417,19 @@ impl RunningPeer {
         let event = self.wait_for("the summary", |event| event["event"] == "summary");
         serde_json::from_value(event.clone()).unwrap_or_else(|error| panic!("{error} in {event}"))
     }
+}
+
+/// What a peer of [`Peer::say`] did.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Said {
+    /// Lines that it was given.
+    pub attempted: u64,
+    /// Those that were written.
+    pub ok: u64,
+    /// Those that were not.
+    pub failed: u64,
+    /// Whether all RELIABLE readers have acknowledged everything.
+    pub acknowledged: bool,
 }
 
 /// What a publisher did.

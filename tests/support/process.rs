@@ -1,8 +1,8 @@
 //! A child process whose output is kept, which can be stopped and killed, and which never outlives its test.
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Instant;
 
@@ -60,20 +60,18 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it. Call it on the test's own thread: the kernel kills the child when the thread that started
-    /// it ends.
+    /// Starts it, with nothing to read. Call it on the test's own thread: the kernel kills the child when the
+    /// thread that started it ends.
     pub fn spawn(name: &str, command: Command) -> Process {
-        Process::start(name, command, Stdio::null())
+        Self::spawn_with(name, command, Stdio::null())
     }
 
-    /// As [`spawn`](Self::spawn), with a stdin to write to.
-    pub fn spawn_with_stdin(name: &str, command: Command) -> (Process, ChildStdin) {
-        let mut process = Process::start(name, command, Stdio::piped());
-        let stdin = process.child.stdin.take().unwrap();
-        (process, stdin)
+    /// As [`Process::spawn`], but it reads what [`Process::feed`] gives it, until [`Process::wait`].
+    pub fn spawn_fed(name: &str, command: Command) -> Process {
+        Self::spawn_with(name, command, Stdio::piped())
     }
 
-    fn start(name: &str, mut command: Command, stdin: Stdio) -> Process {
+    fn spawn_with(name: &str, mut command: Command, stdin: Stdio) -> Process {
         command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
         // SAFETY: between fork and exec the closure makes one system call (prctl), which is
         // async-signal-safe; it neither allocates nor takes a lock.
@@ -86,6 +84,12 @@ impl Process {
         let stdout = Lines::read_from(child.stdout.take().unwrap());
         let stderr = Lines::read_from(child.stderr.take().unwrap());
         Process { name: name.to_owned(), child, stdout, stderr }
+    }
+
+    /// Writes to its stdin.
+    pub fn feed(&mut self, bytes: &[u8]) {
+        let stdin = self.child.stdin.as_mut().unwrap_or_else(|| panic!("{} reads nothing", self.name));
+        stdin.write_all(bytes).unwrap_or_else(|error| panic!("{} does not read: {error}", self.name));
     }
 
     /// The process id.
@@ -132,8 +136,9 @@ impl Process {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// Waits until it has ended, and until all that it wrote has been read.
+    /// Ends its stdin, waits until it has ended, and until all that it wrote has been read.
     pub fn wait(&mut self) -> ExitStatus {
+        self.child.stdin = None;
         let what = format!("the end of {}", self.name);
         let status = super::wait_for(&what, || self.child.try_wait().unwrap());
         // A grandchild may hold the pipe open; then what has come so far is all there is to wait for.

@@ -55,6 +55,11 @@ use crate::{
 #[cfg(not(feature = "security"))]
 use crate::no_security::{security_plugins::SecurityPluginsHandle, EndpointSecurityInfo};
 
+/// Status events that an endpoint holds until the application takes them; the
+/// rest is lost. A peer that joins late is told of endpoints that are already
+/// gone, so each of them makes two events, all at once.
+const STATUS_CHANNEL_CAPACITY: usize = 256;
+
 // -------------------------------------------------------------------
 
 /// DDS Publisher
@@ -480,7 +485,7 @@ impl InnerPublisher {
     SA: adapters::with_key::SerializerAdapter<D>,
   {
     // Status reports back from Writer to DataWriter.
-    let (status_sender, status_receiver) = sync_status_channel(4)?;
+    let (status_sender, status_receiver) = sync_status_channel(STATUS_CHANNEL_CAPACITY)?;
 
     // DDS Spec 2.2.2.4.1.5 create_datawriter:
     // If no QoS is specified, we should take the Publisher default
@@ -1128,7 +1133,7 @@ impl InnerSubscriber {
     // incoming data notification channel from Reader to DataReader
     let (send, rec) = crate::mio_source::notification_channel(4);
     // status change channel from Reader to DataReader
-    let (status_sender, status_receiver) = sync_status_channel::<DataReaderStatus>(4)?;
+    let (status_sender, status_receiver) = sync_status_channel::<DataReaderStatus>(STATUS_CHANNEL_CAPACITY)?;
 
     // reader command channel from Datareader to Reader.
     // Capacity 0 is a rendezvous, matching the previous mio-extras channel: the

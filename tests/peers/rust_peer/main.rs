@@ -1,0 +1,86 @@
+//! A DDS peer on RustDDS, through the bridge's own RTPS edge, with the command line and the output of those
+//! on Cyclone DDS and Fast DDS. `tests/peers/README.md` describes it. It is an example of the package and not
+//! a program of it, so that it is never installed.
+
+mod options;
+mod payload;
+mod publisher;
+mod subscriber;
+
+use std::io::Write;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use adaptive_bridge::telemetry::start_logs;
+use clap::Parser;
+use serde_json::{Value, json};
+use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
+
+use options::{Options, Role};
+
+/// What signals have asked for.
+#[derive(Default)]
+struct Signals {
+    /// SIGINT, SIGTERM.
+    stop: Arc<AtomicBool>,
+    /// SIGUSR1.
+    go: Arc<AtomicBool>,
+}
+
+impl Signals {
+    fn listen(&self) -> std::io::Result<()> {
+        for signal in [SIGINT, SIGTERM] {
+            signal_hook::flag::register(signal, Arc::clone(&self.stop))?;
+        }
+        signal_hook::flag::register(SIGUSR1, Arc::clone(&self.go))?;
+        Ok(())
+    }
+
+    fn stop(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn go(&self) -> bool {
+        self.go.load(Ordering::Relaxed)
+    }
+}
+
+/// One line of JSON to stdout, at once.
+fn emit(event: &Value) {
+    let mut out = std::io::stdout().lock();
+    // Without a reader there is nobody to tell.
+    let _ = writeln!(out, "{event}").and_then(|()| out.flush());
+}
+
+/// Microseconds, to a tenth.
+fn microseconds(ns: i64) -> f64 {
+    (ns as f64 / 100.0).round() / 10.0
+}
+
+/// Order statistics in microseconds; null of nothing.
+fn distribution(ns: &[i64]) -> Value {
+    let mut sorted = ns.to_vec();
+    sorted.sort_unstable();
+    let Some(last) = sorted.len().checked_sub(1) else { return Value::Null };
+    let quantile = |fraction: f64| microseconds(sorted[(fraction * last as f64).round() as usize]);
+    json!({"min": quantile(0.0), "p50": quantile(0.5), "p95": quantile(0.95), "p99": quantile(0.99),
+           "max": quantile(1.0)})
+}
+
+fn main() -> ExitCode {
+    let options = Options::parse();
+    start_logs();
+    let signals = Signals::default();
+    let outcome = signals.listen().map_err(|error| error.to_string()).and_then(|()| match options.role {
+        Role::Pub => publisher::publish(&options, &signals),
+        Role::Sub => subscriber::subscribe(&options, &signals),
+    });
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(message) => {
+            emit(&json!({"event": "error", "message": message}));
+            ExitCode::FAILURE
+        }
+    }
+}
