@@ -22,6 +22,10 @@ use crate::{
   structure::locator::Locator,
 };
 
+// What an IPv4 datagram holds. How much a path carries without fragmentation is
+// the Writers' concern, and loopback carries this.
+const MAX_UDP_PAYLOAD: usize = 65_507;
+
 // We need one multicast sender socket per interface
 
 #[derive(Debug)]
@@ -353,7 +357,7 @@ impl UDPSender {
   /// multicast interface (legacy reachability). Datagrams are queued (never
   /// dropped) if the socket is congested.
   pub fn send_to_locator(&self, buffer: &[u8], locator: &Locator) {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!("send_to_locator: Message size = {}", buffer.len());
     }
     let Some(socket_address) = self.locator_socket_addr(locator, "send_to_locator") else {
@@ -395,7 +399,7 @@ impl UDPSender {
     locator: &Locator,
     interface: &InterfaceSelector,
   ) {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!(
         "send_to_multicast_locator_via: Message size = {}",
         buffer.len()
@@ -438,7 +442,7 @@ impl UDPSender {
   /// Bulk send to a locator. Returns the sockets that could not accept the
   /// datagram (WouldBlock), so the caller can stop and arm write readiness.
   pub(crate) fn try_send_to_locator(&self, buffer: &[u8], locator: &Locator) -> Vec<SocketId> {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!("try_send_to_locator: Message size = {}", buffer.len());
     }
     let mut blocked = Vec::new();
@@ -467,7 +471,7 @@ impl UDPSender {
     locator: &Locator,
     interface: &InterfaceSelector,
   ) -> Vec<SocketId> {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!(
         "try_send_to_multicast_locator_via: Message size = {}",
         buffer.len()
