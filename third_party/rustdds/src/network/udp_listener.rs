@@ -80,11 +80,23 @@ impl UDPListener {
     let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
 
     if recv_buffer_size > 0 {
-      raw_socket
-        .set_recv_buffer_size(recv_buffer_size)
-        .unwrap_or_else(|e| {
-          warn!("Failed to set SO_RCVBUF to {recv_buffer_size}: {e}. Using OS default.");
-        });
+      // With CAP_NET_ADMIN `net.core.rmem_max` is no limit.
+      #[cfg(target_os = "linux")]
+      let forced = nix::sys::socket::setsockopt(
+        &raw_socket,
+        nix::sys::socket::sockopt::RcvBufForce,
+        &recv_buffer_size,
+      )
+      .is_ok();
+      #[cfg(not(target_os = "linux"))]
+      let forced = false;
+      if !forced {
+        raw_socket
+          .set_recv_buffer_size(recv_buffer_size)
+          .unwrap_or_else(|e| {
+            warn!("Failed to set SO_RCVBUF to {recv_buffer_size}: {e}. Using OS default.");
+          });
+      }
 
       // Verify the effective size (getsockopt). The kernel silently clamps
       // SO_RCVBUF to a per-socket ceiling (macOS: `kern.ipc.maxsockbuf`, which

@@ -60,9 +60,17 @@ impl UDPSender {
     if size == 0 {
       return;
     }
-    if let Err(e) = socket.set_send_buffer_size(size) {
-      warn!("Failed to set SO_SNDBUF to {size}: {e}. Using OS default.");
-      return;
+    // With CAP_NET_ADMIN `net.core.wmem_max` is no limit.
+    #[cfg(target_os = "linux")]
+    let forced =
+      nix::sys::socket::setsockopt(socket, nix::sys::socket::sockopt::SndBufForce, &size).is_ok();
+    #[cfg(not(target_os = "linux"))]
+    let forced = false;
+    if !forced {
+      if let Err(e) = socket.set_send_buffer_size(size) {
+        warn!("Failed to set SO_SNDBUF to {size}: {e}. Using OS default.");
+        return;
+      }
     }
     match socket.send_buffer_size() {
       Ok(effective) if effective < size => warn!(
