@@ -3,6 +3,7 @@ use std::{
   collections::HashMap,
   io,
   net::{IpAddr, SocketAddr, UdpSocket},
+  sync::Arc,
 };
 #[cfg(test)]
 use std::net::Ipv4Addr;
@@ -30,7 +31,8 @@ const MAX_UDP_PAYLOAD: usize = 65_507;
 
 #[derive(Debug)]
 pub struct UDPSender {
-  unicast_socket: UdpSocket,
+  // Shared with the threads that write, see `rtps/direct_send.rs`.
+  unicast_socket: Arc<UdpSocket>,
   // One multicast sender socket per local interface, keyed by the interface it
   // was bound to (its `InterfaceSelector`). This lets us target a single
   // interface instead of sending on all of them.
@@ -169,7 +171,7 @@ impl UDPSender {
     } // end for
 
     let sender = Self {
-      unicast_socket,
+      unicast_socket: Arc::new(unicast_socket),
       multicast_sockets,
       control_queues: RefCell::new(HashMap::new()),
     };
@@ -180,6 +182,10 @@ impl UDPSender {
   #[cfg(test)]
   pub fn new_with_random_port() -> io::Result<Self> {
     Self::new(0)
+  }
+
+  pub(crate) fn unicast_socket(&self) -> Arc<UdpSocket> {
+    Arc::clone(&self.unicast_socket)
   }
 
   // --- nonblocking-transmit: socket enumeration & raw non-blocking send ------

@@ -2,9 +2,10 @@ use std::{
   cell::RefCell,
   cmp::{max, min},
   collections::{BTreeMap, BTreeSet},
+  net::SocketAddr,
   ops::Bound::Included,
   rc::Rc,
-  sync::{atomic, mpsc::TrySendError},
+  sync::mpsc::TrySendError,
 };
 
 #[allow(unused_imports)]
@@ -33,6 +34,7 @@ use crate::{
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, REPAIR_BATCH_MAX_BYTES,
       REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
     },
+    direct_send::Plan,
     outbound::{SocketId, TrafficClass},
     rtps_reader_proxy::RtpsReaderProxy,
     timed_event::DpTimerEvent,
@@ -135,7 +137,6 @@ pub(crate) struct WriterIngredients {
 
 pub(crate) struct Writer {
   pub endianness: Endianness,
-  pub heartbeat_message_counter: atomic::AtomicI32,
   /// Configures the mode in which the
   /// Writer operates. If
   /// pushMode==true, then the Writer
@@ -239,9 +240,6 @@ pub(crate) struct Writer {
   /// Shared, flow-controlled buffer of outgoing samples. Filled by the
   /// `DataWriter` (admission + sequence numbering), drained/transmitted here.
   send_buffer: WriterSendBuffer,
-  /// Highest sequence number this Writer has fully transmitted (push mode).
-  /// Samples with `seq` in `(last_sent, send_buffer.last]` are pending send.
-  last_sent: SequenceNumber,
   /// nonblocking-transmit: transmit progress within the sample `last_sent + 1`
   /// (the one currently being pushed). `Fresh` unless a large sample was
   /// interrupted mid-way by a full socket.
@@ -332,7 +330,6 @@ impl Writer {
 
     Self {
       endianness: Endianness::LittleEndian,
-      heartbeat_message_counter: atomic::AtomicI32::new(1),
       push_mode: true,
       heartbeat_period,
       heartbeat_period_fast,
@@ -354,7 +351,6 @@ impl Writer {
       min_datagram_payload: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
       my_topic_name: i.topic_name,
       send_buffer: i.send_buffer,
-      last_sent: SequenceNumber::zero(),
       sample_cursor: SampleCursor::Fresh,
       blocked_sockets: BTreeSet::new(),
       timed_event_timer,
@@ -775,12 +771,14 @@ impl Writer {
     // The doorbell enqueues this writer's id and then wakes. A sample admitted
     // while we are here pushes another id, so the next wake runs us again. The
     // shared buffer's `last_seq` is the source of truth.
+    let send_buffer = self.send_buffer.clone();
+    let _no_other_sender = send_buffer.direct_send().lock();
     loop {
       let last_available = self.send_buffer.last_change_sequence_number();
-      if self.last_sent >= last_available {
+      if self.last_sent() >= last_available {
         break;
       }
-      let sequence_number = self.last_sent.plus_1();
+      let sequence_number = self.last_sent().plus_1();
 
       // Item 1 (DATA aggregation): coalesce several consecutive small samples
       // into one datagram to amortize the per-sample RTPS header + syscall.
@@ -799,7 +797,7 @@ impl Writer {
             // bookkeeping is a no-op (notify + mark_sent cancel out); just
             // advance the frontier. Leaves `unsent_changes` empty on the push
             // path, exactly like the per-sample path after the Item 5 fix.
-            self.last_sent = last_seq;
+            self.set_last_sent(last_seq);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(last_seq);
             continue;
@@ -819,7 +817,7 @@ impl Writer {
       let Some(cc) = self.send_buffer.get_by_sn(sequence_number) else {
         // The sample is gone (e.g. evicted). Skip it; readers that need it will
         // be told via GAP during repair.
-        self.last_sent = sequence_number;
+        self.set_last_sent(sequence_number);
         self.sample_cursor = SampleCursor::Fresh;
         self.send_buffer.set_sent_frontier(sequence_number);
         self.mark_change_sent_to_all_readers(sequence_number);
@@ -883,7 +881,7 @@ impl Writer {
         };
         match progress {
           SendProgress::Complete => {
-            self.last_sent = sequence_number;
+            self.set_last_sent(sequence_number);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(sequence_number);
             self.mark_change_sent_to_all_readers(sequence_number);
@@ -903,7 +901,7 @@ impl Writer {
             // Drop: advance past this sample without recording blocked sockets,
             // so no write-readiness back-pressure is applied. The unsent
             // remainder is discarded and later evicted by cache cleaning.
-            self.last_sent = sequence_number;
+            self.set_last_sent(sequence_number);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(sequence_number);
             self.mark_change_sent_to_all_readers(sequence_number);
@@ -932,7 +930,7 @@ impl Writer {
           &mut self.readers.values(),
           TrafficClass::Control,
         );
-        self.last_sent = sequence_number;
+        self.set_last_sent(sequence_number);
         self.sample_cursor = SampleCursor::Fresh;
         self.send_buffer.set_sent_frontier(sequence_number);
       }
@@ -1154,7 +1152,7 @@ impl Writer {
       AckSubmessage::AckNack(ref an) => {
         // Update the ReaderProxy
         let last_seq = self.send_buffer.last_change_sequence_number(); // to avoid borrow problems
-        let last_sent = self.push_mode.then_some(self.last_sent);
+        let last_sent = self.push_mode.then_some(self.last_sent());
 
         // sanity check requested sequence numbers
         if let Some(0) = an.reader_sn_state.iter().next().map(i64::from) {
@@ -1321,7 +1319,7 @@ impl Writer {
         // Of a sample that is gone the next HEARTBEAT says so; of one that was not
         // sent yet everything is still to come.
         let Some(cc) = Some(nackfrag.writer_sn)
-          .filter(|sn| *sn <= self.last_sent || !self.push_mode)
+          .filter(|sn| *sn <= self.last_sent() || !self.push_mode)
           .and_then(|sn| self.send_buffer.get_by_sn(sn))
         else {
           return;
@@ -1717,7 +1715,7 @@ impl Writer {
       // A HEARTBEAT must not end before one before its first sample (RTPS v2.5
       // Section 8.3.8.6.3), and samples can be evicted before they were sent.
       let before_first = self.send_buffer.first_change_sequence_number() - SequenceNumber::new(1);
-      max(min(last, self.last_sent), before_first)
+      max(min(last, self.last_sent()), before_first)
     } else {
       last
     }
@@ -1785,9 +1783,75 @@ impl Writer {
   }
 
   pub(crate) fn next_heartbeat_count(&self) -> i32 {
-    self
-      .heartbeat_message_counter
-      .fetch_add(1, atomic::Ordering::SeqCst)
+    self.send_buffer.direct_send().next_heartbeat_count()
+  }
+
+  // Highest sequence number that was fully transmitted (push mode), by this Writer
+  // or by the thread that wrote it. Samples with `seq` in
+  // `(last_sent, send_buffer.last]` are pending send.
+  fn last_sent(&self) -> SequenceNumber {
+    self.send_buffer.direct_send().last_sent()
+  }
+
+  fn set_last_sent(&self, last_sent: SequenceNumber) {
+    self.send_buffer.direct_send().set_last_sent(last_sent);
+  }
+
+  // Says what the threads that write may send without the event loop: to every
+  // matched reader a datagram by unicast, as `send_message_to_readers` would.
+  fn refresh_direct_plan(&self) {
+    *self.send_buffer.direct_send().lock() = self.direct_plan();
+  }
+
+  fn direct_plan(&self) -> Option<Plan> {
+    if self.my_guid.entity_id.kind().is_built_in()
+      || self.like_stateless
+      || !self.push_mode
+      || self.security_plugins.is_some()
+      || !self.extra_unicast_destinations.is_empty()
+      || self.readers.is_empty()
+    {
+      return None;
+    }
+    let mut addresses: Vec<SocketAddr> = Vec::new();
+    for reader in self.readers.values() {
+      // Readers of this participant get samples from its cache.
+      if reader.remote_reader_guid.prefix == self.my_guid.prefix {
+        return None;
+      }
+      let route = reader.send_route();
+      let chosen = route.unicast.as_ref().map(std::slice::from_ref);
+      let locators = if route.fallback {
+        &reader.unicast_locator_list[..]
+      } else {
+        chosen?
+      };
+      let before = addresses.len();
+      let mut known = 0;
+      for locator in locators {
+        let Locator::UdpV4(address) = locator else {
+          continue; // cannot be reached
+        };
+        let address = SocketAddr::V4(*address);
+        if address.ip().is_multicast() {
+          return None;
+        }
+        if addresses.contains(&address) {
+          known += 1;
+        } else {
+          addresses.push(address);
+        }
+      }
+      if addresses.len() == before && known == 0 {
+        return None;
+      }
+    }
+    Some(Plan {
+      socket: self.udp_sender.unicast_socket(),
+      addresses,
+      max_payload: self.max_unfragmented_serialized_payload(None),
+      heartbeat: self.is_reliable(),
+    })
   }
 
   #[cfg(feature = "security")]
@@ -2213,6 +2277,7 @@ impl Writer {
       .map(RtpsReaderProxy::max_datagram_payload)
       .min()
       .unwrap_or(FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE);
+    self.refresh_direct_plan();
   }
 
   /// Refresh the [`SendRoute`](crate::rtps::transmit::SendRoute) of every
@@ -2907,7 +2972,7 @@ mod tests {
           Rc::from(Vec::<IfAddr>::new()),
         );
         // Sent already, to nobody.
-        writer.last_sent = writer.send_buffer.last_change_sequence_number();
+        writer.set_last_sent(writer.send_buffer.last_change_sequence_number());
         let reader_guid = GUID::new(GuidPrefix::new(&[2; 12]), reader_id);
         let mut reader_proxy = RtpsReaderProxy::new(reader_guid, reader_qos.clone(), false);
         reader_proxy
@@ -3129,7 +3194,7 @@ mod tests {
     #[test]
     fn what_was_not_sent_yet_is_not_repaired() {
       let mut f = Fixture::user(5, 8, None);
-      f.writer.last_sent = SequenceNumber::new(2);
+      f.writer.set_last_sent(SequenceNumber::new(2));
       f.ack_nack(1..=5, 1);
       assert_eq!(f.unsent(), 2);
       assert_eq!(f.writer.last_advertised(), SequenceNumber::new(2));
