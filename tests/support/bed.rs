@@ -55,19 +55,29 @@ impl Bed {
     /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is
     /// written before the writer knows of a reader is not for that reader.
     pub fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
-        let before = self.readers(topic);
+        let before = self.readers_joined(topic);
         let subscriber = peer.subscriber().topic(topic).start_on(self.host(host));
         subscriber.wait_matched(1);
-        super::wait_until("a reader matched by the bridge", || self.readers(topic) > before);
+        super::wait_until("a reader matched by the bridge", || self.readers_joined(topic) > before);
         subscriber
     }
 
-    /// Readers that the bridge's writer of a DDS topic is matched with.
-    fn readers(&self, topic: &str) -> u64 {
+    /// Readers that the bridge's writer of a DDS topic was ever matched with. Not those of the moment: one
+    /// that is about to be noticed as gone would make up for one that came.
+    fn readers_joined(&self, topic: &str) -> usize {
         let status = self.bridge.status();
-        let found =
-            outputs(&status).find(|output| topic == format!("rt{}", output["topic"].as_str().unwrap_or("")));
-        found.and_then(|output| output["readers"].as_u64()).unwrap_or_else(|| panic!("{topic} in {status}"))
+        let routes = status["routes"].as_array().into_iter().flatten();
+        let mut outputs = routes.flat_map(|route| {
+            let lanes = route["lanes"].as_array().into_iter().flatten();
+            lanes.map(move |output| (&route["id"], output))
+        });
+        let is_it = |output: &Value| topic == format!("rt{}", output["topic"].as_str().unwrap_or(""));
+        let Some((route, output)) = outputs.find(|(_, output)| is_it(output)) else {
+            panic!("{topic} in {status}");
+        };
+        let mark = format!("readers changed route={route} lane={} ", output["lane"]);
+        let log = self.up.log();
+        log.lines().filter(|line| line.contains(&mark) && line.contains(" joined=true ")).count()
     }
 
     /// A publisher that begins when ingress reads it.
