@@ -7,9 +7,9 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::backtrace::Backtrace;
 use std::cell::Cell;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -22,6 +22,7 @@ use adaptive_bridge::model::{
 use adaptive_bridge::process::{self, ReloadRequests, Stop};
 use adaptive_bridge::shm::{Boards, BridgeShape, ShmNode};
 use bytes::Bytes;
+use nix::unistd::gettid;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 const DOMAIN_ID: u16 = 76;
@@ -41,9 +42,21 @@ static PAYLOADS: AtomicU64 = AtomicU64::new(0);
 /// Where the first few allocations of ours came from.
 static CULPRITS: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
+/// The thread of the DDS library on which ingress takes samples.
+static RECEIVING_THREAD: AtomicI32 = AtomicI32::new(0);
+
 thread_local! {
     /// The role that this thread runs.
     static ROLE: Cell<Option<usize>> = const { Cell::new(None) };
+    /// Whether this thread was asked for its number already.
+    static NUMBERED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Makes the receiving thread one of ingress.
+fn number_thread() {
+    if !NUMBERED.replace(true) && gettid().as_raw() == RECEIVING_THREAD.load(Ordering::Relaxed) {
+        ROLE.set(Some(0));
+    }
 }
 
 struct Counting;
@@ -82,6 +95,7 @@ fn count(bytes: usize) {
     if !COUNTING.load(Ordering::Relaxed) {
         return;
     }
+    number_thread();
     let Some(role) = ROLE.get() else {
         return;
     };
@@ -129,6 +143,24 @@ fn settings(folder: &Path) -> Settings {
     );
     std::fs::write(&path, text).unwrap();
     config::load(Some(&path), &|_| None).unwrap()
+}
+
+/// The only such thread that there is while ingress is the only role.
+fn receiving_thread() -> i32 {
+    let give_up = Instant::now() + Duration::from_secs(30);
+    loop {
+        let tasks = std::fs::read_dir("/proc/self/task").unwrap().map(|task| task.unwrap().path());
+        // Names of threads are cut at 15 characters.
+        let named = |task: &PathBuf| {
+            std::fs::read_to_string(task.join("comm")).is_ok_and(|name| name.starts_with("RustDDS Partici"))
+        };
+        let found: Vec<PathBuf> = tasks.filter(named).collect();
+        if let [task] = &found[..] {
+            return task.file_name().unwrap().to_str().unwrap().parse().unwrap();
+        }
+        assert!(found.is_empty() && Instant::now() < give_up, "{found:?}");
+        thread::sleep(Duration::from_millis(1));
+    }
 }
 
 fn participant(name: &str) -> Participant {
@@ -228,6 +260,7 @@ fn in_steady_state_no_step_of_ours_allocates_and_payloads_are_copied_once_or_twi
             ROLE.set(Some(0));
             process::ingress(settings, reloads(settings), stop).unwrap();
         });
+        RECEIVING_THREAD.store(receiving_thread(), Ordering::SeqCst);
         for (index, lane) in LANES.into_iter().enumerate() {
             scope.spawn(move || {
                 ROLE.set(Some(1 + index));
@@ -274,4 +307,6 @@ fn check(settings: &Settings) {
     // Of itself iceoryx2 allocates a handle for each slot that it lends; our service variant (shm/service.rs)
     // does not.
     assert_eq!(shared_memory, [0, 0, 0]);
+    // Nobody would have been counted otherwise.
+    assert!(dds.into_iter().all(|allocations| allocations > 0), "{dds:?}");
 }

@@ -123,6 +123,35 @@ fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
 }
 
 #[test]
+fn large_samples_of_which_packets_are_lost_arrive_whole() {
+    let Some(bed) = Bed::start("large_samples_of_which_packets_are_lost_arrive_whole", LARGE) else { return };
+    for (from, to) in [(Library::Cyclone, Library::Fast), (Library::Fast, Library::Cyclone)] {
+        let cloud = |library| {
+            let kind = "sensor_msgs::msg::dds_::PointCloud2_";
+            Peer::on(library).keep_all().seed(13).type_name(kind).size(1_000_000)
+        };
+        let critical = bed.subscribe("critical", cloud(to), "rt/adaptive_bridge/critical/cloud");
+        // Of each sample, some ten packets on the way in and as many on the way out.
+        for host in ["bridge", "critical"] {
+            bed.host(host).lose_incoming(0.01);
+        }
+        let publisher = cloud(from)
+            .option("--max-blocking-ms", 5000)
+            .heartbeat_ms(100)
+            .rate_hz(5.0)
+            .count(20)
+            .linger_s(20.0);
+        let publisher = bed.publish(publisher, "rt/cloud");
+        critical.wait_received(20);
+        for host in ["bridge", "critical"] {
+            bed.host(host).lose_incoming(0.0);
+        }
+        critical.end::<Received>().assert_all_of(&publisher.end());
+    }
+    bed.end();
+}
+
+#[test]
 fn encapsulation_kind_and_padding_bits_arrive_as_they_were_sent() {
     let test = "encapsulation_kind_and_padding_bits_arrive_as_they_were_sent";
     let Some(bed) = Bed::start(test, SCAN) else { return };

@@ -13,7 +13,7 @@ use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::Signal;
 
 use super::link::{self, INPUT, OUTPUT, Record, Route};
-use super::system::{FIFO_PRIORITY, Place, Scheduling};
+use super::system::{self, FIFO_PRIORITY, Place, Scheduling};
 use super::{Case, Options};
 
 /// Domains of the three beds: below the ephemeral ports, and none that the tests use.
@@ -52,6 +52,8 @@ pub struct Run {
     pub damaged: u64,
     /// Refused by the relay's writer.
     pub relay_refused: u64,
+    /// What relay or bridge, all processes together, had of the CPUs meanwhile.
+    pub cpu_ns: u64,
     pub bridge: Option<BridgeRun>,
 }
 
@@ -248,6 +250,13 @@ impl Bed {
         Err(format!("{}: samples of {} do not arrive", self.kind.label(), route.id()))
     }
 
+    /// CPU time of what is between publisher and subscriber so far, in nanoseconds.
+    fn cpu_ns(&self) -> u64 {
+        let relay = self.relay.iter().map(|relay| relay.child.id());
+        let bridge = self.bridge.iter().flat_map(|bridge| bridge.processes.iter().map(Child::id));
+        relay.chain(bridge).map(system::cpu_ns).sum()
+    }
+
     pub fn measure(&mut self, case: &Case) -> Result<Run, String> {
         let route = Route::ALL.iter().position(|route| *route == case.route).unwrap_or(0);
         if let Some(bridge) = &mut self.bridge {
@@ -256,6 +265,7 @@ impl Bed {
         let before = self.bridge.as_ref().map(|bridge| Counted::read(&bridge.boards, route));
         self.subscriber.order("begin")?;
         std::thread::sleep(Duration::from_millis(150));
+        let cpu_before_ns = self.cpu_ns();
         self.publisher.order(&format!(
             "send {} {} {} {} {}",
             case.route.id(),
@@ -265,6 +275,7 @@ impl Bed {
             self.next_number
         ))?;
         let sent = self.publisher.numbers("sent")?;
+        let cpu_ns = self.cpu_ns().saturating_sub(cpu_before_ns);
         let [accepted, refused] = sent[..] else { return Err("the publisher does not say".to_owned()) };
         // A RELIABLE writer repairs within a heartbeat period, a second at most.
         self.subscriber.order(&format!("end {accepted} 3000"))?;
@@ -300,7 +311,7 @@ impl Bed {
             (Some(bridge), Some(before)) => Some(Counted::read(&bridge.boards, route).since(&before)),
             _ => None,
         };
-        Ok(Run { kind: self.kind, accepted, refused, records, damaged, relay_refused, bridge })
+        Ok(Run { kind: self.kind, accepted, refused, records, damaged, relay_refused, cpu_ns, bridge })
     }
 }
 

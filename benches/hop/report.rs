@@ -99,6 +99,7 @@ impl Results {
             ("late_p50", quantile(&late, 0.5)),
             ("late_p99", quantile(&late, 0.99)),
             ("missing", run.accepted as f64 - run.records.len() as f64),
+            ("cpu", run.cpu_ns as f64 / NS_PER_US / run.accepted.max(1) as f64),
         ]);
         if let Some(bridge) = &run.bridge {
             let copies = self.copies.entry(index).or_default();
@@ -204,8 +205,17 @@ impl Results {
             let _ = writeln!(
                 text,
                 "\n{} ({} samples a repetition; medians of the repetitions, µs)\n\
-                 {:<9} {:>9} {:>9} {:>9} {:>9} {:>13} {:>8}",
-                case.name, case.samples, "", "p50", "p99", "hop p50", "hop p99", "from due p99", "missing"
+                 {:<9} {:>9} {:>9} {:>9} {:>9} {:>13} {:>10} {:>8}",
+                case.name,
+                case.samples,
+                "",
+                "p50",
+                "p99",
+                "hop p50",
+                "hop p99",
+                "from due p99",
+                "CPU/sample",
+                "missing"
             );
             let _ = writeln!(
                 text,
@@ -220,9 +230,13 @@ impl Results {
                     Kind::Direct => String::new(),
                     _ => format!("{:.1}", self.hop(index, name, figure)),
                 };
+                let cpu = match kind {
+                    Kind::Direct => String::new(),
+                    _ => format!("{:.1}", self.middle(index, name, "cpu")),
+                };
                 let _ = writeln!(
                     text,
-                    "{name:<9} {:>9.1} {:>9.1} {:>9} {:>9} {:>13.1} {:>8}",
+                    "{name:<9} {:>9.1} {:>9.1} {:>9} {:>9} {:>13.1} {cpu:>10} {:>8}",
                     self.middle(index, name, "p50"),
                     self.middle(index, name, "p99"),
                     hop("p50"),
@@ -247,9 +261,10 @@ impl Results {
             );
             let _ = writeln!(
                 text,
-                "hop of the bridge / hop of the relay: {:.2} (at most 1.10); shared memory / wake-up: {:.2} (at \
-                 most 1.60); copies of a payload: {:.2}",
+                "hop of the bridge / hop of the relay: {:.2} (at most 1.10); CPU of the bridge / CPU of the \
+                 relay: {:.2}; shared memory / wake-up: {:.2} (at most 1.60); copies of a payload: {:.2}",
                 self.hop(index, "bridge", "p50") / self.hop(index, "relay", "p50"),
+                stage("cpu") / self.middle(index, "relay", "cpu"),
                 stage("shm_p50") / self.middle(index, "wake-up", "p50"),
                 self.copies_of(index)
             );

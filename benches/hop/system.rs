@@ -127,6 +127,16 @@ impl Place {
     }
 }
 
+/// What the threads of a process had of the CPUs, in nanoseconds (the first number of their schedstat).
+pub fn cpu_ns(pid: u32) -> u64 {
+    let Ok(tasks) = fs::read_dir(format!("/proc/{pid}/task")) else { return 0 };
+    tasks
+        .flatten()
+        .filter_map(|task| fs::read_to_string(task.path().join("schedstat")).ok())
+        .filter_map(|text| text.split(' ').next()?.parse::<u64>().ok())
+        .sum()
+}
+
 /// Sleeps until that instant of CLOCK_MONOTONIC.
 pub fn sleep_until(instant_ns: u64) {
     let until = libc::timespec {

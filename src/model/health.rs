@@ -51,7 +51,7 @@ pub struct LaneCounters {
     pub waiting: u64,
     /// The sequence of the last forwarded sample.
     pub last_forwarded_sequence: u64,
-    /// When that was.
+    /// When it was given to the DDS writer.
     pub last_forwarded_at: MonotonicNs,
     /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes
     /// from.

@@ -8,20 +8,42 @@ use std::thread::Thread;
 use crate::dds::{RawReader, Take};
 use crate::model::Encapsulation;
 
-/// Rung by the DDS library's thread when a sample arrives; wakes the thread of the role.
-struct Bell {
+/// Rung by the DDS library when a sample has arrived.
+pub(super) struct Bell {
     rung: AtomicBool,
-    thread: Thread,
+    /// To be woken; none where the library's own thread looks.
+    thread: Option<Thread>,
+}
+
+impl Bell {
+    /// One that wakes nobody.
+    pub fn silent() -> Self {
+        Self { rung: AtomicBool::new(false), thread: None }
+    }
+
+    pub fn ring(&self) {
+        self.rung.store(true, Ordering::Release);
+        if let Some(thread) = &self.thread {
+            thread.unpark();
+        }
+    }
+
+    pub fn silence(&self) {
+        self.rung.store(false, Ordering::Release);
+    }
+
+    pub fn is_rung(&self) -> bool {
+        self.rung.load(Ordering::Acquire)
+    }
 }
 
 impl Wake for Bell {
     fn wake(self: Arc<Self>) {
-        self.wake_by_ref();
+        self.ring();
     }
 
     fn wake_by_ref(self: &Arc<Self>) {
-        self.rung.store(true, Ordering::Release);
-        self.thread.unpark();
+        self.ring();
     }
 }
 
@@ -35,8 +57,14 @@ pub(super) struct Inbox {
 impl Inbox {
     /// For the thread that calls this, which is the one that is woken.
     pub fn new(reader: RawReader) -> Self {
+        let thread = Some(std::thread::current());
+        Self::with_bell(reader, Arc::new(Bell { rung: AtomicBool::new(false), thread }))
+    }
+
+    /// For those who look at that bell.
+    pub fn with_bell(reader: RawReader, bell: Arc<Bell>) -> Self {
         // A new reader rings nobody yet: it is looked at first.
-        let bell = Arc::new(Bell { rung: AtomicBool::new(true), thread: std::thread::current() });
+        bell.ring();
         Self { reader, waker: Waker::from(Arc::clone(&bell)), bell }
     }
 
@@ -48,7 +76,7 @@ impl Inbox {
     /// As [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: an arrival after this look keeps
     /// it from sleeping.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
-        if !self.bell.rung.load(Ordering::Acquire) {
+        if !self.bell.is_rung() {
             return Take::Empty;
         }
         let take = self.reader.take(lend);
@@ -56,7 +84,7 @@ impl Inbox {
             return take;
         }
         // Nothing there, so ask to be rung, and look again in case something came in between.
-        self.bell.rung.store(false, Ordering::Release);
+        self.bell.silence();
         self.reader.arm(&self.waker);
         let take = self.reader.take(lend);
         if take != Take::Empty {

@@ -146,10 +146,25 @@ impl Role {
     /// are told that its participant is gone.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
+        self.joined(&participant);
+        Ok(participant)
+    }
+
+    /// Like [`join`](Self::join), with what the thread that receives is to do.
+    pub fn join_receiving(
+        &mut self,
+        options: &ParticipantOptions,
+        on_received: impl FnMut() -> bool + Send + 'static,
+    ) -> Result<Participant, RoleError> {
+        let participant = Participant::open_receiving(options, on_received)?;
+        self.joined(&participant);
+        Ok(participant)
+    }
+
+    fn joined(&mut self, participant: &Participant) {
         participant.say_goodbye_for(self.former_participant);
         let guid = participant.guid();
         self.health.update(|health| health.participant = guid);
-        Ok(participant)
     }
 
     /// Takes over what was reloaded since the last look, if anything was, and shows it. What is yielded then

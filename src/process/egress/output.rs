@@ -197,7 +197,7 @@ impl Output {
                     counters.by_reference += u64::from(by_reference);
                     counters.caught_up += caught_up;
                     counters.last_forwarded_sequence = header.sequence;
-                    counters.last_forwarded_at = done_at;
+                    counters.last_forwarded_at = began_at;
                     counters.last_writer_guid = header.writer_guid;
                     counters.last_writer_sequence = header.writer_sequence;
                 }

@@ -1,8 +1,10 @@
 //! One route in ingress: its reader, its pool, its counters.
 
+use std::sync::Arc;
+
 use tracing::{error, info, warn};
 
-use super::super::inbox::Inbox;
+use super::super::inbox::{Bell, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
 use super::source::{Source, Wanted, label, still_suits};
@@ -37,6 +39,7 @@ pub(super) struct Input {
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
+    bell: Arc<Bell>,
     followed: Followed,
     watch: DropWatch,
     remind_at: MonotonicNs,
@@ -49,7 +52,7 @@ struct Connection {
 }
 
 impl Input {
-    pub fn open(role: &Role, settings: &Settings, index: usize) -> Result<Self, RoleError> {
+    pub fn open(role: &Role, settings: &Settings, index: usize, bell: &Arc<Bell>) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
@@ -67,6 +70,7 @@ impl Input {
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             followed: Followed::default(),
+            bell: Arc::clone(bell),
             remind_at: MonotonicNs(0),
             conflict: None,
             route,
@@ -78,9 +82,11 @@ impl Input {
         self.connection.is_some()
     }
 
-    /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes.
+    /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes. When there was none
+    /// the bell is silent, and rings at the next arrival.
     pub fn step(&mut self, wake: impl FnOnce()) -> bool {
         let Some(connection) = &self.connection else {
+            self.bell.silence();
             return false;
         };
         let publisher = &self.publisher;
@@ -111,6 +117,7 @@ impl Input {
         wake: impl FnOnce(),
     ) {
         let taken_at = clock::monotonic();
+        let taken_at_wall = clock::wall();
         let lost_upstream = self.followed.missing_before(origin.writer, origin.sequence);
         let dropped = match slot {
             Ok(_) => None,
@@ -148,7 +155,7 @@ impl Input {
             }
         }
         if let Some(written) = origin.source_timestamp.to_wall() {
-            self.dds_in.record(clock::wall().since(written));
+            self.dds_in.record(taken_at_wall.since(written));
         }
     }
 
@@ -273,8 +280,13 @@ impl Input {
             "reading"
         );
         self.settled_type = Some(dds_type);
-        self.connection = Some(Connection { inbox: Inbox::new(reader), qos });
+        self.connection = Some(Connection { inbox: Inbox::with_bell(reader, Arc::clone(&self.bell)), qos });
         Ok(())
+    }
+
+    /// Lets go of the reader, which the DDS library wants gone before the participant.
+    pub fn close(&mut self) {
+        self.connection = None;
     }
 
     fn disconnect(&mut self, participant: &mut Participant) {

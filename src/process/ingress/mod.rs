@@ -1,15 +1,19 @@
 //! Ingress: takes every sample of every route from DDS and publishes it once into shared memory.
 //!
 //! Nothing here waits for a lane: a full queue overwrites its oldest sample, and a wake-up is not waited for.
+//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house.
 
 mod input;
+mod receiving;
 mod source;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
+use super::inbox::Bell;
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
@@ -17,11 +21,9 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::{LaneWaker, ProcessRole};
+use crate::shm::ProcessRole;
 use input::Input;
-
-/// Samples taken of one route before the next route has its turn.
-const SAMPLES_PER_TURN: usize = 32;
+use receiving::Receiving;
 
 /// At a shutdown, how long ingress goes on taking what DDS has received, and what still comes.
 const LAST_SAMPLES_MS: u64 = 200;
@@ -38,26 +40,35 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
     let mut ingress = Ingress::open(settings, reloads)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     while !stop.is_requested() {
-        if ingress.turn() {
-            continue;
-        }
         ingress.sleep();
+        if let Err(error) = ingress.keep_house(clock::monotonic()) {
+            tracing::error!(%error, "housekeeping failed");
+        }
     }
     // What DDS has received by now still goes on its way; a publisher that goes on does not hold us up.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
-    while ingress.turn() && clock::monotonic() < give_up_at {}
+    while ingress.receiving.turn_patiently() && clock::monotonic() < give_up_at {}
     info!("ingress is done");
     Ok(())
 }
 
 struct Ingress {
-    /// Before the participant: the DDS library wants its readers and writers gone first.
-    inputs: Vec<Input>,
+    receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
-    /// Of the critical lanes first, each with the routes that it serves.
-    wakers: Vec<(LaneWaker, Vec<bool>)>,
+    /// Turns of the receiving thread at the last housekeeping.
+    turns_seen: u64,
     housekeeping_at: MonotonicNs,
+}
+
+impl Drop for Ingress {
+    fn drop(&mut self) {
+        // Its thread has the routes, too, and the library wants readers gone before their participant.
+        let Ok(_) = self.receiving.visit::<std::convert::Infallible>(|input| {
+            input.close();
+            Ok(())
+        });
+    }
 }
 
 impl Ingress {
@@ -66,7 +77,8 @@ impl Ingress {
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", how)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
-            inputs.push(Input::open(&role, settings, route)?);
+            let bell = Arc::new(Bell::silent());
+            inputs.push((Input::open(&role, settings, route, &bell)?, bell));
         }
         let mut wakers = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
@@ -77,66 +89,50 @@ impl Ingress {
                 wakers.push((role.boards.waker(index), serves));
             }
         }
-        let participant = role.join(&ParticipantOptions {
+        let receiving = Arc::new(Receiving::new(inputs, wakers));
+        let on_received = {
+            let receiving = Arc::clone(&receiving);
+            move || receiving.turn()
+        };
+        let options = ParticipantOptions {
             network: &settings.input,
             namespace: namespace(settings),
             node_name: "ingress".to_owned(),
             graph_gid_bytes: settings.graph_gid_bytes,
-        })?;
-        let mut ingress = Self { role, participant, inputs, wakers, housekeeping_at: MonotonicNs(0) };
-        ingress.keep_house(clock::monotonic())?;
+        };
+        let participant = role.join_receiving(&options, on_received)?;
+        let housekeeping_at = clock::monotonic();
+        let mut ingress = Self { receiving, participant, role, turns_seen: 0, housekeeping_at };
+        ingress.keep_house(housekeeping_at)?;
         Ok(ingress)
     }
 
-    /// Handles what is there; whether anything was.
-    fn turn(&mut self) -> bool {
-        let now = clock::monotonic();
-        // First, because it may connect a route, whose reader must be looked at before sleeping: a new reader
-        // rings nobody yet.
-        if now >= self.housekeeping_at
-            && let Err(error) = self.keep_house(now)
-        {
-            tracing::error!(%error, "housekeeping failed");
-        }
-        let mut busy = false;
-        for route in 0..self.inputs.len() {
-            for _ in 0..SAMPLES_PER_TURN {
-                if !self.inputs[route].step(|| wake(&self.wakers, route)) {
-                    break;
-                }
-                busy = true;
-            }
-        }
-        busy
-    }
-
-    /// Sleeps until a sample arrives or housekeeping is due.
-    fn sleep(&mut self) {
-        // An arrival after the last look rings the bell of its route, and a bell that was rung keeps `park`
-        // from sleeping; so nothing is slept through.
+    /// Sleeps until housekeeping is due.
+    fn sleep(&self) {
         let wait_ns = self.housekeeping_at.since(clock::monotonic());
-        if wait_ns > 0 {
-            std::thread::park_timeout(Duration::from_nanos(wait_ns));
-        }
+        std::thread::sleep(Duration::from_nanos(wait_ns));
     }
 
     fn keep_house(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
         while let Some(change) = self.participant.poll_discovery() {
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
-                    for input in &mut self.inputs {
+                    self.visit(|input, _| {
                         input.writer_found(&writer);
-                    }
+                        Ok(())
+                    })?;
                 }
                 Discovery::WriterGone(guid) => {
-                    for input in &mut self.inputs {
+                    self.visit(|input, _| {
                         input.writer_gone(guid);
-                    }
+                        Ok(())
+                    })?;
                 }
                 Discovery::ParticipantGone { prefix } => {
-                    for input in &mut self.inputs {
+                    self.visit(|input, _| {
                         input.participant_gone(prefix);
-                    }
+                        Ok(())
+                    })?;
                 }
                 Discovery::Incompatible { local, remote } => {
                     debug!(?local, ?remote, "endpoints are not compatible");
@@ -145,22 +141,33 @@ impl Ingress {
             }
         }
         let mut searching = false;
-        for input in &mut self.inputs {
-            input.keep_house(&mut self.participant, now)?;
+        let kept = self.visit(|input, participant| {
+            let kept = input.keep_house(participant, now);
             searching |= !input.is_connected();
+            kept
+        });
+        // What shows as alive is the thread that receives, not this one: it is shown when that thread has
+        // turned since, and asked to turn again, whether or not anything arrives.
+        let turns = self.receiving.turns();
+        if turns != self.turns_seen {
+            self.turns_seen = turns;
+            self.role.turned(LaneMode::Normal as u8, 0);
         }
         self.role.reload();
-        self.role.turned(LaneMode::Normal as u8, 0);
+        self.participant.ring();
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
-        Ok(())
+        kept
     }
-}
 
-/// Wakes the lanes that serve the route, the critical ones first.
-fn wake(wakers: &[(LaneWaker, Vec<bool>)], route: usize) {
-    for (waker, serves) in wakers {
-        if serves[route] {
-            waker.wake();
+    /// Lets `work` have each route, which the receiving thread has to do without meanwhile.
+    fn visit(
+        &mut self,
+        mut work: impl FnMut(&mut Input, &mut Participant) -> Result<(), RoleError>,
+    ) -> Result<(), RoleError> {
+        let participant = &mut self.participant;
+        if self.receiving.visit(|input| work(input, participant))? {
+            self.participant.ring();
         }
+        Ok(())
     }
 }

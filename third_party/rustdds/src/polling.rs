@@ -52,6 +52,10 @@ impl LoopWaker {
   }
 }
 
+/// What an application lets the event loop of its participant do: see
+/// `DomainParticipantBuilder::on_received`.
+pub(crate) type ReceivedHook = Box<dyn FnMut() -> bool + Send>;
+
 /// Bounded queue whose send wakes `waker`'s poll.
 pub(crate) struct WakeSender<T> {
   tx: mpsc::SyncSender<T>,

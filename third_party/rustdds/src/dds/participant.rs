@@ -39,8 +39,8 @@ use crate::{
   },
   network::{constant::*, udp_listener::UDPListener},
   polling::{
-    ready_channel, wake_channel, wake_channel_unbounded, LoopWaker, ReadySender, WakeReceiver,
-    WakeSender, WakeUnboundedSender,
+    ready_channel, wake_channel, wake_channel_unbounded, LoopWaker, ReadySender, ReceivedHook,
+    WakeReceiver, WakeSender, WakeUnboundedSender,
   },
   rtps::{
     constant::*,
@@ -81,6 +81,8 @@ pub struct DomainParticipantBuilder {
   socket_receive_buffer_size: usize,
   socket_send_buffer_size: usize,
 
+  received_hook: Option<ReceivedHook>,
+
   #[cfg(feature = "security")]
   security_plugins: Option<SecurityPlugins>,
   #[cfg(feature = "security")]
@@ -95,6 +97,7 @@ impl DomainParticipantBuilder {
       same_host_loopback: true,
       socket_receive_buffer_size: Self::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
       socket_send_buffer_size: Self::DEFAULT_SOCKET_SEND_BUFFER_SIZE,
+      received_hook: None,
       #[cfg(feature = "security")]
       security_plugins: None,
       #[cfg(feature = "security")]
@@ -161,6 +164,23 @@ impl DomainParticipantBuilder {
   /// - Linux: `sudo sysctl -w net.core.wmem_max=<bytes>`.
   pub fn socket_send_buffer_size(mut self, size: usize) -> Self {
     self.socket_send_buffer_size = size;
+    self
+  }
+
+  /// Lets the participant's event loop call `hook`: after each datagram that it
+  /// has handled, before it sends acknowledgements for it, and once in each of
+  /// its turns; see [`DomainParticipant::wake_event_loop`]. With a waker on a
+  /// DataReader that only notes that there is something, the application can
+  /// take samples here, and saves the hand-over to a thread of its own.
+  ///
+  /// While it runs nothing is received, acknowledged or sent: it must return
+  /// soon, wait for nothing, and not panic. If it has more to do than it does
+  /// at once it returns true, and is called again in the next turn, which then
+  /// follows without sleep. No lock is held. DataReaders may be read; a method
+  /// of the participant, of topics, publishers or subscribers may wait for the
+  /// event loop, for ever.
+  pub fn on_received(mut self, hook: impl FnMut() -> bool + Send + 'static) -> Self {
+    self.received_hook = Some(Box::new(hook));
     self
   }
 
@@ -345,6 +365,7 @@ impl DomainParticipantBuilder {
       self.only_networks,
       self.same_host_loopback,
       dp_waker,
+      self.received_hook,
       discovery_sample_sender,
     )?;
 
@@ -535,6 +556,14 @@ impl DomainParticipant {
   /// ```
   pub fn participant_id(&self) -> u16 {
     self.dpi.lock().unwrap().participant_id()
+  }
+
+  /// Lets the event loop turn once, with a call of the hook that was given to
+  /// [`DomainParticipantBuilder::on_received`].
+  pub fn wake_event_loop(&self) {
+    if let Ok(dpi) = self.dpi.lock() {
+      dpi.dpi.event_loop_waker.wake();
+    }
   }
 
   pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
@@ -985,6 +1014,7 @@ impl DomainParticipantDisc {
     only_networks: Option<Vec<IpAddr>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
+    received_hook: Option<ReceivedHook>,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     let dpi = DomainParticipantInner::new(
@@ -1002,6 +1032,7 @@ impl DomainParticipantDisc {
       only_networks,
       same_host_loopback,
       dp_waker,
+      received_hook,
       discovery_sample_sender,
     )?;
 
@@ -1194,6 +1225,7 @@ pub(crate) struct DomainParticipantInner {
   remove_writer_sender: WakeSender<GUID>,
   /// Writer doorbell ready queue. Ringing records the writer entity id.
   writer_ready: ReadySender<EntityId>,
+  event_loop_waker: LoopWaker,
 
   dds_cache: Arc<RwLock<DDSCache>>,
   discovery_db: Arc<RwLock<DiscoveryDB>>,
@@ -1251,6 +1283,7 @@ impl DomainParticipantInner {
     only_networks: Option<Vec<IpAddr>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
+    received_hook: Option<ReceivedHook>,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     #[cfg(not(feature = "security"))]
@@ -1392,6 +1425,7 @@ impl DomainParticipantInner {
     let disc_db_clone = discovery_db.clone();
     let security_plugins_clone = security_plugins_handle.clone();
     let only_networks_for_ev_loop = only_networks.clone();
+    let event_loop_waker = dp_waker.clone();
     let ev_loop_handle = thread::Builder::new()
       .name(format!("RustDDS Participant {participant_id} event loop"))
       .spawn(move || {
@@ -1429,6 +1463,7 @@ impl DomainParticipantInner {
           reader_ready_rx,
           writer_ready_rx,
           dp_waker,
+          received_hook,
         ) {
           Ok(dp_event_loop) => {
             let _ = ev_ready_tx.send(Ok(()));
@@ -1471,6 +1506,7 @@ impl DomainParticipantInner {
       add_writer_sender,
       remove_writer_sender,
       writer_ready,
+      event_loop_waker,
       dds_cache,
       discovery_db,
       discovery_db_event_receiver,

@@ -80,11 +80,23 @@ impl UDPListener {
     let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
 
     if recv_buffer_size > 0 {
-      raw_socket
-        .set_recv_buffer_size(recv_buffer_size)
-        .unwrap_or_else(|e| {
-          warn!("Failed to set SO_RCVBUF to {recv_buffer_size}: {e}. Using OS default.");
-        });
+      // With CAP_NET_ADMIN `net.core.rmem_max` is no limit.
+      #[cfg(target_os = "linux")]
+      let forced = nix::sys::socket::setsockopt(
+        &raw_socket,
+        nix::sys::socket::sockopt::RcvBufForce,
+        &recv_buffer_size,
+      )
+      .is_ok();
+      #[cfg(not(target_os = "linux"))]
+      let forced = false;
+      if !forced {
+        raw_socket
+          .set_recv_buffer_size(recv_buffer_size)
+          .unwrap_or_else(|e| {
+            warn!("Failed to set SO_RCVBUF to {recv_buffer_size}: {e}. Using OS default.");
+          });
+      }
 
       // Verify the effective size (getsockopt). The kernel silently clamps
       // SO_RCVBUF to a per-socket ceiling (macOS: `kern.ipc.maxsockbuf`, which
@@ -308,86 +320,81 @@ impl UDPListener {
     panic!("test helper didn't recv message after ten attempts.");
   }
 
-  /// Drain up to `max_messages` datagrams waiting in the socket, each paired
-  /// with its [`PacketOrigin`] (source address + receiving interface, when
-  /// available). Pass `usize::MAX` to read everything currently queued.
-  ///
-  /// The reactor registers listeners edge-triggered, so it must pass
-  /// `usize::MAX`: a datagram left unread does not produce another readiness
-  /// event. `Ok(None)` from [`recv_one`](Self::recv_one) (`WouldBlock`) ends
-  /// the drain.
+  /// Drain up to `max_messages` datagrams waiting in the socket.
+  #[cfg(test)]
   pub fn messages_bounded(&mut self, max_messages: usize) -> Vec<(Bytes, PacketOrigin)> {
-    let mut messages = Vec::with_capacity(4);
+    std::iter::from_fn(|| self.next_message())
+      .take(max_messages)
+      .collect()
+  }
 
-    loop {
-      if messages.len() >= max_messages {
-        return messages;
-      }
-      // Loop invariant. Note that capacity() may be large, but .len() == 0.
-      assert_eq!(self.receive_buffer.len(), 0);
+  /// The next datagram that waits in the socket, with its [`PacketOrigin`]
+  /// (source address and receiving interface, when available).
+  ///
+  /// `None` when there is none. The reactor registers listeners edge-triggered:
+  /// a datagram left unread does not produce another readiness event.
+  pub fn next_message(&mut self) -> Option<(Bytes, PacketOrigin)> {
+    // Loop invariant. Note that capacity() may be large, but .len() == 0.
+    assert_eq!(self.receive_buffer.len(), 0);
 
-      // Ensure that receive buffer has enough capacity for a message
-      if self.receive_buffer.capacity() < MAX_MESSAGE_SIZE {
-        self.receive_buffer = BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK);
-        debug!("ensure_receive_buffer_capacity - reallocated receive_buffer");
+    // Ensure that receive buffer has enough capacity for a message
+    if self.receive_buffer.capacity() < MAX_MESSAGE_SIZE {
+      self.receive_buffer = BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK);
+      debug!("ensure_receive_buffer_capacity - reallocated receive_buffer");
+    }
+    unsafe {
+      // This is safe, because we just checked that there is enough capacity,
+      // or allocated more.
+      // We do not read undefined data, because the recv()
+      // will overwrite this space and truncate the rest away.
+      self.receive_buffer.set_len(MAX_MESSAGE_SIZE);
+    }
+    trace!(
+      "ensure_receive_buffer_capacity - {} bytes left",
+      self.receive_buffer.capacity()
+    );
+    let (nbytes, origin) = match self.recv_one() {
+      Ok(Some(received)) => received,
+      Ok(None) => {
+        // WouldBlock: nothing (more) to read.
+        self.receive_buffer.clear();
+        return None;
       }
-      unsafe {
-        // This is safe, because we just checked that there is enough capacity,
-        // or allocated more.
-        // We do not read undefined data, because the recv()
-        // will overwrite this space and truncate the rest away.
-        self.receive_buffer.set_len(MAX_MESSAGE_SIZE);
+      Err(e) => {
+        self.receive_buffer.clear();
+        warn!("socket recv() error: {e:?}");
+        return None;
       }
-      trace!(
-        "ensure_receive_buffer_capacity - {} bytes left",
-        self.receive_buffer.capacity()
-      );
-      let (nbytes, origin) = match self.recv_one() {
-        Ok(Some(received)) => received,
-        Ok(None) => {
-          // WouldBlock: nothing (more) to read.
-          self.receive_buffer.clear();
-          return messages;
-        }
-        Err(e) => {
-          self.receive_buffer.clear();
-          warn!("socket recv() error: {e:?}");
-          return messages;
-        }
-      };
-      // Something was received.
-      // The buffer length is still MAX_MESSAGE_SIZE, set before the receive so
-      // the kernel had room to write into. Shrink it back to the number of bytes
-      // actually received, so that the padding + split below only consume this
-      // datagram's worth of the chunk. Without this, every datagram (however
-      // small) would carve off a full MAX_MESSAGE_SIZE slot, wasting the chunk
-      // and defeating the packing this alignment logic assumes.
-      unsafe {
-        // Safe: recv_one wrote `nbytes` valid bytes at the front of the buffer,
-        // and nbytes <= MAX_MESSAGE_SIZE == the current len.
-        self.receive_buffer.set_len(nbytes);
-      }
+    };
+    // Something was received.
+    // The buffer length is still MAX_MESSAGE_SIZE, set before the receive so
+    // the kernel had room to write into. Shrink it back to the number of bytes
+    // actually received, so that the padding + split below only consume this
+    // datagram's worth of the chunk. Without this, every datagram (however
+    // small) would carve off a full MAX_MESSAGE_SIZE slot, wasting the chunk
+    // and defeating the packing this alignment logic assumes.
+    unsafe {
+      // Safe: recv_one wrote `nbytes` valid bytes at the front of the buffer,
+      // and nbytes <= MAX_MESSAGE_SIZE == the current len.
+      self.receive_buffer.set_len(nbytes);
+    }
 
-      // Now, append some extra data to align the buffer end, so the next piece will
-      // be aligned also. This assumes that the initial buffer was aligned to begin
-      // with. This is because RTPS data is optimized to align to 4-byte boundaries.
-      let pad = padding_needed_for_alignment_4(self.receive_buffer.len());
-      if pad != 0 {
-        self
-          .receive_buffer
-          .extend_from_slice(&[0xCC, 0xCC, 0xCC, 0xCC][..pad]);
-        // Funny value 0xCC encourages a fast crash in case these bytes
-        // are ever accessed, as they should not.
-      }
+    // Now, append some extra data to align the buffer end, so the next piece will
+    // be aligned also. This assumes that the initial buffer was aligned to begin
+    // with. This is because RTPS data is optimized to align to 4-byte boundaries.
+    let pad = padding_needed_for_alignment_4(self.receive_buffer.len());
+    if pad != 0 {
+      self
+        .receive_buffer
+        .extend_from_slice(&[0xCC, 0xCC, 0xCC, 0xCC][..pad]);
+      // Funny value 0xCC encourages a fast crash in case these bytes
+      // are ever accessed, as they should not.
+    }
 
-      // Now split away the used portion.
-      let mut message = self.receive_buffer.split_to(self.receive_buffer.len());
-      message.truncate(nbytes); // discard (hide) padding
-      messages.push((Bytes::from(message), origin)); // freeze bytes and push
-    } // loop
-
-    // unreachable!(); // But why does this cause a warning? (rustc 1.66.0)
-    // Answer: https://github.com/rust-lang/rust/issues/46500
+    // Now split away the used portion.
+    let mut message = self.receive_buffer.split_to(self.receive_buffer.len());
+    message.truncate(nbytes); // discard (hide) padding
+    Some((Bytes::from(message), origin)) // freeze bytes
   }
 
   /// Receive a single datagram into `self.receive_buffer`, capturing its

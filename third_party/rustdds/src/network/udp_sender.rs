@@ -3,6 +3,7 @@ use std::{
   collections::HashMap,
   io,
   net::{IpAddr, SocketAddr, UdpSocket},
+  sync::Arc,
 };
 #[cfg(test)]
 use std::net::Ipv4Addr;
@@ -22,11 +23,16 @@ use crate::{
   structure::locator::Locator,
 };
 
+// What an IPv4 datagram holds. How much a path carries without fragmentation is
+// the Writers' concern, and loopback carries this.
+const MAX_UDP_PAYLOAD: usize = 65_507;
+
 // We need one multicast sender socket per interface
 
 #[derive(Debug)]
 pub struct UDPSender {
-  unicast_socket: UdpSocket,
+  // Shared with the threads that write, see `rtps/direct_send.rs`.
+  unicast_socket: Arc<UdpSocket>,
   // One multicast sender socket per local interface, keyed by the interface it
   // was bound to (its `InterfaceSelector`). This lets us target a single
   // interface instead of sending on all of them.
@@ -56,9 +62,17 @@ impl UDPSender {
     if size == 0 {
       return;
     }
-    if let Err(e) = socket.set_send_buffer_size(size) {
-      warn!("Failed to set SO_SNDBUF to {size}: {e}. Using OS default.");
-      return;
+    // With CAP_NET_ADMIN `net.core.wmem_max` is no limit.
+    #[cfg(target_os = "linux")]
+    let forced =
+      nix::sys::socket::setsockopt(socket, nix::sys::socket::sockopt::SndBufForce, &size).is_ok();
+    #[cfg(not(target_os = "linux"))]
+    let forced = false;
+    if !forced {
+      if let Err(e) = socket.set_send_buffer_size(size) {
+        warn!("Failed to set SO_SNDBUF to {size}: {e}. Using OS default.");
+        return;
+      }
     }
     match socket.send_buffer_size() {
       Ok(effective) if effective < size => warn!(
@@ -157,7 +171,7 @@ impl UDPSender {
     } // end for
 
     let sender = Self {
-      unicast_socket,
+      unicast_socket: Arc::new(unicast_socket),
       multicast_sockets,
       control_queues: RefCell::new(HashMap::new()),
     };
@@ -168,6 +182,10 @@ impl UDPSender {
   #[cfg(test)]
   pub fn new_with_random_port() -> io::Result<Self> {
     Self::new(0)
+  }
+
+  pub(crate) fn unicast_socket(&self) -> Arc<UdpSocket> {
+    Arc::clone(&self.unicast_socket)
   }
 
   // --- nonblocking-transmit: socket enumeration & raw non-blocking send ------
@@ -353,7 +371,7 @@ impl UDPSender {
   /// multicast interface (legacy reachability). Datagrams are queued (never
   /// dropped) if the socket is congested.
   pub fn send_to_locator(&self, buffer: &[u8], locator: &Locator) {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!("send_to_locator: Message size = {}", buffer.len());
     }
     let Some(socket_address) = self.locator_socket_addr(locator, "send_to_locator") else {
@@ -395,7 +413,7 @@ impl UDPSender {
     locator: &Locator,
     interface: &InterfaceSelector,
   ) {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!(
         "send_to_multicast_locator_via: Message size = {}",
         buffer.len()
@@ -438,7 +456,7 @@ impl UDPSender {
   /// Bulk send to a locator. Returns the sockets that could not accept the
   /// datagram (WouldBlock), so the caller can stop and arm write readiness.
   pub(crate) fn try_send_to_locator(&self, buffer: &[u8], locator: &Locator) -> Vec<SocketId> {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!("try_send_to_locator: Message size = {}", buffer.len());
     }
     let mut blocked = Vec::new();
@@ -467,7 +485,7 @@ impl UDPSender {
     locator: &Locator,
     interface: &InterfaceSelector,
   ) -> Vec<SocketId> {
-    if buffer.len() > 1500 {
+    if buffer.len() > MAX_UDP_PAYLOAD {
       warn!(
         "try_send_to_multicast_locator_via: Message size = {}",
         buffer.len()

@@ -45,6 +45,12 @@ pub const REPAIR_INTERVAL_MAX: Duration = Duration::from_millis(100);
 // one reader. A round always sends at least one sample, even a larger one.
 pub const REPAIR_BATCH_MAX_BYTES: usize = 8192;
 
+// Most bytes of fragments one repair round sends to one reader: what 256 fragments
+// hold, which is all that one NACK_FRAG can ask for, four times. A sample of 2 MB
+// that was lost altogether is repaired in 80 ms, and a burst of this size is smaller
+// than the one that the sample was sent in.
+pub const REPAIR_FRAGS_MAX_BYTES: usize = 4 * 256 * FRAGMENT_SIZE;
+
 // Periodic HEARTBEAT period for reliable Writers. The period is adaptive: while
 // some matched reader is behind (has unacknowledged samples), heartbeats are
 // sent at the FAST period to prompt prompt repair (some peers rely on a

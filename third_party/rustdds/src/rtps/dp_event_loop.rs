@@ -30,8 +30,8 @@ use crate::{
     util::{local_interface_table, localhost_spdp_peer_locators, IfAddr},
   },
   polling::{
-    new_shared_timer, timeout_until, wake_channel, LoopWaker, ReadyReceiver, SharedTimer,
-    WakeReceiver, WakeSender,
+    new_shared_timer, timeout_until, wake_channel, LoopWaker, ReadyReceiver, ReceivedHook,
+    SharedTimer, WakeReceiver, WakeSender,
   },
   //qos::HasQoSPolicy,
   rtps::{
@@ -141,7 +141,13 @@ pub struct DPEventLoop {
   // route same-host peers over loopback. See
   // `src/rtps/loopback_same_host_design.md`.
   same_host_loopback: bool,
+
+  // Of the application, called on this thread when something was received.
+  received_hook: Option<ReceivedHook>,
 }
+
+// Datagrams of one socket that are handled before timers and commands.
+const DATAGRAMS_PER_TURN: usize = 64;
 
 impl DPEventLoop {
   // This pub(crate) , because it should be constructed only by DomainParticipant.
@@ -168,6 +174,7 @@ impl DPEventLoop {
     reader_ready: ReadyReceiver<EntityId>,
     writer_ready: ReadyReceiver<EntityId>,
     waker: LoopWaker,
+    received_hook: Option<ReceivedHook>,
   ) -> CreateResult<Self> {
     macro_rules! try_init {
       ($result:expr, $msg:literal) => {
@@ -258,6 +265,7 @@ impl DPEventLoop {
       participant_status_sender,
       discovery_command_sender,
       same_host_loopback,
+      received_hook,
     })
   }
 
@@ -293,6 +301,10 @@ impl DPEventLoop {
       ev_wrapper.remove_local_writer(&writer_guid);
     }
 
+    // Sockets that may hold more than one turn handles.
+    let mut readable: Vec<Token> = Vec::new();
+    let mut application_has_more = false;
+
     // loop starts here
     loop {
       // The poll wakes for a socket, the shared waker, or the sooner of the next
@@ -303,7 +315,11 @@ impl DPEventLoop {
       } else {
         Duration::from_millis(2)
       };
-      let poll_timeout = timeout_until(ev_wrapper.shared_timer.borrow().next_deadline(), idle_cap);
+      let poll_timeout = if readable.is_empty() && !application_has_more {
+        timeout_until(ev_wrapper.shared_timer.borrow().next_deadline(), idle_cap)
+      } else {
+        Duration::ZERO
+      };
       match ev_wrapper.poll.poll(&mut events, Some(poll_timeout)) {
         Ok(_) => {}
         // A process that was stopped and goes on (SIGSTOP and SIGCONT, a debugger, a suspended machine) has its
@@ -333,19 +349,8 @@ impl DPEventLoop {
               | DISCOVERY_MUL_LISTENER_TOKEN
               | USER_TRAFFIC_LISTENER_TOKEN
               | USER_TRAFFIC_MUL_LISTENER_TOKEN => {
-                // Edge-triggered: read until WouldBlock. A cap would leave
-                // datagrams sitting with no further readiness event.
-                let udp_messages = ev_wrapper.udp_listeners.get_mut(&token).map_or_else(
-                  || {
-                    error!("No listener with token {:?}", token);
-                    vec![]
-                  },
-                  |l| l.messages_bounded(usize::MAX),
-                );
-                for (packet, origin) in udp_messages {
-                  ev_wrapper
-                    .message_receiver
-                    .handle_received_packet(&packet, origin);
+                if !readable.contains(&token) {
+                  readable.push(token);
                 }
               }
               LOOP_WAKE_TOKEN => {
@@ -374,6 +379,8 @@ impl DPEventLoop {
         }
       }
 
+      readable.retain(|token| ev_wrapper.receive(*token));
+
       ev_wrapper.drain_timers(preparing_to_stop);
       if ev_wrapper.drain_queues(
         &mut readers_to_remove,
@@ -393,8 +400,40 @@ impl DPEventLoop {
       // nonblocking-transmit: service the per-socket outbound queues and keep
       // write-readiness interest in sync with what is pending.
       ev_wrapper.service_outbound();
+
+      // What was not received from a socket can be for the application, too: a
+      // sample that waited for one that is given up, or a call from outside.
+      application_has_more = ev_wrapper.call_application();
     } // loop
   } // fn
+
+  // Receives what waits in that socket, DATAGRAMS_PER_TURN at most, so that timers
+  // and commands have their turn whatever arrives. Whether there may be more.
+  // Readiness is edge-triggered: nobody says again what was left.
+  //
+  // Each datagram is handled before the next one is read, so that the first of
+  // many does not wait for all others.
+  fn receive(&mut self, token: Token) -> bool {
+    for _ in 0..DATAGRAMS_PER_TURN {
+      let Some(listener) = self.udp_listeners.get_mut(&token) else {
+        error!("No listener with token {token:?}");
+        return false;
+      };
+      let Some((packet, origin)) = listener.next_message() else {
+        return false;
+      };
+      self
+        .message_receiver
+        .handle_received_packet(&packet, origin);
+      self.call_application();
+    }
+    true
+  }
+
+  // Whether the application asks for another call soon.
+  fn call_application(&mut self) -> bool {
+    self.received_hook.as_mut().is_some_and(|hook| hook())
+  }
 
   // Returns true when the loop should exit.
   fn drain_queues(
@@ -1372,6 +1411,7 @@ mod tests {
         reader_ready,
         writer_ready,
         waker,
+        None,
       )
       .expect("DPEventLoop::new in test");
       dp_event_loop.event_loop();

@@ -1,5 +1,5 @@
 use std::{
-  collections::BTreeMap,
+  collections::{BTreeMap, BTreeSet},
   fmt, iter,
   net::SocketAddr,
   rc::Rc,
@@ -183,6 +183,11 @@ fn reply_locators<'a>(
     others => others,
   }
 }
+
+// What one NACK_FRAG can name, RTPS v2.5 Section 8.3.5.7, and how many of them one
+// HEARTBEAT is answered with: 4,096 fragments in a datagram of some 1,000 bytes.
+const NACK_FRAG_MAX_BITS: u32 = 256;
+const NACK_FRAGS_MAX: usize = 16;
 
 // If we are assembling a fragment, but it does not receive any updates
 // for this time, the AssemblyBuffer is just dropped.
@@ -1107,15 +1112,22 @@ impl Reader {
 
           let nackfrag_flags = BitFlags::<NACKFRAG_Flags>::from_flag(NACKFRAG_Flags::Endianness);
 
-          // send NackFrags, if any
+          // send NackFrags, if any. Each names 256 fragments at most, which of a large
+          // sample in small fragments is little.
           let mut nackfrags = Vec::new();
-          for sn in partially_received {
-            let count = writer_proxy.next_ack_nack_sequence_number();
-            let mut missing_frags = this.missing_frags_for(writer_guid, sn);
-            let first_missing = missing_frags.next();
-            if let Some(first) = first_missing {
-              let missing_frags_set = iter::once(first).chain(missing_frags).collect(); // "undo" the .next() above
-              let nf = NackFrag {
+          'samples: for sn in partially_received {
+            let mut missing_frags = this.missing_frags_for(writer_guid, sn).peekable();
+            while let Some(&first) = missing_frags.peek() {
+              if nackfrags.len() >= NACK_FRAGS_MAX {
+                break 'samples;
+              }
+              let mut missing_frags_set = BTreeSet::new();
+              while let Some(frag) = missing_frags
+                .next_if(|frag| u32::from(*frag) - u32::from(first) < NACK_FRAG_MAX_BITS)
+              {
+                missing_frags_set.insert(frag);
+              }
+              nackfrags.push(NackFrag {
                 reader_id,
                 writer_id: writer_proxy.remote_writer_guid.entity_id,
                 writer_sn: sn,
@@ -1123,13 +1135,8 @@ impl Reader {
                   first,
                   &missing_frags_set,
                 ),
-                count,
-              };
-              nackfrags.push(nf);
-            } else {
-              error!("The dog ate my missing fragments.");
-              // Really, this should not happen, as we are above checking
-              // that this SN is really partially (and not fully) received.
+                count: writer_proxy.next_ack_nack_sequence_number(),
+              });
             }
           }
 

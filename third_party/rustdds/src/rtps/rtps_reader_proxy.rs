@@ -20,7 +20,7 @@ use crate::{
   structure::{
     guid::{EntityId, GUID},
     locator::Locator,
-    sequence_number::{FragmentNumber, FragmentNumberSet, SequenceNumber, SequenceNumberRange},
+    sequence_number::{FragmentNumberSet, SequenceNumber, SequenceNumberRange},
   },
 };
 use super::reader::ReaderIngredients;
@@ -469,6 +469,7 @@ impl RtpsReaderProxy {
         }
         self.remove_from_unsent_set_all_before(new_all_acked_before);
         self.all_acked_before = new_all_acked_before;
+        self.frags_requested = self.frags_requested.split_off(&new_all_acked_before);
 
         // Insert the requested changes. These are (by construction) greater
         // then new_all_acked_before.
@@ -503,12 +504,13 @@ impl RtpsReaderProxy {
     self.pending_gap.insert(seq_num);
   }
 
-  pub fn set_pending_gap_up_to(&mut self, last_gap_sn: SequenceNumber) {
-    // form SN range from 1 to last_gap_sn (inclusive)
-    let gap_sn_range = SequenceNumberRange::new(SequenceNumber::new(1), last_gap_sn);
-    // Convert to a set and insert the SNs to pending_gap
-    let gap_sn_set = BTreeSet::from_iter(gap_sn_range);
-    self.pending_gap.extend(gap_sn_set);
+  pub fn set_pending_gap(&mut self, first: SequenceNumber, last: SequenceNumber) {
+    self.pending_gap.extend(SequenceNumberRange::new(first, last));
+  }
+
+  /// Not requested: what comes after `last_sent` will be sent without it.
+  pub fn forget_unsent_after(&mut self, last_sent: SequenceNumber) {
+    self.unsent_changes.split_off(&last_sent.plus_1());
   }
 
   pub fn get_pending_gap(&self) -> &BTreeSet<SequenceNumber> {
@@ -551,86 +553,72 @@ impl RtpsReaderProxy {
 
   // Fragment handling
 
-  pub fn mark_frags_requested(&mut self, seq_num: SequenceNumber, frag_nums: &FragmentNumberSet) {
-    let req_set = self
-      .frags_requested
-      .entry(seq_num)
-      .or_insert_with(|| BitVec::with_capacity(64)); // default capacity out of hat
+  /// `fragment_count` is how many fragments the sample has. What the set claims
+  /// beyond it, or before the first one, is not requested: a NACK_FRAG costs no
+  /// more than the sample that it is about.
+  pub fn mark_frags_requested(
+    &mut self,
+    seq_num: SequenceNumber,
+    frag_nums: &FragmentNumberSet,
+    fragment_count: u32,
+  ) {
+    // A set names its base and the 255 numbers after it, at most.
+    if u32::from(frag_nums.base()) < 1 || u32::from(frag_nums.base()) > fragment_count {
+      return;
+    }
+    // FragmentNumbers start at 1
+    let requested = frag_nums
+      .iter()
+      .map(u32::from)
+      .filter(|f| (1..=fragment_count).contains(f));
+    for f in requested {
+      self
+        .frags_requested
+        .entry(seq_num)
+        .or_insert_with(|| BitVec::from_elem(fragment_count as usize, false))
+        .set(f as usize - 1, true);
+    }
+  }
 
-    for f in frag_nums.iter() {
-      // -1 because FragmentNumbers start at 1
-      let idx = usize::from(f) - 1;
-      // The bit vector must be long enough to address `idx`. Grow it (filling
-      // with `false`) whenever a requested fragment number exceeds the current
-      // length, otherwise `set()` would be out of bounds. Note that a freshly
-      // inserted `BitVec` has length 0 regardless of its capacity.
-      if idx >= req_set.len() {
-        req_set.grow(idx + 1 - req_set.len(), false);
+  /// The first run of requested fragments of the lowest sample that any are
+  /// requested of: its sequence number, the number of the first fragment and how
+  /// many follow one another, `max_run` at most.
+  pub fn first_requested_frags(&self, max_run: u32) -> Option<(SequenceNumber, u32, u32)> {
+    let (&seq_num, requested) = self.frags_requested.iter().find(|(_, rf)| rf.any())?;
+    // By words of 32, the lowest bit first: the set of a large sample is long.
+    let (word, bits) = requested
+      .blocks()
+      .enumerate()
+      .find(|(_, bits)| *bits != 0)?;
+    let start = word * 32 + bits.trailing_zeros() as usize;
+    let run = (start..start + max_run as usize)
+      .take_while(|index| requested.get(*index) == Some(true))
+      .count();
+    Some((seq_num, start as u32 + 1, run as u32))
+  }
+
+  /// The fragments are on their way, or cannot be had: no longer requested.
+  pub fn mark_frags_sent(&mut self, seq_num: SequenceNumber, start: u32, count: u32) {
+    if let Some(requested) = self.frags_requested.get_mut(&seq_num) {
+      for f in start..start.saturating_add(count) {
+        let index = f as usize - 1;
+        if index < requested.len() {
+          requested.set(index, false);
+        }
       }
-      req_set.set(idx, true);
+      if requested.none() {
+        self.frags_requested.remove(&seq_num);
+      }
     }
   }
 
-  // This just removes the FragmentNumber entry from the set.
-  pub fn mark_frag_sent(&mut self, seq_num: SequenceNumber, frag_num: &FragmentNumber) {
-    let mut frag_map_emptied = false;
-    if let Some(frag_map) = self.frags_requested.get_mut(&seq_num) {
-      // -1 because FragmentNumbers start at 1
-      frag_map.set(usize::from(*frag_num) - 1, false);
-      frag_map_emptied = frag_map.none();
-    }
-    if frag_map_emptied {
-      self.frags_requested.remove(&seq_num);
-    }
-  }
-
-  // Note: The current implementation produces an iterator that iterates only
-  // over one fragmented sample, but the upper layer should detect that
-  // there are still other fragmented samples requested (if any)
-  // and continue sending.
-  pub fn frags_requested_iterator(&self) -> FragBitVecIterator {
-    match self.frags_requested.iter().next() {
-      None => FragBitVecIterator::new(SequenceNumber::default(), BitVec::new()), // empty iterator
-      Some((sn, bv)) => FragBitVecIterator::new(*sn, bv.clone()),
-    }
+  /// The sample is acknowledged, or gone.
+  pub fn forget_requested_frags(&mut self, seq_num: SequenceNumber) {
+    self.frags_requested.remove(&seq_num);
   }
 
   pub fn repair_frags_requested(&self) -> bool {
     self.frags_requested.values().any(|rf| rf.any())
-  }
-}
-
-pub struct FragBitVecIterator {
-  sequence_number: SequenceNumber,
-  frag_count: FragmentNumber,
-  bitvec: BitVec,
-}
-
-impl FragBitVecIterator {
-  pub fn new(sequence_number: SequenceNumber, bv: BitVec) -> FragBitVecIterator {
-    FragBitVecIterator {
-      sequence_number,
-      frag_count: FragmentNumber::new(1),
-      bitvec: bv,
-    }
-  }
-}
-
-impl Iterator for FragBitVecIterator {
-  type Item = (SequenceNumber, FragmentNumber);
-
-  fn next(&mut self) -> Option<Self::Item> {
-    // f indexes from 1, like FragmentNumber
-    let mut f = u32::from(self.frag_count);
-    while (f as usize) <= self.bitvec.len() && self.bitvec.get((f - 1) as usize) == Some(false) {
-      f += 1;
-    }
-    if (f as usize) > self.bitvec.len() {
-      None
-    } else {
-      self.frag_count = FragmentNumber::new(f + 1);
-      Some((self.sequence_number, FragmentNumber::new(f)))
-    }
   }
 }
 

@@ -2,9 +2,10 @@ use std::{
   cell::RefCell,
   cmp::{max, min},
   collections::{BTreeMap, BTreeSet},
+  net::SocketAddr,
   ops::Bound::Included,
   rc::Rc,
-  sync::{atomic, mpsc::TrySendError},
+  sync::mpsc::TrySendError,
 };
 
 #[allow(unused_imports)]
@@ -31,8 +32,9 @@ use crate::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, REPAIR_BATCH_MAX_BYTES,
-      REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
+      REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
     },
+    direct_send::Plan,
     outbound::{SocketId, TrafficClass},
     rtps_reader_proxy::RtpsReaderProxy,
     timed_event::DpTimerEvent,
@@ -135,7 +137,6 @@ pub(crate) struct WriterIngredients {
 
 pub(crate) struct Writer {
   pub endianness: Endianness,
-  pub heartbeat_message_counter: atomic::AtomicI32,
   /// Configures the mode in which the
   /// Writer operates. If
   /// pushMode==true, then the Writer
@@ -239,9 +240,6 @@ pub(crate) struct Writer {
   /// Shared, flow-controlled buffer of outgoing samples. Filled by the
   /// `DataWriter` (admission + sequence numbering), drained/transmitted here.
   send_buffer: WriterSendBuffer,
-  /// Highest sequence number this Writer has fully transmitted (push mode).
-  /// Samples with `seq` in `(last_sent, send_buffer.last]` are pending send.
-  last_sent: SequenceNumber,
   /// nonblocking-transmit: transmit progress within the sample `last_sent + 1`
   /// (the one currently being pushed). `Fresh` unless a large sample was
   /// interrupted mid-way by a full socket.
@@ -332,7 +330,6 @@ impl Writer {
 
     Self {
       endianness: Endianness::LittleEndian,
-      heartbeat_message_counter: atomic::AtomicI32::new(1),
       push_mode: true,
       heartbeat_period,
       heartbeat_period_fast,
@@ -354,7 +351,6 @@ impl Writer {
       min_datagram_payload: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
       my_topic_name: i.topic_name,
       send_buffer: i.send_buffer,
-      last_sent: SequenceNumber::zero(),
       sample_cursor: SampleCursor::Fresh,
       blocked_sockets: BTreeSet::new(),
       timed_event_timer,
@@ -745,7 +741,7 @@ impl Writer {
       builder = builder.heartbeat_msg(
         self.entity_id(),
         self.send_buffer.first_change_sequence_number(),
-        self.send_buffer.last_change_sequence_number(),
+        last_seq,
         self.next_heartbeat_count(),
         self.endianness,
         EntityId::UNKNOWN, // to all readers
@@ -775,12 +771,14 @@ impl Writer {
     // The doorbell enqueues this writer's id and then wakes. A sample admitted
     // while we are here pushes another id, so the next wake runs us again. The
     // shared buffer's `last_seq` is the source of truth.
+    let send_buffer = self.send_buffer.clone();
+    let _no_other_sender = send_buffer.direct_send().lock();
     loop {
       let last_available = self.send_buffer.last_change_sequence_number();
-      if self.last_sent >= last_available {
+      if self.last_sent() >= last_available {
         break;
       }
-      let sequence_number = self.last_sent.plus_1();
+      let sequence_number = self.last_sent().plus_1();
 
       // Item 1 (DATA aggregation): coalesce several consecutive small samples
       // into one datagram to amortize the per-sample RTPS header + syscall.
@@ -799,7 +797,7 @@ impl Writer {
             // bookkeeping is a no-op (notify + mark_sent cancel out); just
             // advance the frontier. Leaves `unsent_changes` empty on the push
             // path, exactly like the per-sample path after the Item 5 fix.
-            self.last_sent = last_seq;
+            self.set_last_sent(last_seq);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(last_seq);
             continue;
@@ -819,7 +817,7 @@ impl Writer {
       let Some(cc) = self.send_buffer.get_by_sn(sequence_number) else {
         // The sample is gone (e.g. evicted). Skip it; readers that need it will
         // be told via GAP during repair.
-        self.last_sent = sequence_number;
+        self.set_last_sent(sequence_number);
         self.sample_cursor = SampleCursor::Fresh;
         self.send_buffer.set_sent_frontier(sequence_number);
         self.mark_change_sent_to_all_readers(sequence_number);
@@ -883,7 +881,7 @@ impl Writer {
         };
         match progress {
           SendProgress::Complete => {
-            self.last_sent = sequence_number;
+            self.set_last_sent(sequence_number);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(sequence_number);
             self.mark_change_sent_to_all_readers(sequence_number);
@@ -903,7 +901,7 @@ impl Writer {
             // Drop: advance past this sample without recording blocked sockets,
             // so no write-readiness back-pressure is applied. The unsent
             // remainder is discarded and later evicted by cache cleaning.
-            self.last_sent = sequence_number;
+            self.set_last_sent(sequence_number);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(sequence_number);
             self.mark_change_sent_to_all_readers(sequence_number);
@@ -932,7 +930,7 @@ impl Writer {
           &mut self.readers.values(),
           TrafficClass::Control,
         );
-        self.last_sent = sequence_number;
+        self.set_last_sent(sequence_number);
         self.sample_cursor = SampleCursor::Fresh;
         self.send_buffer.set_sent_frontier(sequence_number);
       }
@@ -1087,7 +1085,7 @@ impl Writer {
         .heartbeat_msg(
           self.entity_id(), // from Writer
           self.send_buffer.first_change_sequence_number(),
-          self.send_buffer.last_change_sequence_number(),
+          self.last_advertised(),
           self.next_heartbeat_count(),
           self.endianness,
           EntityId::UNKNOWN, // to Reader
@@ -1154,6 +1152,7 @@ impl Writer {
       AckSubmessage::AckNack(ref an) => {
         // Update the ReaderProxy
         let last_seq = self.send_buffer.last_change_sequence_number(); // to avoid borrow problems
+        let last_sent = self.push_mode.then_some(self.last_sent());
 
         // sanity check requested sequence numbers
         if let Some(0) = an.reader_sn_state.iter().next().map(i64::from) {
@@ -1198,6 +1197,9 @@ impl Writer {
 
           //TODO: We should drop SNs in "pending gap" from unsent changes
           reader_proxy.handle_ack_nack(ack_submessage, last_seq);
+          if let Some(last_sent) = last_sent {
+            reader_proxy.forget_unsent_after(last_sent);
+          }
 
           // Sanity Check: if the reader asked for something we did not even advertise
           // yet. TODO: This
@@ -1273,7 +1275,10 @@ impl Writer {
           // everything means the reader does not know what we have, typically a
           // preemptive ACKNACK from a reader that matched us after our HEARTBEAT.
           // Answer now instead of at the next heartbeat period.
-          if an.reader_sn_state.iter().next().is_none() && reader_proxy.all_acked_before <= last_seq
+          // One that has asked for fragments does know; it is answered with those.
+          if an.reader_sn_state.iter().next().is_none()
+            && reader_proxy.all_acked_before <= last_seq
+            && !reader_proxy.repair_frags_requested()
           {
             let hb_message = MessageBuilder::new()
               .ts_msg(self.endianness, Some(Timestamp::now()))
@@ -1311,8 +1316,25 @@ impl Writer {
           return;
         }
         reader_proxy.last_nackfrag_count = Some(nackfrag.count);
-        reader_proxy.mark_frags_requested(nackfrag.writer_sn, &nackfrag.fragment_number_state);
-        self.schedule_repair_frags(reader_guid, self.nackfrag_response_delay);
+        // Of a sample that is gone the next HEARTBEAT says so; of one that was not
+        // sent yet everything is still to come.
+        let Some(cc) = Some(nackfrag.writer_sn)
+          .filter(|sn| *sn <= self.last_sent() || !self.push_mode)
+          .and_then(|sn| self.send_buffer.get_by_sn(sn))
+        else {
+          return;
+        };
+        let (fragment_count, _) = self.num_frags_and_frag_size(cc.data_value.payload_size());
+        if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
+          reader_proxy.mark_frags_requested(
+            nackfrag.writer_sn,
+            &nackfrag.fragment_number_state,
+            fragment_count,
+          );
+          if reader_proxy.repair_frags_requested() {
+            self.schedule_repair_frags(reader_guid, self.nackfrag_response_delay);
+          }
+        }
       }
     }
 
@@ -1582,80 +1604,122 @@ impl Writer {
     }
   }
 
+  // One repair round of fragments for a reader: those requested, lowest first,
+  // until REPAIR_FRAGS_MAX_BYTES have gone out. Runs of fragments share a DATAFRAG,
+  // and DATAFRAGs a datagram, as far as the reader's path MTU allows. The HEARTBEAT
+  // after the last one makes the reader say at once what is still missing: a
+  // NACK_FRAG names 256 fragments at most, and repairs get lost, too.
   fn handle_repair_frags_send_worker(
     &mut self,
     reader_proxy: &mut RtpsReaderProxy, /* This is mutable proxy temporarily detached from the
                                          * set of reader proxies */
   ) {
-    // Decide the (max) number of frags to be sent
-    let max_send_count = 8;
-
     let reader_guid = reader_proxy.remote_reader_guid;
+    let budget = reader_proxy.max_datagram_payload();
+    let mut datagram: Option<MessageBuilder> = None;
+    let mut round_bytes = 0;
 
-    // Get (an iterator to) frags requested but not yet sent
-    // reader_proxy.
-    // Iterate over frags to be sent
-    for (seq_num, frag_num) in reader_proxy.frags_requested_iterator().take(max_send_count) {
-      // Sanity check request
-      // ^^^ TODO
-
-      if let Some(cache_change) = self.send_buffer.get_by_sn(seq_num) {
-        // If the data is meant for a single reader only, make sure it is the one we're
-        // about to send frags to.
-        if let Some(single_reader_guid) = cache_change.write_options.to_single_reader() {
-          if single_reader_guid != reader_guid {
-            error!(
-              "We were asked to send datafrags meant for the reader {single_reader_guid:?} to a \
-               different reader {reader_guid:?}. Not gonna happen."
-            );
-            return;
-          }
+    while round_bytes < REPAIR_FRAGS_MAX_BYTES {
+      // A fragment starts at a multiple of the fragment size, so a run that is
+      // longer than a datagram holds is cut here.
+      let max_run = (budget / FRAGMENT_SIZE).max(1) as u32;
+      let Some((seq_num, start, run)) = reader_proxy.first_requested_frags(max_run) else {
+        break;
+      };
+      let Some(cache_change) = self.send_buffer.get_by_sn(seq_num) else {
+        // Evicted meanwhile. The HEARTBEAT says from where on there is anything.
+        reader_proxy.forget_requested_frags(seq_num);
+        continue;
+      };
+      // If the data is meant for a single reader only, make sure it is the one we're
+      // about to send frags to.
+      if let Some(single_reader_guid) = cache_change.write_options.to_single_reader() {
+        if single_reader_guid != reader_guid {
+          error!(
+            "We were asked to send datafrags meant for the reader {single_reader_guid:?} to a \
+             different reader {reader_guid:?}. Not gonna happen."
+          );
+          reader_proxy.forget_requested_frags(seq_num);
+          continue;
         }
-
-        // Generate datafrag message
-        let mut message_builder = MessageBuilder::new();
-        if let Some(src_ts) = cache_change.write_options.source_timestamp() {
-          message_builder = message_builder.ts_msg(self.endianness, Some(src_ts));
-        }
-
-        let fragment_size: u32 = FRAGMENT_SIZE as u32;
-        let data_size: u32 = cache_change.data_value.payload_size() as u32; // TODO: overflow check
-
-        message_builder = message_builder.data_frag_msg(
-          &cache_change,
-          reader_guid.entity_id, // reader
-          self.my_guid,          // writer
-          frag_num,
-          // Repair responds to specifically-NACKed fragment numbers (possibly
-          // non-contiguous), so retransmit one fragment per submessage.
-          1,
-          fragment_size as u16, // TODO: overflow check
-          data_size,
-          self.endianness,
-          self.security_plugins.as_ref(),
-        );
-
-        // Repair frags are a reliability action (response to a NACK_FRAG), so
-        // they must actually reach the reader. Use the never-dropped `Control`
-        // queue: dropping repair on WouldBlock livelocks under sustained send
-        // congestion (reader re-NACKs, retransmit dropped again, forever).
-        let _blocked = self.send_message_to_readers(
-          DeliveryMode::Unicast,
-          message_builder.add_header_and_build(self.my_guid.prefix),
-          &mut std::iter::once(&*reader_proxy),
-          TrafficClass::Control,
-        );
-      } else {
-        error!(
-          "handle_repair_frags_send_worker: {:?} missing from send buffer. topic={:?}",
-          seq_num, self.my_topic_name
-        );
-        // TODO: Should we send a GAP message then?
       }
+      let payload_size = cache_change.data_value.payload_size();
+      let (fragment_count, fragment_size) = self.num_frags_and_frag_size(payload_size);
+      let Ok(sample_size) = u32::try_from(payload_size) else {
+        reader_proxy.forget_requested_frags(seq_num);
+        continue;
+      };
 
-      reader_proxy.mark_frag_sent(seq_num, &frag_num);
-    } // for
+      // Generate datafrag message
+      let mut part = MessageBuilder::new();
+      if let Some(src_ts) = cache_change.write_options.source_timestamp() {
+        part = part.ts_msg(self.endianness, Some(src_ts));
+      } else if datagram.is_some() {
+        // An INFO_TS of the sample before would apply to this one, too.
+        part = part.ts_msg(self.endianness, None);
+      }
+      let header_len = part.len_serialized() + INFO_DST_SUBMESSAGE_SIZE;
+      let count = frags_per_datafrag(
+        header_len,
+        budget,
+        start,
+        fragment_count,
+        fragment_size,
+        payload_size,
+      )
+      .min(run);
+      part = part.data_frag_msg(
+        &cache_change,
+        reader_guid.entity_id, // reader
+        self.my_guid,          // writer
+        FragmentNumber::new(start),
+        count as u16,
+        fragment_size,
+        sample_size,
+        self.endianness,
+        self.security_plugins.as_ref(),
+      );
+      round_bytes += part.submessage_bytes_len();
+      // Repair frags are a reliability action (response to a NACK_FRAG), so they
+      // must actually reach the reader: they use the never-dropped `Control` queue.
+      self.add_to_repair_datagram(&mut datagram, part, 0, reader_proxy);
+      if self.security_plugins.is_some() {
+        // Security encodes each message for its readers as a whole.
+        self.flush_repair_datagram(&mut datagram, reader_proxy);
+      }
+      reader_proxy.mark_frags_sent(seq_num, start, count);
+    }
+
+    if round_bytes > 0 && !reader_proxy.repair_frags_requested() {
+      let heartbeat = MessageBuilder::new().heartbeat_msg(
+        self.entity_id(),
+        self.send_buffer.first_change_sequence_number(),
+        self.last_advertised(),
+        self.next_heartbeat_count(),
+        self.endianness,
+        reader_guid.entity_id,
+        false, // final_flag: request ACKNACK
+        false, // liveliness_flag
+      );
+      self.add_to_repair_datagram(&mut datagram, heartbeat, 0, reader_proxy);
+    }
+    self.flush_repair_datagram(&mut datagram, reader_proxy);
   } // fn
+
+  // The last sample that a HEARTBEAT may speak of. In push mode that is the last
+  // one that was sent: a reader asks at once for those that it hears of and does
+  // not have, and would be sent what waits here a second time.
+  fn last_advertised(&self) -> SequenceNumber {
+    let last = self.send_buffer.last_change_sequence_number();
+    if self.push_mode {
+      // A HEARTBEAT must not end before one before its first sample (RTPS v2.5
+      // Section 8.3.8.6.3), and samples can be evicted before they were sent.
+      let before_first = self.send_buffer.first_change_sequence_number() - SequenceNumber::new(1);
+      max(min(last, self.last_sent()), before_first)
+    } else {
+      last
+    }
+  }
 
   /// Removes permanently cacheChanges from DDSCache.
   /// CacheChanges can be safely removed only if they are acked by all readers.
@@ -1719,9 +1783,75 @@ impl Writer {
   }
 
   pub(crate) fn next_heartbeat_count(&self) -> i32 {
-    self
-      .heartbeat_message_counter
-      .fetch_add(1, atomic::Ordering::SeqCst)
+    self.send_buffer.direct_send().next_heartbeat_count()
+  }
+
+  // Highest sequence number that was fully transmitted (push mode), by this Writer
+  // or by the thread that wrote it. Samples with `seq` in
+  // `(last_sent, send_buffer.last]` are pending send.
+  fn last_sent(&self) -> SequenceNumber {
+    self.send_buffer.direct_send().last_sent()
+  }
+
+  fn set_last_sent(&self, last_sent: SequenceNumber) {
+    self.send_buffer.direct_send().set_last_sent(last_sent);
+  }
+
+  // Says what the threads that write may send without the event loop: to every
+  // matched reader a datagram by unicast, as `send_message_to_readers` would.
+  fn refresh_direct_plan(&self) {
+    *self.send_buffer.direct_send().lock() = self.direct_plan();
+  }
+
+  fn direct_plan(&self) -> Option<Plan> {
+    if self.my_guid.entity_id.kind().is_built_in()
+      || self.like_stateless
+      || !self.push_mode
+      || self.security_plugins.is_some()
+      || !self.extra_unicast_destinations.is_empty()
+      || self.readers.is_empty()
+    {
+      return None;
+    }
+    let mut addresses: Vec<SocketAddr> = Vec::new();
+    for reader in self.readers.values() {
+      // Readers of this participant get samples from its cache.
+      if reader.remote_reader_guid.prefix == self.my_guid.prefix {
+        return None;
+      }
+      let route = reader.send_route();
+      let chosen = route.unicast.as_ref().map(std::slice::from_ref);
+      let locators = if route.fallback {
+        &reader.unicast_locator_list[..]
+      } else {
+        chosen?
+      };
+      let before = addresses.len();
+      let mut known = 0;
+      for locator in locators {
+        let Locator::UdpV4(address) = locator else {
+          continue; // cannot be reached
+        };
+        let address = SocketAddr::V4(*address);
+        if address.ip().is_multicast() {
+          return None;
+        }
+        if addresses.contains(&address) {
+          known += 1;
+        } else {
+          addresses.push(address);
+        }
+      }
+      if addresses.len() == before && known == 0 {
+        return None;
+      }
+    }
+    Some(Plan {
+      socket: self.udp_sender.unicast_socket(),
+      addresses,
+      max_payload: self.max_unfragmented_serialized_payload(None),
+      heartbeat: self.is_reliable(),
+    })
   }
 
   #[cfg(feature = "security")]
@@ -2115,7 +2245,12 @@ impl Writer {
           // With Durabilty::Volatile QoS we won't send the sequence numbers which existed
           // before matching with this reader. Therefore we set the reader as pending GAP
           // for all existing sequence numbers
-          new_proxy.set_pending_gap_up_to(self.send_buffer.last_change_sequence_number());
+          // that we still have. What is older, a HEARTBEAT says that it is gone; to list
+          // it here would take memory for every sample ever written.
+          new_proxy.set_pending_gap(
+            self.send_buffer.first_change_sequence_number(),
+            self.send_buffer.last_change_sequence_number(),
+          );
         }
         new_proxy.resolve_send_route(
           &self.interface_observations.borrow(),
@@ -2142,6 +2277,7 @@ impl Writer {
       .map(RtpsReaderProxy::max_datagram_payload)
       .min()
       .unwrap_or(FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE);
+    self.refresh_direct_plan();
   }
 
   /// Refresh the [`SendRoute`](crate::rtps::transmit::SendRoute) of every
@@ -2256,6 +2392,9 @@ impl HasQoSPolicy for Writer {
 // and inline QoS. Conservative fixed fields only; underestimating inline QoS
 // causes earlier fragmentation (safe), never datagram overflow.
 const DATA_SUBMESSAGE_OVERHEAD: usize = 48;
+
+// Submessage header and GUID prefix.
+const INFO_DST_SUBMESSAGE_SIZE: usize = 16;
 
 // An invalidating INFO_TS is a bare submessage header.
 const SUBMESSAGE_INFO_TS_INVALIDATE_SIZE: usize = 4;
@@ -2526,7 +2665,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
                 .heartbeat_msg(
                   writer.entity_id(), // from Writer
                   writer.send_buffer.first_change_sequence_number(),
-                  writer.send_buffer.last_change_sequence_number(),
+                  max(cc.sequence_number, writer.last_advertised()),
                   writer.next_heartbeat_count(),
                   writer.endianness,
                   reader_entity_id, // to Reader
@@ -2584,7 +2723,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
           message_builder = message_builder.heartbeat_msg(
             writer.entity_id(),
             writer.send_buffer.first_change_sequence_number(),
-            writer.send_buffer.last_change_sequence_number(),
+            max(cc.sequence_number, writer.last_advertised()),
             writer.next_heartbeat_count(),
             writer.endianness,
             reader_entity_id, // to Reader
@@ -2759,11 +2898,15 @@ mod tests {
       },
       discovery::discovery::Discovery,
       messages::submessages::{
-        elements::serialized_payload::SerializedPayload, submessages::AckNack,
+        elements::serialized_payload::SerializedPayload,
+        submessages::{AckNack, NackFrag},
       },
       polling::new_shared_timer,
       rtps::writer_send_buffer::Admission,
-      structure::{guid::EntityKind, sequence_number::SequenceNumberSet},
+      structure::{
+        guid::EntityKind,
+        sequence_number::{FragmentNumberSet, SequenceNumberSet},
+      },
       RepresentationIdentifier,
     };
 
@@ -2828,6 +2971,8 @@ mod tests {
           Rc::new(RefCell::new(InterfaceObservations::default())),
           Rc::from(Vec::<IfAddr>::new()),
         );
+        // Sent already, to nobody.
+        writer.set_last_sent(writer.send_buffer.last_change_sequence_number());
         let reader_guid = GUID::new(GuidPrefix::new(&[2; 12]), reader_id);
         let mut reader_proxy = RtpsReaderProxy::new(reader_guid, reader_qos.clone(), false);
         reader_proxy
@@ -3042,6 +3187,126 @@ mod tests {
       f.ack_nack(1..=5, 2);
       assert_eq!(f.unsent(), 5);
       assert_eq!(f.repair_round(), 5);
+    }
+
+    // What waits to be sent goes out without a request, so a request does not send
+    // it a second time.
+    #[test]
+    fn what_was_not_sent_yet_is_not_repaired() {
+      let mut f = Fixture::user(5, 8, None);
+      f.writer.set_last_sent(SequenceNumber::new(2));
+      f.ack_nack(1..=5, 1);
+      assert_eq!(f.unsent(), 2);
+      assert_eq!(f.writer.last_advertised(), SequenceNumber::new(2));
+    }
+
+    fn nack_frag(f: &mut Fixture, writer_sn: i64, set: FragmentNumberSet, count: i32) {
+      let nack_frag = NackFrag {
+        reader_id: f.reader_guid.entity_id,
+        writer_id: f.writer.my_guid.entity_id,
+        writer_sn: SequenceNumber::new(writer_sn),
+        fragment_number_state: set,
+        count,
+      };
+      f.writer.handle_ack_nack(
+        f.reader_guid.prefix,
+        &AckSubmessage::NackFrag(nack_frag),
+      );
+    }
+
+    fn frags(range: std::ops::RangeInclusive<u32>) -> FragmentNumberSet {
+      let base = FragmentNumber::new(*range.start());
+      FragmentNumberSet::from_base_and_set(base, &range.map(FragmentNumber::new).collect())
+    }
+
+    // 256 bits that are all set, from any base.
+    fn all_from(base: u32) -> FragmentNumberSet {
+      use speedy::{Readable, Writable};
+      let mut bytes = frags(1..=256).write_to_vec_with_ctx(Endianness::LittleEndian).unwrap();
+      bytes[..4].copy_from_slice(&base.to_le_bytes());
+      FragmentNumberSet::read_from_buffer_with_ctx(Endianness::LittleEndian, &bytes).unwrap()
+    }
+
+    // A request for fragments that do not exist costs nothing: no memory, no timer,
+    // no datagram, and no panic.
+    #[test]
+    fn fragments_that_do_not_exist_are_not_requested() {
+      let mut f = Fixture::user(2, 20_000, None); // 79 fragments
+      for (count, (sn, base)) in [
+        (1, 0),
+        (1, 80),
+        (1, u32::MAX),
+        (1, u32::MAX - 255),
+        (0, 1),
+        (3, 1),
+        (-1, 1),
+        (i64::MAX, 1),
+      ]
+      .into_iter()
+      .enumerate()
+      {
+        nack_frag(&mut f, sn, all_from(base), count as i32);
+        assert!(!f.reader_proxy().repair_frags_requested(), "{sn} {base}");
+      }
+      assert!(!f.reader_proxy().repair_frags_scheduled);
+
+      nack_frag(&mut f, 2, all_from(79), 100);
+      let only_the_last = Some((SequenceNumber::new(2), 79, 1));
+      assert_eq!(f.reader_proxy().first_requested_frags(1000), only_the_last);
+      f.writer.handle_repair_frags_send(f.reader_guid);
+      assert!(!f.reader_proxy().repair_frags_requested());
+    }
+
+    // A round answers all that one NACK_FRAG can ask for, and is bounded.
+    #[test]
+    fn a_round_repairs_what_several_nack_frags_ask_for() {
+      let mut f = Fixture::user(1, 600_000, None); // 2,344 fragments
+      for (count, base) in (1..=2_344).step_by(256).enumerate() {
+        nack_frag(&mut f, 1, frags(base..=(base + 255).min(2_344)), count as i32);
+      }
+      let per_round = (REPAIR_FRAGS_MAX_BYTES / FRAGMENT_SIZE) as u32;
+      f.writer.handle_repair_frags_send(f.reader_guid);
+      let (_, start, _) = f.reader_proxy().first_requested_frags(1).unwrap();
+      assert!(start > per_round / 2 && start <= per_round + 1, "{start}");
+      f.writer.handle_repair_frags_send(f.reader_guid);
+      f.writer.handle_repair_frags_send(f.reader_guid);
+      assert!(!f.reader_proxy().repair_frags_requested());
+    }
+
+    // What is acknowledged is requested no longer, in part or as a whole.
+    #[test]
+    fn an_acknowledgement_ends_the_repair_of_fragments() {
+      let mut f = Fixture::user(2, 20_000, None);
+      nack_frag(&mut f, 1, frags(3..=9), 1);
+      assert!(f.reader_proxy().repair_frags_requested());
+      f.writer.handle_ack_nack(
+        f.reader_guid.prefix,
+        &AckSubmessage::AckNack(AckNack {
+          reader_id: f.reader_guid.entity_id,
+          writer_id: f.writer.my_guid.entity_id,
+          reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(2)),
+          count: 1,
+        }),
+      );
+      assert!(!f.reader_proxy().repair_frags_requested());
+    }
+
+    // A VOLATILE reader that comes late costs memory for what the writer still has,
+    // not for all that it ever wrote.
+    #[test]
+    fn a_late_volatile_reader_takes_no_memory_for_what_is_gone() {
+      let mut f = Fixture::user(5, 8, None);
+      f.writer.send_buffer.remove_changes_before(SequenceNumber::new(4));
+      f.writer.qos_policies.durability = Some(Durability::Volatile);
+      let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
+      let qos = QosPolicyBuilder::new().durability(Durability::Volatile).build();
+      f.writer.update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+      let gap: Vec<i64> = f.writer.readers[&late]
+        .get_pending_gap()
+        .iter()
+        .map(|sn| i64::from(*sn))
+        .collect();
+      assert_eq!(gap, [4, 5]);
     }
 
     // While the reader's send socket has queued control datagrams, a round

@@ -11,6 +11,7 @@ use log::{debug, error, trace, warn};
 
 use crate::{
   dds::{ddsdata::DDSData, with_key::datawriter::WriteOptions},
+  rtps::direct_send::DirectSend,
   structure::{cache_change::CacheChange, guid::GUID, sequence_number::SequenceNumber},
 };
 
@@ -77,6 +78,7 @@ struct Inner {
 
 struct Shared {
   inner: Mutex<Inner>,
+  direct_send: DirectSend,
   // Signalled together with `wakers` whenever progress may be possible.
   progress: Condvar,
   // Fixed for the lifetime of the writer.
@@ -132,6 +134,7 @@ impl WriterSendBuffer {
           max_retain: max_retain.max(1),
           wakers: Vec::new(),
         }),
+        direct_send: DirectSend::new(),
         progress: Condvar::new(),
         writer_guid,
         reliable_writer,
@@ -305,7 +308,28 @@ impl WriterSendBuffer {
     seq
   }
 
+  /// Sends a freshly admitted sample on the calling thread, if that is possible.
+  /// If not, the event loop has to do it: ring its doorbell.
+  pub fn send_now(&self, sequence_number: SequenceNumber) -> bool {
+    let sent = self
+      .shared
+      .direct_send
+      .try_send(self.shared.writer_guid, sequence_number, || {
+        let inner = self.shared.inner.lock().unwrap();
+        Some((inner.changes.get(&sequence_number)?.clone(), inner.first_seq))
+      });
+    if sent {
+      self.set_sent_frontier(sequence_number);
+    }
+    sent
+  }
+
   // --- consumer side (Writer / event loop) ---
+
+  /// What the threads that write may send themselves.
+  pub fn direct_send(&self) -> &DirectSend {
+    &self.shared.direct_send
+  }
 
   /// Update the reliable acknowledgement frontier. `acked_before` is the
   /// minimum `all_acked_before` over all matched reliable readers, and

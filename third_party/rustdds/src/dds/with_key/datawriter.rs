@@ -386,7 +386,9 @@ where
       .admit_blocking(write_options, ddsdata, timeout)
     {
       Admission::Admitted(sequence_number) => {
-        self.ring_doorbell();
+        if !self.send_buffer.send_now(sequence_number) {
+          self.ring_doorbell();
+        }
         self.refresh_manual_liveliness();
         Ok(SampleIdentity {
           writer_guid: self.my_guid,

@@ -1,0 +1,129 @@
+//! What ingress does on the DDS library's receiving thread: taking samples and publishing them.
+//!
+//! A sample that is taken where it is received costs one wake-up less than one that is handed to a thread of
+//! ours first; `docs/decisions/0006-hand-overs.md` has the measurements. What need not happen for each sample
+//! is done by the main thread, which holds a route's lock meanwhile. The receiving thread waits for no lock:
+//! it leaves the route alone, and is rung when the lock is free.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering, fence};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+
+use super::super::inbox::Bell;
+use super::input::Input;
+use crate::shm::LaneWaker;
+
+/// Samples taken of one route before the next route, and the DDS library, have their turn.
+const SAMPLES_PER_TURN: usize = 32;
+
+/// A route, its bell, and whether somebody came while its lock was held.
+struct Served {
+    input: Mutex<Input>,
+    bell: Arc<Bell>,
+    missed: AtomicBool,
+}
+
+/// All routes, as the receiving thread and the main thread share them.
+pub(super) struct Receiving {
+    routes: Vec<Served>,
+    /// Of the critical lanes first, each with the routes that it serves.
+    wakers: Vec<(LaneWaker, Vec<bool>)>,
+    turns: AtomicU64,
+}
+
+impl Receiving {
+    pub fn new(inputs: Vec<(Input, Arc<Bell>)>, wakers: Vec<(LaneWaker, Vec<bool>)>) -> Self {
+        let served =
+            |(input, bell)| Served { input: Mutex::new(input), bell, missed: AtomicBool::new(false) };
+        Self { routes: inputs.into_iter().map(served).collect(), wakers, turns: AtomicU64::new(0) }
+    }
+
+    /// Takes and publishes what has arrived; on the receiving thread. Whether there may be more.
+    pub fn turn(&self) -> bool {
+        let mut more = false;
+        for (route, served) in self.routes.iter().enumerate() {
+            if served.bell.is_rung()
+                && let Some(mut input) = served.try_enter()
+            {
+                more |= self.drain(route, &mut input);
+            }
+        }
+        self.turns.fetch_add(1, Ordering::Release);
+        more
+    }
+
+    /// Like [`turn`](Self::turn), on any thread.
+    pub fn turn_patiently(&self) -> bool {
+        let mut more = false;
+        for (route, served) in self.routes.iter().enumerate() {
+            if served.bell.is_rung() {
+                more |= self.drain(route, &mut served.enter());
+            }
+        }
+        more
+    }
+
+    /// Turns of the receiving thread so far.
+    pub fn turns(&self) -> u64 {
+        self.turns.load(Ordering::Acquire)
+    }
+
+    /// Lets `work` have each route; whether the receiving thread has to be rung, because it came meanwhile,
+    /// or because a route has a new reader.
+    ///
+    /// # Errors
+    /// The first one of `work`, after all routes had their turn.
+    pub fn visit<E>(&self, mut work: impl FnMut(&mut Input) -> Result<(), E>) -> Result<bool, E> {
+        let mut ring = false;
+        let mut outcome = Ok(());
+        for served in &self.routes {
+            outcome = outcome.and(work(&mut served.enter()));
+            ring |= served.was_missed() || served.bell.is_rung();
+        }
+        outcome.map(|()| ring)
+    }
+
+    fn drain(&self, route: usize, input: &mut Input) -> bool {
+        for _ in 0..SAMPLES_PER_TURN {
+            if !input.step(|| self.wake(route)) {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// Wakes the lanes that serve the route, the critical ones first.
+    fn wake(&self, route: usize) {
+        for (waker, serves) in &self.wakers {
+            if serves[route] {
+                waker.wake();
+            }
+        }
+    }
+}
+
+impl Served {
+    fn enter(&self) -> MutexGuard<'_, Input> {
+        self.input.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The route, unless the main thread has it; then it is told.
+    fn try_enter(&self) -> Option<MutexGuard<'_, Input>> {
+        let attempt = || match self.input.try_lock() {
+            Ok(input) => Some(input),
+            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        };
+        attempt().or_else(|| {
+            // Either the main thread sees this when it has let go, or it has by now.
+            self.missed.store(true, Ordering::SeqCst);
+            fence(Ordering::SeqCst);
+            attempt()
+        })
+    }
+
+    /// After the lock was let go of.
+    fn was_missed(&self) -> bool {
+        fence(Ordering::SeqCst);
+        self.missed.swap(false, Ordering::SeqCst)
+    }
+}
