@@ -186,7 +186,7 @@ fn a_transient_local_late_joiner_gets_what_the_writer_keeps() {
             received.assert_sound();
             let whole = received.first <= Some(15) && received.missing.iter().all(|(_, last)| *last < 15);
             assert!(whole && received.last == Some(19), "{from:?} to {to:?}: {received:?}");
-            // RustDDS lets go of what is beyond the depth at its cache cleaning only: some of it may come too.
+            // RustDDS lets go of what is beyond the depth at its cache cleaning only: some of it may come.
             assert!(received.received == 5 || from == Library::Rust, "{from:?} to {to:?}: {received:?}");
             assert_eq!(publisher.end::<Sent>().ok, 20);
         }
