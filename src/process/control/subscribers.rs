@@ -85,12 +85,25 @@ impl Subscribers {
             subscriber.listed = is_listed(settings, &subscriber.id);
             let lane = lane_of(settings, &subscriber.id);
             if lane != subscriber.lane {
+                if link_of_lane[lane] != subscriber.link {
+                    // Answers to what is under way would come on a link that is its own no longer.
+                    subscriber.window.stopped(now, now);
+                }
                 (subscriber.lane, subscriber.link) = (lane, link_of_lane[lane]);
             }
         }
         let listed = settings.subscribers.keys().chain(settings.classifier.subscriber_id.iter());
         for id in listed {
-            if self.list.len() < MAX_SUBSCRIBERS && !self.list.iter().any(|known| known.id == *id) {
+            if self.list.iter().any(|known| known.id == *id) {
+                continue;
+            }
+            if self.list.len() == MAX_SUBSCRIBERS
+                && let Some(place) = self.list.iter().position(|known| !known.listed)
+            {
+                // Whoever made up the others cannot keep a listed one out.
+                self.list.remove(place);
+            }
+            if self.list.len() < MAX_SUBSCRIBERS {
                 let lane = lane_of(settings, id);
                 self.list.push(Subscriber::new(id, lane, link_of_lane[lane], true, settings, now));
             }
@@ -200,10 +213,11 @@ impl Subscribers {
             });
         }
         self.list.retain(|subscriber| {
+            // One that was never heard has been listed until now.
             let left = !subscriber.listed
-                && subscriber.window.heard_at().is_some_and(|heard_at| is_forgotten(heard_at, now));
+                && subscriber.window.heard_at().is_none_or(|heard_at| is_forgotten(heard_at, now));
             if left {
-                info!(subscriber = subscriber.id, "silent for a minute and not listed: forgotten");
+                info!(subscriber = subscriber.id, "silent and not listed: forgotten");
             }
             !left
         });
