@@ -13,6 +13,27 @@ use crate::policy::{
 };
 use crate::shm::{BoardWriter, Boards};
 
+/// Who decides on a subscriber's state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Judge {
+    Classifier,
+    Override,
+    /// The classifier is switched off.
+    Nobody,
+}
+
+impl Judge {
+    /// Why a subscriber is in the state in which this one found it.
+    const fn reason_at_first(self, former: Self) -> &'static str {
+        match (self, former) {
+            (Self::Override, _) => "forced by the configuration (overrides)",
+            (Self::Nobody, _) => "not classified (classifier.enabled is false)",
+            (Self::Classifier, Self::Override) => "as the former override left it",
+            (Self::Classifier, _) => "not enough probes answered yet",
+        }
+    }
+}
+
 /// One subscriber.
 struct Subscriber {
     id: String,
@@ -27,6 +48,7 @@ struct Subscriber {
     /// The state before the last change.
     previous: Option<SubscriberState>,
     since: MonotonicNs,
+    judge: Judge,
     reason: String,
     warnings: SubscriberWarnings,
     /// Those that are shown, as `SubscriberWarning`'s bits.
@@ -192,14 +214,22 @@ impl Subscribers {
             subscriber.reading = subscriber.window.reading(now);
             subscriber.warned = subscriber.warnings.read(&warning_thresholds, &subscriber.reading);
             let forced = settings.overrides.get(&subscriber.id).copied();
-            if !settings.classifier.enabled && forced.is_none() {
-                continue;
+            let judge = match forced {
+                Some(_) => Judge::Override,
+                None if settings.classifier.enabled => Judge::Classifier,
+                None => Judge::Nobody,
+            };
+            // Also where the state stays: a reason that no longer holds is worse than none.
+            let former = std::mem::replace(&mut subscriber.judge, judge);
+            if former != judge {
+                judge.reason_at_first(former).clone_into(&mut subscriber.reason);
             }
             let thresholds = &settings.classifier.thresholds;
-            let Some(transition) = subscriber.classifier.evaluate(&subscriber.reading, thresholds, forced)
-            else {
-                continue;
+            let transition = match judge {
+                Judge::Nobody => subscriber.classifier.unclassified(thresholds),
+                _ => subscriber.classifier.evaluate(&subscriber.reading, thresholds, forced),
             };
+            let Some(transition) = transition else { continue };
             subscriber.previous = Some(transition.from);
             subscriber.since = now;
             subscriber.reason = reason_text(&transition.reason);
@@ -281,9 +311,10 @@ impl Subscriber {
             reading: LinkReading::default(),
             previous: None,
             since: now,
+            judge: Judge::Classifier,
+            reason: Judge::Classifier.reason_at_first(Judge::Nobody).to_owned(),
             warnings: SubscriberWarnings::default(),
             warned: 0,
-            reason: "not enough probes answered yet".to_owned(),
         }
     }
 
@@ -329,7 +360,8 @@ fn reason_text(reason: &TransitionReason) -> String {
         format!("{rtt}, loss {:.1} % of {}", reading.loss * 100.0, reading.settled)
     };
     match reason {
-        TransitionReason::Override => "forced by the configuration (overrides)".to_owned(),
+        TransitionReason::Override => Judge::Override.reason_at_first(Judge::Classifier).to_owned(),
+        TransitionReason::Unclassified => Judge::Nobody.reason_at_first(Judge::Classifier).to_owned(),
         TransitionReason::Demoted { reading, .. } => {
             format!("impaired ({}): {}", reason.label(), numbers(reading))
         }
