@@ -319,8 +319,8 @@ fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
 #[test]
 fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
     let test = "a_responder_that_is_not_listed_appears_on_the_noncritical_lane";
-    let yaml = format!("{SCAN}{QUICK}lanes: {{rviz: {{}}}}\nsubscribers: {{desk: rviz}}\n");
-    let Some(bed) = Bed::start(test, &yaml) else { return };
+    let config = |listed: &str| format!("{SCAN}{QUICK}lanes: {{rviz: {{}}}}\nsubscribers: {listed}\n");
+    let Some(bed) = Bed::start(test, &config("{desk: rviz}")) else { return };
     let scene = Scene::start(bed, 30.0, "critical");
     let mut listener = node_on(scene.host("critical"), "listener");
     let array = read(&mut listener, "rt/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_");
@@ -359,6 +359,16 @@ fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
     });
     assert_eq!((values["lane"].as_str(), values["listed"].as_str()), ("noncritical", "no"), "{values:?}");
     assert_ne!(level, 0, "an impaired subscriber is no OK: {values:?}");
+
+    // Whom a reload lists takes his state along to his lane; one that was never heard and is listed no
+    // longer is nobody.
+    scene.reload(&config("{laptop: rviz}"));
+    let (status, _) = scene.wait_state("laptop", "NONCRITICAL", "rviz", "degraded");
+    let laptop = subscriber(&status, "laptop");
+    assert_eq!((&laptop["lane"], &laptop["listed"]), (&"rviz".into(), &true.into()), "{laptop}");
+    let (status, _) = scene.wait("one subscriber", |status| find(status, "desk").is_none());
+    assert_eq!(status["subscribers"].as_array().unwrap().len(), 1, "{status}");
+    scene.wait("noncritical normal", |status| lane_of(status, "noncritical")["applied_mode"] == "normal");
     scene.end_whole();
 }
 
@@ -401,8 +411,12 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
     let Some(bed) = Bed::start(test, &config("true", "{slow: NONCRITICAL}")) else { return };
     let scene = Scene::start(bed, 100.0, "critical");
     let forced = |state, mode, forced: bool| {
-        let (status, _) = scene.wait_state("slow", state, "noncritical", mode);
-        assert_eq!(subscriber(&status, "slow")["forced"], forced, "{status}");
+        scene.wait_state("slow", state, "noncritical", mode);
+        scene.wait("the override", |status| {
+            let slow = subscriber(status, "slow");
+            let reason = slow["reason"].as_str().unwrap();
+            slow["state"] == state && slow["forced"] == forced && reason.starts_with("forced") == forced
+        });
     };
     // At once: nobody has been probed yet.
     forced("NONCRITICAL", "degraded", true);
@@ -426,6 +440,7 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
     // A bad file changes nothing and is told of.
     scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{slow: GOOD}")));
     assert_eq!(scene.bed.bridge.run("reload").status.code(), Some(78));
+    scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{}")));
     scene.assert_rate("noncritical", 3.0, 4);
 
     // Nobody is classified: the lane has its full rate, and nobody is shown as what he is not.
@@ -440,6 +455,11 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
     // Nor does what was found before: the other's override switches the classifier on for nobody else.
     scene.reload(&config("false", "{another: NONCRITICAL}"));
     scene.assert_rate("noncritical", 10.0, 4);
+    scene.reload(&config("true", "{}"));
+    forced("NONCRITICAL", "degraded", false);
+    // One that forces what is so already is told of too, and its end.
+    scene.reload(&config("true", "{slow: NONCRITICAL}"));
+    forced("NONCRITICAL", "degraded", true);
     scene.reload(&config("true", "{}"));
     forced("NONCRITICAL", "degraded", false);
     scene.end_whole();
