@@ -277,8 +277,9 @@ fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
 #[test]
 fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
     let test = "only_the_lane_of_the_impaired_subscriber_is_degraded";
+    // The other lane is in a domain of its own, and so is its responder.
     let yaml = format!(
-        "{SCAN}{QUICK}lanes: {{rviz: {{max_rate_hz: 20, degraded_rate_hz: 5}}}}\n\
+        "{SCAN}{QUICK}lanes: {{rviz: {{domain_id: 7, max_rate_hz: 20, degraded_rate_hz: 5}}}}\n\
          subscribers: {{robot_shop: noncritical, desk: {{lane: rviz}}}}\n"
     );
     let Some(bed) = Bed::start_with(test, &yaml, &["desk"]) else { return };
@@ -286,7 +287,7 @@ fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
     let scene = Scene::start(bed, 50.0, "critical");
     let subscribers = [
         scene.bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL),
-        scene.bed.subscribe("desk", Peer::fast().best_effort(), "rt/adaptive_bridge/rviz/scan"),
+        scene.bed.subscribe("desk", Peer::fast().domain(7).best_effort(), "rt/adaptive_bridge/rviz/scan"),
     ];
     let _responders = [scene.responder("slow", "robot_shop"), scene.responder("desk", "desk")];
     let mut links = [scene.link("slow", 1), scene.link("desk", 2)];
