@@ -1,5 +1,5 @@
-//! Control on a bridge that runs: the shipped binary, subscribers on hosts of their own with a responder beside
-//! each, links that lose and delay, and samples that flow all the while.
+//! Control on a bridge that runs: the shipped binary, subscribers on hosts of their own with a responder
+//! beside each, links that lose and delay, and samples that flow all the while.
 //!
 //! The critical subscriber gets each sample whatever happens; that ends every test.
 
@@ -94,16 +94,20 @@ impl Scene {
     /// Checks that a lane forwards at that rate for some seconds, by its own count: 5 % and two samples are
     /// what the ends of the time and a busy machine may take.
     fn assert_rate(&self, lane: &str, rate_hz: f64, seconds: u64) {
-        let before = self.status();
-        std::thread::sleep(Duration::from_secs(seconds));
-        let after = self.status();
-        let count = |status: &Value| output(status, lane)["forwarded"].as_u64().unwrap();
-        let time_s = |status: &Value| status["time_unix_ms"].as_u64().unwrap() as f64 / 1e3;
-        let forwarded = (count(&after) - count(&before)) as f64;
-        let elapsed_s = time_s(&after) - time_s(&before);
-        println!("{lane} forwards at {:.2} Hz", forwarded / elapsed_s);
-        let expected = rate_hz * elapsed_s;
-        assert!((forwarded - expected).abs() <= expected * 0.05 + 2.0, "{forwarded} of {expected}: {after}");
+        // A machine that is busy for long delays probes as a bad link does, and the mode follows. That time
+        // says nothing about the rate.
+        for _ in 0..5 {
+            let before = self.status();
+            std::thread::sleep(Duration::from_secs(seconds));
+            let after = self.status();
+            let (mode, epoch) = (&lane_of(&before, lane)["mode"], &lane_of(&before, lane)["policy_epoch"]);
+            if lane_of(&after, lane)["policy_epoch"] == *epoch {
+                return assert_rate_between(&before, &after, lane, rate_hz);
+            }
+            println!("{lane} was not {mode} all the time: once more");
+            self.wait("the same mode again", |status| lane_of(status, lane)["applied_mode"] == *mode);
+        }
+        panic!("{lane} has no mode for {seconds} s: {}", self.status());
     }
 
     /// Rewrites the configuration and has it read by every process.
@@ -137,6 +141,16 @@ fn assert_whole(status: &Value) {
     for part in routes.chain(outputs(status)) {
         assert_eq!(part["whole"], true, "{status}");
     }
+}
+
+fn assert_rate_between(before: &Value, after: &Value, lane: &str, rate_hz: f64) {
+    let count = |status: &Value| output(status, lane)["forwarded"].as_u64().unwrap();
+    let time_s = |status: &Value| status["time_unix_ms"].as_u64().unwrap() as f64 / 1e3;
+    let forwarded = (count(after) - count(before)) as f64;
+    let elapsed_s = time_s(after) - time_s(before);
+    println!("{lane} forwards at {:.2} Hz", forwarded / elapsed_s);
+    let expected = rate_hz * elapsed_s;
+    assert!((forwarded - expected).abs() <= expected * 0.05 + 2.0, "{forwarded} of {expected}: {after}");
 }
 
 fn by<'a>(list: &'a Value, key: &str, value: &str) -> Option<&'a Value> {
@@ -260,7 +274,8 @@ fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
     let before = slow.received();
     slow.wait_received(before + 10);
 
-    let transitions = subscriber(&scene.status(), "slow")["transitions"].as_u64().unwrap();
+    let (status, _) = scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    let transitions = subscriber(&status, "slow")["transitions"].as_u64().unwrap();
     println!(
         "demoted after {:.1} s, promoted after {:.1} s, {transitions} transitions; the link lost {}",
         demoted.as_secs_f64(),
@@ -269,7 +284,7 @@ fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
     );
     // To CRITICAL, to NONCRITICAL and back; a machine that is busy for long may add pairs.
     assert!(transitions >= 3 && transitions % 2 == 1, "{transitions} transitions");
-    assert_eq!(scene.said("subscriber demoted").len() as u64, transitions / 2);
+    assert!(scene.said("subscriber demoted").len() as u64 >= transitions / 2);
     slow.end::<Received>().assert_sound();
     scene.end_whole();
 }
