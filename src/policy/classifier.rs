@@ -33,10 +33,12 @@ pub enum TransitionReason {
         /// The last of the readings.
         reading: LinkReading,
     },
+    /// Subscribers are not classified any more.
+    Unclassified,
 }
 
 impl TransitionReason {
-    /// `override`, `loss`, `rtt`, `loss_and_rtt` or `recovered`.
+    /// `override`, `loss`, `rtt`, `loss_and_rtt`, `recovered` or `unclassified`.
     pub const fn label(&self) -> &'static str {
         match self {
             Self::Override => "override",
@@ -44,6 +46,7 @@ impl TransitionReason {
             Self::Demoted { by_rtt: true, .. } => "rtt",
             Self::Demoted { .. } => "loss",
             Self::Promoted { .. } => "recovered",
+            Self::Unclassified => "unclassified",
         }
     }
 }
@@ -154,6 +157,15 @@ impl SubscriberClassifier {
                 None
             }
         }
+    }
+
+    /// Nobody classifies this subscriber, and nothing is forced: whatever was found or forced before is no
+    /// longer looked after, so that it is UNKNOWN again.
+    pub fn unclassified(&mut self, thresholds: &ClassifierThresholds) -> Option<Transition> {
+        self.forced = false;
+        self.demotions = 0;
+        self.promotions = 0;
+        self.change(SubscriberState::Unknown, TransitionReason::Unclassified, thresholds)
     }
 
     /// `None` when nothing changes that is shown.

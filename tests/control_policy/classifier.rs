@@ -115,6 +115,26 @@ fn an_override_applies_at_once_and_the_classifier_goes_on_from_it() {
 }
 
 #[test]
+fn nothing_found_or_forced_stays_when_nobody_is_classified() {
+    let thresholds = ClassifierThresholds::default();
+    let mut classifier = SubscriberClassifier::new();
+    assert_eq!(classifier.unclassified(&thresholds), None);
+    run(&mut classifier, &[full(SLOW); 5]);
+    let change = classifier.unclassified(&thresholds).unwrap();
+    assert_eq!((change.from, change.to), (Noncritical, Unknown));
+    assert_eq!((change.reason, classifier.unclassified(&thresholds)), (TransitionReason::Unclassified, None));
+    // Nor do two of three readings.
+    run(&mut classifier, &[full(SLOW); 2]);
+    classifier.unclassified(&thresholds);
+    assert_eq!(run(&mut classifier, &[full(SLOW); 3]), [Unknown, Unknown, Noncritical]);
+    classifier.evaluate(&full(SLOW), &thresholds, Some(Critical));
+    classifier.unclassified(&thresholds);
+    assert!(!classifier.is_forced());
+    let never_unknown = ClassifierThresholds { allow_unknown_state: false, ..thresholds };
+    assert_eq!(classifier.state(&never_unknown), Critical);
+}
+
+#[test]
 fn an_unlisted_subscriber_is_forgotten_after_a_minute_of_silence() {
     assert!(!is_forgotten(at_ms(5), at_ms(5 + FORGET_UNLISTED_MS)));
     assert!(is_forgotten(at_ms(5), at_ms(6 + FORGET_UNLISTED_MS)));

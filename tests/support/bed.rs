@@ -29,11 +29,16 @@ impl Bed {
     /// Starts a bridge with this configuration, but for its instance name; records that `test` is skipped
     /// where the machine can't.
     pub fn start(test: &str, yaml: &str) -> Option<Self> {
+        Self::start_with(test, yaml, &[])
+    }
+
+    /// As [`start`](Self::start), with more hosts beside the four.
+    pub fn start_with(test: &str, yaml: &str, more: &[&str]) -> Option<Self> {
         if let Some(reason) = super::testbed_missing() {
             super::skip(test, &reason);
             return None;
         }
-        let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+        let net = Net::new(&[&["publisher", "bridge", "critical", "slow"], more].concat());
         let bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
         let up = bridge.start_on(net.host("bridge"), "up");
         let bed = Self { up, bridge, net };

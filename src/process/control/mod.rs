@@ -282,6 +282,8 @@ impl Control {
             self.settings = settings.clone();
             self.trust = trust(&self.settings, self.config.as_deref());
             self.subscribers.adopt(&self.settings, &self.link_of_lane, now);
+            // With the modes that follow from it, and not an evaluation later.
+            self.subscribers.show(&self.settings);
             self.diagnostics.adopt(&self.settings);
         }
         self.guard.keep_house(&mut self.participants, &self.settings, now);

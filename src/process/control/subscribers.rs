@@ -13,6 +13,27 @@ use crate::policy::{
 };
 use crate::shm::{BoardWriter, Boards};
 
+/// Who decides on a subscriber's state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Judge {
+    Classifier,
+    Override,
+    /// The classifier is switched off.
+    Nobody,
+}
+
+impl Judge {
+    /// Why a subscriber is in the state in which this one found it.
+    const fn reason_at_first(self, former: Self) -> &'static str {
+        match (self, former) {
+            (Self::Override, _) => "forced by the configuration (overrides)",
+            (Self::Nobody, _) => "not classified (classifier.enabled is false)",
+            (Self::Classifier, Self::Override) => "as the former override left it",
+            (Self::Classifier, _) => "not enough probes answered yet",
+        }
+    }
+}
+
 /// One subscriber.
 struct Subscriber {
     id: String,
@@ -27,6 +48,7 @@ struct Subscriber {
     /// The state before the last change.
     previous: Option<SubscriberState>,
     since: MonotonicNs,
+    judge: Judge,
     reason: String,
     warnings: SubscriberWarnings,
     /// Those that are shown, as `SubscriberWarning`'s bits.
@@ -85,12 +107,25 @@ impl Subscribers {
             subscriber.listed = is_listed(settings, &subscriber.id);
             let lane = lane_of(settings, &subscriber.id);
             if lane != subscriber.lane {
+                if link_of_lane[lane] != subscriber.link {
+                    // Answers to what is under way would come on a link that is its own no longer.
+                    subscriber.window.stopped(now, now);
+                }
                 (subscriber.lane, subscriber.link) = (lane, link_of_lane[lane]);
             }
         }
         let listed = settings.subscribers.keys().chain(settings.classifier.subscriber_id.iter());
         for id in listed {
-            if self.list.len() < MAX_SUBSCRIBERS && !self.list.iter().any(|known| known.id == *id) {
+            if self.list.iter().any(|known| known.id == *id) {
+                continue;
+            }
+            if self.list.len() == MAX_SUBSCRIBERS
+                && let Some(place) = self.list.iter().position(|known| !known.listed)
+            {
+                // Whoever made up the others cannot keep a listed one out.
+                self.list.remove(place);
+            }
+            if self.list.len() < MAX_SUBSCRIBERS {
                 let lane = lane_of(settings, id);
                 self.list.push(Subscriber::new(id, lane, link_of_lane[lane], true, settings, now));
             }
@@ -189,14 +224,22 @@ impl Subscribers {
             subscriber.reading = subscriber.window.reading(now);
             subscriber.warned = subscriber.warnings.read(&warning_thresholds, &subscriber.reading);
             let forced = settings.overrides.get(&subscriber.id).copied();
-            if !settings.classifier.enabled && forced.is_none() {
-                continue;
+            let judge = match forced {
+                Some(_) => Judge::Override,
+                None if settings.classifier.enabled => Judge::Classifier,
+                None => Judge::Nobody,
+            };
+            // Also where the state stays: a reason that no longer holds is worse than none.
+            let former = std::mem::replace(&mut subscriber.judge, judge);
+            if former != judge {
+                judge.reason_at_first(former).clone_into(&mut subscriber.reason);
             }
             let thresholds = &settings.classifier.thresholds;
-            let Some(transition) = subscriber.classifier.evaluate(&subscriber.reading, thresholds, forced)
-            else {
-                continue;
+            let transition = match judge {
+                Judge::Nobody => subscriber.classifier.unclassified(thresholds),
+                _ => subscriber.classifier.evaluate(&subscriber.reading, thresholds, forced),
             };
+            let Some(transition) = transition else { continue };
             subscriber.previous = Some(transition.from);
             subscriber.since = now;
             subscriber.reason = reason_text(&transition.reason);
@@ -210,10 +253,11 @@ impl Subscribers {
             });
         }
         self.list.retain(|subscriber| {
+            // One that was never heard has been listed until now.
             let left = !subscriber.listed
-                && subscriber.window.heard_at().is_some_and(|heard_at| is_forgotten(heard_at, now));
+                && subscriber.window.heard_at().is_none_or(|heard_at| is_forgotten(heard_at, now));
             if left {
-                info!(subscriber = subscriber.id, "silent for a minute and not listed: forgotten");
+                info!(subscriber = subscriber.id, "silent and not listed: forgotten");
             }
             !left
         });
@@ -277,9 +321,10 @@ impl Subscriber {
             reading: LinkReading::default(),
             previous: None,
             since: now,
+            judge: Judge::Classifier,
+            reason: Judge::Classifier.reason_at_first(Judge::Nobody).to_owned(),
             warnings: SubscriberWarnings::default(),
             warned: 0,
-            reason: "not enough probes answered yet".to_owned(),
         }
     }
 
@@ -325,7 +370,8 @@ fn reason_text(reason: &TransitionReason) -> String {
         format!("{rtt}, loss {:.1} % of {}", reading.loss * 100.0, reading.settled)
     };
     match reason {
-        TransitionReason::Override => "forced by the configuration (overrides)".to_owned(),
+        TransitionReason::Override => Judge::Override.reason_at_first(Judge::Classifier).to_owned(),
+        TransitionReason::Unclassified => Judge::Nobody.reason_at_first(Judge::Classifier).to_owned(),
         TransitionReason::Demoted { reading, .. } => {
             format!("impaired ({}): {}", reason.label(), numbers(reading))
         }

@@ -1,0 +1,568 @@
+//! Control on a bridge that runs: the shipped binary, subscribers on hosts of their own with a responder
+//! beside each, links that lose and delay, and samples that flow all the while.
+//!
+//! The critical subscriber gets each sample whatever happens; that ends every test.
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use adaptive_bridge::config::DdsNetwork;
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, ReaderQos, Take};
+use adaptive_bridge::model::{Durability, Reliability};
+use serde_json::Value;
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE, is_whole_and_quiet, outputs};
+use support::impairment::Impairment;
+use support::netns::Host;
+use support::peer::{Peer, Received, RunningPeer, Sent};
+use support::process::Process;
+
+/// Where the paper's figures don't matter: a window of 2 s in place of 10, and a patience with answers that a
+/// busy machine needs. What decides is loss.
+const QUICK: &str = "probes: {rate_hz: 10, window_size: 20, timeout_ms: 2000}\n\
+                     classifier: {evaluate_rate_hz: 5, demote_rtt_ms: 500, promote_rtt_ms: 400}\n";
+
+/// A link as bad as the worst of the paper's evaluation was when it was run.
+const STRONG: &str = "--level strong --reading as-run --delay-ms 20 --jitter-ms 10 --state off";
+
+/// A bridge, and the flow through it to a critical subscriber.
+struct Scene {
+    bed: Bed,
+    publisher: RunningPeer,
+    critical: RunningPeer,
+}
+
+impl Scene {
+    /// Samples at that rate; `at` is the host of the critical subscriber.
+    fn start(bed: Bed, rate_hz: f64, at: &str) -> Self {
+        bed.up.wait_for_log("control is up");
+        let critical = bed.subscribe(at, Peer::fast().keep_all(), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(rate_hz), INPUT);
+        critical.wait_received(20);
+        Self { bed, publisher, critical }
+    }
+
+    fn host(&self, name: &str) -> &Host {
+        self.bed.host(name)
+    }
+
+    /// A responder beside the subscriber on a host.
+    fn responder(&self, host: &str, id: &str) -> Process {
+        let responder = self.bed.bridge.start_on(self.host(host), &format!("responder --id {id}"));
+        responder.wait_for_log("responder is up");
+        responder
+    }
+
+    /// The link from the bridge to a host, well so far.
+    fn link(&self, host: &str, seed: u64) -> Impairment {
+        Impairment::start(self.host(host), self.host("bridge"), &format!("{STRONG} --seed {seed}"))
+    }
+
+    /// What `status` says now; every sample is accounted for in it.
+    fn status(&self) -> Value {
+        let status = self.bed.bridge.status();
+        assert_whole(&status);
+        status
+    }
+
+    /// Waits until the status fulfils a condition; yields it, and how long that took. Every sample is
+    /// accounted for all the while.
+    fn wait(&self, what: &str, mut fulfilled: impl FnMut(&Value) -> bool) -> (Value, Duration) {
+        let began = Instant::now();
+        let status = self.bed.bridge.wait_status(what, |status| {
+            assert_whole(status);
+            fulfilled(status)
+        });
+        (status, began.elapsed())
+    }
+
+    /// Waits until a subscriber is in a state and its lane in a mode that control has decided on.
+    fn wait_state(&self, id: &str, state: &str, lane: &str, mode: &str) -> (Value, Duration) {
+        let (status, took) = self.wait(&format!("{id} {state}, {lane} {mode}"), |status| {
+            let lane = lane_of(status, lane);
+            find(status, id).is_some_and(|found| found["state"] == state)
+                && lane["mode"] == mode
+                && lane["mode_reason"] == "control"
+                && lane["applied_mode"] == mode
+        });
+        let found = subscriber(&status, id);
+        println!("{id} {state} and {lane} {mode} after {:.1} s: {}", took.as_secs_f64(), found["reason"]);
+        (status, took)
+    }
+
+    /// Checks that a lane forwards at that rate for some seconds, by its own count: 5 % and two samples are
+    /// what the ends of the time and a busy machine may take.
+    fn assert_rate(&self, lane: &str, rate_hz: f64, seconds: u64) {
+        // A machine that is busy for long delays probes as a bad link does, and the mode follows. That time
+        // says nothing about the rate.
+        for _ in 0..5 {
+            let before = self.status();
+            std::thread::sleep(Duration::from_secs(seconds));
+            let after = self.status();
+            let (mode, epoch) = (&lane_of(&before, lane)["mode"], &lane_of(&before, lane)["policy_epoch"]);
+            if lane_of(&after, lane)["policy_epoch"] == *epoch {
+                return assert_rate_between(&before, &after, lane, rate_hz);
+            }
+            println!("{lane} was not {mode} all the time: once more");
+            self.wait("the same mode again", |status| lane_of(status, lane)["applied_mode"] == *mode);
+        }
+        panic!("{lane} has no mode for {seconds} s: {}", self.status());
+    }
+
+    /// Rewrites the configuration and has it read by every process.
+    fn reload(&self, yaml: &str) {
+        self.bed.bridge.write_config(&format!("instance: {{instance}}\n{yaml}"));
+        let output = self.bed.bridge.run("reload");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+
+    /// Lines of the log with a text in them.
+    fn said(&self, text: &str) -> Vec<String> {
+        self.bed.up.log().lines().filter(|line| line.contains(text)).map(str::to_owned).collect()
+    }
+
+    /// Ends the flow: the publisher was never held up, the critical subscriber got each sample once, and
+    /// every sample on every lane is accounted for.
+    fn end_whole(self) {
+        let sent: Sent = self.publisher.end();
+        self.critical.wait_received(sent.ok);
+        let received: Received = self.critical.end();
+        received.assert_all_of(&sent);
+        assert_eq!(sent.failed, 0, "{sent:?}");
+        println!("{} samples whole; write took {:?} µs", sent.ok, sent.call_us.map(|call| call.max));
+        assert!(is_whole_and_quiet(&self.bed.wait_whole()));
+        self.bed.end();
+    }
+}
+
+fn assert_whole(status: &Value) {
+    let routes = status["routes"].as_array().into_iter().flatten();
+    for part in routes.chain(outputs(status)) {
+        assert_eq!(part["whole"], true, "{status}");
+    }
+}
+
+fn assert_rate_between(before: &Value, after: &Value, lane: &str, rate_hz: f64) {
+    let count = |status: &Value| output(status, lane)["forwarded"].as_u64().unwrap();
+    let time_s = |status: &Value| status["time_unix_ms"].as_u64().unwrap() as f64 / 1e3;
+    let forwarded = (count(after) - count(before)) as f64;
+    let elapsed_s = time_s(after) - time_s(before);
+    println!("{lane} forwards at {:.2} Hz", forwarded / elapsed_s);
+    let expected = rate_hz * elapsed_s;
+    assert!((forwarded - expected).abs() <= expected * 0.05 + 2.0, "{forwarded} of {expected}: {after}");
+}
+
+fn by<'a>(list: &'a Value, key: &str, value: &str) -> Option<&'a Value> {
+    list.as_array().into_iter().flatten().find(|item| item[key] == value)
+}
+
+fn find<'a>(status: &'a Value, id: &str) -> Option<&'a Value> {
+    by(&status["subscribers"], "id", id)
+}
+
+fn subscriber<'a>(status: &'a Value, id: &str) -> &'a Value {
+    find(status, id).unwrap_or_else(|| panic!("{id} in {status}"))
+}
+
+fn lane_of<'a>(status: &'a Value, name: &str) -> &'a Value {
+    by(&status["lanes"], "name", name).unwrap_or_else(|| panic!("{name} in {status}"))
+}
+
+fn output<'a>(status: &'a Value, lane: &str) -> &'a Value {
+    outputs(status).find(|output| output["lane"] == lane).unwrap_or_else(|| panic!("{lane} in {status}"))
+}
+
+/// A ROS 2 node on a host.
+fn node_on(host: &Host, name: &str) -> Participant {
+    let options = ParticipantOptions {
+        network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+        namespace: "/fleet".into(),
+        node_name: name.into(),
+        graph_gid_bytes: 16,
+    };
+    host.within(|| Participant::open(&options).unwrap())
+}
+
+fn read(node: &mut Participant, topic: &str, dds_type: &str) -> RawReader {
+    let qos = ReaderQos {
+        reliability: Reliability::Reliable,
+        durability: Durability::Volatile,
+        depth: 64,
+        deadline_ms: None,
+    };
+    node.create_reader(topic, dds_type, &qos).unwrap()
+}
+
+/// The next payload of a reader for which `wanted` yields a value.
+fn wait_payload<T>(reader: &RawReader, what: &str, mut wanted: impl FnMut(&[u8]) -> Option<T>) -> T {
+    support::wait_for(what, || {
+        let mut found = None;
+        while found.is_none() {
+            let take = reader.take(&mut |payload, _| found = wanted(payload));
+            if take == Take::Empty {
+                break;
+            }
+        }
+        found
+    })
+}
+
+/// Little-endian CDR of messages of numbers, texts and lists.
+struct Cdr<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl Cdr<'_> {
+    fn u8(&mut self) -> u8 {
+        self.at += 1;
+        self.bytes[self.at - 1]
+    }
+
+    fn u32(&mut self) -> u32 {
+        self.at = self.at.next_multiple_of(4) + 4;
+        u32::from_le_bytes(self.bytes[self.at - 4..self.at].try_into().unwrap())
+    }
+
+    fn text(&mut self) -> String {
+        let length = self.u32() as usize;
+        self.at += length;
+        String::from_utf8(self.bytes[self.at - length..self.at - 1].to_vec()).unwrap()
+    }
+}
+
+/// The JSON of a `std_msgs/String`.
+fn json(payload: &[u8]) -> Value {
+    serde_json::from_str(&Cdr { bytes: payload, at: 0 }.text()).unwrap()
+}
+
+/// The statuses of a `diagnostic_msgs/DiagnosticArray`: level and values, by name.
+fn statuses(payload: &[u8]) -> BTreeMap<String, (u8, BTreeMap<String, String>)> {
+    let mut cdr = Cdr { bytes: payload, at: 0 };
+    let (_sec, _nanosec, _frame_id) = (cdr.u32(), cdr.u32(), cdr.text());
+    let statuses = (0..cdr.u32()).map(|_| {
+        let level = cdr.u8();
+        let (name, _message, _hardware_id) = (cdr.text(), cdr.text(), cdr.text());
+        (name, (level, (0..cdr.u32()).map(|_| (cdr.text(), cdr.text())).collect()))
+    });
+    statuses.collect()
+}
+
+#[test]
+fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
+    let test = "an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well";
+    // The paper's figures: 5 Hz, a window of 10 s, its thresholds, its rates.
+    let yaml = format!("{SCAN}subscribers: {{slow: noncritical}}\n");
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    let scene = Scene::start(bed, 100.0, "critical");
+    let slow = scene.bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL);
+    let _responder = scene.responder("slow", "slow");
+    let mut link = scene.link("slow", 7);
+    scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    scene.assert_rate("noncritical", 10.0, 6);
+
+    link.on();
+    let (status, demoted) = scene.wait_state("slow", "NONCRITICAL", "noncritical", "degraded");
+    assert!(lane_of(&status, "noncritical")["mode_detail"].as_str().unwrap().contains("slow"), "{status}");
+    assert_eq!(lane_of(&status, "critical")["mode"], "normal");
+    scene.assert_rate("noncritical", 3.0, 10);
+
+    let counters = link.off();
+    let (_, promoted) = scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    scene.assert_rate("noncritical", 10.0, 6);
+    let before = slow.received();
+    slow.wait_received(before + 10);
+
+    let (status, _) = scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    let transitions = subscriber(&status, "slow")["transitions"].as_u64().unwrap();
+    println!(
+        "demoted after {:.1} s, promoted after {:.1} s, {transitions} transitions; the link lost {}",
+        demoted.as_secs_f64(),
+        promoted.as_secs_f64(),
+        counters["loss"]
+    );
+    // To CRITICAL, to NONCRITICAL and back; a machine that is busy for long may add pairs.
+    assert!(transitions >= 3 && transitions % 2 == 1, "{transitions} transitions");
+    assert!(scene.said("subscriber demoted").len() as u64 >= transitions / 2);
+    slow.end::<Received>().assert_sound();
+    scene.end_whole();
+}
+
+#[test]
+fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
+    let test = "only_the_lane_of_the_impaired_subscriber_is_degraded";
+    // The other lane is in a domain of its own, and so is its responder.
+    let yaml = format!(
+        "{SCAN}{QUICK}lanes: {{rviz: {{domain_id: 7, max_rate_hz: 20, degraded_rate_hz: 5}}}}\n\
+         subscribers: {{robot_shop: noncritical, desk: {{lane: rviz}}}}\n"
+    );
+    let Some(bed) = Bed::start_with(test, &yaml, &["desk"]) else { return };
+    bed.up.wait_for_log("egress is up lane=\"rviz\"");
+    let scene = Scene::start(bed, 50.0, "critical");
+    let subscribers = [
+        scene.bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL),
+        scene.bed.subscribe("desk", Peer::fast().domain(7).best_effort(), "rt/adaptive_bridge/rviz/scan"),
+    ];
+    let _responders = [scene.responder("slow", "robot_shop"), scene.responder("desk", "desk")];
+    let mut links = [scene.link("slow", 1), scene.link("desk", 2)];
+    scene.wait_state("robot_shop", "CRITICAL", "noncritical", "normal");
+    scene.wait_state("desk", "CRITICAL", "rviz", "normal");
+
+    links[0].on();
+    scene.wait_state("robot_shop", "NONCRITICAL", "noncritical", "degraded");
+    scene.assert_rate("rviz", 20.0, 3);
+    let status = scene.status();
+    assert_eq!(lane_of(&status, "rviz")["mode"], "normal", "{status}");
+    assert_eq!(subscriber(&status, "desk")["transitions"], 1, "{status}");
+
+    links[0].off();
+    links[1].on();
+    scene.wait_state("desk", "NONCRITICAL", "rviz", "degraded");
+    scene.wait_state("robot_shop", "CRITICAL", "noncritical", "normal");
+    scene.assert_rate("rviz", 5.0, 3);
+    scene.assert_rate("noncritical", 10.0, 3);
+    links[1].off();
+    scene.wait_state("desk", "CRITICAL", "rviz", "normal");
+    for subscriber in subscribers {
+        let before = subscriber.received();
+        subscriber.wait_received(before + 5);
+        subscriber.end::<Received>().assert_sound();
+    }
+    scene.end_whole();
+}
+
+#[test]
+fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
+    let test = "a_responder_that_is_not_listed_appears_on_the_noncritical_lane";
+    let config = |listed: &str| format!("{SCAN}{QUICK}lanes: {{rviz: {{}}}}\nsubscribers: {listed}\n");
+    let Some(bed) = Bed::start(test, &config("{desk: rviz}")) else { return };
+    let scene = Scene::start(bed, 30.0, "critical");
+    let mut listener = node_on(scene.host("critical"), "listener");
+    let array = read(&mut listener, "rt/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_");
+    let string = "std_msgs::msg::dds_::String_";
+    let diagnostics = read(&mut listener, "rt/adaptive_bridge/diagnostics", string);
+    let decisions = read(&mut listener, "rt/adaptive_bridge/classifier/state", string);
+    assert_eq!(find(&scene.status(), "laptop"), None);
+
+    let _responder = scene.responder("slow", "laptop");
+    let (status, _) = scene.wait_state("laptop", "CRITICAL", "noncritical", "normal");
+    let laptop = subscriber(&status, "laptop");
+    assert_eq!((&laptop["lane"], &laptop["listed"]), (&"noncritical".into(), &false.into()), "{laptop}");
+    assert_eq!(scene.said("not listed under `subscribers`").len(), 1);
+    // One that is listed and was never heard is no reason to slow its lane.
+    let desk = subscriber(&status, "desk");
+    assert_eq!((&desk["state"], &desk["listed"]), (&"UNKNOWN".into(), &true.into()), "{desk}");
+    assert_eq!(lane_of(&status, "rviz")["mode"], "normal");
+
+    let mut link = scene.link("slow", 3);
+    link.on();
+    scene.wait_state("laptop", "NONCRITICAL", "noncritical", "degraded");
+    let decision = wait_payload(&decisions, "the decision", |payload| {
+        let decision = json(payload);
+        (decision["subscriber_id"] == "laptop" && decision["state"] == "NONCRITICAL").then_some(decision)
+    });
+    assert_eq!((&decision["lane"], &decision["v"]), (&"noncritical".into(), &1.into()), "{decision}");
+    let report = wait_payload(&diagnostics, "diagnostics of it", |payload| {
+        let report = json(payload);
+        find(&report, "laptop").is_some_and(|laptop| laptop["state"] == "NONCRITICAL").then_some(report)
+    });
+    assert_eq!(subscriber(&report, "laptop")["lane"], "noncritical");
+    assert_eq!(lane_of(&report, "noncritical")["mode"], "degraded", "{report}");
+    let (level, values) = wait_payload(&array, "its status", |payload| {
+        let found = statuses(payload).into_iter().find(|(name, _)| name.ends_with("subscriber laptop"));
+        found.map(|(_, status)| status).filter(|(_, values)| values["state"] == "NONCRITICAL")
+    });
+    assert_eq!((values["lane"].as_str(), values["listed"].as_str()), ("noncritical", "no"), "{values:?}");
+    assert_ne!(level, 0, "an impaired subscriber is no OK: {values:?}");
+
+    // Whom a reload lists takes his state along to his lane; one that was never heard and is listed no
+    // longer is nobody.
+    scene.reload(&config("{laptop: rviz}"));
+    let (status, _) = scene.wait_state("laptop", "NONCRITICAL", "rviz", "degraded");
+    let laptop = subscriber(&status, "laptop");
+    assert_eq!((&laptop["lane"], &laptop["listed"]), (&"rviz".into(), &true.into()), "{laptop}");
+    let (status, _) = scene.wait("one subscriber", |status| find(status, "desk").is_none());
+    assert_eq!(status["subscribers"].as_array().unwrap().len(), 1, "{status}");
+    scene.wait("noncritical normal", |status| lane_of(status, "noncritical")["applied_mode"] == "normal");
+    scene.end_whole();
+}
+
+#[test]
+fn a_responder_that_falls_silent_is_demoted_by_loss_and_comes_back() {
+    let test = "a_responder_that_falls_silent_is_demoted_by_loss_and_comes_back";
+    let yaml = format!("{SCAN}{QUICK}subscribers: {{slow: noncritical}}\n");
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    let scene = Scene::start(bed, 100.0, "critical");
+    let mut responder = scene.responder("slow", "slow");
+    scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    let wait_silent = || {
+        let (status, _) = scene.wait_state("slow", "NONCRITICAL", "noncritical", "degraded");
+        let slow = subscriber(&status, "slow");
+        assert!(slow["reason"].as_str().unwrap().contains("impaired (loss)"), "{slow}");
+        // Silence goes on being loss: nothing of it is forgotten.
+        scene.wait("a window of nothing but loss", |status| subscriber(status, "slow")["loss"] == 1.0);
+        scene.assert_rate("noncritical", 3.0, 2);
+    };
+
+    responder.stop();
+    wait_silent();
+    responder.cont();
+    scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    responder.kill9();
+    wait_silent();
+    let _responder = scene.responder("slow", "slow");
+    let (status, _) = scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
+    assert_eq!(status["subscribers"].as_array().unwrap().len(), 1, "{status}");
+    scene.end_whole();
+}
+
+#[test]
+fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
+    let test = "overrides_go_before_the_classifier_and_change_by_a_reload_under_flow";
+    let config = |classifier: &str, overrides: &str| {
+        let quick = QUICK.replace("classifier: {", &format!("classifier: {{enabled: {classifier}, "));
+        format!("{SCAN}{quick}subscribers: {{slow: noncritical}}\noverrides: {overrides}\n")
+    };
+    let Some(bed) = Bed::start(test, &config("true", "{slow: NONCRITICAL}")) else { return };
+    let scene = Scene::start(bed, 100.0, "critical");
+    let forced = |state, mode, forced: bool| {
+        scene.wait_state("slow", state, "noncritical", mode);
+        scene.wait("the override", |status| {
+            let slow = subscriber(status, "slow");
+            let reason = slow["reason"].as_str().unwrap();
+            slow["state"] == state && slow["forced"] == forced && reason.starts_with("forced") == forced
+        });
+    };
+    // At once: nobody has been probed yet.
+    forced("NONCRITICAL", "degraded", true);
+    let _responder = scene.responder("slow", "slow");
+    scene.wait("a full window", |status| subscriber(status, "slow")["settled"] == 20);
+    forced("NONCRITICAL", "degraded", true);
+
+    // Without it the classifier goes on, and a good link is seen for one.
+    scene.reload(&config("true", "{}"));
+    forced("CRITICAL", "normal", false);
+    let mut link = scene.link("slow", 5);
+    link.on();
+    forced("NONCRITICAL", "degraded", false);
+    scene.reload(&config("true", "{slow: CRITICAL}"));
+    forced("CRITICAL", "normal", true);
+    scene.assert_rate("noncritical", 10.0, 4);
+    forced("CRITICAL", "normal", true);
+    scene.reload(&config("true", "{}"));
+    forced("NONCRITICAL", "degraded", false);
+
+    // A bad file changes nothing and is told of.
+    scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{slow: GOOD}")));
+    assert_eq!(scene.bed.bridge.run("reload").status.code(), Some(78));
+    scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{}")));
+    scene.assert_rate("noncritical", 3.0, 4);
+
+    // Nobody is classified: the lane has its full rate, and nobody is shown as what he is not.
+    scene.reload(&config("false", "{}"));
+    forced("UNKNOWN", "normal", false);
+    scene.assert_rate("noncritical", 10.0, 4);
+    // An override counts all the same, and nothing of it stays.
+    scene.reload(&config("false", "{slow: NONCRITICAL}"));
+    forced("NONCRITICAL", "degraded", true);
+    scene.reload(&config("false", "{}"));
+    forced("UNKNOWN", "normal", false);
+    // Nor does what was found before: the other's override switches the classifier on for nobody else.
+    scene.reload(&config("false", "{another: NONCRITICAL}"));
+    scene.assert_rate("noncritical", 10.0, 4);
+    scene.reload(&config("true", "{}"));
+    forced("NONCRITICAL", "degraded", false);
+    // One that forces what is so already is told of too, and its end.
+    scene.reload(&config("true", "{slow: NONCRITICAL}"));
+    forced("NONCRITICAL", "degraded", true);
+    scene.reload(&config("true", "{}"));
+    forced("NONCRITICAL", "degraded", false);
+    scene.end_whole();
+}
+
+#[test]
+fn remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once() {
+    let test = "remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    // The critical subscriber is on the robot, where it should be.
+    let scene = Scene::start(bed, 50.0, "bridge");
+    assert_eq!(scene.status()["intruders"], Value::Array(Vec::new()));
+    let slow = scene.host("slow").clone();
+    let address = slow.address().to_string();
+
+    let input = Peer::cyclone().subscriber().topic(INPUT).start_on(&slow);
+    let critical = Peer::fast().best_effort().subscriber().topic(CRITICAL).start_on(&slow);
+    let mut rviz = node_on(&slow, "rviz");
+    let by_rviz = read(&mut rviz, INPUT, SCAN_TYPE);
+    let all = |status: &Value| status["intruders"].as_array().unwrap().len() == 3;
+    let (status, _) = scene.wait("three intruders", all);
+    let shown = |topic: &str, node: Value, remedy: &str| {
+        let intruders = status["intruders"].as_array().unwrap();
+        let found = intruders.iter().find(|it| it["topic"] == topic && it["node"] == node);
+        let found = found.unwrap_or_else(|| panic!("{topic} by {node} in {status}"));
+        assert!(found["host"].as_str().unwrap().contains(&address), "{found}");
+        assert!(found["remedy"].as_str().unwrap().contains(remedy), "{found}");
+    };
+    let remedy = "point it at /adaptive_bridge/noncritical/scan";
+    shown("/scan", Value::Null, remedy);
+    shown("/scan", "/fleet/rviz".into(), remedy);
+    shown("/adaptive_bridge/critical/scan", Value::Null, remedy);
+    assert_eq!(status["intruders_seen"], 3, "{status}");
+    assert!(!status["problems"].as_array().unwrap().is_empty(), "{status}");
+
+    // They stay for a while, and announce themselves again and again.
+    std::thread::sleep(Duration::from_secs(5));
+    for (who, topic) in [
+        ("a reader of no known node", "/scan itself"),
+        ("node /fleet/rviz", "/scan itself"),
+        ("a reader of no known node", "/adaptive_bridge/critical/scan"),
+    ] {
+        let text = format!("{who} on host {address} subscribes to {topic}");
+        let said = scene.said(&text);
+        assert_eq!(said.len(), 1, "{text} in {:?}", scene.said("subscribes to"));
+        assert!(said[0].contains("WARN") && said[0].contains(remedy), "{said:?}");
+    }
+
+    drop((by_rviz, rviz));
+    let _: Received = input.end();
+    critical.end::<Received>().assert_sound();
+    let (status, _) = scene.wait("no intruders", |status| status["intruders"] == Value::Array(Vec::new()));
+    assert_eq!(status["intruders_seen"], 3, "{status}");
+    support::wait_until("three ends in the log", || scene.said("gone: ").len() == 3);
+    scene.end_whole();
+}
+
+#[test]
+fn a_stopped_critical_subscriber_is_named_in_a_warning() {
+    let test = "a_stopped_critical_subscriber_is_named_in_a_warning";
+    let yaml = format!("{SCAN}lanes: {{critical: {{window_samples: 64}}}}\n");
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    bed.up.wait_for_log("control is up");
+    let laggard = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let other = bed.subscribe("slow", Peer::fast().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(50.0), INPUT);
+    laggard.wait_received(20);
+    laggard.stop();
+    bed.up.wait_for_log("critical writes failed");
+    let log = bed.up.log();
+    let warning = log.lines().find(|line| line.contains("critical writes failed")).unwrap();
+    println!("{warning}");
+    assert!(warning.contains("WARN") && warning.contains("critical"), "{warning}");
+    for host in ["critical", "slow"] {
+        assert!(warning.contains(&bed.host(host).address().to_string()), "{host} in {warning}");
+    }
+    laggard.cont();
+    for subscriber in [&laggard, &other] {
+        let before = subscriber.received();
+        subscriber.wait_received(before + 100);
+    }
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "the publisher notices nothing: {sent:?}");
+    let status = bed.wait_whole();
+    assert!(output(&status, "critical")["drops"]["window_full"].as_u64() > Some(0), "{status}");
+    for subscriber in [laggard, other] {
+        subscriber.end::<Received>().assert_sound();
+    }
+    bed.end();
+}
