@@ -7,9 +7,9 @@
 //! What others can bring about does not:
 //!
 //! - noncritical lanes, whatever they do: DEGRADED at most;
-//! - a subscriber that doesn't acknowledge (`window_full`) and a write that DDS refuses (`write_failed`):
-//!   DEGRADED at most. One bad reader would otherwise stop the data of all, which is what the bridge is there
-//!   to prevent;
+//! - a subscriber that doesn't acknowledge (`window_full`): nothing. One bad reader would otherwise take the
+//!   data from others, which is what the bridge is there to prevent, and to suspend them wouldn't mend it;
+//! - a write that DDS refuses (`write_failed`): DEGRADED at most;
 //! - a publisher's clock: the lag from source to shared memory leads to DEGRADED at most, see [`SourceLag`];
 //! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that is
 //!   silent doesn't count as its queue;
@@ -69,8 +69,6 @@ impl SourceLag {
 /// Errors of one process since the last evaluation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ErrorCounts {
-    /// Samples dropped because a reader doesn't acknowledge.
-    pub window_full: u64,
     /// Samples that the DDS library refused.
     pub write_failed: u64,
     /// Samples for which shared memory had no slot.
@@ -114,13 +112,7 @@ impl<'a> ProcessLoad<'a> {
             name,
             class,
             silent_ms: 0,
-            errors: ErrorCounts {
-                window_full: 0,
-                write_failed: 0,
-                pool_exhausted: 0,
-                queue_overflow: 0,
-                restarts: 0,
-            },
+            errors: ErrorCounts { write_failed: 0, pool_exhausted: 0, queue_overflow: 0, restarts: 0 },
             queued: 0,
             queue_capacity: 0,
             waiting: 0,
@@ -394,9 +386,9 @@ impl Reading {
         if let Some(elapsed_s) = elapsed_s {
             let errors = &process.errors;
             let ours = errors.queue_overflow.saturating_add(errors.pool_exhausted);
-            let others = errors.window_full.saturating_add(errors.write_failed);
             let ours_per_s = ours as f64 / elapsed_s;
-            let per_s = ours.saturating_add(others).saturating_add(errors.restarts) as f64 / elapsed_s;
+            let per_s =
+                ours.saturating_add(errors.write_failed).saturating_add(errors.restarts) as f64 / elapsed_s;
             if ours_per_s >= rules.emergency_errors_per_s {
                 let limit_per_s = rules.emergency_errors_per_s;
                 self.add(process, SafetyTrouble::Errors { per_s: ours_per_s, limit_per_s }, true);

@@ -127,8 +127,8 @@ fn each_trouble_of_the_critical_path_speaks_for_what_it_should() {
         ("six lost samples a second", lost(3), Degraded),
         ("100 lost samples a second", lost(50), Emergency),
         (
-            "readers that don't acknowledge",
-            errors(ErrorCounts { window_full: 1 << 40, write_failed: 1 << 40, ..ErrorCounts::default() }),
+            "writes that DDS refuses",
+            errors(ErrorCounts { write_failed: 1 << 40, ..ErrorCounts::default() }),
             Degraded,
         ),
         ("restarts", errors(ErrorCounts { restarts: u64::MAX, ..ErrorCounts::default() }), Degraded),
@@ -151,11 +151,7 @@ fn each_trouble_of_a_noncritical_lane_speaks_for_degraded_at_most() {
         ("as many as may wait", ProcessLoad { waiting: 50, ..NONCRITICAL }, Normal),
         ("lag", ProcessLoad { writer_lag_ms: Some(1e9), ..NONCRITICAL }, Degraded),
         ("SIGSTOP", ProcessLoad { silent_ms: 600_000, waiting: 4_096, ..NONCRITICAL }, Normal),
-        (
-            "a reader that doesn't acknowledge, and a limited rate",
-            errors(ErrorCounts { window_full: 1 << 40, queue_overflow: 1 << 40, ..ErrorCounts::default() }),
-            Normal,
-        ),
+        ("a limited rate", errors(ErrorCounts { queue_overflow: 1 << 40, ..ErrorCounts::default() }), Normal),
         ("failed writes", errors(ErrorCounts { write_failed: 3, ..ErrorCounts::default() }), Degraded),
     ];
     for (what, process, expected) in cases {
@@ -182,7 +178,7 @@ fn a_restart_of_a_process_never_causes_emergency() {
 #[test]
 fn a_control_process_that_was_stopped_changes_nothing() {
     let mut bench = bench();
-    let errors = ErrorCounts { queue_overflow: 400, window_full: 100, ..ErrorCounts::default() };
+    let errors = ErrorCounts { queue_overflow: 400, write_failed: 100, ..ErrorCounts::default() };
     bench.now_ms += 3_600_000;
     assert_eq!(bench.last(ProcessLoad { silent_ms: 3_600_000, errors, ..EXTREME }, 1), Normal);
     assert_eq!(bench.last(CRITICAL, 1), Normal);
@@ -208,12 +204,11 @@ fn a_constant_difference_between_clocks_is_no_lag_and_growth_is() {
 
 fn load(class: TrafficClass) -> impl Strategy<Value = ProcessLoad<'static>> {
     let count = prop_oneof![Just(0), 0..100_u64, any::<u64>()];
-    let errors = prop::collection::vec(count.clone(), 5).prop_map(|n| ErrorCounts {
-        window_full: n[0],
-        write_failed: n[1],
-        pool_exhausted: n[2],
-        queue_overflow: n[3],
-        restarts: n[4],
+    let errors = prop::collection::vec(count.clone(), 4).prop_map(|n| ErrorCounts {
+        write_failed: n[0],
+        pool_exhausted: n[1],
+        queue_overflow: n[2],
+        restarts: n[3],
     });
     let lag = prop_oneof![Just(None), (-1e5..1e5).prop_map(Some), Just(Some(f64::NAN))];
     (errors, count.clone(), count.clone(), count.clone(), count, lag.clone(), lag).prop_map(

@@ -158,7 +158,6 @@ impl Supervision {
         for output in &configured.outputs {
             let counters = boards.lane(lane, output.route).unwrap_or_default();
             let drops = |reason| counters.drops.get(reason);
-            total.window_full += drops(DropReason::WindowFull);
             total.write_failed += drops(DropReason::WriteFailed);
             total.queue_overflow += drops(DropReason::QueueOverflow);
             queued = queued.max(in_queue(&counters, published[output.route]));
@@ -230,7 +229,6 @@ impl Former {
             return there.then(|| (now.since(health.alive_at) / 1_000_000, ErrorCounts::default()));
         }
         let errors = ErrorCounts {
-            window_full: grown(total.window_full, before.window_full),
             write_failed: grown(total.write_failed, before.write_failed),
             pool_exhausted: grown(total.pool_exhausted, before.pool_exhausted),
             queue_overflow: grown(total.queue_overflow, before.queue_overflow),
