@@ -255,7 +255,7 @@ fn a_stopped_critical_subscriber_fills_the_window_and_holds_nobody_up() {
     let before = laggard.received();
     laggard.wait_received(before + 100);
     let sent: Sent = publisher.end();
-    assert_eq!((sent.failed, sent.skipped_ticks), (0, 0), "the publisher notices nothing: {sent:?}");
+    assert_eq!(sent.failed, 0, "no call of the publisher waited in vain: {sent:?}");
     let status = bed.wait_whole();
     let critical = lane(&status, "critical");
     assert_eq!(
