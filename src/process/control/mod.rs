@@ -270,6 +270,7 @@ impl Control {
             classifies: u8::from(
                 self.settings.classifier.enabled && self.settings.probes.enabled && self.trust.is_some(),
             ),
+            without_secret: u8::from(self.trust.is_none()),
             ..*self.record.get()
         };
         if shown != *self.record.get() {

@@ -86,6 +86,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         problems.extend(process_problem(process, former, now));
     }
     problems.extend(control::missing(now));
+    problems.extend(control::without_secret(now));
     for (route, output) in outputs(now) {
         problems.extend(unaccounted(route, output, &now.lanes[output.lane]));
     }
