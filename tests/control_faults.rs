@@ -15,7 +15,9 @@ use adaptive_bridge::config::{DdsNetwork, SecretSource, Security, TrustMode};
 use adaptive_bridge::dds::{
     Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take, WriterEvent,
 };
-use adaptive_bridge::model::{Durability, Encapsulation, ProbeRefusal, Reliability, SourceTimestamp, WallNs};
+use adaptive_bridge::model::{
+    Durability, Encapsulation, History, ProbeRefusal, QosProfile, Reliability, SourceTimestamp, WallNs,
+};
 use adaptive_bridge::process::probes::{
     PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeRequest, ProbeResponse, Trust,
 };
@@ -399,9 +401,10 @@ impl Stranger {
         let mut reader = |topic| participant.create_reader(topic, PROBE_TYPE, &PROBE_READER_QOS).unwrap();
         let requests = reader("rt/adaptive_bridge/probe_req");
         let responses = reader("rt/adaptive_bridge/probe_resp");
-        let writer = participant
-            .create_writer("rt/adaptive_bridge/probe_resp", PROBE_TYPE, &PROBE_WRITER_QOS, 64)
-            .unwrap();
+        // Else a flood would overwrite itself before it has left.
+        let qos = QosProfile { history: History::KeepLast { depth: 4096 }, ..PROBE_WRITER_QOS };
+        let writer =
+            participant.create_writer("rt/adaptive_bridge/probe_resp", PROBE_TYPE, &qos, 4096).unwrap();
         let mut stranger = Self {
             requests,
             responses,
