@@ -20,6 +20,8 @@ has_python() {
     return 1
 }
 
+has_faketime() { ls /usr/lib/*/faketime/libfaketimeMT.so.1 >/dev/null 2>&1; }
+
 # Each line: whether it is there, the packages that bring it (the first that exists is taken), what needs it.
 missing=""
 lacking=""
@@ -45,6 +47,7 @@ check_all() {
     need "has nsenter" util-linux "tests between hosts (network namespaces)"
     need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
     need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
+    need "has_faketime" faketime "tests with a wall clock that steps"
     need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
 }
 

@@ -4,7 +4,6 @@ mod support;
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
-use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,18 +19,10 @@ use adaptive_bridge::telemetry::{
     RouteReading, Snapshot, SubscriberReading,
 };
 use serde_json::Value;
+use support::prometheus::{parse, python};
 
 /// Would end its label, its line and its name, if it were not escaped.
 const HOSTILE: &str = "x\"} 1\nadaptive_bridge_info{a=\"\\";
-
-/// Reads a page from standard input and prints each family: name, type, samples as [name, labels, value].
-const PARSER: &str = "
-import json, sys
-from prometheus_client.parser import text_string_to_metric_families
-text = sys.stdin.buffer.read().decode()
-families = text_string_to_metric_families(text)
-print(json.dumps([[f.name, f.type, [[s.name, s.labels, str(s.value)] for s in f.samples]] for f in families]))
-";
 
 /// A bridge of one route, its critical lane and one subscriber.
 fn report() -> Report {
@@ -109,29 +100,6 @@ fn scrape(report: Report) -> String {
     let mut answer = String::new();
     client.read_to_string(&mut answer).unwrap();
     answer.split_once("\r\n\r\n").expect(&answer).1.to_owned()
-}
-
-/// A Python that has the parser. That of the system is not always the first in the path.
-fn python() -> Option<&'static str> {
-    let has_parser = |python: &&str| {
-        let import = Command::new(python).args(["-c", "import prometheus_client.parser"]).output();
-        import.is_ok_and(|import| import.status.success())
-    };
-    ["python3", "/usr/bin/python3"].into_iter().find(has_parser)
-}
-
-fn parse(python: &str, page: &str) -> Vec<(String, String, Vec<Value>)> {
-    let mut parser = Command::new(python)
-        .args(["-c", PARSER])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    parser.stdin.take().unwrap().write_all(page.as_bytes()).unwrap();
-    let output = parser.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}\n{page}", String::from_utf8_lossy(&output.stderr));
-    serde_json::from_slice(&output.stdout).unwrap()
 }
 
 #[test]

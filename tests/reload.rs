@@ -3,28 +3,18 @@
 
 mod support;
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::Duration;
 
-use adaptive_bridge::clock;
 use adaptive_bridge::config::{self, DdsNetwork, Settings};
-use adaptive_bridge::dds::{
-    Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take, WriterEvent,
-};
-use adaptive_bridge::model::{
-    Durability, Encapsulation, ProcessHealth, QosProfile, Reliability, SourceTimestamp,
-};
+use adaptive_bridge::dds::{Participant, ParticipantOptions};
+use adaptive_bridge::model::ProcessHealth;
 use adaptive_bridge::shm::{Boards, BridgeShape, ProcessRole};
-use bytes::Bytes;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bridge::Bridge;
+use support::flow::{Flow, lane};
 use support::process::{self, Process};
 use support::{wait_for, wait_until};
-
-const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
 /// The file of a bridge of one route; `more` is what it says beside.
 fn file(domain_id: u16, more: &str) -> String {
@@ -67,94 +57,9 @@ fn participant(name: &str, domain_id: u16) -> Participant {
     .unwrap()
 }
 
-/// A subscriber of the critical lane, and a publisher of about 200 numbered samples per second that has begun
-/// when the bridge has matched both.
-struct Flow {
-    reader: RawReader,
-    received: Vec<u32>,
-    stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<u32>>,
-    _participants: [Participant; 2],
-}
-
-impl Flow {
-    fn start(bridge: &Bridge, domain_id: u16) -> Self {
-        let mut publisher = participant("publisher", domain_id);
-        let writer: RawWriter =
-            publisher.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
-        wait_until("ingress to match the publisher", || {
-            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
-        });
-        let mut subscriber = participant("subscriber", domain_id);
-        let qos = ReaderQos {
-            reliability: Reliability::Reliable,
-            durability: Durability::Volatile,
-            depth: 100_000,
-            deadline_ms: None,
-        };
-        let reader = subscriber.create_reader("rt/adaptive_bridge/critical/scan", TYPE, &qos).unwrap();
-        bridge.wait_status("the subscriber", |status| lane(status, "critical")["readers"] == 1);
-        let stop = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let mut number = 0_u32;
-            while !asked.load(Ordering::Relaxed) {
-                let payload = [number.to_le_bytes(), [0; 4]].concat();
-                let stamp = SourceTimestamp::from_wall(clock::wall());
-                writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
-                number += 1;
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            // Until the last one has been acknowledged, the writer must stay.
-            writer.wait_acknowledged(support::patience());
-            number
-        });
-        let participants = [publisher, subscriber];
-        Self { reader, received: Vec::new(), stop, thread: Some(thread), _participants: participants }
-    }
-
-    fn receive(&mut self) {
-        let received = &mut self.received;
-        let mut lend = |payload: &[u8], _| {
-            received.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
-        };
-        while self.reader.take(&mut lend) != Take::Empty {}
-    }
-
-    /// Ends the flow: every sample has reached the critical subscriber, in order, and the bridge can account
-    /// for each on both lanes.
-    fn end_whole(mut self, bridge: &Bridge) {
-        self.stop.store(true, Ordering::Relaxed);
-        let sent = self.thread.take().unwrap().join().unwrap();
-        wait_until("every sample at the critical subscriber", || {
-            self.receive();
-            self.received.len() >= sent as usize
-        });
-        assert_eq!(self.received, (0..sent).collect::<Vec<_>>());
-        let status = bridge.wait_status("every sample accounted for", |status| {
-            let settled = |name| {
-                let lane = lane(status, name);
-                lane["received"] == sent && lane["waiting"] == 0
-            };
-            settled("critical") && settled("noncritical")
-        });
-        assert_eq!(status["routes"][0]["whole"], true, "{status}");
-        for name in ["critical", "noncritical"] {
-            assert_eq!(lane(&status, name)["whole"], true, "{status}");
-        }
-        assert_eq!(lane(&status, "critical")["forwarded"], sent, "{status}");
-    }
-}
-
-impl Drop for Flow {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-    }
-}
-
-fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
-    let lanes = status["routes"][0]["lanes"].as_array().unwrap();
-    lanes.iter().find(|lane| lane["lane"] == name).unwrap()
+/// A flow in that domain.
+fn flow(bridge: &Bridge, domain_id: u16) -> Flow {
+    Flow::start(bridge, |name| participant(name, domain_id))
 }
 
 /// Waits until the noncritical lane forwards at about that rate.
@@ -191,7 +96,7 @@ fn assert_same_processes(before: &[ProcessHealth; 3], now: &[ProcessHealth; 3]) 
 fn rates_and_staleness_change_under_flow_and_no_sample_is_lost() {
     let bridge = Bridge::new(&file(110, ""));
     let (_up, before) = up(&bridge);
-    let flow = Flow::start(&bridge, 110);
+    let flow = flow(&bridge, 110);
     wait_rate(&bridge, 10.0);
 
     bridge.write_config(&file(
@@ -229,7 +134,7 @@ fn a_bad_file_changes_nothing_and_is_reported() {
     let bridge = Bridge::new(&file(111, ""));
     let good = settings(&bridge);
     let (up, before) = up(&bridge);
-    let flow = Flow::start(&bridge, 111);
+    let flow = flow(&bridge, 111);
     bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: -1}}\nclassifyer: {}"));
 
     // The command asks nobody.
@@ -266,7 +171,7 @@ fn what_needs_a_restart_is_named_and_left_as_it_is() {
     let bridge = Bridge::new(&file(112, ""));
     let old = settings(&bridge);
     let (_up, before) = up(&bridge);
-    let flow = Flow::start(&bridge, 112);
+    let flow = flow(&bridge, 112);
     bridge.write_config(&file(
         112,
         "lanes: {rviz: {}, noncritical: {domain_id: 113, max_rate_hz: 20}}\n\
@@ -307,7 +212,7 @@ fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
         healths(&started)
     });
     assert!(before.iter().all(|health| health.starts == 1), "{before:?}\n{}", up_process.log());
-    let flow = Flow::start(&bridge, 113);
+    let flow = flow(&bridge, 113);
     let storm = || {
         for round in 0..100 {
             let rate_hz = 10 + round % 2 * 10;

@@ -10,6 +10,7 @@ use crate::config::{self, DdsNetwork, NetworkSelector, SecretSource, Settings};
 use crate::model::{LaneName, TopicName, is_probe_id};
 use crate::process::probes::Trust;
 use crate::process::{self, ResponderOptions};
+use crate::telemetry;
 
 /// What `responder` is asked.
 ///
@@ -48,6 +49,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
             return ExitCode::from(EXIT_CONFIG);
         }
     };
+    telemetry::set_verbosity(settings.diagnostics.verbosity);
     let request_topic = arguments.request_topic.as_ref().unwrap_or(&settings.probes.request_topic);
     let response_topic = arguments.response_topic.as_ref().unwrap_or(&settings.probes.response_topic);
     if request_topic == response_topic {

@@ -8,6 +8,7 @@ use clap::Args;
 use super::{ConfigArguments, failed};
 use crate::config::Settings;
 use crate::process::{self, HangUp, ReloadRequests, RoleError, Stop};
+use crate::telemetry;
 
 /// What `egress` is asked.
 #[derive(Args, Debug)]
@@ -42,6 +43,7 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
         Ok(settings) => settings,
         Err(code) => return code,
     };
+    telemetry::set_verbosity(settings.diagnostics.verbosity);
     let passed_on: Vec<OsString> = match arguments.path() {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
@@ -63,6 +65,7 @@ fn role(
         Ok(settings) => settings,
         Err(code) => return code,
     };
+    telemetry::set_verbosity(settings.diagnostics.verbosity);
     run(|stop| role(&settings, reloads, stop))
 }
 

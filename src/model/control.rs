@@ -35,8 +35,10 @@ pub struct ControlRecord {
     pub safety: u8,
     /// 1 while subscribers are classified.
     pub classifies: u8,
+    /// 1 while nobody is probed because the secret of the probes cannot be had.
+    pub without_secret: u8,
     /// Always 0.
-    pub reserved: [u8; 6],
+    pub reserved: [u8; 5],
     /// What brought the safety mode about; empty in normal mode.
     pub safety_reason: FixedText,
 }

@@ -24,6 +24,7 @@ use crate::clock;
 use crate::config::{ConfigError, Reload, Settings};
 use crate::model::MonotonicNs;
 use crate::shm::{RoleHolder, ShmError};
+use crate::telemetry;
 
 type Load = Box<dyn FnMut() -> Result<Settings, ConfigError> + Send>;
 
@@ -230,6 +231,7 @@ fn serve(
             Ok(new) => {
                 let file_fingerprint = new.fingerprint();
                 let (settings, reload) = present.reloaded(new);
+                telemetry::set_verbosity(settings.diagnostics.verbosity);
                 log(&reload);
                 present = settings.clone();
                 (Outcome::Accepted(Box::new(settings)), ReloadResult::Accepted { file_fingerprint, reload })

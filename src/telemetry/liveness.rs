@@ -25,7 +25,9 @@ pub enum ProcessState {
     Stopped,
     /// It is there and its data path has not turned for more than 2 s.
     Silent,
-    /// It is gone.
+    /// It has ended in good order, because it was told to.
+    Ended,
+    /// It is gone without a word.
     Dead,
 }
 
@@ -37,6 +39,7 @@ impl ProcessState {
             Self::Running => "running",
             Self::Stopped => "stopped",
             Self::Silent => "silent",
+            Self::Ended => "ended",
             Self::Dead => "dead",
         }
     }
@@ -55,6 +58,7 @@ impl ProcessState {
         let silent_for_ns = now.since(health.alive_at);
         match kernel_state {
             _ if health.pid == 0 => Self::NotStarted,
+            _ if health.ended != 0 => Self::Ended,
             Some('T' | 't') => Self::Stopped,
             // A zombie has ended, and its parent has not looked.
             Some('Z' | 'X') => Self::Dead,
@@ -91,6 +95,15 @@ mod tests {
         assert_eq!(state(7, Some('T'), 0), ProcessState::Stopped);
         assert_eq!(state(7, Some('Z'), 0), ProcessState::Dead);
         assert_eq!(state(7, None, 501), ProcessState::Dead);
+    }
+
+    #[test]
+    fn a_process_that_said_goodbye_has_ended_and_is_not_dead() {
+        for kernel_state in [None, Some('S'), Some('Z')] {
+            let health = ProcessHealth { pid: 7, ended: 1, ..ProcessHealth::default() };
+            let state = ProcessState::of(&health, kernel_state, MonotonicNs(u64::MAX));
+            assert_eq!((state, state.exists()), (ProcessState::Ended, false));
+        }
     }
 
     #[test]

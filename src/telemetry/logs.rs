@@ -1,25 +1,59 @@
 //! Logs, on stderr.
 
 use std::io::IsTerminal;
+use std::sync::OnceLock;
 
-use tracing_subscriber::EnvFilter;
+use tracing::warn;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Registry, reload};
 
-/// Without `RUST_LOG`: ourselves in full; of the libraries what is an error. A RELIABLE writer of RustDDS
-/// warns of each sample that its full window refuses; those are counted and named here.
-const DEFAULT_FILTER: &str = "info,rustdds=error,ros2_client=error,iceoryx2=error";
+use crate::config::Verbosity;
 
-/// Starts logging to stderr, filtered by `RUST_LOG`. What the libraries log through the `log` crate comes
-/// too.
+/// The filter, where `RUST_LOG` leaves it to the configuration.
+static CONFIGURED: OnceLock<reload::Handle<EnvFilter, Registry>> = OnceLock::new();
+
+/// Starts logging to stderr, filtered by `RUST_LOG`; without it as [`set_verbosity`] says, and until then as
+/// [`Verbosity::Info`]. What the libraries log through the `log` crate comes too.
 pub fn start_logs() {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
-    let outcome = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
+    let asked_for = environment.and_then(|text| EnvFilter::try_new(text).ok());
+    let is_configured = asked_for.is_none();
+    let (filter, handle) = reload::Layer::new(asked_for.unwrap_or_else(|| filter(Verbosity::Info)));
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         // It would say on stderr that stderr is gone, a closed terminal say, and panic because it cannot.
         .log_internal_errors(false)
-        .with_ansi(std::io::stderr().is_terminal())
-        .try_init();
-    if let Err(error) = outcome {
-        eprintln!("no logs: {error}");
+        .with_ansi(std::io::stderr().is_terminal());
+    match tracing_subscriber::registry().with(filter).with(lines).try_init() {
+        Ok(()) if is_configured => {
+            // It is set once: logs cannot be started twice.
+            let _ = CONFIGURED.set(handle);
+        }
+        Ok(()) => {}
+        Err(error) => eprintln!("no logs: {error}"),
     }
+}
+
+/// From now on logs what the configuration asks for (`diagnostics.verbosity`). Does nothing where `RUST_LOG`
+/// says what to log.
+pub fn set_verbosity(verbosity: Verbosity) {
+    if let Some(handle) = CONFIGURED.get()
+        && let Err(error) = handle.reload(filter(verbosity))
+    {
+        warn!(%error, "the verbosity of the log stays as it is");
+    }
+}
+
+/// Ourselves as asked; of the libraries what is an error. A RELIABLE writer of RustDDS warns of each sample
+/// that its full window refuses; those are counted and named here.
+fn filter(verbosity: Verbosity) -> EnvFilter {
+    let own = match verbosity {
+        Verbosity::Error => "error",
+        Verbosity::Warn => "warn",
+        Verbosity::Info => "info",
+        Verbosity::Debug => "debug",
+        Verbosity::Trace => "trace",
+    };
+    EnvFilter::new(format!("error,adaptive_bridge={own},adaptive_bridge_eval={own}"))
 }

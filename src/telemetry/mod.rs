@@ -18,7 +18,7 @@ pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES,
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};
 pub use liveness::ProcessState;
-pub use logs::start_logs;
+pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problems::{Level, Problem};
 pub use report::{

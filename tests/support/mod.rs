@@ -8,11 +8,13 @@
 
 pub mod bed;
 pub mod bridge;
+pub mod flow;
 #[cfg(feature = "eval")]
 pub mod impairment;
 pub mod netns;
 pub mod peer;
 pub mod process;
+pub mod prometheus;
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;

@@ -26,7 +26,7 @@ use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{
     ControlRecord, FixedText, LaneMode, LanePolicy, MonotonicNs, ProbeRefusal, RefusalCounts, SafetyMode,
 };
-use crate::policy::{LaneDecision, LaneReason, STOPPED_NS, safety_floor};
+use crate::policy::{LaneDecision, LaneReason, safety_floor};
 use crate::shm::{BoardWriter, ProcessRole};
 use diagnostics::Diagnostics;
 use intruders::Guard;
@@ -88,8 +88,6 @@ struct Control {
     refusals: RefusalLog,
     /// What was decided last for each lane, to tell a change.
     decided: Vec<String>,
-    /// When this thread last asked to be woken.
-    asked_at: Option<MonotonicNs>,
     probe_at: MonotonicNs,
     evaluate_at: MonotonicNs,
     supervise_at: MonotonicNs,
@@ -136,7 +134,6 @@ impl Control {
             record,
             refusals: RefusalLog::default(),
             decided: vec![String::new(); settings.lanes.len()],
-            asked_at: None,
             probe_at: now,
             evaluate_at: now,
             supervise_at: now,
@@ -148,11 +145,7 @@ impl Control {
     /// Does what is due, and says when the next is.
     fn turn(&mut self) -> MonotonicNs {
         let now = clock::monotonic();
-        if let Some(asked_at) = self.asked_at.take()
-            && now.since(asked_at) > STOPPED_NS
-        {
-            self.subscribers.stopped(asked_at, now);
-        }
+        self.subscribers.awake(now);
         self.receive();
         if now >= self.probe_at {
             self.probe();
@@ -180,7 +173,7 @@ impl Control {
         if wait_ns > 0 {
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
-        self.asked_at = Some(until);
+        self.subscribers.asleep(until);
     }
 
     fn receive(&mut self) {
@@ -270,6 +263,7 @@ impl Control {
             classifies: u8::from(
                 self.settings.classifier.enabled && self.settings.probes.enabled && self.trust.is_some(),
             ),
+            without_secret: u8::from(self.trust.is_none()),
             ..*self.record.get()
         };
         if shown != *self.record.get() {

@@ -67,7 +67,7 @@ impl Supervision {
         self.supervisor.transitions()
     }
 
-    /// What brought it about, or what is wrong though the mode has not changed; empty when nothing is.
+    /// What brought it about; empty in normal mode.
     pub fn reason(&self) -> &str {
         &self.reason
     }
@@ -83,7 +83,8 @@ impl Supervision {
         let inputs = SafetyInputs { processes: &loads };
         let decision = self.supervisor.evaluate(&inputs, &settings.safety.rules, now);
         self.critical_trouble = decision.critical_trouble;
-        self.reason = decision.cause.as_ref().map(cause_text).unwrap_or_default();
+        let cause = decision.cause.as_ref().filter(|_| decision.mode != SafetyMode::Normal);
+        self.reason = cause.map(cause_text).unwrap_or_default();
         let Some(from) = decision.changed_from else { return };
         self.since = now;
         let (from, to) = (from.label(), decision.mode.label());

@@ -8,8 +8,8 @@ use crate::model::{
     FixedText, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, SubscriberRecord, SubscriberState,
 };
 use crate::policy::{
-    Answer, LaneDecision, LinkReading, ProbeWindow, SubscriberClassifier, SubscriberWarnings, Transition,
-    TransitionReason, WarningThresholds, is_forgotten, lane_mode,
+    Answer, LaneDecision, LinkReading, ProbeWindow, STOPPED_NS, SubscriberClassifier, SubscriberWarnings,
+    Transition, TransitionReason, WarningThresholds, is_forgotten, lane_mode,
 };
 use crate::shm::{BoardWriter, Boards};
 
@@ -78,6 +78,8 @@ pub(super) struct Shown<'a> {
 /// All subscribers, listed ones first.
 pub(super) struct Subscribers {
     list: Vec<Subscriber>,
+    /// When control was last seen to run, or until when it means to sleep.
+    awake_at: MonotonicNs,
     /// The place of each in the table on the board is its place in the list.
     places: Vec<BoardWriter<SubscriberRecord>>,
 }
@@ -87,6 +89,7 @@ impl Subscribers {
     pub fn new(boards: &Boards, settings: &Settings, link_of_lane: &[usize], now: MonotonicNs) -> Self {
         let mut subscribers = Self {
             list: Vec::with_capacity(MAX_SUBSCRIBERS),
+            awake_at: now,
             places: (0..MAX_SUBSCRIBERS).map(|place| boards.subscriber_writer(place)).collect(),
         };
         subscribers.adopt(settings, link_of_lane, now);
@@ -134,6 +137,7 @@ impl Subscribers {
 
     /// A probe was sent on a link.
     pub fn sent(&mut self, link: usize, seq: u64, at: MonotonicNs) {
+        self.awake(at);
         // With the answers, a recording of the link: `RUST_LOG=adaptive_bridge::process::control=trace`.
         trace!(link, seq, sent_at_ms = at.0 / 1_000_000, "probe sent");
         for subscriber in self.list.iter_mut().filter(|subscriber| subscriber.link == link) {
@@ -141,11 +145,20 @@ impl Subscribers {
         }
     }
 
-    /// Control did not run in between: what was under way says nothing.
-    pub fn stopped(&mut self, from: MonotonicNs, until: MonotonicNs) {
-        for subscriber in &mut self.list {
-            subscriber.window.stopped(from, until);
+    /// Control runs. If it has not for much longer than it meant to, then what was under way says nothing.
+    /// It may be stopped anywhere, so that this is asked whenever the windows are told of something.
+    pub fn awake(&mut self, now: MonotonicNs) {
+        if now.since(self.awake_at) > STOPPED_NS {
+            for subscriber in &mut self.list {
+                subscriber.window.stopped(self.awake_at, now);
+            }
         }
+        self.awake_at = now;
+    }
+
+    /// Control means to sleep until then.
+    pub fn asleep(&mut self, until: MonotonicNs) {
+        self.awake_at = until;
     }
 
     /// Takes in a response that is believed.
@@ -156,6 +169,7 @@ impl Subscribers {
         response: &Response,
         settings: &Settings,
     ) -> Result<(), ProbeRefusal> {
+        self.awake(response.arrived_at);
         let place = match self.list.iter().position(|known| known.id == response.responder_id) {
             Some(place) => place,
             None => self.welcome(number, link, response, settings)?,

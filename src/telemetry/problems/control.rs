@@ -16,6 +16,16 @@ pub(super) fn missing(now: &Snapshot) -> Option<Problem> {
     })
 }
 
+/// Control runs, and cannot probe.
+pub(super) fn without_secret(now: &Snapshot) -> Option<Problem> {
+    let mut runs = now.processes.iter().filter(|process| process.role == ProcessRole::Control);
+    (now.control.without_secret != 0 && runs.any(|process| process.state.exists())).then(|| {
+        let text = "nobody is probed: the secret of the probes cannot be had; the log of control says why, \
+                    and after a reload it is tried again";
+        Problem::new("probes", Level::Error, text.to_owned())
+    })
+}
+
 /// The safety supervisor has taken something away.
 pub(super) fn safety(now: &Snapshot) -> Option<Problem> {
     let mode = now.control.safety();
@@ -189,6 +199,17 @@ mod tests {
             health,
             state: ProcessState::Running,
         }
+    }
+
+    #[test]
+    fn a_control_that_cannot_probe_is_an_error_while_it_is_there() {
+        let said = after(|now| {
+            now.control.without_secret = 1;
+            now.processes.push(control());
+        });
+        assert_eq!(said.len(), 1);
+        assert!(said[0].starts_with("nobody is probed: the secret"), "{said:?}");
+        assert_eq!(after(|now| now.control.without_secret = 1), [""; 0]);
     }
 
     #[test]

@@ -86,6 +86,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         problems.extend(process_problem(process, former, now));
     }
     problems.extend(control::missing(now));
+    problems.extend(control::without_secret(now));
     for (route, output) in outputs(now) {
         problems.extend(unaccounted(route, output, &now.lanes[output.lane]));
     }
@@ -129,6 +130,10 @@ fn process_problem(
         ProcessRole::Ingress | ProcessRole::Control => name.clone(),
     };
     let text = match process.state {
+        // Somebody wanted that; what follows is worth a word all the same.
+        ProcessState::Ended => {
+            return Some(Problem::new(about, Level::Warn, format!("{name} has ended: {consequence}")));
+        }
         ProcessState::Dead => format!("{name} (pid {pid}) is dead: {consequence}"),
         ProcessState::Stopped => {
             format!("{name} (pid {pid}) is stopped: {consequence}; `kill -CONT {pid}` lets it go on")
@@ -397,6 +402,14 @@ pub(super) mod tests {
                 "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing",
             ]
         );
+    }
+
+    #[test]
+    fn a_process_that_was_told_to_end_is_no_error() {
+        let mut now = sound();
+        now.processes[0].state = ProcessState::Ended;
+        let expected = Problem::new("ingress", Level::Warn, "ingress has ended: nothing is taken in".into());
+        assert_eq!(of(&now, &sound()), [expected]);
     }
 
     #[test]

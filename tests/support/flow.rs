@@ -1,0 +1,136 @@
+//! A flow of 200 numbered samples per second through a bridge of one route, `/scan`, from a publisher to a
+//! subscriber of the critical lane, both of this process.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use adaptive_bridge::clock;
+use adaptive_bridge::dds::{Participant, RawReader, RawWriter, ReaderQos, Take, WriterEvent};
+use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp};
+use bytes::Bytes;
+use serde_json::Value;
+
+use super::bridge::Bridge;
+use super::wait_until;
+
+const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
+
+/// A subscriber of the critical lane, and a publisher that has begun when the bridge has matched both.
+pub struct Flow {
+    reader: RawReader,
+    received: Vec<u32>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<u32>>,
+    _participants: [Participant; 2],
+}
+
+impl Flow {
+    /// Starts it. `join` opens a participant of that name in the bridge's network.
+    pub fn start(bridge: &Bridge, join: impl Fn(&str) -> Participant) -> Self {
+        let mut publisher = join("publisher");
+        let writer: RawWriter =
+            publisher.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
+        wait_until("ingress to match the publisher", || {
+            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
+        });
+        let mut subscriber = join("subscriber");
+        let qos = ReaderQos {
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            depth: 100_000,
+            deadline_ms: None,
+        };
+        let reader = subscriber.create_reader("rt/adaptive_bridge/critical/scan", TYPE, &qos).unwrap();
+        bridge.wait_status("the subscriber", |status| lane(status, "critical")["readers"] == 1);
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let mut number = 0_u32;
+            while !asked.load(Ordering::Relaxed) {
+                let payload = [number.to_le_bytes(), [0; 4]].concat();
+                let stamp = SourceTimestamp::from_wall(clock::wall());
+                writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
+                number += 1;
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            // Until the last one has been acknowledged, the writer must stay.
+            writer.wait_acknowledged(super::patience());
+            number
+        });
+        let participants = [publisher, subscriber];
+        Self { reader, received: Vec::new(), stop, thread: Some(thread), _participants: participants }
+    }
+
+    /// Takes what has come; how many samples it is so far.
+    pub fn received(&mut self) -> usize {
+        let received = &mut self.received;
+        let mut lend = |payload: &[u8], _| {
+            received.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
+        };
+        while self.reader.take(&mut lend) != Take::Empty {}
+        self.received.len()
+    }
+
+    /// Waits until that many more samples have come.
+    pub fn wait_more(&mut self, samples: usize) {
+        let before = self.received();
+        wait_until("samples at the critical subscriber", || self.received() >= before + samples);
+    }
+
+    /// Ends the flow: every sample has reached the critical subscriber, in order, and the bridge can account
+    /// for each on both lanes.
+    pub fn end_whole(mut self, bridge: &Bridge) -> Value {
+        let sent = self.stop();
+        wait_until("every sample at the critical subscriber", || self.received() >= sent as usize);
+        assert_eq!(self.received, (0..sent).collect::<Vec<_>>());
+        let status = accounted(bridge, sent);
+        assert_eq!(lane(&status, "critical")["forwarded"], sent, "{status}");
+        status
+    }
+
+    /// Ends a flow of which the bridge was to stop a part: what reached the critical subscriber is in order,
+    /// and the bridge can account for each sample on both lanes.
+    pub fn end_accounted(mut self, bridge: &Bridge) -> Value {
+        let sent = self.stop();
+        let status = accounted(bridge, sent);
+        let forwarded = lane(&status, "critical")["forwarded"].as_u64().unwrap();
+        wait_until("every forwarded sample", || self.received() as u64 >= forwarded);
+        assert!(self.received.is_sorted_by(|one, next| one < next), "{:?}", self.received);
+        assert_eq!(self.received.len() as u64, forwarded, "{status}");
+        status
+    }
+
+    fn stop(&mut self) -> u32 {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap()
+    }
+}
+
+impl Drop for Flow {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+fn accounted(bridge: &Bridge, sent: u32) -> Value {
+    let status = bridge.wait_status("every sample accounted for", |status| {
+        let settled = |name| {
+            let lane = lane(status, name);
+            lane["received"] == sent && lane["waiting"] == 0
+        };
+        settled("critical") && settled("noncritical")
+    });
+    assert_eq!(status["routes"][0]["whole"], true, "{status}");
+    for name in ["critical", "noncritical"] {
+        assert_eq!(lane(&status, name)["whole"], true, "{status}");
+    }
+    status
+}
+
+/// What a status says of a lane of the first route.
+pub fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
+    let lanes = status["routes"][0]["lanes"].as_array().unwrap();
+    lanes.iter().find(|lane| lane["lane"] == name).unwrap()
+}
