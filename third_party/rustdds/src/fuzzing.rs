@@ -11,15 +11,18 @@ use bytes::Bytes;
 
 use crate::{
   dds::{
+    ddsdata::DDSData,
     qos::{policy, QosPolicies, QosPolicyBuilder},
     statusevents::{sync_status_channel, DataReaderStatus},
     typedesc::TypeDesc,
-    with_key::simpledatareader::ReaderCommand,
+    with_key::{datawriter::WriteOptions, simpledatareader::ReaderCommand},
   },
   discovery::{
     DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData, SpdpDiscoveredParticipantData,
   },
-  messages::submessages::submessages::InterpreterSubmessage,
+  messages::submessages::{
+    elements::serialized_payload::SerializedPayload, submessages::InterpreterSubmessage,
+  },
   mio_source,
   network::udp_sender::UDPSender,
   rtps::transmit::InterfaceObservations,
@@ -27,7 +30,10 @@ use crate::{
   rtps::{
     message_receiver::MessageReceiver,
     reader::{Reader, ReaderIngredients},
+    rtps_reader_proxy::RtpsReaderProxy,
     rtps_writer_proxy::RtpsWriterProxy,
+    writer::{Writer, WriterIngredients},
+    writer_send_buffer::WriterSendBuffer,
     Message, SubmessageBody,
   },
   serialization::pl_cdr_adapters::PlCdrDeserialize,
@@ -62,8 +68,10 @@ pub fn read_discovery(bytes: &[u8], encoding: RepresentationIdentifier) -> usize
   .count()
 }
 
-/// Lets a reader, RELIABLE or not, that has matched the writer 000001.02 of
-/// [`SENDER`] receive datagrams. Nothing is sent in reply.
+/// Lets a participant receive datagrams. Its reader 000001.07, RELIABLE or not,
+/// has matched the writer 000001.02 of [`SENDER`], and its RELIABLE writer
+/// 000002.02, which has sent a sample of 79 fragments and a small one, the reader
+/// 000002.07. Nothing is sent in reply.
 pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
   thread_local! {
     static UDP_SENDER: Option<Rc<UDPSender>> =
@@ -131,17 +139,27 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
       security_plugins: None,
       discovery_notify: None,
     },
-    udp_sender,
+    Rc::clone(&udp_sender),
     new_shared_timer(),
     participant_status_sender,
   );
   // Without a locator there is nowhere to send a reply to.
-  let writer = GUID::new_with_prefix_and_id(GuidPrefix::new(&SENDER), writer_id);
+  let remote_writer = GUID::new_with_prefix_and_id(GuidPrefix::new(&SENDER), writer_id);
   reader.update_writer_proxy(
-    RtpsWriterProxy::new(writer, vec![], vec![], EntityId::UNKNOWN),
+    RtpsWriterProxy::new(remote_writer, vec![], vec![], EntityId::UNKNOWN),
     &qos,
   );
   message_receiver.add_reader(reader);
+
+  let writer_qos = QosPolicyBuilder::new()
+    .reliability(policy::Reliability::Reliable {
+      max_blocking_time: Duration::ZERO,
+    })
+    .durability(policy::Durability::TransientLocal)
+    .build();
+  let Some((mut writer, remote_reader)) = sent_by_a_writer(udp_sender, &writer_qos) else {
+    return;
+  };
 
   for datagram in datagrams {
     let Ok(mut message) = Message::read_from_buffer(&Bytes::copy_from_slice(datagram)) else {
@@ -155,6 +173,52 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
       )
     });
     message_receiver.handle_parsed_message(message);
-    while acknack_receiver.try_recv().is_ok() {}
+    while let Ok((prefix, acknack)) = acknack_receiver.try_recv() {
+      writer.handle_ack_nack(prefix, &acknack);
+      writer.repair(remote_reader);
+    }
   }
+}
+
+// A writer that has sent something, and its one reader.
+fn sent_by_a_writer(udp_sender: Rc<UDPSender>, qos: &QosPolicies) -> Option<(Writer, GUID)> {
+  let entity = |kind| EntityId::new([0, 0, 2], kind);
+  let guid = GUID::new_with_prefix_and_id(
+    GuidPrefix::new(&RECEIVER),
+    entity(EntityKind::WRITER_WITH_KEY_USER_DEFINED),
+  );
+  let remote_reader = GUID::new_with_prefix_and_id(
+    GuidPrefix::new(&SENDER),
+    entity(EntityKind::READER_WITH_KEY_USER_DEFINED),
+  );
+  let send_buffer = WriterSendBuffer::new(guid, "t".to_string(), true, false, false, 8, 8, 8);
+  let (status_sender, _status) = sync_status_channel(4).ok()?;
+  let (participant_status_sender, _participant_status) = sync_status_channel(16).ok()?;
+  let mut writer = Writer::new(
+    WriterIngredients {
+      guid,
+      send_buffer: send_buffer.clone(),
+      topic_name: "t".to_string(),
+      like_stateless: false,
+      qos_policies: qos.clone(),
+      status_sender,
+      security_plugins: None,
+    },
+    udp_sender,
+    new_shared_timer(),
+    participant_status_sender,
+    Rc::new(RefCell::new(InterfaceObservations::new())),
+    Rc::from(Vec::new()),
+  );
+  for bytes in [20_000, 8] {
+    let payload = SerializedPayload::new(RepresentationIdentifier::CDR_LE, vec![0; bytes]);
+    send_buffer.admit_blocking(
+      WriteOptions::default(),
+      DDSData::new(payload),
+      Some(std::time::Duration::ZERO),
+    );
+  }
+  writer.process_pending();
+  writer.update_reader_proxy(&RtpsReaderProxy::new(remote_reader, qos.clone(), false), qos);
+  Some((writer, remote_reader))
 }

@@ -1429,6 +1429,12 @@ impl Writer {
     }
   }
 
+  // A repair round of each kind, at once.
+  pub(crate) fn repair(&mut self, to_reader: GUID) {
+    self.handle_repair_data_send(to_reader);
+    self.handle_repair_frags_send(to_reader);
+  }
+
   // One repair round for a reader: send its unsent changes, lowest first, until
   // REPAIR_BATCH_MAX_BYTES have gone out (at least one change) or nothing is
   // left, which ends repair mode. GAPs and unfragmented DATA are packed into

@@ -242,8 +242,22 @@ impl TopicCache {
   }
 
   // The Writer is gone, so samples it never completed are no longer awaited.
+  //
+  // Its samples go, too. No Reliable DataReader gets them from here on, but when the
+  // Writer is matched again, all that it sent before count as received, and a new
+  // DataReader of the topic would get what a former one has taken.
   pub fn forget_reliable_writer(&mut self, writer: GUID) {
-    self.received_reliably_before.remove(&writer);
+    if self.received_reliably_before.remove(&writer).is_none() {
+      return;
+    }
+    for instant in self
+      .sequence_numbers
+      .remove(&writer)
+      .unwrap_or_default()
+      .values()
+    {
+      self.changes.remove(instant);
+    }
   }
 
   // The oldest change that a Reliable DataReader cannot yet take, because an
