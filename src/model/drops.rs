@@ -35,8 +35,6 @@ drop_reasons! {
     PoolExhausted = "pool_exhausted",
     /// Ingress: an encapsulation that DDS does not define, or a payload the DDS library could not decode.
     Malformed = "malformed",
-    /// Ingress: taken before; the DDS library gave it once more when its publisher came back.
-    Repeated = "repeated",
     /// Lane: a hole in the route's sequence, left by an ingress process that died between numbering a
     /// sample and publishing it.
     IngressDied = "ingress_died",
@@ -71,7 +69,6 @@ impl DropReason {
             Self::TooLarge => "larger than the route's max_sample_bytes; raise it",
             Self::PoolExhausted => "no free slot in shared memory; raise queue_depth",
             Self::Malformed => "an encapsulation that DDS does not know",
-            Self::Repeated => "taken before, and given once more when the publisher came back",
             Self::IngressDied => "an ingress process died while it had them",
             Self::QueueOverflow => "the lane took them too slowly; raise its queue_depth",
             Self::LaneDown => "no process served the lane when they came, or it was killed while it had them",

@@ -13,7 +13,6 @@ use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, RouteInfo, SampleHeader,
-    SourceTimestamp,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Slot, Stage};
 
@@ -119,10 +118,8 @@ impl Input {
     ) {
         let taken_at = clock::monotonic();
         let taken_at_wall = clock::wall();
-        let missing = self.followed.missing_before(&origin);
-        let lost_upstream = missing.unwrap_or(0);
+        let lost_upstream = self.followed.missing_before(origin.writer, origin.sequence);
         let dropped = match slot {
-            _ if missing.is_none() => Some(DropReason::Repeated),
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
             Err(_) => Some(DropReason::PoolExhausted),
@@ -140,9 +137,7 @@ impl Input {
             }
             counters.published
         });
-        if let Ok(slot) = slot
-            && dropped.is_none()
-        {
+        if let Ok(slot) = slot {
             let header = SampleHeader {
                 sequence,
                 source_timestamp: origin.source_timestamp,
@@ -159,9 +154,7 @@ impl Input {
                 error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
             }
         }
-        if let Some(written) = origin.source_timestamp.to_wall()
-            && missing.is_some()
-        {
+        if let Some(written) = origin.source_timestamp.to_wall() {
             self.dds_in.record(taken_at_wall.since(written));
         }
     }
@@ -222,7 +215,7 @@ impl Input {
             }
         }
         self.publisher.attend();
-        self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[DropReason::Repeated], now);
+        self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[], now);
         Ok(())
     }
 
@@ -319,42 +312,29 @@ impl Input {
     }
 }
 
-/// The last sample of each writer, to tell what is missing and what was here before.
-#[derive(Debug, Default)]
+/// The last sequence number of each writer, to know what never reached us.
+#[derive(Default)]
 struct Followed {
-    writers: Vec<(Guid, Last)>,
+    writers: Vec<(Guid, i64)>,
     oldest: usize,
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Last {
-    sequence: i64,
-    source_timestamp: SourceTimestamp,
-}
-
 impl Followed {
-    /// Samples that the writer numbered between the last one that we got and this one; what came before we
-    /// began to follow is not missing. `None` for a sample that was here before: a reader that is made anew
-    /// for a writer that comes back begins with what the DDS library still keeps of it. One that has an old
-    /// number and a later timestamp is none of these: its writer began anew.
-    fn missing_before(&mut self, origin: &SampleOrigin) -> Option<u64> {
-        let now = Last { sequence: origin.sequence, source_timestamp: origin.source_timestamp };
-        if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == origin.writer) {
-            let former = *last;
-            if now.sequence <= former.sequence && now.source_timestamp <= former.source_timestamp {
-                return None;
-            }
-            *last = now;
-            let missing = now.sequence.saturating_sub(former.sequence).saturating_sub(1).max(0);
-            return Some(missing.unsigned_abs());
+    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began
+    /// to follow is not missing.
+    fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
+        if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == writer) {
+            let missing = sequence.saturating_sub(*last).saturating_sub(1).max(0);
+            *last = sequence.max(*last);
+            return missing.unsigned_abs();
         }
         if self.writers.len() < WRITERS_FOLLOWED {
-            self.writers.push((origin.writer, now));
+            self.writers.push((writer, sequence));
         } else {
-            self.writers[self.oldest] = (origin.writer, now);
+            self.writers[self.oldest] = (writer, sequence);
             self.oldest = (self.oldest + 1) % WRITERS_FOLLOWED;
         }
-        Some(0)
+        0
     }
 }
 
@@ -362,39 +342,23 @@ impl Followed {
 mod tests {
     use super::*;
 
-    /// Written at the second of that number.
-    fn origin(writer: u8, sequence: i64, second: u64) -> SampleOrigin {
-        let source_timestamp = SourceTimestamp(second << 32);
-        SampleOrigin { source_timestamp, writer: Guid([writer; 16]), sequence }
-    }
-
     #[test]
     fn gaps_are_counted_for_each_writer_by_itself() {
         let mut followed = Followed::default();
-        assert_eq!(followed.missing_before(&origin(1, 10, 1)), Some(0));
-        assert_eq!(followed.missing_before(&origin(2, 500, 1)), Some(0));
-        assert_eq!(followed.missing_before(&origin(1, 11, 2)), Some(0));
-        assert_eq!(followed.missing_before(&origin(1, 15, 3)), Some(3));
-        assert_eq!(followed.missing_before(&origin(1, 16, 3)), Some(0));
-        assert_eq!(followed.missing_before(&origin(2, i64::MAX, 2)), Some((i64::MAX - 501) as u64));
-    }
-
-    #[test]
-    fn a_sample_that_was_here_before_is_told_from_one_of_a_writer_that_began_anew() {
-        let mut followed = Followed::default();
-        assert_eq!(followed.missing_before(&origin(1, 10, 5)), Some(0));
-        assert_eq!(followed.missing_before(&origin(1, 10, 5)), None);
-        assert_eq!(followed.missing_before(&origin(1, 3, 1)), None);
-        assert_eq!(followed.missing_before(&origin(1, 11, 5)), Some(0));
-        assert_eq!(followed.missing_before(&origin(1, 1, 6)), Some(0));
-        assert_eq!(followed.missing_before(&origin(1, 2, 6)), Some(0));
+        assert_eq!(followed.missing_before(Guid([1; 16]), 10), 0);
+        assert_eq!(followed.missing_before(Guid([2; 16]), 500), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 11), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 15), 3);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 12), 0);
+        assert_eq!(followed.missing_before(Guid([1; 16]), 16), 0);
+        assert_eq!(followed.missing_before(Guid([2; 16]), i64::MAX), (i64::MAX - 501) as u64);
     }
 
     #[test]
     fn many_writers_take_bounded_memory() {
         let mut followed = Followed::default();
         for writer in 0..=255 {
-            followed.missing_before(&origin(writer, 1, 1));
+            followed.missing_before(Guid([writer; 16]), 1);
         }
         assert_eq!(followed.writers.len(), WRITERS_FOLLOWED);
     }

@@ -291,8 +291,8 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
         DropReason::Superseded | DropReason::QueueFull | DropReason::Suspended => {
             matches!(class, TrafficClass::Noncritical)
         }
-        // The lane's mode says it; nothing is lost by a repetition.
-        DropReason::Stopped | DropReason::Repeated => true,
+        // The lane's mode says it.
+        DropReason::Stopped => true,
         _ => false,
     }
 }
