@@ -222,6 +222,19 @@ fn the_traces_have_their_expected_transitions() {
         (190_500, Critical),
     ];
     assert_eq!(toggle, expected);
+    // As the running control decided when the link was recorded: after 3.5, 70.0, 108.0, 110.5, 120.5, 187.0
+    // and 237.5 s.
+    let recorded = states_of(include_str!("../data/probe_traces/recorded_toggle.csv"));
+    let expected = [
+        (3_000, Critical),
+        (70_000, Noncritical),
+        (108_000, Critical),
+        (110_500, Noncritical),
+        (120_500, Critical),
+        (187_000, Noncritical),
+        (237_500, Critical),
+    ];
+    assert_eq!(recorded, expected);
     let restart = states_of(include_str!("../data/probe_traces/responder_restart.csv"));
     assert_eq!(restart, [(4_500, Critical), (32_000, Noncritical), (53_500, Critical)]);
     let slow = states_of(include_str!("../data/probe_traces/slow_link.csv"));
