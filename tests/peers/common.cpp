@@ -207,6 +207,7 @@ Options parse_options(int argc, char** argv) {
     else if (name == "--seed") options.seed = whole(name, value);
     else if (name == "--encap") options.encapsulation = hex_bytes(value);
     else if (name == "--payload-file") options.payload_file = value;
+    else if (name == "--record") options.record_file = value;
     else if (name == "--source-age-ms") options.source_age_s = number(name, value, 1e9) / 1e3;
     else if (name == "--wait-match") options.wait_match = static_cast<int32_t>(number(name, value, 1e6));
     else if (name == "--heartbeat-ms") options.heartbeat_s = number(name, value, 1e6) / 1e3;
@@ -260,6 +261,34 @@ void emit_error(const std::string& message) {
   emit("{\"event\":\"error\",\"message\":" + json_string(message) + "}");
 }
 
+void emit_ready(const std::string& library) {
+  emit("{\"event\":\"ready\",\"library\":" + json_string(library) + "}");
+}
+
+Record::Record(const std::string& file, const char* header) {
+  if (file.empty()) return;
+  file_ = std::fopen(file.c_str(), "we");
+  if (file_ == nullptr) usage("--record " + file + ": can't be written");
+  std::setvbuf(file_, nullptr, _IOLBF, 256);
+  std::fprintf(file_, "%s\n", header);
+}
+
+Record::~Record() {
+  if (file_ != nullptr) std::fclose(file_);
+}
+
+void Record::row(uint64_t seq, int64_t time_ns, int64_t duration_ns) {
+  if (file_ == nullptr) return;
+  std::fprintf(file_, "%llu,%lld,%lld\n", static_cast<unsigned long long>(seq), static_cast<long long>(time_ns),
+               static_cast<long long>(duration_ns));
+}
+
+void Record::row(uint64_t seq, int64_t time_ns, int64_t duration_ns, bool ok) {
+  if (file_ == nullptr) return;
+  std::fprintf(file_, "%llu,%lld,%lld,%d\n", static_cast<unsigned long long>(seq), static_cast<long long>(time_ns),
+               static_cast<long long>(duration_ns), ok ? 1 : 0);
+}
+
 std::string json_string(const std::string& text) {
   std::string json = "\"";
   for (size_t at = 0; at < text.size();) {
@@ -292,7 +321,8 @@ std::string hex(const uint8_t* bytes, size_t count) {
   return text;
 }
 
-Publisher::Publisher(const Options& options) : options_(options) {
+Publisher::Publisher(const Options& options)
+    : options_(options), record_(options.record_file, "seq,time_ns,call_ns,ok") {
   if (!options.payload_file.empty()) {
     std::ifstream file(options.payload_file, std::ios::binary);
     if (!file) usage("--payload-file " + options.payload_file + ": can't be read");
@@ -321,7 +351,7 @@ bool Publisher::next() {
   if (all_sent || time_up || stop_requested) return false;
 
   seq_ = options_.first_seq + attempted_;
-  const int64_t now_ns = monotonic_ns();
+  sent_ns_ = monotonic_ns();
   source_ns_ = realtime_ns() - static_cast<int64_t>(options_.source_age_s * 1e9);
   const size_t header = options_.encapsulation.size();
   if (options_.payload_file.empty()) {
@@ -330,7 +360,7 @@ bool Publisher::next() {
     uint8_t* payload = bytes_.data() + header;
     uint8_t front[24];
     std::memcpy(front, &seq_, 8);
-    std::memcpy(front + 8, &now_ns, 8);
+    std::memcpy(front + 8, &sent_ns_, 8);
     std::memcpy(front + 16, &source_ns_, 8);
     std::memcpy(payload, front, std::min<size_t>(size, sizeof front));
     if (size > sizeof front) fill(payload + sizeof front, size - sizeof front, options_.seed, seq_);
@@ -355,6 +385,7 @@ void Publisher::record(bool ok, int64_t call_ns) {
   ++(ok ? ok_ : failed_);
   if (ok) hash_ += hash_of(bytes_.data(), bytes_.size());
   calls_ns_.push_back(call_ns);
+  record_.row(seq_, sent_ns_, call_ns, ok);
   end_ns_ = monotonic_ns();
   if (!options_.summary) {
     emit("{\"event\":\"write\",\"seq\":" + std::to_string(seq_) + ",\"call_us\":" + microseconds(call_ns) +
@@ -383,7 +414,10 @@ void Publisher::print_summary() {
 }
 
 Subscriber::Subscriber(const Options& options)
-    : options_(options), begin_ns_(monotonic_ns()), stalled_ns_(begin_ns_) {}
+    : options_(options),
+      record_(options.record_file, "seq,time_ns,latency_ns"),
+      begin_ns_(monotonic_ns()),
+      stalled_ns_(begin_ns_) {}
 
 bool Subscriber::check(const uint8_t* payload, size_t count, uint64_t seq) {
   size_t size = count;
@@ -451,6 +485,7 @@ void Subscriber::take(const uint8_t* bytes, size_t count, int64_t source_ns) {
     int64_t sent_ns = 0;
     std::memcpy(&sent_ns, payload + 8, 8);
     latencies_ns_.push_back(now_ns - sent_ns);
+    record_.row(seq, now_ns, now_ns - sent_ns);
     latency = microseconds(now_ns - sent_ns);
   }
   if (numbered && size >= 24) {

@@ -3,6 +3,7 @@
 
 #include <csignal>
 #include <cstdint>
+#include <cstdio>
 #include <string>
 #include <unordered_map>
 #include <unordered_set>
@@ -42,6 +43,7 @@ struct Options {
   std::string decode;          // a subscriber decodes this message by its definition
   bool opaque = false;         // the payload is not a peer's: no sequence, no check
   bool summary = false;        // no line per sample
+  std::string record_file;     // each sample as a row of CSV
   double stall_every_s = 0;
   double stall_for_s = 0;
   uint32_t gid_bytes = 24;
@@ -64,12 +66,28 @@ void sleep_until(int64_t at_ns);
 // One line of JSON to stdout, at once.
 void emit(const std::string& json);
 void emit_error(const std::string& message);
+// The endpoints exist; `library` is the name of the DDS library with its version.
+void emit_ready(const std::string& library);
 // Text in UTF-8 as a JSON string; bytes that are none become U+FFFD.
 std::string json_string(const std::string& text);
 std::string hex(const uint8_t* bytes, size_t count);
 
 // The sequence number of a sample that only opens the way for others.
 constexpr uint64_t priming_seq = UINT64_MAX;
+
+// A file of rows, each written at once, so that it is whole when the program is killed; without a name there is none.
+class Record {
+ public:
+  Record(const std::string& file, const char* header);
+  ~Record();
+  Record(const Record&) = delete;
+  Record& operator=(const Record&) = delete;
+  void row(uint64_t seq, int64_t time_ns, int64_t duration_ns);
+  void row(uint64_t seq, int64_t time_ns, int64_t duration_ns, bool ok);
+
+ private:
+  std::FILE* file_ = nullptr;
+};
 
 // A serialized sample: its encapsulation header and what follows. In memory both are one block, as on the wire.
 using Bytes = std::vector<uint8_t>;
@@ -126,9 +144,11 @@ class Publisher {
   void finish_sending();
 
   const Options& options_;
+  Record record_;
   Bytes file_;
   Bytes bytes_;
   uint64_t seq_ = 0;
+  int64_t sent_ns_ = 0;
   int64_t source_ns_ = 0;
   int64_t begin_ns_ = 0;
   int64_t end_ns_ = 0;
@@ -160,6 +180,7 @@ class Subscriber {
   bool check(const uint8_t* payload, size_t count, uint64_t seq);
 
   const Options& options_;
+  Record record_;
   int64_t begin_ns_ = 0;
   int64_t stalled_ns_ = 0;
   int64_t progress_ns_ = 0;

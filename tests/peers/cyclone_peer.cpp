@@ -4,6 +4,7 @@
 #include <dds/ddsi/ddsi_serdata.h>
 #include <dds/ddsi/ddsi_sertype.h>
 #include <dds/ddsi/q_radmin.h>
+#include <dds/version.h>
 #include <poll.h>
 #include <unistd.h>
 
@@ -223,7 +224,7 @@ int publish(const Options& options, dds_entity_t participant) {
   dds_qos_t* qos = qos_of(options);
   const dds_entity_t topic = raw_topic(participant, options.topic, options.type);
   const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos, listener()));
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Cyclone DDS " DDS_VERSION);
   wait_for_readers(options, writer);
   Publisher publisher(options);
   const auto write = [&](const Bytes& bytes, int64_t source_ns) {
@@ -265,7 +266,7 @@ int say(const Options& options, dds_entity_t participant) {
   const dds_entity_t topic =
       check("topic", dds_create_topic(participant, message.descriptor, options.topic.c_str(), nullptr, nullptr));
   const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos_of(options), listener()));
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Cyclone DDS " DDS_VERSION);
   wait_for_readers(options, writer);
   uint64_t attempted = 0;
   uint64_t failed = 0;
@@ -310,7 +311,7 @@ int subscribe(const Options& options, dds_entity_t participant) {
   const dds_entity_t reader = check("reader", dds_create_reader(participant, topic, qos, listener()));
   const dds_entity_t waitset = check("waitset", dds_create_waitset(participant));
   check("attach", dds_waitset_attach(waitset, check("condition", dds_create_readcondition(reader, DDS_ANY_STATE)), 0));
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Cyclone DDS " DDS_VERSION);
   Subscriber subscriber(options);
   while (!subscriber.done()) {
     dds_waitset_wait(waitset, nullptr, 0, DDS_MSECS(100));
@@ -335,7 +336,7 @@ int decode(const Options& options, dds_entity_t participant) {
   const dds_entity_t reader = check("reader", dds_create_reader(participant, topic, qos_of(options), listener()));
   const dds_entity_t waitset = check("waitset", dds_create_waitset(participant));
   check("attach", dds_waitset_attach(waitset, check("condition", dds_create_readcondition(reader, DDS_ANY_STATE)), 0));
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Cyclone DDS " DDS_VERSION);
   const int64_t end_ns = monotonic_ns() + static_cast<int64_t>(options.duration_s * 1e9);
   uint64_t decoded = 0;
   while (!stop_requested && (options.duration_s == 0 || monotonic_ns() < end_ns) &&
@@ -528,7 +529,7 @@ int show_graph(const Options& options, dds_entity_t participant) {
   for (const dds_entity_t reader : {participants, writers, readers, entries}) {
     check("attach", dds_waitset_attach(waitset, check("condition", dds_create_readcondition(reader, DDS_ANY_STATE)), 0));
   }
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Cyclone DDS " DDS_VERSION);
   const int64_t end_ns = monotonic_ns() + static_cast<int64_t>(options.duration_s * 1e9);
   while (!stop_requested && (options.duration_s == 0 || monotonic_ns() < end_ns)) {
     dds_waitset_wait(waitset, nullptr, 0, DDS_MSECS(100));

@@ -12,6 +12,7 @@
 #include <fastdds/dds/topic/TopicDataType.hpp>
 #include <fastdds/dds/topic/TypeSupport.hpp>
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
+#include <fastrtps/config.h>
 
 #include <algorithm>
 #include <atomic>
@@ -133,7 +134,7 @@ int publish(const Options& options, fast::DomainParticipant* participant, fast::
     emit_error("the writer could not be created");
     return 1;
   }
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Fast DDS " FASTRTPS_VERSION_STR);
   while (!stop_requested && events.matched < options.wait_match) sleep_until(monotonic_ns() + 10'000'000);
   Publisher publisher(options);
   const auto write = [&](const Bytes& bytes, int64_t source_ns) {
@@ -164,7 +165,7 @@ int subscribe(const Options& options, fast::DomainParticipant* participant, fast
     emit_error("the reader could not be created");
     return 1;
   }
-  emit("{\"event\":\"ready\"}");
+  emit_ready("Fast DDS " FASTRTPS_VERSION_STR);
   Subscriber subscriber(options);
   Bytes bytes;
   fast::SampleInfo info;
