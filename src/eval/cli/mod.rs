@@ -4,6 +4,7 @@
 //! want to read goes to stdout, and nothing else does.
 
 mod impair;
+mod runs;
 
 use std::process::ExitCode;
 
@@ -11,7 +12,7 @@ use clap::{Parser, Subcommand};
 
 use crate::telemetry;
 
-/// The evaluation of Adaptive Bridge: impaired links, and what the bridge makes of them.
+/// The evaluation of Adaptive Bridge: the paper's experiments and more, on hosts and links of its own.
 #[derive(Debug, Parser)]
 #[command(name = "adaptive-bridge-eval", version, max_term_width = 100)]
 struct Cli {
@@ -21,6 +22,12 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Show the scenarios
+    List(runs::Folder),
+    /// Run scenarios
+    Run(runs::RunArguments),
+    /// Run every scenario
+    Matrix(runs::MatrixArguments),
     /// Lose and delay what this network namespace receives from one host, until SIGINT or SIGTERM
     Impair(impair::Arguments),
 }
@@ -31,6 +38,9 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     telemetry::start_logs();
     match cli.command {
+        Command::List(folder) => runs::list(&folder),
+        Command::Run(arguments) => runs::run(&arguments),
+        Command::Matrix(arguments) => runs::matrix(&arguments),
         Command::Impair(arguments) => impair::run(&arguments),
     }
 }

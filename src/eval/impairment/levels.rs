@@ -1,11 +1,13 @@
 //! The impairments of the paper's evaluation (Table I), in both readings.
 
 use clap::ValueEnum;
+use serde::{Deserialize, Serialize};
 
 use super::gilbert_elliott::GilbertElliott;
 
 /// A row of Table I.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
 pub enum Level {
     /// No loss.
     Clean,
@@ -20,7 +22,8 @@ pub enum Level {
 /// How the last two columns of Table I are read. netem takes the loss in the bad state first and that in the
 /// good one last (tc-netem(8)); the paper's harness passes them the other way round. So what was run is not
 /// what is printed, and a figure is of one of the two.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
 pub enum Reading {
     /// As the table says: 2.3, 7.1 and 9.2 % are lost in the long run.
     AsPrinted,
@@ -28,9 +31,29 @@ pub enum Reading {
     AsRun,
 }
 
+impl Reading {
+    /// As the command line has it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::AsPrinted => "as-printed",
+            Self::AsRun => "as-run",
+        }
+    }
+}
+
 impl Level {
     /// All rows.
     pub const ALL: [Self; 4] = [Self::Clean, Self::Mild, Self::Moderate, Self::Strong];
+
+    /// As the command line has it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Mild => "mild",
+            Self::Moderate => "moderate",
+            Self::Strong => "strong",
+        }
+    }
 
     /// The model of this row.
     pub const fn model(self, reading: Reading) -> GilbertElliott {

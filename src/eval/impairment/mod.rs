@@ -14,7 +14,7 @@ mod link;
 mod netem;
 mod nfqueue;
 mod random;
-mod system;
+pub(super) mod system;
 
 pub use backend::{Backend, BackendChoice, Opened, open};
 pub use delay::{DelayLine, NormalDelay};

@@ -9,7 +9,7 @@ use super::error::ImpairmentError;
 const SYSTEM_FOLDERS: &str = "/usr/local/sbin:/usr/sbin:/sbin";
 
 /// Runs a program to its end; yields what it wrote to stdout.
-pub(super) fn run(words: &[String]) -> Result<String, ImpairmentError> {
+pub(in crate::eval) fn run(words: &[String]) -> Result<String, ImpairmentError> {
     let failed = |said: String| ImpairmentError::Command { command: words.join(" "), said };
     let Some((program, arguments)) = words.split_first() else {
         return Err(failed("no program".to_owned()));
@@ -34,7 +34,7 @@ fn path() -> OsString {
 }
 
 /// A command line without quotes as words.
-pub(super) fn words(line: &str) -> Vec<String> {
+pub(in crate::eval) fn words(line: &str) -> Vec<String> {
     line.split_whitespace().map(str::to_owned).collect()
 }
 

@@ -1,0 +1,96 @@
+//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge in
+//! a namespace of its own. They share all else with the machine.
+
+use std::fs;
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::process;
+
+use super::stale::{self, NAMESPACES};
+use super::{Bed, Host, Network};
+use crate::eval::error::EvalError;
+use crate::eval::impairment::system;
+use crate::eval::scenario::Switch;
+
+/// Whether what passes a bridge of the present network namespace goes through netfilter.
+const BRIDGE_NETFILTER: &str = "/proc/sys/net/bridge/bridge-nf-call-iptables";
+
+/// Why this machine can't; `None` when it can.
+pub(super) fn missing(switch: Switch) -> Option<String> {
+    if !nix::unistd::geteuid().is_root() {
+        return Some("network namespaces need root".to_owned());
+    }
+    let probe = stale::name("probe");
+    let made = ip(&format!("netns add {probe}"));
+    stale::remove_namespace(&probe);
+    if let Err(error) = made {
+        return Some(format!("network namespaces can't be made: {error}"));
+    }
+    let lacks = switch == Switch::Reassembling && !Path::new(BRIDGE_NETFILTER).exists();
+    lacks.then(|| "the kernel has no bridge netfilter: modprobe br_netfilter".to_owned())
+}
+
+/// Removes what this process has made, whole or not.
+struct Remover;
+
+impl Drop for Remover {
+    fn drop(&mut self) {
+        stale::remove_namespaces(process::id());
+    }
+}
+
+/// Makes the hosts, all connected at once.
+pub(super) fn make(names: &[String], switch: Switch) -> Result<Bed, EvalError> {
+    let remover = Remover;
+    let between = stale::name("switch");
+    ip(&format!("netns add {between}"))?;
+    ip(&format!("-n {between} link add br0 type bridge mcast_snooping 0"))?;
+    ip(&format!("-n {between} link set br0 up"))?;
+    let network = network(&between);
+    set_up_switch(&network, switch)?;
+    let mut hosts = Vec::with_capacity(names.len());
+    for (index, name) in (0_u8..).zip(names) {
+        let namespace = stale::name(name);
+        let port = format!("p{index}");
+        let address = Ipv4Addr::new(10, 77, 0, index.saturating_add(1));
+        ip(&format!("netns add {namespace}"))?;
+        ip(&format!("link add {port} netns {between} type veth peer name eth0 netns {namespace}"))?;
+        ip(&format!("-n {between} link set {port} master br0 up"))?;
+        ip(&format!("-n {namespace} link set lo up"))?;
+        ip(&format!("-n {namespace} addr add {address}/24 dev eth0"))?;
+        ip(&format!("-n {namespace} link set eth0 up"))?;
+        ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"))?;
+        let network = self::network(&namespace);
+        hosts.push(Host { name: name.clone(), address, entry: network.entry(), network, port });
+    }
+    Ok(Bed { hosts, switch: network, _remover: Box::new(remover) })
+}
+
+/// Lets the switch pass packets on, or put fragments together as one with connection tracking does.
+fn set_up_switch(network: &Network, switch: Switch) -> Result<(), EvalError> {
+    let value = match switch {
+        Switch::Plain => "0",
+        Switch::Reassembling => "1",
+    };
+    network.within(|| {
+        // Where there is no bridge netfilter, there is nothing to be switched off.
+        if switch == Switch::Plain && !Path::new(BRIDGE_NETFILTER).exists() {
+            return Ok(());
+        }
+        fs::write(BRIDGE_NETFILTER, value).map_err(|error| EvalError::file(BRIDGE_NETFILTER.as_ref(), &error))
+    })?;
+    if switch == Switch::Reassembling {
+        // A rule that asks for a connection begins connection tracking in this namespace.
+        network.run("iptables -w 5 -A FORWARD -m conntrack --ctstate ESTABLISHED -j ACCEPT")?;
+    }
+    Ok(())
+}
+
+fn network(namespace: &str) -> Network {
+    Network::new(Path::new(NAMESPACES).join(namespace))
+}
+
+fn ip(arguments: &str) -> Result<(), EvalError> {
+    system::run(&system::words(&format!("ip {arguments}")))?;
+    Ok(())
+}

@@ -1,0 +1,62 @@
+//! A network namespace, by the file that stands for it.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::thread;
+
+use nix::sched::{CloneFlags, setns};
+
+use crate::eval::error::EvalError;
+use crate::eval::impairment::system;
+
+/// Interfaces, ports and tables of a host or of the switch.
+#[derive(Clone, Debug)]
+pub struct Network(PathBuf);
+
+impl Network {
+    /// That of a file such as `/run/netns/NAME` or `/proc/PID/ns/net`.
+    pub fn new(file: impl Into<PathBuf>) -> Self {
+        Self(file.into())
+    }
+
+    /// The words that run a program in it.
+    pub fn entry(&self) -> Vec<String> {
+        vec!["nsenter".to_owned(), format!("--net={}", self.0.display())]
+    }
+
+    /// A command that will run in it, and in all else where the harness is.
+    pub fn command(&self, program: &Path) -> Command {
+        let mut command = Command::new("nsenter");
+        command.arg(format!("--net={}", self.0.display()));
+        command.args(["setpriv", "--pdeathsig", "KILL"]).arg(program);
+        command
+    }
+
+    /// Runs a command line without quotes to its end; yields what it wrote to stdout.
+    ///
+    /// # Errors
+    /// It is not there, or failed.
+    pub fn run(&self, line: &str) -> Result<String, EvalError> {
+        let words: Vec<String> = self.entry().into_iter().chain(system::words(line)).collect();
+        Ok(system::run(&words)?)
+    }
+
+    /// Calls a function in it. Files of `/proc/thread-self/net` and sockets that it opens stay there.
+    ///
+    /// # Errors
+    /// The namespace can't be entered, or the function failed.
+    pub fn within<T: Send>(
+        &self,
+        call: impl FnOnce() -> Result<T, EvalError> + Send,
+    ) -> Result<T, EvalError> {
+        let enter = || {
+            let file = File::open(&self.0).map_err(|error| EvalError::file(&self.0, &error))?;
+            setns(file, CloneFlags::CLONE_NEWNET)
+                .map_err(|error| EvalError::new(format!("{}: {error}", self.0.display())))?;
+            call()
+        };
+        let joined = thread::scope(|scope| scope.spawn(enter).join());
+        joined.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    }
+}

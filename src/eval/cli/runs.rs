@@ -1,0 +1,208 @@
+//! `list`, `run` and `matrix`: the scenarios, and runs of them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::rc::Rc;
+
+use clap::Args;
+
+use super::failed;
+use crate::eval::bed::{self, BedKind};
+use crate::eval::error::EvalError;
+use crate::eval::harness::{self, Dimensions, Library, Plan, Settings};
+use crate::eval::impairment::{BackendChoice, Reading};
+use crate::eval::scenario::{Scenario, Switch};
+
+/// Seconds that a run takes beside its window: hosts, matching, settling, acknowledgements.
+const AROUND_S: f64 = 20.0;
+
+/// Where the scenarios are.
+#[derive(Args, Debug)]
+pub(super) struct Folder {
+    /// The folder of the scenarios
+    #[arg(long, value_name = "DIR", default_value = "config/scenarios")]
+    scenarios: PathBuf,
+}
+
+/// What `run` is asked.
+#[derive(Args, Debug)]
+pub(super) struct RunArguments {
+    /// Names of scenarios, as `list` shows them, or files
+    #[arg(required = true)]
+    scenario: Vec<String>,
+    /// Whose DDS publisher and subscribers run on; several with commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "fast")]
+    library: Vec<Library>,
+    /// Which reading of Table I; several with commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "as-printed")]
+    reading: Vec<Reading>,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// What `matrix` is asked.
+#[derive(Args, Debug)]
+pub(super) struct MatrixArguments {
+    /// Whose DDS publisher and subscribers run on; several with commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "fast,cyclone")]
+    library: Vec<Library>,
+    /// Which reading of Table I; several with commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "as-printed,as-run")]
+    reading: Vec<Reading>,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Args, Debug)]
+struct Common {
+    /// What the hosts are made of; several with commas
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "netns")]
+    bed: Vec<BedKind>,
+    /// The host between; several with commas [default: as the scenario says]
+    #[arg(long, value_enum, value_delimiter = ',')]
+    switch: Vec<Switch>,
+    /// A few seconds in place of minutes: shows that it works, and measures nothing
+    #[arg(long)]
+    quick: bool,
+    /// How often each
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    repeat: u32,
+    /// The links lose the same packets for the same seed (where they are of NFQUEUE)
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// The folder of the results; runs that are there are not made again
+    #[arg(long, value_name = "DIR", default_value = "eval-results")]
+    out: PathBuf,
+    /// What impairs the links
+    #[arg(long, value_enum, default_value = "auto")]
+    backend: BackendChoice,
+    /// The CPUs for a host's programs, such as `critical=1` or `bridge=0-1`; repeatable
+    #[arg(long, value_name = "HOST=CPUS", value_parser = pin)]
+    pin: Vec<(String, String)>,
+    /// The program `adaptive-bridge` [default: the one beside this program]
+    #[arg(long, value_name = "FILE")]
+    bridge: Option<PathBuf>,
+    /// The folder of the peers' programs
+    #[arg(long, value_name = "DIR", default_value = "tests/peers/build")]
+    peers: PathBuf,
+    #[command(flatten)]
+    folder: Folder,
+}
+
+fn pin(text: &str) -> Result<(String, String), String> {
+    let cpus = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || ",-".contains(c));
+    match text.split_once('=') {
+        Some((host, list)) if cpus(list) => Ok((host.to_owned(), list.to_owned())),
+        _ => Err("must be a host, =, and CPUs such as 0, 0,2 or 1-3".to_owned()),
+    }
+}
+
+pub(super) fn list(folder: &Folder) -> ExitCode {
+    match Scenario::load_all(&folder.scenarios) {
+        Ok(scenarios) => {
+            let width = scenarios.iter().map(|scenario| scenario.name.len()).max().unwrap_or(0);
+            for Scenario { name, title, duration_s, .. } in scenarios {
+                println!("{name:width$}  {duration_s:>4.0} s  {title}");
+            }
+            ExitCode::SUCCESS
+        }
+        Err(error) => failed(&error),
+    }
+}
+
+pub(super) fn run(arguments: &RunArguments) -> ExitCode {
+    let folder = &arguments.common.folder.scenarios;
+    let scenarios = arguments.scenario.iter().map(|name| find(folder, name)).collect();
+    make(scenarios, &arguments.library, &arguments.reading, &arguments.common)
+}
+
+pub(super) fn matrix(arguments: &MatrixArguments) -> ExitCode {
+    let scenarios = Scenario::load_all(&arguments.common.folder.scenarios);
+    make(scenarios, &arguments.library, &arguments.reading, &arguments.common)
+}
+
+fn find(folder: &Path, name: &str) -> Result<Scenario, EvalError> {
+    if name.ends_with(".yaml") {
+        return Scenario::load(Path::new(name));
+    }
+    let path = folder.join(format!("{name}.yaml"));
+    if path.exists() {
+        return Scenario::load(&path);
+    }
+    Err(EvalError::new(format!("no scenario '{name}' in {}: `list` shows what there is", folder.display())))
+}
+
+fn make(
+    scenarios: Result<Vec<Scenario>, EvalError>,
+    libraries: &[Library],
+    readings: &[Reading],
+    common: &Common,
+) -> ExitCode {
+    let made = scenarios.and_then(|scenarios| {
+        let scenarios: Vec<Rc<Scenario>> = scenarios.into_iter().map(Rc::new).collect();
+        let dimensions = Dimensions {
+            libraries: libraries.to_vec(),
+            readings: readings.to_vec(),
+            beds: common.bed.clone(),
+            switches: common.switch.clone(),
+            repetitions: common.repeat,
+        };
+        let plans = dimensions.plans(&scenarios, bed::docker_switch());
+        let settings = common.settings()?;
+        check_possible(&plans, &settings)?;
+        let seconds: f64 = plans.iter().map(|plan| plan.duration_s(settings.quick) + AROUND_S).sum();
+        eprintln!("{} runs, about {:.0} min, into {}", plans.len(), seconds / 60.0, settings.out.display());
+        harness::make_all(&plans, &settings)
+    });
+    match made {
+        Ok(outcome) => {
+            let harness::Outcome { made, skipped, failed } = outcome;
+            eprintln!("{made} made, {skipped} were there, {failed} failed");
+            if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+        }
+        Err(error) => failed(&error),
+    }
+}
+
+/// Whatever would fail in the middle of a matrix is said before it.
+fn check_possible(plans: &[Plan], settings: &Settings) -> Result<(), EvalError> {
+    let mut beds: Vec<(BedKind, Switch)> = Vec::new();
+    for plan in plans {
+        settings.peer(plan.library)?;
+        if !beds.contains(&(plan.bed, plan.switch)) {
+            beds.push((plan.bed, plan.switch));
+        }
+    }
+    for (bed, switch) in beds {
+        if let Some(reason) = bed.missing(switch) {
+            let (bed, switch) = (bed.name(), switch.name());
+            return Err(EvalError::new(format!("no {bed} bed with a {switch} switch here: {reason}")));
+        }
+    }
+    if !settings.bridge.exists() {
+        return Err(EvalError::new(format!("{} is not there: cargo build", settings.bridge.display())));
+    }
+    Ok(())
+}
+
+impl Common {
+    fn settings(&self) -> Result<Settings, EvalError> {
+        let harness = std::env::current_exe()
+            .map_err(|error| EvalError::new(format!("where this program is: {error}")))?;
+        let beside = harness.with_file_name("adaptive-bridge");
+        let absolute =
+            |path: &Path| std::path::absolute(path).map_err(|error| EvalError::file(path, &error));
+        Ok(Settings {
+            out: absolute(&self.out)?,
+            bridge: absolute(self.bridge.as_deref().unwrap_or(&beside))?,
+            harness,
+            peers: absolute(&self.peers)?,
+            quick: self.quick,
+            seed: self.seed,
+            backend: self.backend,
+            pins: self.pin.iter().cloned().collect::<BTreeMap<_, _>>(),
+            command_line: std::env::args().collect(),
+        })
+    }
+}

@@ -1,0 +1,238 @@
+//! The impaired links of a run: a program at each receiver, and caps on the ports of the switch.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use super::csv::Csv;
+use super::manifest::LinkEntry;
+use super::plan::Plan;
+use super::program::Program;
+use super::settings::Settings;
+use crate::eval::bed::Bed;
+use crate::eval::error::EvalError;
+use crate::eval::impairment::Level;
+use crate::eval::scenario::{Action, Remote, Scenario, Variant};
+use crate::model::MonotonicNs;
+
+/// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
+/// radio link has some such queue; a longer one delays more and drops less.
+const CAP_QUEUE: &str = "burst 16kb latency 200ms";
+
+const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped";
+
+/// A program that impairs what a host receives from another.
+struct Link {
+    remote: String,
+    entry: LinkEntry,
+    program: Program,
+}
+
+/// A token bucket on the switch's port towards a remote subscriber.
+struct Cap {
+    remote: String,
+    port: String,
+    kbit_per_s: u64,
+    on: bool,
+}
+
+/// All links of a run. They are clean until they are switched.
+pub(super) struct Links {
+    links: Vec<Link>,
+    caps: Vec<Cap>,
+    csv: Csv,
+}
+
+/// One direction of a link.
+struct Way<'a> {
+    direction: &'static str,
+    host: &'a str,
+    source: &'a str,
+    level: Level,
+    delay_ms: f64,
+    jitter_ms: f64,
+}
+
+impl Links {
+    /// Starts the programs.
+    pub fn open(plan: &Plan, settings: &Settings, bed: &Bed, folder: &Path) -> Result<Self, EvalError> {
+        let scenario = &plan.scenario;
+        let mut links = Vec::new();
+        let mut caps = Vec::new();
+        for remote in &scenario.remotes {
+            for way in ways(scenario, remote) {
+                let number = u16::try_from(links.len()).unwrap_or(u16::MAX);
+                links.push(open(plan, settings, bed, folder, remote, &way, number)?);
+            }
+            if let Some(kbit_per_s) = remote.cap_kbit_per_s {
+                let port = bed.host(&remote.name)?.port.clone();
+                caps.push(Cap { remote: remote.name.clone(), port, kbit_per_s, on: false });
+            }
+        }
+        Ok(Self { links, caps, csv: Csv::create(folder, "links.csv", COLUMNS)? })
+    }
+
+    /// Whether all of them are there.
+    pub fn are_ready(&mut self) -> bool {
+        self.links.iter_mut().all(|link| link.program.said("ready").is_some())
+    }
+
+    /// Does to a remote subscriber's link what an event says.
+    pub fn switch(&mut self, bed: &Bed, remote: &str, action: Action) -> Result<(), EvalError> {
+        let word = match action {
+            Action::LinkOn => "on",
+            Action::LinkDown => "down",
+            _ => "off",
+        };
+        for link in self.links.iter_mut().filter(|link| link.remote == remote) {
+            link.program.tell(word);
+        }
+        for cap in self.caps.iter_mut().filter(|cap| cap.remote == remote) {
+            let on = action != Action::LinkOff;
+            if on != cap.on {
+                let verb = if on { "add" } else { "del" };
+                let (port, rate) = (&cap.port, cap.kbit_per_s);
+                let bucket = if on { format!("tbf rate {rate}kbit {CAP_QUEUE}") } else { String::new() };
+                bed.switch().run(&format!("tc qdisc {verb} dev {port} root {bucket}"))?;
+                cap.on = on;
+            }
+        }
+        Ok(())
+    }
+
+    /// Ports with a cap.
+    pub fn capped_ports(&self) -> impl Iterator<Item = &str> {
+        self.caps.iter().filter(|cap| cap.on).map(|cap| cap.port.as_str())
+    }
+
+    /// Records what the links have counted since they were asked last, and asks again.
+    pub fn sample(&mut self, now: MonotonicNs) -> Result<(), EvalError> {
+        for link in &mut self.links {
+            if let Some(said) = link.program.take("counters") {
+                let number = |key: &str| said[key].as_u64().unwrap_or(0);
+                let state = said["state"].as_str().unwrap_or("");
+                let counts = ["seen", "fragments", "judged", "lost", "cut", "held", "passed", "kernel_dropped"];
+                let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
+                self.csv.row(&[&now.0, &link.entry.name, &state, &counts.join(",")])?;
+            }
+            link.program.tell("counters");
+        }
+        Ok(())
+    }
+
+    /// The programs, to be watched.
+    pub fn programs(&mut self) -> impl Iterator<Item = &mut Program> {
+        self.links.iter_mut().map(|link| &mut link.program)
+    }
+
+    /// Removes all links; yields what they were and what they did, and what makes that doubtful.
+    pub fn end(mut self) -> Result<(Vec<LinkEntry>, Vec<String>), EvalError> {
+        let mut entries = Vec::new();
+        let mut problems = Vec::new();
+        for link in &mut self.links {
+            let name = link.entry.name.clone();
+            if !link.program.end(Duration::from_secs(10)) {
+                problems.push(format!("the link {name} did not end as asked"));
+            }
+            // What it said last is still on its way through the pipe.
+            let last = last_words(&mut link.program);
+            let lost_by_harness = ["kernel_dropped", "overflowed"]
+                .map(|key| last.as_ref().and_then(|last| last[key].as_u64()).unwrap_or(0));
+            if lost_by_harness != [0, 0] {
+                problems.push(format!(
+                    "the link {name} lost packets that it should not: {} before it saw them, {} for want of room",
+                    lost_by_harness[0], lost_by_harness[1]
+                ));
+            }
+            entries.push(LinkEntry { impairment: last, ..link.entry.clone() });
+        }
+        for cap in &self.caps {
+            match entries
+                .iter_mut()
+                .find(|entry| entry.host == cap.remote && entry.direction == "forward")
+            {
+                Some(entry) => entry.cap_kbit_per_s = Some(cap.kbit_per_s),
+                None => entries.push(LinkEntry {
+                    name: format!("{}<-*", cap.remote),
+                    direction: "forward",
+                    host: cap.remote.clone(),
+                    source: "*".to_owned(),
+                    cap_kbit_per_s: Some(cap.kbit_per_s),
+                    impairment: None,
+                }),
+            }
+        }
+        self.csv.flush()?;
+        Ok((entries, problems))
+    }
+}
+
+/// The last line of a link that has ended.
+fn last_words(program: &mut Program) -> Option<Value> {
+    for _ in 0..100 {
+        if let Some(ended) = program.take("ended") {
+            return Some(ended);
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    None
+}
+
+/// What is impaired of a remote subscriber's link. One that is never switched and loses nothing needs no
+/// program.
+fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
+    let sender = match scenario.variant {
+        Variant::Baseline => "publisher",
+        Variant::Bridge => "bridge",
+    };
+    let is_cut =
+        scenario.events.iter().any(|event| event.action == Action::LinkDown && event.to == remote.name);
+    let mut ways = Vec::new();
+    if remote.is_impaired() || is_cut {
+        let (delay_ms, jitter_ms) = (remote.delay_ms, remote.jitter_ms);
+        let (host, source) = (remote.name.as_str(), sender);
+        ways.push(Way { direction: "forward", host, source, level: remote.level, delay_ms, jitter_ms });
+    }
+    if remote.returns_late() || is_cut {
+        let (delay_ms, jitter_ms) = (remote.return_delay_ms, remote.return_jitter_ms);
+        let (host, source) = (sender, remote.name.as_str());
+        ways.push(Way { direction: "return", host, source, level: Level::Clean, delay_ms, jitter_ms });
+    }
+    ways
+}
+
+/// Starts the program of one direction; `number` tells it from the others.
+fn open(
+    plan: &Plan,
+    settings: &Settings,
+    bed: &Bed,
+    folder: &Path,
+    remote: &Remote,
+    way: &Way,
+    number: u16,
+) -> Result<Link, EvalError> {
+    let (host, source) = (bed.host(way.host)?, bed.host(way.source)?);
+    let mut command = host.network.command(&settings.harness);
+    command.args(["impair", "--json", "--state", "off"]);
+    command.args(["--backend", settings.backend_name(), "--queue", &number.to_string()]);
+    command.args(["--source", &source.address.to_string()]);
+    command.args(["--level", way.level.name()]);
+    if let Some(reading) = plan.reading {
+        command.args(["--reading", reading.name()]);
+    }
+    command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
+    command.args(["--seed", &settings.seed.saturating_add(u64::from(number)).to_string()]);
+    let name = format!("{}<-{}", way.host, way.source);
+    let program =
+        Program::start(&format!("link-{}-{}", way.host, way.source), command, &folder.join("logs"))?;
+    let entry = LinkEntry {
+        name,
+        direction: way.direction,
+        host: way.host.to_owned(),
+        source: way.source.to_owned(),
+        cap_kbit_per_s: None,
+        impairment: None,
+    };
+    Ok(Link { remote: remote.name.clone(), entry, program })
+}

@@ -1,0 +1,85 @@
+//! The machine and the software that a run was made with.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use serde::Serialize;
+
+/// The machine.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Machine {
+    pub kernel: String,
+    pub os: String,
+    pub cpu: String,
+    pub cpus: usize,
+    pub memory_bytes: u64,
+    pub load_before: f64,
+}
+
+impl Machine {
+    /// As it is now.
+    pub fn read() -> Self {
+        let text = |path: &str| fs::read_to_string(path).unwrap_or_default();
+        let load = text("/proc/loadavg");
+        let memory = field(&text("/proc/meminfo"), "MemTotal", ':');
+        let kib: u64 = memory.split_whitespace().next().and_then(|kib| kib.parse().ok()).unwrap_or(0);
+        Self {
+            kernel: text("/proc/sys/kernel/osrelease").trim().to_owned(),
+            os: field(&text("/etc/os-release"), "PRETTY_NAME", '=').trim_matches('"').to_owned(),
+            cpu: field(&text("/proc/cpuinfo"), "model name", ':'),
+            cpus: std::thread::available_parallelism().map_or(0, Into::into),
+            memory_bytes: kib * 1_024,
+            load_before: load.split_whitespace().next().and_then(|load| load.parse().ok()).unwrap_or(0.0),
+        }
+    }
+}
+
+/// What a file of `name`, a separator and a value on each line says of a name; empty if it says nothing.
+fn field(text: &str, name: &str, separator: char) -> String {
+    let mut pairs = text.lines().filter_map(|line| line.split_once(separator));
+    pairs.find(|(key, _)| key.trim() == name).map(|(_, value)| value.trim().to_owned()).unwrap_or_default()
+}
+
+/// The programs.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Software {
+    pub version: &'static str,
+    pub commit: Option<String>,
+    pub modified: bool,
+    pub bridge: Option<String>,
+    pub peer: Option<String>,
+}
+
+impl Software {
+    /// The harness, the checkout in which it runs, and the bridge.
+    pub fn read(bridge: Option<&Path>) -> Self {
+        let commit = said(Command::new("git").args(["rev-parse", "HEAD"]));
+        let changes = said(Command::new("git").args(["status", "--porcelain", "--untracked-files=no"]));
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            modified: changes.is_some_and(|changes| !changes.is_empty()),
+            commit,
+            bridge: bridge.and_then(|bridge| said(Command::new(bridge).arg("--version"))),
+            peer: None,
+        }
+    }
+}
+
+/// What a program says, if it ends well.
+fn said(command: &mut Command) -> Option<String> {
+    let output = command.stdin(Stdio::null()).stderr(Stdio::null()).output().ok()?;
+    output.status.success().then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_found_by_its_name() {
+        assert_eq!(field("A=1\nPRETTY_NAME=\"Debian\"\n", "PRETTY_NAME", '='), "\"Debian\"");
+        assert_eq!(field("MemTotal:  16 kB\nMemFree: 1 kB\n", "MemTotal", ':'), "16 kB");
+        assert_eq!(field("", "MemTotal", ':'), "");
+    }
+}
