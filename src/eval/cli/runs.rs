@@ -191,8 +191,7 @@ impl Common {
         let harness = std::env::current_exe()
             .map_err(|error| EvalError::new(format!("where this program is: {error}")))?;
         let beside = harness.with_file_name("adaptive-bridge");
-        let absolute =
-            |path: &Path| std::path::absolute(path).map_err(|error| EvalError::file(path, &error));
+        let absolute = |path: &Path| std::path::absolute(path).map_err(|error| EvalError::file(path, &error));
         Ok(Settings {
             out: absolute(&self.out)?,
             bridge: absolute(self.bridge.as_deref().unwrap_or(&beside))?,

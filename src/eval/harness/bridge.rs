@@ -36,7 +36,8 @@ impl Bridge {
     /// Starts it.
     pub fn start(plan: &Plan, settings: &Settings, bed: &Bed, folder: &Path) -> Result<Self, EvalError> {
         let config = folder.join("bridge.yaml");
-        fs::write(&config, configuration(&plan.scenario)).map_err(|error| EvalError::file(&config, &error))?;
+        fs::write(&config, configuration(&plan.scenario))
+            .map_err(|error| EvalError::file(&config, &error))?;
         let logs = folder.join("logs");
         let host = bed.host("bridge")?;
         let mut command = pinned(settings, host, &settings.bridge);

@@ -3,8 +3,6 @@
 use std::path::Path;
 use std::time::Duration;
 
-use serde_json::Value;
-
 use super::csv::Csv;
 use super::manifest::LinkEntry;
 use super::plan::Plan;
@@ -14,7 +12,6 @@ use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::impairment::Level;
 use crate::eval::scenario::{Action, Remote, Scenario, Variant};
-use crate::model::MonotonicNs;
 
 /// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
 /// radio link has some such queue; a longer one delays more and drops less.
@@ -107,14 +104,15 @@ impl Links {
     }
 
     /// Records what the links have counted since they were asked last, and asks again.
-    pub fn sample(&mut self, now: MonotonicNs) -> Result<(), EvalError> {
+    pub fn sample(&mut self) -> Result<(), EvalError> {
         for link in &mut self.links {
-            if let Some(said) = link.program.take("counters") {
+            if let Some((time, said)) = link.program.take("counters") {
                 let number = |key: &str| said[key].as_u64().unwrap_or(0);
                 let state = said["state"].as_str().unwrap_or("");
-                let counts = ["seen", "fragments", "judged", "lost", "cut", "held", "passed", "kernel_dropped"];
+                let counts =
+                    ["seen", "fragments", "judged", "lost", "cut", "held", "passed", "kernel_dropped"];
                 let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
-                self.csv.row(&[&now.0, &link.entry.name, &state, &counts.join(",")])?;
+                self.csv.row(&[&time.0, &link.entry.name, &state, &counts.join(",")])?;
             }
             link.program.tell("counters");
         }
@@ -135,8 +133,7 @@ impl Links {
             if !link.program.end(Duration::from_secs(10)) {
                 problems.push(format!("the link {name} did not end as asked"));
             }
-            // What it said last is still on its way through the pipe.
-            let last = last_words(&mut link.program);
+            let last = link.program.last_words("ended");
             let lost_by_harness = ["kernel_dropped", "overflowed"]
                 .map(|key| last.as_ref().and_then(|last| last[key].as_u64()).unwrap_or(0));
             if lost_by_harness != [0, 0] {
@@ -148,10 +145,7 @@ impl Links {
             entries.push(LinkEntry { impairment: last, ..link.entry.clone() });
         }
         for cap in &self.caps {
-            match entries
-                .iter_mut()
-                .find(|entry| entry.host == cap.remote && entry.direction == "forward")
-            {
+            match entries.iter_mut().find(|entry| entry.host == cap.remote && entry.direction == "forward") {
                 Some(entry) => entry.cap_kbit_per_s = Some(cap.kbit_per_s),
                 None => entries.push(LinkEntry {
                     name: format!("{}<-*", cap.remote),
@@ -166,17 +160,6 @@ impl Links {
         self.csv.flush()?;
         Ok((entries, problems))
     }
-}
-
-/// The last line of a link that has ended.
-fn last_words(program: &mut Program) -> Option<Value> {
-    for _ in 0..100 {
-        if let Some(ended) = program.take("ended") {
-            return Some(ended);
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    None
 }
 
 /// What is impaired of a remote subscriber's link. One that is never switched and loses nothing needs no

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::manifest::EndpointEntry;
+use super::pinned;
 use super::plan::Plan;
 use super::program::Program;
 use super::settings::{Library, Settings};
-use super::pinned;
 use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::scenario::{ReaderHistory, Scenario, Variant};

@@ -98,3 +98,58 @@ impl Plan {
         at_s * self.duration_s(quick) / self.scenario.duration_s
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scenario(name: &str, level: &str) -> Rc<Scenario> {
+        let text = format!(
+            "title: a\nvariant: baseline\nduration_s: 180\nquick_s: 9\nswitches: [plain, reassembling]\n\
+             remotes:\n  - {{name: slow, level: {level}}}\n"
+        );
+        Rc::new(Scenario::parse(name, &text).unwrap_or_else(|problems| panic!("{problems:?}")))
+    }
+
+    fn dimensions() -> Dimensions {
+        Dimensions {
+            libraries: vec![Library::Fast, Library::Cyclone],
+            readings: vec![Reading::AsPrinted, Reading::AsRun],
+            beds: vec![BedKind::Netns],
+            switches: Vec::new(),
+            repetitions: 2,
+        }
+    }
+
+    #[test]
+    fn every_combination_is_there_once_and_the_first_repetition_comes_first() {
+        let scenarios = [scenario("clean", "clean"), scenario("mild", "mild")];
+        let plans = dimensions().plans(&scenarios, Switch::Reassembling);
+        // Two libraries, two switches, two repetitions; what loses nothing has no readings.
+        assert_eq!(plans.len(), 2 * 2 * 2 * (1 + 2));
+        let mut names: Vec<String> = plans.iter().map(Plan::name).collect();
+        assert_eq!(names[0], "clean.fast.none.netns.plain.r1");
+        assert!(names[..12].iter().all(|name| name.ends_with(".r1")));
+        assert!(names.contains(&"mild.cyclone.as-run.netns.reassembling.r2".to_owned()));
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), plans.len());
+    }
+
+    #[test]
+    fn switches_are_as_asked_else_of_the_scenario_and_docker_has_one() {
+        let scenarios = [scenario("mild", "mild")];
+        let count = |dimensions: &Dimensions| dimensions.plans(&scenarios, Switch::Reassembling).len();
+        let one = Dimensions { switches: vec![Switch::Plain], ..dimensions() };
+        let docker = Dimensions { beds: vec![BedKind::Docker], ..dimensions() };
+        assert_eq!((count(&dimensions()), count(&one), count(&docker)), (16, 8, 8));
+    }
+
+    #[test]
+    fn events_move_with_the_window() {
+        let scenarios = [scenario("mild", "mild")];
+        let plan = &dimensions().plans(&scenarios, Switch::Plain)[0];
+        assert_eq!((plan.duration_s(false), plan.at_s(60.0, false)), (180.0, 60.0));
+        assert_eq!((plan.duration_s(true), plan.at_s(60.0, true)), (9.0, 3.0));
+    }
+}

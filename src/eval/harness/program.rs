@@ -18,8 +18,11 @@ use crate::clock;
 use crate::eval::error::EvalError;
 use crate::model::MonotonicNs;
 
-/// A line of output and when it came. It is shared with nobody.
-type Said = (MonotonicNs, Value);
+/// How often it is looked for the last line of a program, 10 ms apart.
+const LAST_WORDS_TRIES: u32 = 100;
+
+/// A line of output and when it came.
+pub(super) type Said = (MonotonicNs, Value);
 
 /// A running child, the leader of a process group. Dropping it kills the group.
 pub(super) struct Program {
@@ -28,7 +31,7 @@ pub(super) struct Program {
     stdin: Option<ChildStdin>,
     lines: Receiver<Said>,
     /// The latest line of each event; a line without one is of event "".
-    latest: BTreeMap<String, Value>,
+    latest: BTreeMap<String, Said>,
     ended: Option<ExitStatus>,
 }
 
@@ -61,7 +64,7 @@ impl Program {
         for (time, value) in self.lines.try_iter() {
             match value["event"].as_str().map(str::to_owned) {
                 Some(event) => {
-                    self.latest.insert(event, value);
+                    self.latest.insert(event, (time, value));
                 }
                 None => plain.push((time, value)),
             }
@@ -72,13 +75,24 @@ impl Program {
     /// The latest line of an event so far.
     pub fn said(&mut self, event: &str) -> Option<&Value> {
         self.listen();
-        self.latest.get(event)
+        self.latest.get(event).map(|(_, value)| value)
     }
 
-    /// Takes the latest line of an event, so that the next one is another.
-    pub fn take(&mut self, event: &str) -> Option<Value> {
+    /// Takes the latest line of an event and when it came, so that the next one is another.
+    pub fn take(&mut self, event: &str) -> Option<Said> {
         self.listen();
         self.latest.remove(event)
+    }
+
+    /// The last line of an event of one that has ended; some of what it said may still be on its way.
+    pub fn last_words(&mut self, event: &str) -> Option<Value> {
+        for _ in 0..LAST_WORDS_TRIES {
+            if let Some(said) = self.said(event) {
+                return Some(said.clone());
+            }
+            thread::sleep(Duration::from_millis(10));
+        }
+        None
     }
 
     /// Writes a line to its stdin. One that has gone does not hear it, which is found elsewhere.

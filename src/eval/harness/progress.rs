@@ -14,8 +14,11 @@ pub(super) struct Progress {
 impl Progress {
     /// Begins the line of run `number` of `all`.
     pub fn begin(number: usize, all: usize, run: &str) -> Self {
-        let progress =
-            Self { head: format!("[{number}/{all}] {run}"), in_place: stderr().is_terminal(), shown: String::new() };
+        let progress = Self {
+            head: format!("[{number}/{all}] {run}"),
+            in_place: stderr().is_terminal(),
+            shown: String::new(),
+        };
         if !progress.in_place {
             eprintln!("{}", progress.head);
         }

@@ -16,7 +16,6 @@ use super::machine::{Machine, Software};
 use super::manifest::{FORMAT, Manifest, PortEntry};
 use super::peers::{self, Endpoint};
 use super::plan::Plan;
-use super::program::Program;
 use super::progress::Progress;
 use super::sampler::{Sampler, queue_drops};
 use super::settings::Settings;
@@ -173,7 +172,8 @@ impl<'a> Run<'a> {
         self.note(begin, "begin", "")?;
         for remote in &self.plan.scenario.remotes {
             // Where nothing is impaired and no event changes that, there is nothing to tell.
-            let mentioned = self.plan.scenario.events.iter().any(|it| it.action.is_of_link() && it.to == remote.name);
+            let mentioned =
+                self.plan.scenario.events.iter().any(|it| it.action.is_of_link() && it.to == remote.name);
             let impaired = remote.is_impaired() || remote.returns_late() || remote.cap_kbit_per_s.is_some();
             if remote.impaired_at_begin && (impaired || mentioned) {
                 self.act(&Event { at_s: 0.0, action: Action::LinkOn, to: remote.name.clone() })?;
@@ -229,7 +229,8 @@ impl<'a> Run<'a> {
 
     /// Ends everything in order, and writes down what it was.
     fn finish(self, machine: &Machine, begin: MonotonicNs, end: MonotonicNs) -> Result<(), EvalError> {
-        let Self { plan, settings, folder, bed, mut endpoints, links, bridge, sampler, mut events, .. } = self;
+        let Self { plan, settings, folder, bed, mut endpoints, links, bridge, sampler, mut events, .. } =
+            self;
         let mut problems = Vec::new();
         let mut software = Software::read(bridge.is_some().then_some(settings.bridge.as_path()));
         // First publishers, so that no subscriber goes while it is written to.
@@ -237,7 +238,7 @@ impl<'a> Run<'a> {
         let mut entries = Vec::with_capacity(endpoints.len());
         for Endpoint { mut entry, mut program } in endpoints {
             program.end(END_PATIENCE);
-            entry.summary = last_line(&mut program, "summary");
+            entry.summary = program.last_words("summary");
             if entry.summary.is_none() {
                 problems.push(format!("{} was held up and had to be killed", entry.name));
             }
@@ -316,11 +317,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    fn wait_until(
-        &mut self,
-        time: MonotonicNs,
-        mut show: impl FnMut(MonotonicNs),
-    ) -> Result<(), EvalError> {
+    fn wait_until(&mut self, time: MonotonicNs, mut show: impl FnMut(MonotonicNs)) -> Result<(), EvalError> {
         loop {
             let now = clock::monotonic();
             if now >= time {
@@ -356,7 +353,7 @@ impl<'a> Run<'a> {
             drops.push((port.to_owned(), queue_drops(&json)));
         }
         self.sampler.sample(now, &self.processes(), &drops)?;
-        self.links.sample(now)
+        self.links.sample()
     }
 
     /// Nobody ends by itself but a publisher that has sent all.
@@ -376,17 +373,6 @@ impl<'a> Run<'a> {
         }
         Ok(())
     }
-}
-
-/// The last line of an event of a program that has ended; some of what it said may still be on its way.
-fn last_line(program: &mut Program, event: &str) -> Option<serde_json::Value> {
-    for _ in 0..50 {
-        if let Some(said) = program.said(event) {
-            return Some(said.clone());
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    None
 }
 
 fn ports(bed: &Bed) -> Vec<PortEntry> {

@@ -45,7 +45,8 @@ impl Sampler {
         for host in bed.hosts() {
             hosts.push(HostFiles::open(&host.name, &host.network)?);
         }
-        let ticks_per_s = sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|ticks| u64::try_from(ticks).ok());
+        let ticks_per_s =
+            sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|ticks| u64::try_from(ticks).ok());
         Ok(Self {
             ports: bed.hosts().iter().map(|host| (host.name.clone(), host.port.clone())).collect(),
             interfaces: ProcFile::of_network(bed.switch(), "dev")?,

@@ -317,3 +317,137 @@ fn noncritical() -> String {
 fn clean() -> Level {
     Level::Clean
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEAST: &str = "title: a\nvariant: bridge\nduration_s: 10\nremotes:\n  - {name: slow}\n";
+
+    fn scenarios() -> Vec<Scenario> {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/config/scenarios");
+        Scenario::load_all(folder.as_ref()).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    #[test]
+    fn every_scenario_of_the_paper_is_there_and_all_are_valid() {
+        let scenarios = scenarios();
+        let find = |name: &str| scenarios.iter().find(|it| it.name == name).expect(name);
+        for level in Level::ALL {
+            let duration_s = if level == Level::Clean { 120.0 } else { 180.0 };
+            for (prefix, variant) in [("baseline", Variant::Baseline), ("bridge", Variant::Bridge)] {
+                let scenario = find(&format!("{prefix}_{}", level.name()));
+                assert_eq!(
+                    (scenario.variant, scenario.duration_s),
+                    (variant, duration_s),
+                    "{}",
+                    scenario.name
+                );
+                assert_eq!(scenario.remotes.iter().map(|it| it.level).collect::<Vec<_>>(), [level]);
+                assert_eq!(scenario.workload, Workload::default());
+                let returns = (scenario.remotes[0].return_delay_ms, scenario.remotes[0].return_jitter_ms);
+                assert_eq!(returns, if level == Level::Clean { (0.0, 0.0) } else { (20.0, 10.0) });
+                assert!(scenario.events.is_empty() && scenario.classifier);
+            }
+        }
+        let toggle = find("bridge_toggle");
+        assert_eq!(toggle.duration_s, 240.0);
+        assert_eq!(toggle.events.iter().map(|event| event.at_s).collect::<Vec<_>>(), [60.0, 120.0, 180.0]);
+        assert!(!find("bridge_ablation").classifier);
+    }
+
+    #[test]
+    fn the_least_is_the_papers_workload_on_the_plain_switch() {
+        let scenario = Scenario::parse("a", LEAST).expect("valid");
+        assert_eq!((scenario.switches, scenario.workload.rate_hz), (vec![Switch::Plain], 30.0));
+        assert_eq!(Workload::default().dds_type(), "sensor_msgs::msg::dds_::LaserScan_");
+        assert!(!Scenario::parse("a", LEAST).expect("valid").has_readings());
+    }
+
+    #[test]
+    fn lanes_and_processes_are_those_of_the_remote_subscribers() {
+        let text = LEAST.replace("{name: slow}", "{name: slow}\n  - {name: laptop, lane: rviz}");
+        let scenario = Scenario::parse("a", &text).expect("valid");
+        assert_eq!(scenario.lanes(), ["critical", "noncritical", "rviz"]);
+        assert!(scenario.bridge_processes().contains(&"egress-rviz".to_owned()));
+        assert_eq!((scenario.endpoint_name("slow", 0), scenario.endpoint_name("slow", 1)), {
+            ("slow".to_owned(), "slow-2".to_owned())
+        });
+    }
+
+    #[test]
+    fn what_is_wrong_is_said_all_at_once() {
+        for (from, to, said) in [
+            ("duration_s: 10", "duration_s: 0", "duration_s is 0, and may be 1 to 86400"),
+            ("duration_s: 10", "duration_s: .nan", "duration_s is NaN"),
+            ("variant: bridge", "variant: bridges", "bridges"),
+            ("title: a", "titel: a", "titel"),
+            ("{name: slow}", "{name: bridge}", "remotes[0].name is 'bridge', which is taken"),
+            ("{name: slow}", "{name: 'a b'}", "remotes[0].name is 'a b', and may be"),
+            ("{name: slow}", "{name: slow}\n  - {name: slow}", "remotes[1].name is 'slow', which is taken"),
+            ("{name: slow}", "{name: slow, lane: critical}", "which is for the local subscriber"),
+            ("{name: slow}", "{name: slow, delay_ms: -1}", "remotes[0].delay_ms is -1"),
+            ("{name: slow}", "{name: slow, cap_kbit_per_s: 1}", "remotes[0].cap_kbit_per_s is 1"),
+            ("title: a", "title: a\nswitches: []", "switches is empty"),
+            ("title: a", "title: a\nworkload: {routes: 0}", "workload.routes is 0"),
+            ("title: a", "title: a\nworkload: {message_type: LaserScan}", "workload.message_type"),
+            ("title: a", "title: a\nevents: [{at_s: 11, do: stop, to: slow}]", "events[0].at_s is 11"),
+            ("title: a", "title: a\nevents: [{at_s: 1, do: kill, to: up}]", "events[0].to is 'up'"),
+            ("title: a", "title: a\nevents: [{at_s: 1, do: kill, to: slow}]", "kill can be done to ingress"),
+            (
+                "title: a",
+                "title: a\nevents: [{at_s: 1, do: link_on, to: critical}]",
+                "link_on can be done to slow",
+            ),
+            (
+                "title: a",
+                "title: a\nevents: [{at_s: 2, do: stop, to: slow}, {at_s: 1, do: stop, to: slow}]",
+                "not in the order",
+            ),
+        ] {
+            let problems = Scenario::parse("a", &LEAST.replace(from, to)).expect_err(to).join("\n");
+            assert!(problems.contains(said), "{to}: {problems}");
+        }
+        let text = LEAST.replace("duration_s: 10", "duration_s: 0").replace("slow", "up");
+        assert_eq!(Scenario::parse("a", &text).expect_err("two problems").len(), 2);
+        assert!(Scenario::parse("a", "").is_err());
+        assert!(Scenario::load("/nowhere/a.yaml".as_ref()).is_err());
+        assert!(Scenario::load_all("/nowhere".as_ref()).is_err());
+    }
+
+    #[test]
+    fn every_key_is_documented() {
+        let page = include_str!("../../../config/scenarios/README.md");
+        let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| `")).collect();
+        for key in [
+            "title",
+            "variant",
+            "classifier",
+            "duration_s",
+            "quick_s",
+            "switches",
+            "workload.routes",
+            "workload.rate_hz",
+            "workload.size_bytes",
+            "workload.message_type",
+            "workload.slow_history",
+            "remotes",
+            "remotes[].name",
+            "remotes[].lane",
+            "remotes[].level",
+            "remotes[].delay_ms",
+            "remotes[].jitter_ms",
+            "remotes[].return_delay_ms",
+            "remotes[].return_jitter_ms",
+            "remotes[].cap_kbit_per_s",
+            "remotes[].impaired_at_begin",
+            "events",
+            "events[].at_s",
+            "events[].do",
+            "events[].to",
+        ] {
+            let documented = rows.iter().any(|row| row.contains(&format!("`{key}`")));
+            assert!(documented, "{key} is not documented");
+        }
+    }
+}

@@ -1,0 +1,309 @@
+//! The evaluation harness from outside: quick runs without and with the bridge, whose results are consistent;
+//! and a harness that is interrupted or killed, after which nothing is left.
+
+mod support;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use support::process::Process;
+use support::{exclusive, skip, testbed_missing, wait_until};
+use tempfile::TempDir;
+
+fn program() -> &'static Path {
+    Path::new(env!("CARGO_BIN_EXE_adaptive-bridge-eval"))
+}
+
+/// A command of the harness in the checkout, whose results go to a folder.
+fn command(out: &Path, arguments: &str) -> Command {
+    let mut command = Command::new(program());
+    command.args(arguments.split_whitespace()).arg("--out").arg(out);
+    command.args(["--bridge", env!("CARGO_BIN_EXE_adaptive-bridge")]);
+    command.current_dir(env!("CARGO_MANIFEST_DIR")).env("NO_COLOR", "1");
+    command
+}
+
+fn run(out: &Path, arguments: &str) -> Output {
+    command(out, arguments).output().unwrap()
+}
+
+/// As [`run`], of what is to end well.
+fn run_well(out: &Path, arguments: &str) -> String {
+    let output = run(out, arguments);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments}: {}\n{said}", output.status);
+    said
+}
+
+/// A folder, or nothing where the machine can't; that is noted.
+fn folder(test: &str) -> Option<TempDir> {
+    match testbed_missing() {
+        Some(reason) => {
+            skip(test, &reason);
+            None
+        }
+        None => Some(tempfile::tempdir().unwrap()),
+    }
+}
+
+/// What processes of that id have on the machine: hosts, folders, shared memory.
+fn traces(pid: i32) -> Vec<String> {
+    let mut found = Vec::new();
+    for (folder, prefix) in [
+        (PathBuf::from("/run/netns"), format!("abe-{pid}-")),
+        (std::env::temp_dir(), format!("abe-{pid}-")),
+        (PathBuf::from("/dev/shm"), format!("ab1_abe_{pid}_")),
+    ] {
+        let names = fs::read_dir(folder).into_iter().flatten().flatten();
+        let names = names.filter_map(|entry| entry.file_name().into_string().ok());
+        found.extend(names.filter(|name| name.starts_with(&prefix)));
+    }
+    found
+}
+
+/// The folder of a run.
+struct Run {
+    folder: PathBuf,
+    manifest: Value,
+}
+
+impl Run {
+    fn read(out: &Path, name: &str) -> Run {
+        let folder = out.join("runs").join(name);
+        let text = fs::read_to_string(folder.join("manifest.json")).unwrap();
+        Run { folder, manifest: serde_json::from_str(&text).unwrap() }
+    }
+
+    fn time(&self, key: &str) -> u64 {
+        self.manifest[key].as_u64().unwrap()
+    }
+
+    /// The rows of a file, by the names of the columns.
+    fn rows(&self, file: &str) -> Vec<BTreeMap<String, String>> {
+        let text = fs::read_to_string(self.folder.join(file)).unwrap();
+        let mut lines = text.lines();
+        let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+        let row = |line: &str| {
+            let values: Vec<String> = line.split(',').map(str::to_owned).collect();
+            assert_eq!(values.len(), names.len(), "{file}: {line}");
+            names.iter().map(|name| (*name).to_owned()).zip(values).collect()
+        };
+        lines.map(row).collect()
+    }
+
+    /// A column of numbers.
+    fn numbers(&self, file: &str, column: &str) -> Vec<u64> {
+        self.rows(file).iter().map(|row| row[column].parse().unwrap()).collect()
+    }
+
+    fn endpoint(&self, name: &str) -> &Value {
+        let endpoints = self.manifest["endpoints"].as_array().unwrap();
+        endpoints.iter().find(|endpoint| endpoint["name"] == name).unwrap()
+    }
+
+    /// What each file says fits what the programs said at their end, and the window.
+    fn assert_consistent(&self) {
+        let manifest = &self.manifest;
+        assert_eq!((&manifest["format"], &manifest["problems"]), (&1.into(), &Value::Array(Vec::new())));
+        let (begin, end) = (self.time("begin_ns"), self.time("end_ns"));
+        let duration_s = manifest["duration_s"].as_f64().unwrap();
+        assert_eq!(end - begin, (duration_s * 1e9) as u64);
+
+        let attempts = self.numbers("publisher.csv", "seq");
+        let summary = &self.endpoint("publisher")["summary"];
+        assert_eq!(summary["attempted"], attempts.len());
+        assert_eq!(attempts, (0..attempts.len() as u64).collect::<Vec<_>>());
+        let sent = self.numbers("publisher.csv", "time_ns");
+        assert!(sent[0] < begin && *sent.last().unwrap() >= end - 1_000_000_000, "the window is covered");
+        let ok: u64 = self.numbers("publisher.csv", "ok").iter().sum();
+        assert_eq!(summary["ok"], ok);
+
+        for subscriber in ["critical", "slow"] {
+            let file = format!("{subscriber}.csv");
+            let summary = &self.endpoint(subscriber)["summary"];
+            let received = self.rows(&file);
+            let distinct: BTreeSet<&String> = received.iter().map(|row| &row["seq"]).collect();
+            assert_eq!(summary["received"], distinct.len(), "{subscriber}");
+            assert!(!received.is_empty(), "{subscriber} has received nothing");
+            for row in &received {
+                let [seq, time, latency] =
+                    ["seq", "time_ns", "latency_ns"].map(|key| row[key].parse::<u64>().unwrap());
+                assert_eq!(time - latency, sent[seq as usize], "{file}: {row:?}");
+            }
+        }
+
+        let events = self.rows("events.csv");
+        let bounds: Vec<_> = events.iter().filter(|row| row["subject"].is_empty()).collect();
+        assert_eq!(bounds.iter().map(|row| row["event"].as_str()).collect::<Vec<_>>(), ["begin", "end"]);
+        for file in ["wire.csv", "kernel.csv", "processes.csv"] {
+            let times = self.numbers(file, "time_ns");
+            assert!(times.is_sorted() && times[0] < begin && *times.last().unwrap() > begin, "{file}");
+        }
+        for port in ["publisher", "critical", "slow"] {
+            let wire = self.rows("wire.csv");
+            let bytes =
+                wire.iter().filter(|row| row["port"] == port).map(|row| row["to_host_bytes"].parse::<u64>());
+            let bytes: Vec<u64> = bytes.map(Result::unwrap).collect();
+            assert!(bytes.is_sorted() && bytes.first() < bytes.last(), "{port}: {bytes:?}");
+        }
+    }
+}
+
+const BASELINE: &str = "baseline_strong.cyclone.as-run.netns.reassembling.r1";
+const BRIDGE: &str = "bridge_strong.fast.as-printed.netns.plain.r1";
+
+#[test]
+fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_made_again() {
+    let test = "quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_made_again";
+    let Some(out) = folder(test) else { return };
+    let _exclusive = exclusive();
+    let out = out.path();
+    let baseline =
+        "run baseline_strong --quick --library cyclone --reading as-run --switch reassembling --seed 3";
+    run_well(out, baseline);
+    let run_of = |name: &str| Run::read(out, name);
+    let made = run_of(BASELINE);
+    made.assert_consistent();
+    let manifest = &made.manifest;
+    for (key, value) in [
+        ("variant", "baseline"),
+        ("level", "strong"),
+        ("library", "cyclone"),
+        ("reading", "as-run"),
+        ("bed", "netns"),
+        ("switch", "reassembling"),
+    ] {
+        assert_eq!(manifest[key], value, "{key}");
+    }
+    let link = &manifest["links"][0]["impairment"];
+    assert_eq!((&manifest["links"][0]["name"], &link["loss_good"]), (&"slow<-publisher".into(), &0.5.into()));
+    assert!(link["lost"].as_u64() > Some(0), "{link}");
+    assert!(manifest["software"]["peer"].as_str().unwrap().starts_with("Cyclone DDS"), "{manifest}");
+
+    run_well(out, "run bridge_strong --quick --seed 3");
+    let made = run_of(BRIDGE);
+    made.assert_consistent();
+    assert_eq!((&made.manifest["classifier"], &made.manifest["seed"]), (&true.into(), &3.into()));
+    assert_eq!(made.endpoint("slow")["lane"], "noncritical");
+    let status = fs::read_to_string(made.folder.join("status.jsonl")).unwrap();
+    let status: Vec<Value> = status.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(status.len() >= 8, "{} lines of status", status.len());
+    let last = &status.last().unwrap()["status"];
+    assert_eq!((&last["routes"][0]["id"], &last["subscribers"][0]["id"]), (&"scan".into(), &"slow".into()));
+    let processes: BTreeSet<String> =
+        made.rows("processes.csv").into_iter().map(|row| row["process"].clone()).collect();
+    for process in ["up", "ingress", "control", "egress-critical", "egress-noncritical", "responder-slow"] {
+        assert!(processes.contains(process), "{process} in {processes:?}");
+    }
+
+    // What is there is left as it is, and what was made otherwise is not mixed with it.
+    let before = fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap();
+    let said = run_well(out, "run bridge_strong --quick --seed 3");
+    assert!(said.contains("0 made, 1 were there, 0 failed"), "{said}");
+    assert_eq!(fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap(), before);
+    for (arguments, differs) in [("--quick --seed 4", "--seed"), ("--seed 3", "--quick")] {
+        let output = run(out, &format!("run bridge_strong {arguments}"));
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains(&format!("other settings ({differs})")), "{said}");
+    }
+    assert!(!out.join(".partial").exists() && !out.join("failed").exists());
+}
+
+/// A run of the bridge that is in its measured window.
+fn start_long(out: &Path) -> Process {
+    let harness = Process::spawn("the harness", command(out, "run bridge_strong"));
+    let publisher = out.join(".partial/publisher.csv");
+    wait_until("samples of the run", || {
+        fs::read_to_string(&publisher).is_ok_and(|text| text.lines().count() > 5)
+    });
+    assert!(!traces(harness.pid().as_raw()).is_empty());
+    harness
+}
+
+#[test]
+fn a_harness_that_is_interrupted_leaves_nothing() {
+    let Some(out) = folder("a_harness_that_is_interrupted_leaves_nothing") else { return };
+    let _exclusive = exclusive();
+    let mut harness = start_long(out.path());
+    let pid = harness.pid().as_raw();
+    harness.signal(Signal::SIGINT);
+    let status = harness.wait();
+    assert_eq!(status.code(), Some(1), "{}", harness.log());
+    assert!(harness.log().contains("interrupted"), "{}", harness.log());
+    assert_eq!(traces(pid), Vec::<String>::new());
+    assert!(!out.path().join(".partial").exists());
+    assert_eq!(fs::read_dir(out.path().join("runs")).unwrap().count(), 0);
+}
+
+#[test]
+fn what_a_harness_that_is_killed_leaves_is_removed_by_the_next() {
+    let Some(out) = folder("what_a_harness_that_is_killed_leaves_is_removed_by_the_next") else { return };
+    let _exclusive = exclusive();
+    let mut harness = start_long(out.path());
+    let pid = harness.pid().as_raw();
+    // A second one has to wait for its turn.
+    let output = run(out.path(), "run baseline_clean --quick");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("another harness writes into"), "{said}");
+
+    harness.kill9();
+    assert!(!traces(pid).is_empty(), "a killed harness can't clean up");
+    let said = run_well(out.path(), "run baseline_clean --quick");
+    assert!(said.contains("removed what a harness that died has left"), "{said}");
+    assert_eq!(traces(pid), Vec::<String>::new());
+    Run::read(out.path(), "baseline_clean.fast.none.netns.plain.r1").assert_consistent();
+    assert!(!out.path().join(".partial").exists());
+}
+
+#[test]
+fn a_run_that_fails_is_kept_with_its_reason_and_the_next_is_made() {
+    let Some(out) = folder("a_run_that_fails_is_kept_with_its_reason_and_the_next_is_made") else { return };
+    let _exclusive = exclusive();
+    // A subscriber of the right name that ends at once.
+    let peers = out.path().join("peers");
+    fs::create_dir(&peers).unwrap();
+    std::os::unix::fs::symlink("/bin/false", peers.join("fast_peer")).unwrap();
+    let built = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/peers/build/cyclone_peer");
+    std::os::unix::fs::symlink(built, peers.join("cyclone_peer")).unwrap();
+    let peers = peers.display();
+    let arguments = format!("run baseline_clean --quick --library fast,cyclone --peers {peers}");
+    let output = run(out.path(), &arguments);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("1 made, 0 were there, 1 failed"), "{said}");
+    let failed = out.path().join("failed/baseline_clean.fast.none.netns.plain.r1");
+    let reason = fs::read_to_string(failed.join("reason.txt")).unwrap();
+    assert!(reason.contains("ended before its time"), "{reason}");
+    assert!(failed.join("scenario.yaml").exists());
+    Run::read(out.path(), "baseline_clean.cyclone.none.netns.plain.r1").assert_consistent();
+}
+
+#[test]
+fn wrong_command_lines_are_said_before_anything_is_made() {
+    let out = tempfile::tempdir().unwrap();
+    let listed =
+        Command::new(program()).arg("list").current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+    let listed = String::from_utf8(listed.stdout).unwrap();
+    for name in ["baseline_clean", "bridge_strong", "bridge_toggle", "bridge_ablation"] {
+        assert!(listed.lines().any(|line| line.starts_with(name)), "{listed}");
+    }
+    for (arguments, code, said) in [
+        ("run nothing_of_the_kind", 1, "no scenario 'nothing_of_the_kind'"),
+        ("run /nowhere/a.yaml", 1, "/nowhere/a.yaml"),
+        ("run baseline_clean --peers /nowhere", 1, "fast_peer is not in /nowhere"),
+        ("run", 2, "required"),
+        ("run baseline_clean --pin critical", 2, "must be a host"),
+        ("run baseline_clean --repeat 0", 2, "--repeat"),
+        ("matrix --scenarios /nowhere", 1, "/nowhere"),
+    ] {
+        let output = run(out.path(), arguments);
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{arguments}: {error}");
+        assert!(error.contains(said), "{arguments}: {error}");
+    }
+}
