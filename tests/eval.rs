@@ -139,7 +139,7 @@ impl Run {
         let events = self.rows("events.csv");
         let bounds: Vec<_> = events.iter().filter(|row| row["subject"].is_empty()).collect();
         assert_eq!(bounds.iter().map(|row| row["event"].as_str()).collect::<Vec<_>>(), ["begin", "end"]);
-        for file in ["wire.csv", "kernel.csv", "processes.csv"] {
+        for file in ["wire.csv", "rtps.csv", "kernel.csv", "processes.csv"] {
             let times = self.numbers(file, "time_ns");
             assert!(times.is_sorted() && times[0] < begin && *times.last().unwrap() > begin, "{file}");
         }
@@ -182,9 +182,14 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     let link = &manifest["links"][0]["impairment"];
     assert_eq!((&manifest["links"][0]["name"], &link["loss_good"]), (&"slow<-publisher".into(), &0.5.into()));
     assert!(link["lost"].as_u64() > Some(0), "{link}");
+    // What is lost before the switch leaves incomplete datagrams to it, and no fragments to the receiver alone.
+    assert_eq!(manifest["links"][0]["before_switch"], true);
+    let kernel = made.rows("kernel.csv");
+    let held = kernel.iter().filter(|row| row["host"] == "switch").map(|row| &row["fragment_memory_bytes"]);
+    assert!(held.clone().any(|bytes| bytes != "0"), "{held:?}");
     assert!(manifest["software"]["peer"].as_str().unwrap().starts_with("Cyclone DDS"), "{manifest}");
 
-    run_well(out, "run bridge_strong --quick --seed 3");
+    run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
     let made = run_of(BRIDGE);
     made.assert_consistent();
     assert_eq!((&made.manifest["classifier"], &made.manifest["seed"]), (&true.into(), &3.into()));
@@ -202,11 +207,11 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
 
     // What is there is left as it is, and what was made otherwise is not mixed with it.
     let before = fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap();
-    let said = run_well(out, "run bridge_strong --quick --seed 3");
+    let said = run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
     assert!(said.contains("0 made, 1 were there, 0 failed"), "{said}");
     assert_eq!(fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap(), before);
     for (arguments, differs) in [("--quick --seed 4", "--seed"), ("--seed 3", "--quick")] {
-        let output = run(out, &format!("run bridge_strong {arguments}"));
+        let output = run(out, &format!("run bridge_strong --switch plain {arguments}"));
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(1), "{said}");
         assert!(said.contains(&format!("other settings ({differs})")), "{said}");

@@ -1,26 +1,144 @@
-//! Hosts as containers.
+//! Hosts as containers on a bridge network, as in the paper. The containers have this machine's own programs
+//! and libraries (`/usr` and `/etc`, read only), so nothing has to be pulled or built; network, shared memory
+//! and files are their own. They share the machine's process ids, so that signals and counters work as in
+//! network namespaces.
 
+use std::fs;
+use std::net::Ipv4Addr;
 use std::path::Path;
+use std::process;
 
-use super::Bed;
+use serde_json::Value;
+
+use super::stale;
+use super::{Bed, Host, Network};
 use crate::eval::error::EvalError;
+use crate::eval::impairment::system;
 use crate::eval::scenario::Switch;
 
-pub(super) fn missing(_switch: Switch) -> Option<String> {
-    Some("not there yet".to_owned())
+/// An image of folders to mount into, and of the links between them.
+const IMAGE: &str = "adaptive-bridge-eval:host";
+const FOLDERS: [&str; 8] = ["usr", "etc", "proc", "sys", "dev", "tmp", "run", "var"];
+const LINKS: [&str; 4] = ["bin", "sbin", "lib", "lib64"];
+/// What a network is called. Hosts have no dash in their names.
+const NETWORK: &str = "bridge-network";
+/// Docker gives 64 MiB, too little for the shared memory of ten routes.
+const SHM_SIZE: &str = "1g";
+
+/// Why this machine can't; `None` when it can.
+pub(super) fn missing(asked: Switch) -> Option<String> {
+    if !nix::unistd::geteuid().is_root() {
+        return Some("programs on containers are started as root".to_owned());
+    }
+    if let Err(error) = docker("version") {
+        return Some(error.to_string());
+    }
+    let link = |name: &&str| fs::symlink_metadata(format!("/{name}")).is_ok_and(|it| it.is_dir());
+    if let Some(name) = LINKS.iter().find(|name| link(name)) {
+        return Some(format!("/{name} is not a link into /usr on this machine"));
+    }
+    let own = switch();
+    (asked != own).then(|| format!("docker's bridge is a {} one here", own.name()))
 }
 
-pub(super) fn make(_names: &[String], _shared: &[&Path]) -> Result<Bed, EvalError> {
-    Err(EvalError::new("not there yet"))
-}
-
-pub(super) fn leftovers() -> Vec<String> {
-    Vec::new()
-}
-
-pub(super) fn remove(_name: &str) {}
-
-/// The switch that docker's bridge is on this machine.
+/// What docker's bridge is on this machine. Docker itself turns connection tracking on.
 pub fn switch() -> Switch {
-    Switch::Reassembling
+    let setting = fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables").unwrap_or_default();
+    if setting.trim() == "1" { Switch::Reassembling } else { Switch::Plain }
+}
+
+/// Removes what this process has made, whole or not.
+struct Remover;
+
+impl Drop for Remover {
+    fn drop(&mut self) {
+        let prefix = stale::name("");
+        leftovers().iter().filter(|name| name.starts_with(&prefix)).for_each(|name| remove(name));
+    }
+}
+
+/// Makes the containers.
+pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError> {
+    make_image()?;
+    let remover = Remover;
+    let network = stale::name(NETWORK);
+    docker(&format!("network create {network}"))?;
+    let mut hosts = Vec::with_capacity(names.len());
+    for name in names {
+        let container = stale::name(name);
+        let mut words = system::words(&format!(
+            "docker run --detach --rm --name {container} --hostname {name} --network {network} --pid host \
+             --ipc private --shm-size {SHM_SIZE} --volume /usr:/usr:ro --volume /etc:/etc:ro"
+        ));
+        for folder in shared {
+            let folder = folder.display();
+            words.extend(["--volume".to_owned(), format!("{folder}:{folder}")]);
+        }
+        words.extend(system::words(&format!("{IMAGE} /usr/bin/sleep infinity")));
+        system::run(&words)?;
+        hosts.push(host(name, &container)?);
+    }
+    let switch = Network::new(format!("/proc/{}/ns/net", process::id()));
+    Ok(Bed { hosts, switch, _remover: Box::new(remover) })
+}
+
+/// Makes the image anew: that takes no time, and an older one may be of another shape.
+fn make_image() -> Result<(), EvalError> {
+    let folder = stale::scratch("image");
+    let root = folder.join("root");
+    let made = FOLDERS.iter().try_for_each(|name| fs::create_dir_all(root.join(name)));
+    let linked = made.and_then(|()| {
+        LINKS.iter().try_for_each(|name| std::os::unix::fs::symlink(format!("usr/{name}"), root.join(name)))
+    });
+    linked.map_err(|error| EvalError::file(&root, &error))?;
+    let archive = folder.join("image.tar");
+    let (archive, root) = (archive.display(), root.display());
+    let made = system::run(&system::words(&format!("tar --create --file {archive} --directory {root} .")))
+        .map_err(EvalError::from)
+        .and_then(|_| docker(&format!("import {archive} {IMAGE}")));
+    let _ = fs::remove_dir_all(&folder);
+    made.map(|_| ())
+}
+
+fn host(name: &str, container: &str) -> Result<Host, EvalError> {
+    let strange = |what: &str| EvalError::new(format!("container {container}: no {what}"));
+    let shown: Value = serde_json::from_str(&docker(&format!("inspect {container}"))?).unwrap_or_default();
+    let pid = shown[0]["State"]["Pid"].as_u64().filter(|pid| *pid > 0).ok_or_else(|| strange("process"))?;
+    let networks = shown[0]["NetworkSettings"]["Networks"].as_object();
+    let address = networks.and_then(|networks| networks.values().next()?["IPAddress"].as_str());
+    let address: Ipv4Addr = address.and_then(|text| text.parse().ok()).ok_or_else(|| strange("address"))?;
+    let network = Network::new(format!("/proc/{pid}/ns/net"));
+    let port = port(&network)?.ok_or_else(|| strange("port on the bridge"))?;
+    let namespaces = ["--mount", "--net", "--ipc", "--uts"].map(str::to_owned);
+    let entry = ["nsenter".to_owned(), format!("--target={pid}")].into_iter().chain(namespaces).collect();
+    Ok(Host { name: name.to_owned(), address, network, entry, port, uplink: None })
+}
+
+/// The interface of this machine at the other end of the container's.
+fn port(network: &Network) -> Result<Option<String>, EvalError> {
+    let inside: Value = serde_json::from_str(&network.run("ip -j link show dev eth0")?).unwrap_or_default();
+    let index = &inside[0]["link_index"];
+    let outside = system::run(&system::words("ip -j link show"))?;
+    let outside: Value = serde_json::from_str(&outside).unwrap_or_default();
+    let mut links = outside.as_array().into_iter().flatten();
+    let found = links.find(|link| index.is_u64() && link["ifindex"] == *index);
+    Ok(found.and_then(|link| link["ifname"].as_str()).map(str::to_owned))
+}
+
+/// Containers and networks of harnesses, of this one too; none where there is no docker.
+pub(super) fn leftovers() -> Vec<String> {
+    let containers = docker("ps --all --filter name=^abe- --format {{.Names}}").unwrap_or_default();
+    let networks = docker("network ls --filter name=^abe- --format {{.Name}}").unwrap_or_default();
+    // Containers first: a network that is in use can't be removed.
+    containers.lines().chain(networks.lines()).map(str::to_owned).collect()
+}
+
+/// Removes a container or a network of that name.
+pub(super) fn remove(name: &str) {
+    let what = if name.ends_with(NETWORK) { "network rm" } else { "rm --force" };
+    let _ = docker(&format!("{what} {name}"));
+}
+
+fn docker(arguments: &str) -> Result<String, EvalError> {
+    Ok(system::run(&system::words(&format!("docker {arguments}")))?)
 }

@@ -45,13 +45,20 @@ impl BedKind {
         }
     }
 
-    /// Makes a bed with these hosts. `shared` are the folders that their programs read and write.
+    /// Makes a bed with these hosts. What `sender` sends is impaired before a switch that puts fragments
+    /// together. `shared` are the folders that the hosts' programs read and write.
     ///
     /// # Errors
     /// The machine refused something.
-    pub fn make(self, hosts: &[String], switch: Switch, shared: &[&Path]) -> Result<Bed, EvalError> {
+    pub fn make(
+        self,
+        hosts: &[String],
+        sender: &str,
+        switch: Switch,
+        shared: &[&Path],
+    ) -> Result<Bed, EvalError> {
         match self {
-            Self::Netns => netns::make(hosts, switch),
+            Self::Netns => netns::make(hosts, sender, switch),
             Self::Docker => docker::make(hosts, shared),
         }
     }
@@ -78,6 +85,8 @@ pub struct Host {
     entry: Vec<String>,
     /// The interface of the switch that leads to it.
     pub port: String,
+    /// What its cable to the switch leads through, where packets can be lost before the switch sees them.
+    pub uplink: Option<Network>,
 }
 
 impl Bed {

@@ -39,51 +39,69 @@ impl Drop for Remover {
     }
 }
 
-/// Makes the hosts, all connected at once.
-pub(super) fn make(names: &[String], switch: Switch) -> Result<Bed, EvalError> {
+/// Makes the hosts, all connected at once. Where the switch puts fragments together, the cable of the sender
+/// leads through a second, plain one: what is lost there leaves incomplete datagrams to the switch.
+pub(super) fn make(names: &[String], sender: &str, switch: Switch) -> Result<Bed, EvalError> {
     let remover = Remover;
     let between = stale::name("switch");
-    ip(&format!("netns add {between}"))?;
-    ip(&format!("-n {between} link add br0 type bridge mcast_snooping 0"))?;
-    ip(&format!("-n {between} link set br0 up"))?;
+    make_switch(&between)?;
     let network = network(&between);
-    set_up_switch(&network, switch)?;
+    set_bridge_netfilter(&network, switch == Switch::Reassembling)?;
+    if switch == Switch::Reassembling {
+        // A rule that asks for a connection begins connection tracking in this namespace.
+        network.run("iptables -w 5 -A FORWARD -m conntrack --ctstate ESTABLISHED -j ACCEPT")?;
+    }
     let mut hosts = Vec::with_capacity(names.len());
     for (index, name) in (0_u8..).zip(names) {
         let namespace = stale::name(name);
         let port = format!("p{index}");
         let address = Ipv4Addr::new(10, 77, 0, index.saturating_add(1));
         ip(&format!("netns add {namespace}"))?;
-        ip(&format!("link add {port} netns {between} type veth peer name eth0 netns {namespace}"))?;
+        let uplink = if switch == Switch::Reassembling && name == sender {
+            let uplink = stale::name("uplink");
+            make_uplink(&uplink)?;
+            ip(&format!("link add {port} netns {between} type veth peer name up netns {uplink}"))?;
+            ip(&format!("-n {uplink} link set up master br0 up"))?;
+            ip(&format!("link add down netns {uplink} type veth peer name eth0 netns {namespace}"))?;
+            ip(&format!("-n {uplink} link set down master br0 up"))?;
+            Some(self::network(&uplink))
+        } else {
+            ip(&format!("link add {port} netns {between} type veth peer name eth0 netns {namespace}"))?;
+            None
+        };
         ip(&format!("-n {between} link set {port} master br0 up"))?;
         ip(&format!("-n {namespace} link set lo up"))?;
         ip(&format!("-n {namespace} addr add {address}/24 dev eth0"))?;
         ip(&format!("-n {namespace} link set eth0 up"))?;
         ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"))?;
         let network = self::network(&namespace);
-        hosts.push(Host { name: name.clone(), address, entry: network.entry(), network, port });
+        let entry = network.entry();
+        hosts.push(Host { name: name.clone(), address, entry, network, port, uplink });
     }
     Ok(Bed { hosts, switch: network, _remover: Box::new(remover) })
 }
 
-/// Lets the switch pass packets on, or put fragments together as one with connection tracking does.
-fn set_up_switch(network: &Network, switch: Switch) -> Result<(), EvalError> {
-    let value = match switch {
-        Switch::Plain => "0",
-        Switch::Reassembling => "1",
-    };
+fn make_switch(namespace: &str) -> Result<(), EvalError> {
+    ip(&format!("netns add {namespace}"))?;
+    ip(&format!("-n {namespace} link add br0 type bridge mcast_snooping 0"))?;
+    ip(&format!("-n {namespace} link set br0 up"))
+}
+
+/// A switch whose packets go through netfilter, without connection tracking: each fragment still is a packet.
+fn make_uplink(namespace: &str) -> Result<(), EvalError> {
+    make_switch(namespace)?;
+    set_bridge_netfilter(&network(namespace), true)
+}
+
+fn set_bridge_netfilter(network: &Network, on: bool) -> Result<(), EvalError> {
     network.within(|| {
-        // Where there is no bridge netfilter, there is nothing to be switched off.
-        if switch == Switch::Plain && !Path::new(BRIDGE_NETFILTER).exists() {
+        // Where there is none, there is nothing to be switched off.
+        if !on && !Path::new(BRIDGE_NETFILTER).exists() {
             return Ok(());
         }
+        let value = if on { "1" } else { "0" };
         fs::write(BRIDGE_NETFILTER, value).map_err(|error| EvalError::file(BRIDGE_NETFILTER.as_ref(), &error))
-    })?;
-    if switch == Switch::Reassembling {
-        // A rule that asks for a connection begins connection tracking in this namespace.
-        network.run("iptables -w 5 -A FORWARD -m conntrack --ctstate ESTABLISHED -j ACCEPT")?;
-    }
-    Ok(())
+    })
 }
 
 fn network(namespace: &str) -> Network {

@@ -32,7 +32,12 @@ pub fn instance() -> String {
 /// A folder of this process for short-lived files, which is not made yet. Its path is short, as names in it
 /// may be long.
 pub fn folder() -> PathBuf {
-    std::env::temp_dir().join(name("bridge"))
+    scratch("bridge")
+}
+
+/// A folder of this process for short-lived files of another kind.
+pub(super) fn scratch(what: &str) -> PathBuf {
+    std::env::temp_dir().join(name(what))
 }
 
 /// Removes what harnesses that are gone have left, and says what it was.

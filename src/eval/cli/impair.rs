@@ -35,6 +35,9 @@ pub(super) struct Arguments {
     /// The IPv4 address of the host whose packets are lost and delayed
     #[arg(long, value_name = "ADDRESS")]
     source: Ipv4Addr,
+    /// On a host that passes packets on: only those for this address (NFQUEUE only)
+    #[arg(long, value_name = "ADDRESS")]
+    destination: Option<Ipv4Addr>,
     /// Loss by a row of the paper's Table I
     #[arg(long, value_enum, default_value = "clean")]
     level: Level,
@@ -96,8 +99,10 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
 fn impair(arguments: &Arguments, impairment: &Impairment) -> Result<(), ImpairmentError> {
     // Before anything is set up, so that a signal always finds who removes it.
     let signals = signals().map_err(|error| ImpairmentError::system("signal handlers", error))?;
-    let Opened { backend, reason } =
-        impairment::open(arguments.backend, arguments.source, arguments.queue, impairment)?;
+    let Opened { backend, reason } = {
+        let Arguments { backend, source, destination, queue, .. } = arguments;
+        impairment::open(*backend, *source, *destination, *queue, impairment)?
+    };
     let mut link = Running { arguments, impairment, backend, reason };
     if arguments.state != LinkState::On {
         link.backend.switch(arguments.state)?;
@@ -195,6 +200,7 @@ impl Running<'_> {
             backend: self.backend.name(),
             reason: &self.reason,
             source: self.arguments.source,
+            destination: self.arguments.destination,
             state: self.backend.state(),
             seed: self.backend.is_seeded().then_some(self.impairment.seed),
             p: self.impairment.loss.p(),
@@ -244,6 +250,7 @@ struct Report<'a> {
     backend: &'static str,
     reason: &'a str,
     source: Ipv4Addr,
+    destination: Option<Ipv4Addr>,
     state: LinkState,
     seed: Option<u64>,
     p: f64,

@@ -11,7 +11,7 @@ use super::settings::Settings;
 use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::impairment::Level;
-use crate::eval::scenario::{Action, Remote, Scenario, Variant};
+use crate::eval::scenario::{Action, Remote, Scenario};
 
 /// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
 /// radio link has some such queue; a longer one delays more and drops less.
@@ -152,6 +152,7 @@ impl Links {
                     direction: "forward",
                     host: cap.remote.clone(),
                     source: "*".to_owned(),
+                    before_switch: false,
                     cap_kbit_per_s: Some(cap.kbit_per_s),
                     impairment: None,
                 }),
@@ -165,10 +166,7 @@ impl Links {
 /// What is impaired of a remote subscriber's link. One that is never switched and loses nothing needs no
 /// program.
 fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
-    let sender = match scenario.variant {
-        Variant::Baseline => "publisher",
-        Variant::Bridge => "bridge",
-    };
+    let sender = scenario.variant.sender();
     let is_cut =
         scenario.events.iter().any(|event| event.action == Action::LinkDown && event.to == remote.name);
     let mut ways = Vec::new();
@@ -196,8 +194,12 @@ fn open(
     number: u16,
 ) -> Result<Link, EvalError> {
     let (host, source) = (bed.host(way.host)?, bed.host(way.source)?);
-    let mut command = host.network.command(&settings.harness);
+    let uplink = source.uplink.as_ref();
+    let mut command = uplink.unwrap_or(&host.network).command(&settings.harness);
     command.args(["impair", "--json", "--state", "off"]);
+    if uplink.is_some() {
+        command.args(["--destination", &host.address.to_string()]);
+    }
     command.args(["--backend", settings.backend_name(), "--queue", &number.to_string()]);
     command.args(["--source", &source.address.to_string()]);
     command.args(["--level", way.level.name()]);
@@ -214,6 +216,7 @@ fn open(
         direction: way.direction,
         host: way.host.to_owned(),
         source: way.source.to_owned(),
+        before_switch: uplink.is_some(),
         cap_kbit_per_s: None,
         impairment: None,
     };

@@ -71,6 +71,7 @@ pub(super) struct LinkEntry {
     pub direction: &'static str,
     pub host: String,
     pub source: String,
+    pub before_switch: bool,
     pub cap_kbit_per_s: Option<u64>,
     pub impairment: Option<Value>,
 }

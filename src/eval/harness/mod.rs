@@ -2,6 +2,7 @@
 //! docs/eval-results.md describes the folders.
 
 mod bridge;
+mod capture;
 mod counters;
 mod csv;
 mod links;

@@ -53,7 +53,8 @@ pub(super) fn run(
     let shared = shared_folders(settings, folder);
     let shared: Vec<&Path> = shared.iter().map(PathBuf::as_path).collect();
     // Declared first, so that it is dropped last: its programs end before their hosts.
-    let bed = plan.bed.make(&host_names(&plan.scenario), plan.switch, &shared)?;
+    let sender = plan.scenario.variant.sender();
+    let bed = plan.bed.make(&host_names(&plan.scenario), sender, plan.switch, &shared)?;
     let mut run = Run::start(plan, settings, folder, &bed, interrupted)?;
     run.match_all(progress)?;
     let (begin, end) = run.measure(progress)?;
@@ -105,7 +106,8 @@ impl<'a> Run<'a> {
             Variant::Baseline => None,
         };
         let links = Links::open(plan, settings, bed, folder)?;
-        let sampler = Sampler::open(bed, folder)?;
+        let remotes: Vec<&str> = plan.scenario.remotes.iter().map(|remote| remote.name.as_str()).collect();
+        let sampler = Sampler::open(bed, &remotes, folder)?;
         let events = Csv::create(folder, "events.csv", "time_ns,event,subject")?;
         let next_sample = clock::monotonic();
         let endpoints = Vec::new();
@@ -333,6 +335,7 @@ impl<'a> Run<'a> {
         if self.interrupted.load(Ordering::Relaxed) {
             return Err(EvalError::Interrupted);
         }
+        self.sampler.work();
         let now = clock::monotonic();
         if now >= self.next_sample {
             self.next_sample = now.plus_ms(SAMPLE_MS);

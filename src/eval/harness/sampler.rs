@@ -6,6 +6,7 @@ use std::path::Path;
 
 use nix::unistd::{SysconfVar, sysconf};
 
+use super::capture::{Capture, Tally};
 use super::counters::{Interface, ProcFile, cpu_ticks, fragments, rss_bytes, snmp};
 use super::csv::Csv;
 use crate::eval::bed::{Bed, Network};
@@ -32,25 +33,30 @@ pub(super) struct Sampler {
     ports: Vec<(String, String)>,
     interfaces: ProcFile,
     hosts: Vec<HostFiles>,
+    captures: Vec<Capture>,
     tick_ms: u64,
     wire: Csv,
     kernel: Csv,
     processes: Csv,
+    rtps: Csv,
 }
 
 impl Sampler {
-    /// Of all hosts of a bed.
-    pub fn open(bed: &Bed, folder: &Path) -> Result<Self, EvalError> {
+    /// Of all hosts of a bed; packets are captured at the remote ones.
+    pub fn open(bed: &Bed, remotes: &[&str], folder: &Path) -> Result<Self, EvalError> {
         let mut hosts = vec![HostFiles::open("switch", bed.switch())?];
         for host in bed.hosts() {
             hosts.push(HostFiles::open(&host.name, &host.network)?);
         }
+        let captures: Result<Vec<Capture>, EvalError> =
+            remotes.iter().map(|remote| Capture::open(remote, &bed.host(remote)?.network)).collect();
         let ticks_per_s =
             sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|ticks| u64::try_from(ticks).ok());
         Ok(Self {
             ports: bed.hosts().iter().map(|host| (host.name.clone(), host.port.clone())).collect(),
             interfaces: ProcFile::of_network(bed.switch(), "dev")?,
             hosts,
+            captures: captures?,
             tick_ms: 1_000 / ticks_per_s.unwrap_or(100).clamp(1, 1_000),
             wire: Csv::create(
                 folder,
@@ -64,7 +70,13 @@ impl Sampler {
                  reassembly_timed_out,udp_in_errors,udp_buffer_errors",
             )?,
             processes: Csv::create(folder, "processes.csv", "time_ns,process,pid,cpu_ms,rss_bytes")?,
+            rtps: Csv::create(folder, "rtps.csv", &format!("time_ns,port,direction,{}", Tally::COLUMNS))?,
         })
+    }
+
+    /// To be called often: takes in what was captured.
+    pub fn work(&mut self) {
+        self.captures.iter_mut().for_each(Capture::work);
     }
 
     /// Reads all once. `queue_drops` are what the caps on ports have dropped, by port.
@@ -98,6 +110,11 @@ impl Sampler {
             self.kernel
                 .row(&[&now.0, &host.name, &queues, &memory, &whole, &failed, &late, &errors, &buffer])?;
         }
+        for capture in &self.captures {
+            for (direction, tally) in capture.tallies() {
+                self.rtps.row(&[&now.0, &capture.port, &direction, &tally.row()])?;
+            }
+        }
         for (name, pid) in processes {
             let read = |file: &str| fs::read_to_string(format!("/proc/{pid}/{file}")).unwrap_or_default();
             // One that has just died is left out.
@@ -112,6 +129,7 @@ impl Sampler {
     pub fn end(mut self) -> Result<(), EvalError> {
         self.wire.flush()?;
         self.kernel.flush()?;
+        self.rtps.flush()?;
         self.processes.flush()
     }
 }

@@ -73,19 +73,21 @@ pub struct Opened {
     pub reason: String,
 }
 
-/// Begins to impair what the present network namespace receives from `source`. `queue` is a number that no
-/// other program in the namespace uses.
+/// Begins to impair what the present network namespace receives from `source`, or of that only what is for
+/// `destination`, where it passes packets on. `queue` is a number that no other program in the namespace uses.
 ///
 /// # Errors
 /// The machine can't, or what the link needs is in use.
 pub fn open(
     choice: BackendChoice,
     source: Ipv4Addr,
+    destination: Option<Ipv4Addr>,
     queue: u16,
     impairment: &Impairment,
 ) -> Result<Opened, ImpairmentError> {
     let lacks_netem = match choice {
         BackendChoice::Nfqueue => None,
+        _ if destination.is_some() => Some("here it impairs only what a host itself receives".to_owned()),
         BackendChoice::Netem | BackendChoice::Auto => super::netem::missing(queue),
     };
     let (netem, reason) = match (choice, lacks_netem) {
@@ -100,7 +102,7 @@ pub fn open(
     let backend: Box<dyn Backend> = if netem {
         Box::new(Netem::open(source, queue, impairment)?)
     } else {
-        Box::new(Nfqueue::open(source, queue, impairment)?)
+        Box::new(Nfqueue::open(source, destination, queue, impairment)?)
     };
     Ok(Opened { backend, reason })
 }

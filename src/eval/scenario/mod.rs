@@ -60,6 +60,16 @@ pub enum Variant {
     Bridge,
 }
 
+impl Variant {
+    /// The host that sends to the remote subscribers.
+    pub const fn sender(self) -> &'static str {
+        match self {
+            Self::Baseline => "publisher",
+            Self::Bridge => "bridge",
+        }
+    }
+}
+
 /// The host between the hosts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]

@@ -41,16 +41,21 @@ pub struct Nfqueue {
 }
 
 impl Nfqueue {
-    /// Begins to impair what the present network namespace receives from `source`. What a former one that has
-    /// died has left is removed.
+    /// Begins to impair what the present network namespace receives from `source`, or of that only what it
+    /// passes on to `destination`. What a former one that has died has left is removed.
     ///
     /// # Errors
     /// The machine can't, or another program listens on the queue.
-    pub fn open(source: Ipv4Addr, queue: u16, impairment: &Impairment) -> Result<Self, ImpairmentError> {
+    pub fn open(
+        source: Ipv4Addr,
+        destination: Option<Ipv4Addr>,
+        queue: u16,
+        impairment: &Impairment,
+    ) -> Result<Self, ImpairmentError> {
         rules::remove_stale()?;
         // First the listener, so that a rule of ours without one is always stale.
         let queue = Queue::open(queue)?;
-        let rule = Rule::install(source, queue.number)?;
+        let rule = Rule::install(source, destination, queue.number)?;
         Ok(Self { _rule: rule, queue, link: Link::new(impairment) })
     }
 }

@@ -21,9 +21,13 @@ pub(super) struct Rule {
 }
 
 impl Rule {
-    /// Sends what comes from `source` to `queue`.
-    pub(super) fn install(source: Ipv4Addr, queue: u16) -> Result<Self, ImpairmentError> {
-        let line = |verb| words(&command_line(verb, source, queue));
+    /// Sends what comes from `source`, and is for `destination` if there is one, to `queue`.
+    pub(super) fn install(
+        source: Ipv4Addr,
+        destination: Option<Ipv4Addr>,
+        queue: u16,
+    ) -> Result<Self, ImpairmentError> {
+        let line = |verb| words(&command_line(verb, source, destination, queue));
         run(&line("-A"))?;
         Ok(Self { removal: line("-D") })
     }
@@ -38,10 +42,11 @@ impl Drop for Rule {
 }
 
 /// With a bypass, so that when the program has died the host is no longer impaired, rather than cut off.
-fn command_line(verb: &str, source: Ipv4Addr, queue: u16) -> String {
+fn command_line(verb: &str, source: Ipv4Addr, destination: Option<Ipv4Addr>, queue: u16) -> String {
+    let to = destination.map_or(String::new(), |destination| format!(" -d {destination}/32"));
     format!(
-        "{TABLE} {verb} PREROUTING -s {source}/32 -m comment --comment {MARK} -j NFQUEUE --queue-num {queue} \
-         --queue-bypass"
+        "{TABLE} {verb} PREROUTING -s {source}/32{to} -m comment --comment {MARK} -j NFQUEUE \
+         --queue-num {queue} --queue-bypass"
     )
 }
 
@@ -131,9 +136,12 @@ mod tests {
     #[test]
     fn a_rule_names_its_source_its_queue_and_us() {
         assert_eq!(
-            command_line("-A", Ipv4Addr::new(10, 1, 2, 3), 7),
+            command_line("-A", Ipv4Addr::new(10, 1, 2, 3), None, 7),
             "iptables -w 5 -t mangle -A PREROUTING -s 10.1.2.3/32 -m comment --comment adaptive-bridge-eval \
              -j NFQUEUE --queue-num 7 --queue-bypass"
         );
+        let to = Some(Ipv4Addr::new(10, 1, 2, 4));
+        let line = command_line("-D", Ipv4Addr::new(10, 1, 2, 3), to, 7);
+        assert!(line.contains(" -D PREROUTING -s 10.1.2.3/32 -d 10.1.2.4/32 -m comment "), "{line}");
     }
 }
