@@ -60,10 +60,10 @@ pub(super) fn make(names: &[String], sender: &str, switch: Switch) -> Result<Bed
         let uplink = if switch == Switch::Reassembling && name == sender {
             let uplink = stale::name("uplink");
             make_uplink(&uplink)?;
-            ip(&format!("link add {port} netns {between} type veth peer name up netns {uplink}"))?;
-            ip(&format!("-n {uplink} link set up master br0 up"))?;
-            ip(&format!("link add down netns {uplink} type veth peer name eth0 netns {namespace}"))?;
-            ip(&format!("-n {uplink} link set down master br0 up"))?;
+            ip(&format!("link add {port} netns {between} type veth peer name u0 netns {uplink}"))?;
+            ip(&format!("-n {uplink} link set u0 master br0 up"))?;
+            ip(&format!("link add u1 netns {uplink} type veth peer name eth0 netns {namespace}"))?;
+            ip(&format!("-n {uplink} link set u1 master br0 up"))?;
             Some(self::network(&uplink))
         } else {
             ip(&format!("link add {port} netns {between} type veth peer name eth0 netns {namespace}"))?;
