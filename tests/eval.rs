@@ -219,6 +219,38 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     assert!(!out.join(".partial").exists() && !out.join("failed").exists());
 }
 
+#[test]
+fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
+    let test = "quick_runs_on_containers_have_consistent_results_and_leave_no_container";
+    let docker = |arguments: &str| Command::new("docker").args(arguments.split_whitespace()).output();
+    if !docker("version").is_ok_and(|output| output.status.success()) {
+        skip(test, "no docker, or nobody who answers it");
+        return;
+    }
+    let Some(out) = folder(test) else { return };
+    let _exclusive = exclusive();
+    let mut harness = Process::spawn(
+        "the harness",
+        command(out.path(), "run baseline_mild bridge_mild --quick --bed docker"),
+    );
+    let pid = harness.pid().as_raw();
+    let status = harness.wait();
+    assert!(status.success(), "{status}\n{}", harness.log());
+    let runs = fs::read_dir(out.path().join("runs")).unwrap();
+    let names: Vec<String> = runs.map(|run| run.unwrap().file_name().into_string().unwrap()).collect();
+    assert_eq!(names.len(), 2, "{names:?}");
+    for name in &names {
+        let run = Run::read(out.path(), name);
+        run.assert_consistent();
+        assert_eq!(run.manifest["bed"], "docker");
+    }
+    for list in ["ps --all --format {{.Names}}", "network ls --format {{.Name}}"] {
+        let left = String::from_utf8(docker(list).unwrap().stdout).unwrap();
+        assert!(!left.contains(&format!("abe-{pid}-")), "{left}");
+    }
+    assert_eq!(traces(pid), Vec::<String>::new());
+}
+
 /// A run of the bridge that is in its measured window.
 fn start_long(out: &Path) -> Process {
     let harness = Process::spawn("the harness", command(out, "run bridge_strong"));

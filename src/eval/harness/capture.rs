@@ -123,7 +123,10 @@ impl Capture {
             socket(AddressFamily::Packet, SockType::Datagram, flags, SockProtocol::EthAll).map_err(refused)
         };
         let socket = network.within(open)?;
-        setsockopt(&socket, sockopt::RcvBufForce, &RECEIVE_BUFFER_BYTES).map_err(refused)?;
+        // Beyond the system's limit where that is allowed, otherwise up to it.
+        if setsockopt(&socket, sockopt::RcvBufForce, &RECEIVE_BUFFER_BYTES).is_err() {
+            setsockopt(&socket, sockopt::RcvBuf, &RECEIVE_BUFFER_BYTES).map_err(refused)?;
+        }
         let (to_host, from_host) = (Tally::default(), Tally::default());
         Ok(Self { port: port.to_owned(), socket, to_host, from_host })
     }

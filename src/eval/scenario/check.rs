@@ -52,7 +52,7 @@ fn workload_type(scenario: &Scenario) -> Option<String> {
     let message_type = &scenario.workload.message_type;
     let parts: Vec<&str> = message_type.split('/').collect();
     let word = |part: &&str| !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
-    let good = parts.len() == 3 && parts[1] == "msg" && parts.iter().all(|part| word(part));
+    let good = parts.len() == 3 && parts[1] == "msg" && parts.iter().all(word);
     (!good).then(|| format!("workload.message_type is '{message_type}', and may be pkg/msg/Name"))
 }
 
