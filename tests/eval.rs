@@ -182,7 +182,7 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     let link = &manifest["links"][0]["impairment"];
     assert_eq!((&manifest["links"][0]["name"], &link["loss_good"]), (&"slow<-publisher".into(), &0.5.into()));
     assert!(link["lost"].as_u64() > Some(0), "{link}");
-    // What is lost before the switch leaves incomplete datagrams to it, and no fragments to the receiver alone.
+    // What is lost before the switch leaves incomplete datagrams to it.
     assert_eq!(manifest["links"][0]["before_switch"], true);
     let kernel = made.rows("kernel.csv");
     let held = kernel.iter().filter(|row| row["host"] == "switch").map(|row| &row["fragment_memory_bytes"]);
