@@ -36,6 +36,7 @@ const LIBRARIES: &[(&str, &str)] = &[
     ("iceoryx2_cal", "src/shm/"),
     ("rustdds", "src/dds/"),
     ("ros2_client", "src/dds/"),
+    ("sd_notify", "src/process/notify.rs"),
     ("serde_yaml", "src/config/yaml/"),
     ("granit_parser", "src/config/yaml/"),
 ];
