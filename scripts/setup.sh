@@ -48,6 +48,8 @@ check_all() {
     need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
     need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
     need "has_faketime" faketime "tests with a wall clock that steps"
+    need "has systemd-nspawn" systemd-container "tests of the services (a systemd of their own)"
+    need "has systemd-analyze" systemd "tests of the service units"
     need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
 }
 
