@@ -6,6 +6,7 @@
 mod check;
 mod completions;
 mod demo;
+mod doctor;
 mod man;
 mod mode;
 mod reload;
@@ -62,6 +63,8 @@ enum Command {
     Mode(mode::Arguments),
     /// Let the running bridge take over what was changed in its configuration file, without a restart
     Reload(ConfigArguments),
+    /// Say what on this machine will hurt the bridge, and the command that mends it
+    Doctor(doctor::Arguments),
     /// Show, or write, what a configuration needs of systemd beyond the installed units
     Units(units::Arguments),
     /// Print what a shell needs to complete command lines
@@ -127,6 +130,7 @@ pub fn main() -> ExitCode {
         Command::Tap(arguments) => tap::run(&arguments),
         Command::Mode(arguments) => mode::run(&arguments),
         Command::Reload(arguments) => reload::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Units(arguments) => units::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => man::run(&arguments),
