@@ -6,6 +6,7 @@ mod support;
 use std::process::Command;
 use std::time::Instant;
 
+use serde_json::Value;
 use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::machine::{Machine, install, machine_missing};
 use support::netns::Net;
@@ -98,8 +99,9 @@ impl Flow {
     fn end(self) -> (Sent, Received) {
         let sent: Sent = self.publisher.end();
         assert_eq!(sent.failed, 0, "{sent:?}");
+        let longest_ms = sent.call_us.map_or(0.0, |calls| calls.max / 1e3);
         println!(
-            "publisher: {} samples, {:.1} Hz, {} ticks skipped",
+            "publisher: {} samples, {:.1} Hz, {} ticks skipped, longest write {longest_ms:.1} ms",
             sent.ok, sent.rate_hz, sent.skipped_ticks
         );
         let received: Received = self.critical.end();
@@ -222,7 +224,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     says(EGRESS_NONCRITICAL, "superseded");
 
     // Structured fields, and a reload that is refused.
-    let reading = |entry: &serde_json::Value| {
+    let reading = |entry: &Value| {
         entry["BRIDGE_ROUTE"] == "scan"
             && entry["MESSAGE"].as_str().is_some_and(|text| text.starts_with("reading route=scan"))
     };
@@ -252,7 +254,23 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
         "{SCAN}lanes: {{rviz: {{scheduling: {{cpus: [1]}}}}, critical: {{scheduling: {{cpus: [0]}}}}}}\n"
     );
     let Some(bed) = Bed::boot(test, &yaml) else { return };
-    let written = bed.machine.run(&["adaptive-bridge", "units", "--write"]);
+    let doctor = |check: &str| {
+        let output = bed.machine.try_run(&["adaptive-bridge", "doctor", "--json"]);
+        let diagnosis: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let code = match diagnosis["severity"].as_str() {
+            Some("ok" | "note") => 0,
+            Some("warning") => 3,
+            _ => 4,
+        };
+        assert_eq!(output.status.code(), Some(code), "{diagnosis}");
+        let findings = diagnosis["findings"].as_array().unwrap();
+        let found = findings.iter().find(|finding| finding["check"] == check);
+        found.unwrap_or_else(|| panic!("{check} in {diagnosis}")).clone()
+    };
+    let units = doctor("units");
+    assert_eq!(units["severity"], "warning", "{units}");
+    let command = units["command"].as_str().unwrap().replace("sudo ", "");
+    let written = bed.machine.run(&command.split(' ').collect::<Vec<_>>());
     assert!(written.contains("adaptive-bridge.target.d") && written.contains("daemon-reload"), "{written}");
     // FIFO by a capability: a container may not be allowed to raise the limit that the units use.
     let may =
@@ -261,6 +279,10 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
     bed.machine.write("/etc/systemd/system/adaptive-bridge-egress@critical.service.d/90-nice.conf", may);
     bed.machine.run(&["systemctl", "daemon-reload"]);
     bed.start();
+    assert_eq!(doctor("units")["severity"], "ok");
+    assert_eq!(doctor("services")["severity"], "warning");
+    bed.machine.run(&["systemctl", "enable", TARGET]);
+    assert_eq!(doctor("services")["severity"], "ok");
     let rviz = "adaptive-bridge-egress@rviz.service";
     bed.machine.wait_property(rviz, "ActiveState", "active");
     let shown = |unit: &str, field: &str| {
