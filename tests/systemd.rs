@@ -3,6 +3,8 @@
 
 mod support;
 
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
 
@@ -38,7 +40,12 @@ impl Bed {
             return None;
         }
         let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
-        let machine = Machine::boot(net.host("bridge"), &[(CONFIG, yaml.to_owned())]);
+        let machine = Machine::boot(net.host("bridge"), |root| {
+            install(root);
+            let config = root.join(CONFIG.trim_start_matches('/'));
+            fs::create_dir_all(config.parent().unwrap()).unwrap();
+            fs::write(config, yaml).unwrap();
+        });
         Some(Self { machine, net })
     }
 
@@ -123,9 +130,9 @@ fn the_units_are_sound_and_hardened() {
     install(root.path());
     let units = root.path().join("usr/lib/systemd/system");
     for unit in ["basic", "multi-user", "network", "shutdown", "sysinit"] {
-        std::fs::write(units.join(format!("{unit}.target")), "[Unit]\nDescription=Here\n").unwrap();
+        fs::write(units.join(format!("{unit}.target")), "[Unit]\nDescription=Here\n").unwrap();
     }
-    std::fs::copy("/bin/kill", root.path().join("usr/bin/kill")).unwrap();
+    fs::copy("/bin/kill", root.path().join("usr/bin/kill")).unwrap();
     let analyze = |arguments: &[&str], unit: &str| {
         let mut command = Command::new("systemd-analyze");
         command.arg(format!("--root={}", root.path().display())).args(arguments).arg(unit);
@@ -310,4 +317,78 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
     bed.machine.wait_property(rviz, "ActiveState", "inactive");
     let written = bed.machine.run(&["adaptive-bridge", "units", "--write"]);
     assert_eq!(written, "everything is as the configuration needs it\n");
+}
+
+/// Makes the package of the program under test, with that version.
+fn package(version: &str) -> Result<PathBuf, String> {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut command = Command::new(source.join("scripts/package.sh"));
+    command.args(["--deb-version", version]).env("PROGRAM", support::bridge::program());
+    let output = command.output().map_err(|error| error.to_string())?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    match String::from_utf8_lossy(&output.stdout).lines().last() {
+        Some(path) if output.status.success() => Ok(source.join(path)),
+        _ => Err(said.into_owned()),
+    }
+}
+
+#[test]
+fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
+    let test = "the_package_installs_upgrades_while_samples_flow_and_leaves_nothing";
+    let cargo_deb = Command::new("cargo").args(["deb", "--version"]).output();
+    let no_cargo_deb = (!cargo_deb.is_ok_and(|output| output.status.success()))
+        .then(|| "cargo-deb is not installed (make setup)".to_owned());
+    if let Some(reason) = machine_missing().or(no_cargo_deb) {
+        support::skip(test, &reason);
+        return;
+    }
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let [old, new] = ["0.0.1-1", "0.0.2-1"].map(|version| package(version).unwrap());
+    let contents = Command::new("dpkg-deb").arg("-c").arg(&new).output().unwrap();
+    let contents = String::from_utf8(contents.stdout).unwrap();
+    let help = Command::new(support::bridge::program()).arg("help").output().unwrap();
+    let help = String::from_utf8(help.stdout).unwrap();
+    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    let commands = commands.take_while(|line| !line.is_empty()).filter_map(|line| line.strip_prefix("  "));
+    // What a description that is too long for a line goes on with is indented further.
+    let commands = commands.filter(|line| !line.starts_with(' '));
+    let commands: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(commands.contains(&"egress"), "{help}");
+    for command in commands.iter().filter(|command| **command != "help") {
+        assert!(
+            contents.contains(&format!("man1/adaptive-bridge-{command}.1.gz\n")),
+            "{command}: {contents}"
+        );
+    }
+    for completions in ["completions/adaptive-bridge", "adaptive-bridge.fish", "_adaptive-bridge"] {
+        assert!(contents.contains(&format!("{completions}\n")), "{completions}: {contents}");
+    }
+
+    let machine = Machine::boot(net.host("bridge"), |root| {
+        fs::copy(&old, root.join("old.deb")).unwrap();
+        fs::copy(&new, root.join("new.deb")).unwrap();
+    });
+    let bed = Bed { machine, net };
+    bed.machine.run(&["dpkg", "-i", "/old.deb"]);
+    assert_eq!(bed.machine.property(TARGET, "ActiveState"), "inactive");
+    bed.machine.run(&["systemctl", "enable", "--now", TARGET]);
+    bed.start();
+    let flow = bed.flow();
+    let pids = UNITS.map(|unit| bed.machine.main_pid(unit));
+    bed.machine.run(&["dpkg", "-i", "/new.deb"]);
+    for (unit, pid) in UNITS.iter().zip(&pids) {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+        assert_ne!(bed.machine.main_pid(unit), *pid, "{unit} was not restarted");
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+    }
+    flow.wait_on();
+    flow.end();
+
+    bed.machine.run(&["dpkg", "-r", "adaptive-bridge"]);
+    let processes = bed.machine.try_run(&["pgrep", "-u", "adaptive-bridge"]);
+    assert!(processes.stdout.is_empty(), "processes are left: {processes:?}");
+    bed.machine.run(&["dpkg", "-P", "adaptive-bridge"]);
+    let find = "find /dev/shm /run /etc /usr/lib/systemd /usr/bin -name 'adaptive-bridge*' -o -name 'ab1_*'";
+    assert_eq!(bed.machine.run(&["sh", "-c", find]), "");
+    assert!(!bed.machine.try_run(&["id", "adaptive-bridge"]).status.success());
 }

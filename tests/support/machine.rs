@@ -59,18 +59,14 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// Boots a machine on a host, with these files beside what this machine has; their folders are made.
-    pub fn boot(host: &Host, files: &[(&str, String)]) -> Machine {
+    /// Boots a machine on a host. `stage` puts files into a folder that becomes part of its root.
+    pub fn boot(host: &Host, stage: impl FnOnce(&Path)) -> Machine {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let folder = tempfile::tempdir().unwrap();
         let [disk, staged] = ["disk", "staged"].map(|name| folder.path().join(name));
         fs::create_dir(&disk).unwrap();
-        install(&staged);
-        for (path, text) in files {
-            let path = staged.join(path.trim_start_matches('/'));
-            fs::create_dir_all(path.parent().unwrap()).unwrap();
-            fs::write(path, text).unwrap();
-        }
+        fs::create_dir(&staged).unwrap();
+        stage(&staged);
         let name = format!("ab-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
         let hierarchies = CGROUPS.iter().map(Path::new).filter(|path| path.is_dir());
         let cgroups: Vec<PathBuf> = hierarchies.map(|path| path.join(&name)).collect();
