@@ -11,7 +11,8 @@ use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::peer::{Peer, Received, Sent};
 use support::process::signal;
 
-/// The image that the Dockerfile begins with. Where no registry is in reach, Debian's own tool makes the like.
+/// The image that the Dockerfile begins with. Where no registry is in reach, Debian's own tool makes the
+/// like.
 const BASE: &str = "debian:bookworm-slim";
 const BOOTSTRAPPED: &str = "adaptive-bridge-test-base";
 

@@ -1,5 +1,5 @@
-//! The bridge as services of a real systemd: hardened, supervised, restarted. Machines in containers, real signals,
-//! real DDS peers on hosts of their own.
+//! The bridge as services of a real systemd: hardened, supervised, restarted. Machines in containers, real
+//! signals, real DDS peers on hosts of their own.
 
 mod support;
 
@@ -72,7 +72,8 @@ impl Bed {
         };
         let critical = subscriber("critical", Peer::fast().keep_all(), CRITICAL);
         let slow = subscriber("slow", Peer::fast().best_effort(), NONCRITICAL);
-        // KEEP_LAST, as ROS 2 has it: a KEEP_ALL writer waits for an ingress that is stopped, until that is restarted.
+        // KEEP_LAST, as ROS 2 has it: a KEEP_ALL writer waits for an ingress that is stopped, until that is
+        // restarted.
         let publisher = Peer::cyclone().rate_hz(200.0).publisher().topic(INPUT).wait_match(1);
         let publisher = publisher.start_on(self.net.host("publisher"));
         critical.wait_received(50);

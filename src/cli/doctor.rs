@@ -215,7 +215,9 @@ mod tests {
         let shown = Diagnosis::of(vec![finding]).to_string();
         assert_eq!(
             shown,
-            "WARNING  clock              hpet\n                            Slow.\n                            $ fix it\n"
+            "WARNING  clock              hpet\n\
+             \x20                           Slow.\n\
+             \x20                           $ fix it\n"
         );
     }
 }

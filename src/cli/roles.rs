@@ -10,8 +10,9 @@ use crate::config::Settings;
 use crate::process::{self, HangUp, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
 
-/// A service manager restarts a process that died at once, so that samples flow again; one that cannot start, for
-/// want of a network interface say, does not come sooner for being tried more often. It waits before it ends.
+/// A service manager restarts a process that died at once, so that samples flow again; one that cannot start,
+/// for want of a network interface say, does not come sooner for being tried more often. It waits before it
+/// ends.
 const FAILED_START_MS: u64 = 2_000;
 
 /// What `egress` is asked.

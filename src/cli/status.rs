@@ -28,7 +28,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 1_000)]
     #[arg(value_parser = value_parser!(u64).range(INTERVALS_MS))]
     interval_ms: u64,
-    /// Print nothing, and exit with 0 only if that process runs and turns: `ingress`, `control`, `egress-LANE`
+    /// Print nothing, and exit with 0 only if that process runs and turns: `ingress`, `control`,
+    /// `egress-LANE`
     #[arg(long, value_name = "PROCESS", conflicts_with_all = ["json", "watch"])]
     require: Option<String>,
     #[command(flatten)]

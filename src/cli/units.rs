@@ -29,8 +29,8 @@ const MAX_PRIORITY: u8 = 50;
 /// What `units` is asked.
 ///
 /// The installed units run ingress, the lanes critical and noncritical, and control, with
-/// /etc/adaptive-bridge/config.yaml. What a configuration needs beyond that goes into drop-ins, which this prints:
-/// the lanes of your own, and what scheduling, paths and another file take.
+/// /etc/adaptive-bridge/config.yaml. What a configuration needs beyond that goes into drop-ins, which this
+/// prints: the lanes of your own, and what scheduling, paths and another file take.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Write the drop-ins, and remove former ones that are not needed any more

@@ -1,5 +1,5 @@
-//! What a process tells the service manager that started it: that it is ready, what it does, that it turns, that
-//! it ends (sd_notify(3)). Nobody else listens; then all of this does nothing.
+//! What a process tells the service manager that started it: that it is ready, what it does, that it turns,
+//! that it ends (sd_notify(3)). Nobody else listens; then all of this does nothing.
 
 use std::fmt::{Display, Write};
 use std::time::Duration;
@@ -48,7 +48,8 @@ impl Notifier {
         self.listens
     }
 
-    /// The process is up: shared memory is attached, and so are the DDS endpoints whose types are known. Once.
+    /// The process is up: shared memory is attached, and so are the DDS endpoints whose types are known.
+    /// Once.
     pub fn ready(&mut self) {
         if self.listens && !std::mem::replace(&mut self.ready, true) {
             send(&[NotifyState::Ready]);

@@ -9,7 +9,8 @@ use tracing::{info, warn};
 
 use crate::config::{Scheduling, SchedulingPolicy};
 
-/// The FIFO priority of a process for which the configuration names no policy: what its service unit thinks right.
+/// The FIFO priority of a process for which the configuration names no policy: what its service unit thinks
+/// right.
 const DEFAULT_VARIABLE: &str = "ADAPTIVE_BRIDGE_FIFO_PRIORITY";
 
 /// Applies what is configured to this process and the threads that it starts from now on. What the system

@@ -1,6 +1,6 @@
-//! Logs for journald, in its native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): each field of an event is a
-//! field of the journal's entry, so that `journalctl BRIDGE_ROUTE=scan` finds it, and stands in the message, too,
-//! so that nobody has to know that.
+//! Logs for journald, in its native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): each field of an event is
+//! a field of the journal's entry, so that `journalctl BRIDGE_ROUTE=scan` finds it, and stands in the
+//! message, too, so that nobody has to know that.
 
 use std::ffi::OsString;
 use std::fmt::{Debug, Write};
@@ -18,7 +18,8 @@ use tracing_subscriber::layer::Context;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
 
-/// A datagram of a unix socket is at most some 200 KiB long (`net.core.wmem_default`); no event of ours comes near.
+/// A datagram of a unix socket is at most some 200 KiB long (`net.core.wmem_default`); no event of ours comes
+/// near.
 const MAX_MESSAGE_BYTES: usize = 32 * 1024;
 
 /// Sends events to journald.
@@ -27,7 +28,8 @@ pub(super) struct Journal {
 }
 
 impl Journal {
-    /// If `log` goes to the journal, as `JOURNAL_STREAM` says of the standard error that a service is started with.
+    /// If `log` goes to the journal, as `JOURNAL_STREAM` says of the standard error that a service is started
+    /// with.
     pub fn behind(log: impl AsFd, journal_stream: Option<OsString>) -> Option<Self> {
         let named = journal_stream?.into_string().ok()?;
         let metadata = fstat(log).ok()?;

@@ -1,5 +1,5 @@
-//! A machine with a systemd of its own, in a container of systemd-nspawn: this machine's files, below a layer that is
-//! gone with it; its own processes, `/dev/shm` and users; the network of a [`Host`].
+//! A machine with a systemd of its own, in a container of systemd-nspawn: this machine's files, below a layer
+//! that is gone with it; its own processes, `/dev/shm` and users; the network of a [`Host`].
 
 use std::fmt::Write as _;
 use std::fs;
@@ -22,7 +22,8 @@ const CGROUPS: [&str; 2] = ["/sys/fs/cgroup/systemd", "/sys/fs/cgroup/unified"];
 /// systemd shuts down in order (systemd(1): SIGRTMIN+4).
 const POWER_OFF: &str = "RTMIN+4";
 
-/// What runs between the start and systemd-nspawn: in a mount namespace of its own, so that its mounts go with it.
+/// What runs between the start and systemd-nspawn: in a mount namespace of its own, so that its mounts go
+/// with it.
 const PREPARE: &str = "\
 set -e
 mount -t tmpfs -o mode=755 tmpfs $1

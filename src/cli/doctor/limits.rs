@@ -76,7 +76,8 @@ fn limits_line(item: &str, value: &str) -> String {
         uid => nix::unistd::User::from_uid(uid).ok().flatten().map_or(uid.to_string(), |user| user.name),
     };
     format!(
-        "echo '{user} - {item} {value}' | sudo tee -a /etc/security/limits.d/60-adaptive-bridge.conf # then log in again"
+        "echo '{user} - {item} {value}' | sudo tee -a \
+         /etc/security/limits.d/60-adaptive-bridge.conf # then log in again"
     )
 }
 

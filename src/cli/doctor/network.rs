@@ -50,7 +50,8 @@ fn buffer(name: &'static str, bytes: i64, largest_sample: usize) -> Finding {
         "The kernel drops fragments of large samples in a burst; repairing them takes milliseconds.",
     )
     .mended_by(format!(
-        "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf && sudo sysctl --system"
+        "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf \
+         && sudo sysctl --system"
     ))
 }
 
