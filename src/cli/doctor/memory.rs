@@ -27,10 +27,10 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let mut findings = Vec::new();
     match statvfs(SHM) {
         Ok(found) => {
-            let block = found.fragment_size() as u64;
+            let block = found.fragment_size();
             let room = Room {
-                size: found.blocks() as u64 * block,
-                free: found.blocks_available() as u64 * block,
+                size: found.blocks() * block,
+                free: found.blocks_available() * block,
                 taken: !holders.is_empty(),
             };
             findings.push(size(needed, &room));
@@ -130,8 +130,8 @@ fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
     if !with_logind {
         return Finding::ok(check, "no systemd runs here");
     }
-    let values = logind.lines().filter_map(|line| line.trim().strip_prefix("RemoveIPC=")).map(str::trim);
-    let value = values.last().unwrap_or("yes");
+    let mut values = logind.lines().filter_map(|line| line.trim().strip_prefix("RemoveIPC=")).map(str::trim);
+    let value = values.next_back().unwrap_or("yes");
     if ["no", "false", "off", "0"].contains(&value) {
         return Finding::ok(check, "is off");
     }
