@@ -25,6 +25,10 @@ lint:
 demo: build
 	target/release/adaptive-bridge demo
 
+# The Debian package: target/debian/adaptive-bridge_*.deb
+package:
+	scripts/package.sh
+
 bench:
 	cargo bench --locked
 
@@ -35,4 +39,4 @@ clean:
 	cargo clean
 	$(MAKE) --no-print-directory -C tests/peers clean
 
-.PHONY: build setup peers test lint demo bench fuzz clean
+.PHONY: build setup peers test lint demo package bench fuzz clean

@@ -48,6 +48,14 @@ check_all() {
     need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
     need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
     need "has_faketime" faketime "tests with a wall clock that steps"
+    if has docker; then
+        need "docker compose version >/dev/null 2>&1 || has docker-compose" "docker-compose-v2|docker-compose" \
+            "tests of the deployment in containers"
+        need "has debootstrap" debootstrap "the same, where no registry is in reach"
+    fi
+    need "has dpkg-shlibdeps" dpkg-dev "the Debian package, and its tests"
+    need "has systemd-nspawn" systemd-container "tests of the services (a systemd of their own)"
+    need "has systemd-analyze" systemd "tests of the service units"
     need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
 }
 
@@ -119,5 +127,9 @@ done
 if ! cargo fuzz --version >/dev/null 2>&1; then
     say "cargo install cargo-fuzz --locked"
     cargo install cargo-fuzz --locked
+fi
+if ! cargo deb --version >/dev/null 2>&1; then
+    say "cargo install cargo-deb --locked"
+    cargo install cargo-deb --locked
 fi
 say "done"

@@ -6,6 +6,7 @@
 mod check;
 mod completions;
 mod demo;
+mod doctor;
 mod man;
 mod mode;
 mod reload;
@@ -13,6 +14,7 @@ mod responder;
 mod roles;
 mod status;
 mod tap;
+mod units;
 
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -61,6 +63,10 @@ enum Command {
     Mode(mode::Arguments),
     /// Let the running bridge take over what was changed in its configuration file, without a restart
     Reload(ConfigArguments),
+    /// Say what on this machine will hurt the bridge, and the command that mends it
+    Doctor(doctor::Arguments),
+    /// Show, or write, what a configuration needs of systemd beyond the installed units
+    Units(units::Arguments),
     /// Print what a shell needs to complete command lines
     Completions(completions::Arguments),
     /// Write the manual pages to a folder
@@ -85,6 +91,14 @@ struct ConfigArguments {
 impl ConfigArguments {
     fn path(&self) -> Option<&Path> {
         self.config.as_deref()
+    }
+
+    /// The file, with its whole path, that is read when it exists.
+    fn file(&self) -> PathBuf {
+        let named = || std::env::var_os(config::PATH_VARIABLE).filter(|path| !path.is_empty());
+        let path = self.config.clone().or_else(|| named().map(PathBuf::from));
+        let path = path.unwrap_or_else(|| config::DEFAULT_PATH.into());
+        std::path::absolute(&path).unwrap_or(path)
     }
 
     /// The settings, or the exit code after the problems were printed.
@@ -116,6 +130,8 @@ pub fn main() -> ExitCode {
         Command::Tap(arguments) => tap::run(&arguments),
         Command::Mode(arguments) => mode::run(&arguments),
         Command::Reload(arguments) => reload::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
+        Command::Units(arguments) => units::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => man::run(&arguments),
         Command::Demo(arguments) => demo::run(&arguments),
@@ -144,8 +160,15 @@ fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, Str
 
 /// Prints that there is no bridge to look at, and gives the exit code.
 fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
+    let services = Path::new("/run/adaptive-bridge");
+    let hint = match std::fs::metadata(services) {
+        Ok(_) if services != root => {
+            "look at that of the services with `sudo -u adaptive-bridge adaptive-bridge …`, or start one"
+        }
+        _ => "start it",
+    };
     failed(&format!(
-        "no bridge runs as instance {} (root {}); start it with `adaptive-bridge up`",
+        "no bridge runs as instance {} (root {}); {hint} with `adaptive-bridge up`",
         settings.instance,
         root.display()
     ))

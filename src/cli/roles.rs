@@ -5,10 +5,15 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed};
+use super::{ConfigArguments, failed, pause};
 use crate::config::Settings;
 use crate::process::{self, HangUp, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
+
+/// A service manager restarts a process that died at once, so that samples flow again; one that cannot start,
+/// for want of a network interface say, does not come sooner for being tried more often. It waits before it
+/// ends.
+const FAILED_START_MS: u64 = 2_000;
 
 /// What `egress` is asked.
 #[derive(Args, Debug)]
@@ -76,6 +81,12 @@ pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E
     };
     match role(&stop) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => failed(&error),
+        Err(error) => {
+            let code = failed(&error);
+            if std::env::var_os("NOTIFY_SOCKET").is_some() {
+                pause(FAILED_START_MS, &stop);
+            }
+            code
+        }
     }
 }

@@ -10,7 +10,7 @@ use clap::{Args, value_parser};
 use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
 use crate::config::Settings;
 use crate::process::Stop;
-use crate::telemetry::{Report, Snapshot};
+use crate::telemetry::{ProcessState, Report, Snapshot};
 
 /// From what tells a rate of 100 Hz to an hour.
 const INTERVALS_MS: RangeInclusive<u64> = 10..=3_600_000;
@@ -28,6 +28,10 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 1_000)]
     #[arg(value_parser = value_parser!(u64).range(INTERVALS_MS))]
     interval_ms: u64,
+    /// Print nothing, and exit with 0 only if that process runs and turns: `ingress`, `control`,
+    /// `egress-LANE`
+    #[arg(long, value_name = "PROCESS", conflicts_with_all = ["json", "watch"])]
+    require: Option<String>,
     #[command(flatten)]
     config: ConfigArguments,
 }
@@ -43,6 +47,9 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(None) => return no_bridge(&settings, &root),
         Err(error) => return failed(&error),
     };
+    if let Some(process) = &arguments.require {
+        return require(&first, process);
+    }
     if arguments.watch {
         return watch(arguments, &root, &settings, first);
     }
@@ -54,6 +61,18 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         },
         Ok(None) => no_bridge(&settings, &root),
         Err(error) => failed(&error),
+    }
+}
+
+/// Whether a process is as it should be, for a health check.
+fn require(bridge: &Snapshot, process: &str) -> ExitCode {
+    match bridge.processes.iter().find(|reading| reading.name == process) {
+        Some(reading) if reading.state == ProcessState::Running => ExitCode::SUCCESS,
+        Some(reading) => failed(&format!("{process} is {}", reading.state.label())),
+        None => {
+            let names: Vec<&str> = bridge.processes.iter().map(|reading| reading.name.as_str()).collect();
+            failed(&format!("there is no process {process}; there are: {}", names.join(", ")))
+        }
     }
 }
 

@@ -10,6 +10,7 @@ mod egress;
 mod inbox;
 mod ingress;
 mod manual;
+mod notify;
 pub mod probes;
 mod reload;
 mod responder;

@@ -20,6 +20,7 @@ use signal_hook::consts::SIGHUP;
 use signal_hook::iterator::Signals;
 use tracing::{error, info, warn};
 
+use super::notify;
 use crate::clock;
 use crate::config::{ConfigError, Reload, Settings};
 use crate::model::MonotonicNs;
@@ -226,6 +227,7 @@ fn serve(
             let _ = raise(Signal::SIGTERM);
             return;
         }
+        notify::reloading();
         let began_at = clock::monotonic();
         let (outcome, result) = match load() {
             Ok(new) => {

@@ -3,12 +3,14 @@
 //! It needs no bridge and no shared memory on its machine. Requests come from the network and cost little
 //! whatever they are: each is looked at once, and what is no good is counted.
 
+use std::fmt::Write;
 use std::time::Duration;
 
 use tracing::{debug, info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::inbox::Inbox;
+use super::notify::{Meter, Notifier};
 use super::probes::{
     Answers, MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RefusalWatch, Trust,
 };
@@ -67,6 +69,7 @@ pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleE
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
     }
+    responder.notifier.stopping();
     info!(
         answered = responder.answers.answered,
         refused = responder.answers.refused.total(),
@@ -90,6 +93,8 @@ struct Responder {
     heard_at: MonotonicNs,
     said: Said,
     where_to_look: String,
+    notifier: Notifier,
+    answered: Meter,
 }
 
 /// What the log said last about probes.
@@ -130,6 +135,8 @@ impl Responder {
             heard_at: now,
             said: Said::Nothing,
             where_to_look: format!("domain {}, topic {}", options.network.domain_id, options.request_topic),
+            notifier: Notifier::new(),
+            answered: Meter::default(),
         })
     }
 
@@ -193,6 +200,15 @@ impl Responder {
                 self.where_to_look
             );
         }
+        // The first time everything is there, and any other time a turn is over.
+        self.notifier.ready();
+        self.notifier.turned(now);
+        let (answers, answered) = (&self.answers, &mut self.answered);
+        self.notifier.status(now, |line| {
+            let per_s = answered.per_s(answers.answered, now);
+            // Writing to a String cannot fail.
+            let _ = write!(line, "{per_s:.1} probes answered per s; {} refused", answers.refused.total());
+        });
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }
 }

@@ -5,12 +5,13 @@ use std::path::PathBuf;
 
 use tracing::info;
 
+use super::notify::Notifier;
 use super::reload::{Look, ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
 use crate::config::{Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
-use crate::model::{Guid, ProcessHealth};
+use crate::model::{Guid, MonotonicNs, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
 
 /// Why a role could not start, or had to end.
@@ -95,6 +96,7 @@ pub(super) struct Role {
     pub boards: Boards,
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
+    notifier: Notifier,
     /// The participant of the process that served the role before; all zero for none.
     former_participant: Guid,
     /// Last, so that the role is free only when everything else is gone.
@@ -139,7 +141,7 @@ impl Role {
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self { node, boards, reloads, health, former_participant, _lock: lock })
+        Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former_participant, _lock: lock })
     }
 
     /// Opens the role's DDS participant. If the process that served the role before was killed, the others
@@ -179,7 +181,23 @@ impl Role {
             health.settings_fingerprint = fingerprint;
             health.refused_reloads = refused;
         });
+        self.notifier.reloaded(look == Look::Refused);
         (look == Look::Reloaded).then(|| self.reloads.settings())
+    }
+
+    /// The role is up: its DDS endpoints are there, but for those whose type discovery has yet to tell.
+    pub fn ready(&mut self) {
+        self.notifier.ready();
+    }
+
+    /// Says what the role does, about once a second, if anybody listens. `describe` writes a line.
+    pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
+        self.notifier.status(now, describe);
+    }
+
+    /// The role begins to end.
+    pub fn stopping(&self) {
+        self.notifier.stopping();
     }
 
     /// Counts a failure that cost no sample.
@@ -196,6 +214,7 @@ impl Role {
             health.mode = mode;
             health.policy_epoch = policy_epoch;
         });
+        self.notifier.turned(now);
     }
 }
 

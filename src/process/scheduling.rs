@@ -9,6 +9,10 @@ use tracing::{info, warn};
 
 use crate::config::{Scheduling, SchedulingPolicy};
 
+/// The FIFO priority of a process for which the configuration names no policy: what its service unit thinks
+/// right.
+const DEFAULT_VARIABLE: &str = "ADAPTIVE_BRIDGE_FIFO_PRIORITY";
+
 /// Applies what is configured to this process and the threads that it starts from now on. What the system
 /// refuses is a warning that says what would allow it: a bridge with the wrong priority is better than none.
 pub(super) fn apply(scheduling: &Scheduling) {
@@ -20,20 +24,20 @@ pub(super) fn apply(scheduling: &Scheduling) {
             }
         }
     }
-    let (policy, name) = match scheduling.policy {
-        SchedulingPolicy::Other => (None, "other"),
-        SchedulingPolicy::Fifo => (Some(libc::SCHED_FIFO), "fifo"),
-        SchedulingPolicy::RoundRobin => (Some(libc::SCHED_RR), "rr"),
+    let (policy, name, priority) = match scheduling.policy {
+        SchedulingPolicy::Other => (libc::SCHED_FIFO, "fifo", default_priority()),
+        SchedulingPolicy::Fifo => (libc::SCHED_FIFO, "fifo", Some(scheduling.priority)),
+        SchedulingPolicy::RoundRobin => (libc::SCHED_RR, "rr", Some(scheduling.priority)),
     };
-    if let Some(policy) = policy {
-        match set_policy(policy, scheduling.priority) {
-            Ok(()) => info!(policy = name, priority = scheduling.priority, "scheduling policy set"),
+    if let Some(priority) = priority {
+        match set_policy(policy, priority) {
+            Ok(()) => info!(policy = name, priority, "scheduling policy set"),
             Err(error) => warn!(
                 policy = name,
-                priority = scheduling.priority,
+                priority,
                 %error,
                 "scheduling policy not set: the process needs CAP_SYS_NICE or an RLIMIT_RTPRIO of at least \
-                 the priority"
+                 the priority, and with RT_GROUP_SCHED a control group that has real-time runtime"
             ),
         }
     }
@@ -45,6 +49,16 @@ pub(super) fn apply(scheduling: &Scheduling) {
             }
         }
     }
+}
+
+/// `None` without the variable, or where it is empty.
+fn default_priority() -> Option<u8> {
+    let text = std::env::var(DEFAULT_VARIABLE).ok().filter(|text| !text.is_empty())?;
+    let priority = text.parse().ok().filter(|priority| (1..=99).contains(priority));
+    if priority.is_none() {
+        warn!("{DEFAULT_VARIABLE} is {text:?} and must be 1 to 99; no scheduling policy is set");
+    }
+    priority
 }
 
 fn set_affinity(cpus: &[usize]) -> nix::Result<()> {

@@ -5,7 +5,7 @@
 //! because each asks the kernel to be terminated when its parent dies, however that dies.
 
 use std::ffi::OsString;
-use std::fmt;
+use std::fmt::{self, Write as _};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -16,15 +16,22 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, getppid};
 use tracing::{error, info, warn};
 
+use super::notify::{Notifier, write_list};
 use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
+use super::role::root;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
 use crate::model::MonotonicNs;
 use crate::policy::{ChildExit, GiveUpReason, RestartBackoff, RestartDecision};
+use crate::shm::ShmError;
+use crate::telemetry::Snapshot;
 
 /// How often the children are looked at.
 const LOOK_MS: u64 = 20;
+
+/// How often the boards are looked at for the service manager.
+const ACCOUNT_MS: u64 = 250;
 
 /// Roles end within a second of a request; one that has not by then is killed.
 const GRACE_MS: u64 = 900;
@@ -97,6 +104,7 @@ pub fn up(
             break;
         }
     }
+    let mut account = Account::new(settings);
     while outcome.is_ok() && !stop.is_requested() {
         std::thread::sleep(Duration::from_millis(LOOK_MS));
         match hang_up.take() {
@@ -114,12 +122,71 @@ pub fn up(
         for child in &mut children {
             child.look(now);
         }
+        account.give(&children, now);
         if children.iter().all(|child| child.state == State::GaveUp) {
             outcome = Err(SupervisorError::AllGaveUp);
         }
     }
+    account.notifier.stopping();
     end(&mut children);
     outcome
+}
+
+/// What the service manager of `up` is told, where there is one.
+struct Account<'a> {
+    settings: &'a Settings,
+    notifier: Notifier,
+    look_at: MonotonicNs,
+    last: Option<Snapshot>,
+}
+
+impl<'a> Account<'a> {
+    fn new(settings: &'a Settings) -> Self {
+        Self { settings, notifier: Notifier::new(), look_at: MonotonicNs(0), last: None }
+    }
+
+    /// Ready when each child has turned once, which is when it is ready itself. `up` has no data path: its
+    /// work is to look after the children, and that was just done.
+    fn give(&mut self, children: &[Supervised], now: MonotonicNs) {
+        self.notifier.turned(now);
+        if !self.notifier.listens() || now < self.look_at {
+            return;
+        }
+        self.look_at = now.plus_ms(ACCOUNT_MS);
+        let next = match Snapshot::take(&root(self.settings), self.settings) {
+            Ok(Some(next)) => next,
+            // The children have yet to make the boards, or the present ones are of another configuration.
+            Ok(None) | Err(ShmError::Incompatible { .. }) => return,
+            Err(error) => {
+                warn!(%error, "the bridge cannot be looked at");
+                return;
+            }
+        };
+        let has_turned = |child: &Supervised| {
+            let reading = next.processes.iter().find(|reading| reading.name == child.name);
+            reading.is_some_and(|reading| reading.health.turns > 0 && Some(reading.health.pid) == child.pid())
+        };
+        if children.iter().all(has_turned) {
+            self.notifier.ready();
+        }
+        let report = next.since(self.last.as_ref().unwrap_or(&next));
+        self.notifier.status(now, |line| {
+            let running = children.iter().filter(|child| child.state == State::Running).count();
+            // Writing to a String cannot fail.
+            let _ = write!(line, "{running} of {} processes; in", children.len());
+            let rate = |hz: Option<f64>| hz.unwrap_or_default();
+            let routes = report.routes.iter();
+            write_list(line, "", routes.map(|route| format!("{} {:.1}/s", route.id, rate(route.rate_hz))));
+            let lanes = report.lanes.iter().map(|lane| {
+                let outputs = report.routes.iter().flat_map(|route| &route.lanes);
+                let of_lane = outputs.filter(|output| output.lane == lane.name);
+                let per_s: f64 = of_lane.map(|output| rate(output.rate_hz)).sum();
+                format!("{} ({}) {per_s:.1}/s", lane.name, lane.mode)
+            });
+            write_list(line, "; out", lanes);
+        });
+        self.last = Some(next);
+    }
 }
 
 /// Asks all children to end and sees to it that they do.
@@ -175,6 +242,10 @@ impl Supervised {
     fn start(&mut self) -> io::Result<()> {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
+        // The children answer to this process, and this one to the service manager.
+        for variable in ["NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"] {
+            command.env_remove(variable);
+        }
         command.stdin(Stdio::null()).stderr(Stdio::piped());
         let mut process = with_hang_up_blocked(|| command.spawn())?;
         if let Some(log) = process.stderr.take() {
@@ -185,6 +256,10 @@ impl Supervised {
         self.process = Some(process);
         self.state = State::Running;
         Ok(())
+    }
+
+    fn pid(&self) -> Option<u64> {
+        self.process.as_ref().map(|process| u64::from(process.id()))
     }
 
     fn look(&mut self, now: MonotonicNs) {

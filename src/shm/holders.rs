@@ -60,6 +60,14 @@ impl RoleHolder {
     }
 }
 
+/// The files of an instance in the shared-memory file system, whoever made them.
+pub fn instance_files(root: &Path, instance: &InstanceName) -> Vec<PathBuf> {
+    match InstanceDir::find(root, instance) {
+        Ok(Some(dir)) => dir.shm_files(),
+        Ok(None) | Err(_) => Vec::new(),
+    }
+}
+
 /// Whether the process holds a lock on the file of that inode: a line of the list such as
 /// `1: FLOCK  ADVISORY  WRITE 708 00:1a:2389 0 EOF`. The device is not compared: some file systems show
 /// another one there than `stat` does.

@@ -29,7 +29,7 @@ pub use channel::{
 };
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
-pub use holders::RoleHolder;
+pub use holders::{RoleHolder, instance_files};
 pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
 pub use sample_error::{LoanError, PublishError, TakeError};

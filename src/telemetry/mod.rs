@@ -2,6 +2,7 @@
 
 mod diagnostics;
 mod intervals;
+mod journal;
 mod json;
 mod liveness;
 mod logs;

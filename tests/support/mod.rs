@@ -11,6 +11,7 @@ pub mod bridge;
 pub mod flow;
 #[cfg(feature = "eval")]
 pub mod impairment;
+pub mod machine;
 pub mod netns;
 pub mod peer;
 pub mod process;

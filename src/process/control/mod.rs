@@ -10,12 +10,14 @@ mod link;
 mod safety;
 mod subscribers;
 
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tracing::{error, info, warn};
 
 use super::HOUSEKEEPING_MS;
+use super::notify::write_list;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
@@ -64,6 +66,7 @@ pub fn control(
         let until = control.turn();
         control.sleep(until);
     }
+    control.role.stopping();
     info!("control is done");
     Ok(())
 }
@@ -285,7 +288,18 @@ impl Control {
         self.refusals.look(&self.record.get().refused, now);
         self.show();
         self.role.turned(self.supervision.mode() as u8, 0);
+        // The first turn is over, and with it everything is there.
+        self.role.ready();
+        self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decided, line));
     }
+}
+
+/// What control found and decided, in a line for the service manager.
+fn describe(record: &ControlRecord, settings: &Settings, decided: &[String], line: &mut String) {
+    // Writing to a String cannot fail.
+    let _ = write!(line, "safety mode {}; {} subscribers", record.safety(), record.subscribers);
+    let lanes = settings.lanes.iter().zip(decided);
+    write_list(line, "; lanes:", lanes.map(|(lane, decided)| format!("{} {decided}", lane.name)));
 }
 
 /// Control does more than to probe, and goes on without it.

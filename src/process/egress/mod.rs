@@ -10,19 +10,21 @@ mod late_joiners;
 mod noncritical;
 mod output;
 
+use std::fmt::Write;
 use std::time::Duration;
 
 use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::arena::CopyArena;
+use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Lane, Settings};
 use crate::dds::{Participant, ParticipantOptions};
-use crate::model::{LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
+use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::effective_mode;
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use noncritical::Noncritical;
@@ -69,6 +71,7 @@ pub fn egress(
         let turn = egress.turn();
         egress.sleep(&turn);
     }
+    egress.role.stopping();
     egress.shut_down();
     info!(lane = name, "egress is done");
     Ok(())
@@ -87,6 +90,14 @@ struct Egress {
     policy: PolicyWatch,
     housekeeping_at: MonotonicNs,
     applied_mode: LaneMode,
+    meters: Meters,
+}
+
+/// What the lane does, as rates.
+#[derive(Default)]
+struct Meters {
+    offered: Meter,
+    forwarded: Meter,
 }
 
 /// How the lane chooses what to send.
@@ -128,8 +139,10 @@ impl Egress {
             sleeper,
             housekeeping_at: now,
             applied_mode: LaneMode::Normal,
+            meters: Meters::default(),
         };
         egress.keep_house(now);
+        egress.role.ready();
         Ok(egress)
     }
 
@@ -181,6 +194,7 @@ impl Egress {
         }
         self.reload(now);
         self.role.turned(self.policy.mode as u8, self.policy.epoch);
+        self.role.status(now, |line| describe(&self.outputs, self.policy.mode, &mut self.meters, line, now));
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }
 
@@ -223,6 +237,18 @@ impl Egress {
             }
         }
     }
+}
+
+/// What the lane does, in a line for the service manager.
+fn describe(outputs: &[Output], mode: LaneMode, meters: &mut Meters, line: &mut String, now: MonotonicNs) {
+    let sum = |count: fn(&LaneCounters) -> u64| outputs.iter().map(|output| count(output.counters())).sum();
+    let offered_per_s = meters.offered.per_s(sum(LaneCounters::received), now);
+    let forwarded_per_s = meters.forwarded.per_s(sum(|counters| counters.forwarded), now);
+    // Writing to a String cannot fail.
+    let _ = write!(line, "mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
+    write_drops(line, outputs.iter().map(|output| &output.counters().drops));
+    let without = outputs.iter().filter(|output| !output.has_writer());
+    write_list(line, "; type not known yet of route", without.map(Output::id));
 }
 
 /// What the policy board says to this lane.

@@ -123,6 +123,16 @@ impl Output {
         &self.id
     }
 
+    /// What was done so far.
+    pub fn counters(&self) -> &LaneCounters {
+        self.counters.get()
+    }
+
+    /// Whether there is a DDS writer; there is none before the type is known.
+    pub fn has_writer(&self) -> bool {
+        self.writer.is_some()
+    }
+
     pub fn durability(&self) -> Durability {
         self.qos.durability
     }

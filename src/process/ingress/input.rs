@@ -13,6 +13,7 @@ use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, RouteInfo, SampleHeader,
+    TopicName,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Slot, Stage};
 
@@ -80,6 +81,16 @@ impl Input {
     /// Whether a publisher was found and is read.
     pub fn is_connected(&self) -> bool {
         self.connection.is_some()
+    }
+
+    /// What was done so far.
+    pub fn counters(&self) -> &IngressCounters {
+        self.counters.get()
+    }
+
+    /// The input topic.
+    pub fn topic(&self) -> &TopicName {
+        &self.route.input_topic
     }
 
     /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes. When there was none

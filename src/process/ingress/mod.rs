@@ -7,6 +7,7 @@ mod input;
 mod receiving;
 mod source;
 
+use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,6 +15,7 @@ use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
 use super::inbox::Bell;
+use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
@@ -45,6 +47,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
             tracing::error!(%error, "housekeeping failed");
         }
     }
+    ingress.role.stopping();
     // What DDS has received by now still goes on its way; a publisher that goes on does not hold us up.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
     while ingress.receiving.turn_patiently() && clock::monotonic() < give_up_at {}
@@ -59,6 +62,7 @@ struct Ingress {
     /// Turns of the receiving thread at the last housekeeping.
     turns_seen: u64,
     housekeeping_at: MonotonicNs,
+    received: Meter,
 }
 
 impl Drop for Ingress {
@@ -101,9 +105,10 @@ impl Ingress {
             graph_gid_bytes: settings.graph_gid_bytes,
         };
         let participant = role.join_receiving(&options, on_received)?;
-        let housekeeping_at = clock::monotonic();
-        let mut ingress = Self { receiving, participant, role, turns_seen: 0, housekeeping_at };
+        let (housekeeping_at, received) = (clock::monotonic(), Meter::default());
+        let mut ingress = Self { receiving, participant, role, turns_seen: 0, housekeeping_at, received };
         ingress.keep_house(housekeeping_at)?;
+        ingress.role.ready();
         Ok(ingress)
     }
 
@@ -154,6 +159,7 @@ impl Ingress {
             self.role.turned(LaneMode::Normal as u8, 0);
         }
         self.role.reload();
+        self.role.status(now, |line| describe(&self.receiving, &mut self.received, line, now));
         self.participant.ring();
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
         kept
@@ -170,4 +176,27 @@ impl Ingress {
         }
         Ok(())
     }
+}
+
+/// What ingress does, in a line for the service manager. The receiving thread is to be rung after it.
+fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) {
+    let (mut routes, mut connected, mut total) = (0, 0, 0);
+    let mut drops = Vec::new();
+    let mut without = Vec::new();
+    let Ok(_) = receiving.visit::<std::convert::Infallible>(|input| {
+        routes += 1;
+        total += input.counters().received;
+        drops.push(input.counters().drops);
+        if input.is_connected() {
+            connected += 1;
+        } else {
+            without.push(input.topic().to_string());
+        }
+        Ok(())
+    });
+    // Writing to a String cannot fail.
+    let _ =
+        write!(line, "reading {connected} of {routes} routes, {:.1} samples/s", received.per_s(total, now));
+    write_drops(line, drops.iter());
+    write_list(line, "; no publisher found yet of", without.iter());
 }

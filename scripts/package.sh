@@ -1,0 +1,26 @@
+#!/bin/sh
+# Makes the Debian package, with manual pages and completions: scripts/package.sh [OPTIONS OF CARGO DEB…]
+#
+# PROGRAM: the program to package, where it is not to be built.
+set -eu
+cd "$(dirname "$0")/.."
+PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
+
+if ! cargo deb --version >/dev/null 2>&1; then
+    cargo install cargo-deb --locked
+fi
+if [ -z "${PROGRAM:-}" ]; then
+    cargo build --locked --release --bin adaptive-bridge
+    PROGRAM=target/release/adaptive-bridge
+fi
+
+made=target/package
+rm -rf $made
+mkdir -p $made/man $made/completions $made/release target/debian
+cp "$PROGRAM" $made/release/adaptive-bridge
+$made/release/adaptive-bridge man $made/man
+for shell in bash fish zsh; do
+    $made/release/adaptive-bridge completions $shell >$made/completions/$shell
+done
+# For cargo-deb the program is in the folder of a build.
+CARGO_TARGET_DIR=$made cargo deb --locked --no-build --output target/debian/ "$@"

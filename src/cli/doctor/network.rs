@@ -1,0 +1,201 @@
+//! Socket buffers, interfaces, multicast.
+
+use std::net::{Ipv4Addr, UdpSocket};
+
+use nix::ifaddrs::getifaddrs;
+use nix::net::if_::InterfaceFlags;
+
+use super::{Finding, Severity, list, number};
+use crate::config::{NetworkSelector, Settings};
+
+/// What a burst of one large sample takes: 1 MiB in fragments came through with this and was repaired for
+/// milliseconds with the kernel's usual 208 KiB.
+const BUFFER_BYTES: i64 = 4 << 20;
+
+/// Samples below this go through the kernel's usual buffers at any rate that a robot has.
+const SMALL_SAMPLE_BYTES: usize = 64 << 10;
+
+/// Where RTPS participants announce themselves.
+const SPDP: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
+
+pub(super) fn check(settings: &Settings) -> Vec<Finding> {
+    let largest = settings.routes.iter().map(|route| route.max_sample_bytes).max().unwrap_or(0);
+    let mut findings = Vec::new();
+    for name in ["rmem_max", "wmem_max"] {
+        findings
+            .extend(number(&format!("/proc/sys/net/core/{name}")).map(|bytes| buffer(name, bytes, largest)));
+    }
+    let networks = settings.lanes.iter().map(|lane| &lane.network).chain([&settings.input]);
+    let mut selectors: Vec<&NetworkSelector> = networks.flat_map(|network| &network.interfaces).collect();
+    selectors.sort_by_key(|selector| format!("{selector:?}"));
+    selectors.dedup();
+    let interfaces = interfaces();
+    findings.extend(selectors.iter().map(|selector| selected(selector, &interfaces)));
+    findings.push(any_multicast(&interfaces));
+    let routed = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).and_then(|socket| socket.connect(SPDP)).is_ok();
+    findings.push(multicast_route(routed, &interfaces));
+    findings
+}
+
+fn buffer(name: &'static str, bytes: i64, largest_sample: usize) -> Finding {
+    let found = format!("net.core.{name} is {bytes}");
+    if bytes >= BUFFER_BYTES {
+        return Finding::ok(name, found);
+    }
+    let severity = if largest_sample <= SMALL_SAMPLE_BYTES { Severity::Note } else { Severity::Warning };
+    Finding::new(
+        name,
+        severity,
+        found,
+        "The kernel drops fragments of large samples in a burst; repairing them takes milliseconds.",
+    )
+    .mended_by(format!(
+        "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf \
+         && sudo sysctl --system"
+    ))
+}
+
+/// A network interface.
+#[derive(Clone, Debug)]
+struct Interface {
+    name: String,
+    address: Option<Ipv4Addr>,
+    flags: InterfaceFlags,
+}
+
+impl Interface {
+    fn carries_multicast(&self) -> bool {
+        self.flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_MULTICAST)
+    }
+}
+
+fn interfaces() -> Vec<Interface> {
+    let addresses = getifaddrs().into_iter().flatten();
+    let interfaces = addresses.map(|found| Interface {
+        name: found.interface_name,
+        address: found.address.and_then(|address| address.as_sockaddr_in().map(|address| address.ip())),
+        flags: found.flags,
+    });
+    interfaces.collect()
+}
+
+fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
+    let (name, found): (String, Option<&Interface>) = match selector {
+        NetworkSelector::Name(name) => {
+            let mut named = interfaces.iter().filter(|interface| interface.name == *name);
+            let with_address = named.clone().find(|interface| interface.address.is_some());
+            (name.clone(), with_address.or_else(|| named.next()))
+        }
+        NetworkSelector::Address(address) => {
+            (address.to_string(), interfaces.iter().find(|interface| interface.address == Some(*address)))
+        }
+    };
+    let check = "interface";
+    match found {
+        None => Finding::new(
+            check,
+            Severity::Error,
+            format!("there is no interface {name}; there are: {}", names(interfaces)),
+            "A process that is to use it does not start.",
+        ),
+        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => {
+            Finding::new(check, Severity::Error, format!("{name} is down"), "Nobody is found there.")
+                .mended_by(format!("sudo ip link set {} up", interface.name))
+        }
+        Some(interface) if interface.address.is_none() => Finding::new(
+            check,
+            Severity::Error,
+            format!("{name} has no IPv4 address"),
+            "Nobody is found there.",
+        ),
+        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_MULTICAST) => Finding::new(
+            check,
+            Severity::Error,
+            format!("{name} carries no multicast"),
+            "Participants announce themselves by multicast: nobody is found there.",
+        )
+        .mended_by(format!("sudo ip link set {} multicast on", interface.name)),
+        Some(_) => Finding::ok(check, format!("{name} is up")),
+    }
+}
+
+fn names(interfaces: &[Interface]) -> String {
+    let mut names: Vec<&str> = interfaces.iter().map(|interface| interface.name.as_str()).collect();
+    names.sort_unstable();
+    names.dedup();
+    list(names)
+}
+
+fn any_multicast(interfaces: &[Interface]) -> Finding {
+    let carrying = interfaces.iter().filter(|found| found.carries_multicast() && found.address.is_some());
+    let carrying: Vec<Interface> = carrying.cloned().collect();
+    if carrying.is_empty() {
+        return Finding::new(
+            "multicast",
+            Severity::Warning,
+            "no interface that is up and has an address carries multicast",
+            "Participants on other machines are not found.",
+        )
+        .mended_by("sudo ip link set lo multicast on");
+    }
+    Finding::ok("multicast", format!("carried by {}", names(&carrying)))
+}
+
+fn multicast_route(routed: bool, interfaces: &[Interface]) -> Finding {
+    if routed {
+        return Finding::ok("multicast route", format!("{} can be reached", SPDP.0));
+    }
+    let carrying = interfaces.iter().find(|found| found.carries_multicast() && found.address.is_some());
+    let through = carrying.map_or("eth0", |interface| interface.name.as_str());
+    Finding::new(
+        "multicast route",
+        Severity::Warning,
+        format!("there is no route to {}", SPDP.0),
+        "Announcements that do not name an interface go nowhere, and nobody is found.",
+    )
+    .mended_by(format!("sudo ip route add 239.0.0.0/8 dev {through}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn interface(name: &str, address: Option<[u8; 4]>, flags: InterfaceFlags) -> Interface {
+        Interface { name: name.to_owned(), address: address.map(Ipv4Addr::from), flags }
+    }
+
+    #[test]
+    fn small_buffers_matter_as_far_as_samples_are_large() {
+        assert_eq!(buffer("rmem_max", 4 << 20, 1 << 20).severity, Severity::Ok);
+        assert_eq!(buffer("rmem_max", 212_992, 1 << 20).severity, Severity::Warning);
+        assert_eq!(buffer("wmem_max", 212_992, 3_000).severity, Severity::Note);
+    }
+
+    #[test]
+    fn an_interface_must_be_there_up_addressed_and_carry_multicast() {
+        let good = InterfaceFlags::IFF_UP | InterfaceFlags::IFF_MULTICAST;
+        let all = [
+            interface("eth0", None, good),
+            interface("eth0", Some([10, 0, 0, 1]), good),
+            interface("wlan0", Some([10, 0, 1, 1]), InterfaceFlags::IFF_MULTICAST),
+            interface("tun0", Some([10, 0, 2, 1]), InterfaceFlags::IFF_UP),
+            interface("eth1", None, good),
+        ];
+        let of = |selector: &str| selected(&NetworkSelector::parse(selector).unwrap(), &all);
+        assert_eq!(of("eth0").severity, Severity::Ok);
+        assert_eq!(of("10.0.0.1").severity, Severity::Ok);
+        for (selector, found) in [
+            ("eth9", "no interface"),
+            ("10.9.9.9", "no interface"),
+            ("wlan0", "down"),
+            ("tun0", "no multicast"),
+            ("eth1", "no IPv4"),
+        ] {
+            let finding = of(selector);
+            assert!(finding.severity == Severity::Error && finding.found.contains(found), "{finding:?}");
+        }
+        assert_eq!(any_multicast(&all).found, "carried by eth0");
+        assert_eq!(any_multicast(&all[3..]).severity, Severity::Warning);
+        assert!(multicast_route(false, &all).command.unwrap().ends_with("dev eth0"));
+    }
+}

@@ -1,0 +1,147 @@
+//! Versions, and the services of systemd.
+
+use std::fs;
+use std::path::Path;
+
+use super::super::units::{self, DropIns};
+use super::{Finding, Severity, list, output};
+use crate::cli::root;
+use crate::config::Settings;
+use crate::shm::RoleHolder;
+
+const TARGET: &str = "adaptive-bridge.target";
+
+/// The oldest Linux that the libraries are used with (ROS 2 Humble's time).
+const OLDEST_KERNEL: (u32, u32) = (5, 4);
+
+pub(super) fn versions() -> Vec<Finding> {
+    let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let ros = std::env::var("ROS_DISTRO").ok().filter(|name| !name.is_empty());
+    let ros = ros.map_or_else(String::new, |name| format!(", ROS 2 {name}"));
+    let found = format!("adaptive-bridge {}, Linux {}{ros}", env!("CARGO_PKG_VERSION"), kernel.trim());
+    vec![kernel_version(kernel.trim(), found)]
+}
+
+fn kernel_version(release: &str, found: String) -> Finding {
+    let mut numbers = release.split(['.', '-']).map(|number| number.parse().unwrap_or(0));
+    let version = (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0));
+    if version >= OLDEST_KERNEL {
+        return Finding::ok("versions", found);
+    }
+    Finding::new(
+        "versions",
+        Severity::Warning,
+        found,
+        "This kernel is older than any that the bridge is tested with.",
+    )
+}
+
+pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
+    let holders = RoleHolder::all(&root(settings), &settings.instance).unwrap_or_default();
+    let mut findings = vec![programs(&holders)];
+    if !Path::new("/run/systemd/system").exists() {
+        let text = "no systemd runs here; `adaptive-bridge up` supervises the processes";
+        findings.push(Finding::ok("services", text));
+        return findings;
+    }
+    let enabled = output("systemctl", &["is-enabled", TARGET]).unwrap_or_default();
+    findings.push(services(&enabled));
+    if !["", "not-found"].contains(&enabled.as_str()) {
+        let fits = DropIns::of(settings, file).are_in(Path::new(units::FOLDER));
+        findings.push(lanes(fits, file));
+        let list = ["list-units", "--plain", "--no-legend", "--state=failed", "adaptive-bridge-*"];
+        findings.push(failed(&output("systemctl", &list).unwrap_or_default()));
+    }
+    findings
+}
+
+/// Whether all processes run the program that is installed.
+fn programs(holders: &[RoleHolder]) -> Finding {
+    let is_replaced = |holder: &&RoleHolder| {
+        fs::read_link(format!("/proc/{}/exe", holder.pid))
+            .is_ok_and(|path| path.as_os_str().as_encoded_bytes().ends_with(b" (deleted)"))
+    };
+    let old: Vec<&str> = holders.iter().filter(is_replaced).map(|holder| holder.role.as_str()).collect();
+    if old.is_empty() {
+        return Finding::ok("processes", format!("{} of the bridge run", holders.len()));
+    }
+    Finding::new(
+        "processes",
+        Severity::Warning,
+        format!("{} still run a program that was replaced", list(old)),
+        "An upgrade takes effect with a restart.",
+    )
+    .mended_by(format!("sudo systemctl restart {TARGET}"))
+}
+
+fn services(enabled: &str) -> Finding {
+    match enabled {
+        "enabled" | "enabled-runtime" => Finding::ok("services", format!("{TARGET} is enabled")),
+        "" | "not-found" => Finding::new(
+            "services",
+            Severity::Note,
+            "the service units are not installed",
+            "Nothing starts the bridge with the machine.",
+        ),
+        state => Finding::new(
+            "services",
+            Severity::Warning,
+            format!("{TARGET} is {state}"),
+            "The bridge does not start with the machine.",
+        )
+        .mended_by(format!("sudo systemctl enable --now {TARGET}")),
+    }
+}
+
+fn lanes(fits: bool, file: &Path) -> Finding {
+    if fits {
+        return Finding::ok("units", "are those that the configuration needs");
+    }
+    Finding::new(
+        "units",
+        Severity::Warning,
+        "are not those that the configuration needs",
+        "A lane of your own has no process, or lacks a right that the configuration takes.",
+    )
+    .mended_by(format!("sudo adaptive-bridge units --write --config {}", file.display()))
+}
+
+fn failed(units: &str) -> Finding {
+    let names: Vec<&str> = units.lines().filter_map(|line| line.split_whitespace().next()).collect();
+    let Some(first) = names.first().copied() else {
+        return Finding::ok("failed", "no service has failed");
+    };
+    Finding::new(
+        "failed",
+        Severity::Error,
+        list(&names),
+        "They were given up: the configuration is bad, or they died again and again.",
+    )
+    .mended_by(format!("journalctl -u {first} -n 50"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_and_services_are_judged() {
+        let severity = |release: &str| kernel_version(release, String::new()).severity;
+        assert_eq!(severity("6.18.5-rt1"), Severity::Ok);
+        assert_eq!(severity("5.15.0-91-generic"), Severity::Ok);
+        assert_eq!(severity("4.19.0"), Severity::Warning);
+        assert_eq!(services("enabled").severity, Severity::Ok);
+        assert_eq!(services("disabled").severity, Severity::Warning);
+        assert_eq!(services("not-found").severity, Severity::Note);
+        assert_eq!(lanes(false, Path::new("/x")).severity, Severity::Warning);
+        assert_eq!(failed("").severity, Severity::Ok);
+        let found = failed("adaptive-bridge-control.service loaded failed failed Adaptive Bridge: control\n");
+        assert_eq!(found.command.unwrap(), "journalctl -u adaptive-bridge-control.service -n 50");
+    }
+
+    #[test]
+    fn a_process_of_the_installed_program_needs_no_restart() {
+        let holder = RoleHolder { role: "ingress".into(), pid: std::process::id(), note: "/x".into() };
+        assert_eq!(programs(&[holder]).severity, Severity::Ok);
+    }
+}

@@ -1,0 +1,284 @@
+//! `units`: what a configuration needs of systemd beyond the units that are installed.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::fs;
+use std::io::{self, ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::Args;
+
+use super::{ConfigArguments, failed, output_ended};
+use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
+use crate::model::TrafficClass;
+
+/// Where an administrator's units are.
+pub(super) const FOLDER: &str = "/etc/systemd/system";
+
+/// With what each file begins, and by which a former one is known.
+const HEADER: &str =
+    "# Written by `adaptive-bridge units`, and to be written anew after a change of the configuration.\n";
+
+/// The name of each file, after those of the package (10 and 50), so that it has the last word among them.
+const FILE: &str = "60-configuration.conf";
+
+/// The highest real-time priority that the installed units of the critical path allow.
+const MAX_PRIORITY: u8 = 50;
+
+/// What `units` is asked.
+///
+/// The installed units run ingress, the lanes critical and noncritical, and control, with
+/// /etc/adaptive-bridge/config.yaml. What a configuration needs beyond that goes into drop-ins, which this
+/// prints: the lanes of your own, and what scheduling, paths and another file take.
+#[derive(Args, Debug)]
+pub(super) struct Arguments {
+    /// Write the drop-ins, and remove former ones that are not needed any more
+    #[arg(long)]
+    write: bool,
+    /// The folder of the drop-ins
+    #[arg(long, value_name = "DIR", default_value = FOLDER)]
+    folder: PathBuf,
+    #[command(flatten)]
+    config: ConfigArguments,
+}
+
+pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    let settings = match arguments.config.load() {
+        Ok(settings) => settings,
+        Err(code) => return code,
+    };
+    let wanted = DropIns::of(&settings, &arguments.config.file());
+    let text = if arguments.write {
+        match wanted.write(&arguments.folder) {
+            Ok(text) => text,
+            Err(error) => return failed(&error),
+        }
+    } else {
+        wanted.print(&arguments.folder)
+    };
+    match io::stdout().write_all(text.as_bytes()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => output_ended(&error),
+    }
+}
+
+/// The drop-ins of a configuration, by the unit that each belongs to.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct DropIns(BTreeMap<String, String>);
+
+impl DropIns {
+    /// Those that `settings` take, which are those of the file `config`.
+    pub fn of(settings: &Settings, config: &Path) -> Self {
+        let mut drop_ins = BTreeMap::new();
+        let mut add = |unit: String, section: &str, lines: Vec<String>| {
+            if !lines.is_empty() {
+                drop_ins.insert(unit, format!("{HEADER}[{section}]\n{}\n", lines.join("\n")));
+            }
+        };
+        let of_the_target = ["critical", "noncritical"];
+        let lanes = settings.lanes.iter().filter(|lane| !of_the_target.contains(&lane.name.as_str()));
+        let wants = lanes.map(|lane| format!("Wants={}", egress(lane.name.as_str())));
+        add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
+
+        let common = common(settings, config);
+        let mut service = |unit: String, how: &Scheduling, critical: bool, own: Vec<String>| {
+            add(unit, "Service", [common.clone(), scheduling(how, critical), own].concat());
+        };
+        service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, Vec::new());
+        for lane in &settings.lanes {
+            let critical = lane.class == TrafficClass::Critical;
+            service(egress(lane.name.as_str()), &lane.scheduling, critical, Vec::new());
+        }
+        let mut own = Vec::new();
+        if let Some(MetricsListener::Unix(socket)) = &settings.diagnostics.metrics {
+            own.extend(socket.parent().map(|folder| format!("ReadWritePaths={}", quoted(folder))));
+        }
+        service("adaptive-bridge-control.service".to_owned(), &settings.control_scheduling, false, own);
+        Self(drop_ins)
+    }
+
+    /// Whether `folder` has exactly these.
+    pub fn are_in(&self, folder: &Path) -> bool {
+        let there = self
+            .0
+            .iter()
+            .all(|(unit, text)| fs::read_to_string(path(folder, unit)).is_ok_and(|present| present == *text));
+        there && self.former(folder).is_ok_and(|former| former.is_empty())
+    }
+
+    fn print(&self, folder: &Path) -> String {
+        let mut text = String::new();
+        for (unit, drop_in) in &self.0 {
+            // Writing to a String cannot fail.
+            let _ = writeln!(text, "# {}\n{drop_in}", path(folder, unit).display());
+        }
+        if self.0.is_empty() {
+            text.push_str("# The installed units are all that this configuration needs.\n");
+        }
+        text
+    }
+
+    /// Writes them and removes former ones; yields what was done and what is to be done next.
+    fn write(&self, folder: &Path) -> Result<String, String> {
+        let at = |path: &Path, error: io::Error| format!("{}: {error}", path.display());
+        let mut text = String::new();
+        let mut done = |what: &str, path: &Path| {
+            let _ = writeln!(text, "{what} {}", path.display());
+        };
+        for path in self.former(folder).map_err(|error| at(folder, error))? {
+            fs::remove_file(&path).map_err(|error| at(&path, error))?;
+            // Fails while the administrator has something there.
+            let _ = path.parent().map(fs::remove_dir);
+            done("removed", &path);
+        }
+        for (unit, drop_in) in &self.0 {
+            let path = path(folder, unit);
+            if fs::read_to_string(&path).is_ok_and(|present| present == *drop_in) {
+                continue;
+            }
+            path.parent().map_or(Ok(()), fs::create_dir_all).map_err(|error| at(&path, error))?;
+            fs::write(&path, drop_in).map_err(|error| at(&path, error))?;
+            done("written", &path);
+        }
+        text.push_str(if text.is_empty() {
+            "everything is as the configuration needs it\n"
+        } else {
+            "now: systemctl daemon-reload && systemctl restart adaptive-bridge.target\n"
+        });
+        Ok(text)
+    }
+
+    /// Drop-ins that were written for a former configuration.
+    fn former(&self, folder: &Path) -> io::Result<Vec<PathBuf>> {
+        let entries = match fs::read_dir(folder) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let mut former = Vec::new();
+        for entry in entries {
+            let entry = entry?;
+            let name = entry.file_name();
+            let Some(unit) = name.to_str().and_then(|name| name.strip_suffix(".d")) else { continue };
+            let path = entry.path().join(FILE);
+            let ours = || fs::read_to_string(&path).is_ok_and(|text| text.starts_with(HEADER));
+            if unit.starts_with("adaptive-bridge") && !self.0.contains_key(unit) && ours() {
+                former.push(path);
+            }
+        }
+        former.sort();
+        Ok(former)
+    }
+}
+
+fn path(folder: &Path, unit: &str) -> PathBuf {
+    folder.join(format!("{unit}.d")).join(FILE)
+}
+
+fn egress(lane: &str) -> String {
+    format!("adaptive-bridge-egress@{lane}.service")
+}
+
+/// What every process needs.
+fn common(settings: &Settings, config: &Path) -> Vec<String> {
+    let mut lines = Vec::new();
+    let mut read = vec![config];
+    if config != Path::new(config::DEFAULT_PATH) {
+        let named = format!("{}={}", config::PATH_VARIABLE, config.display());
+        lines.push(format!("Environment={}", quoted(Path::new(&named))));
+    }
+    if let Some(SecretSource::File(secret)) = &settings.security.secret {
+        read.push(secret);
+    }
+    let is_home = |path: &&Path| ["/home", "/root", "/run/user"].iter().any(|home| path.starts_with(home));
+    if read.iter().any(is_home) {
+        lines.push("ProtectHome=read-only".to_owned());
+    }
+    if let Some(root) = &settings.shared_memory.root_path {
+        lines.push(format!("ReadWritePaths={}", quoted(root)));
+    }
+    lines
+}
+
+/// A word of a unit file, with whatever characters (systemd.syntax(7)).
+fn quoted(word: &Path) -> String {
+    let escaped = word.display().to_string().replace('\\', r"\\").replace('"', "\\\"").replace('%', "%%");
+    format!("\"{escaped}\"")
+}
+
+/// What the configured scheduling needs that the installed unit does not allow.
+fn scheduling(how: &Scheduling, critical: bool) -> Vec<String> {
+    let mut lines = Vec::new();
+    let is_real_time = how.policy != SchedulingPolicy::Other;
+    if is_real_time && (!critical || how.priority > MAX_PRIORITY) {
+        lines.push(format!("LimitRTPRIO={}", how.priority));
+    }
+    if is_real_time && !critical {
+        lines.extend(["RestrictRealtime=no", "LimitRTTIME=500ms:1s"].map(str::to_owned));
+    }
+    if how.lock_memory && !critical {
+        lines.push("LimitMEMLOCK=infinity".to_owned());
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(yaml: &str) -> Settings {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        fs::write(file.path(), yaml).unwrap();
+        config::load(Some(file.path()), &|_| None).unwrap()
+    }
+
+    const PLAIN: &str = "topics: [{id: scan, input_topic: /scan}]\n";
+    const LANES: &str = "topics: [{id: scan, input_topic: /scan}]\n\
+        lanes: {rviz: {}, noncritical: {scheduling: {policy: rr, priority: 7, lock_memory: true}}, \
+        critical: {scheduling: {policy: fifo, priority: 80}}}\n\
+        shared_memory: {root_path: /srv/bridge}\n\
+        diagnostics: {metrics: 'unix:/run/metrics/bridge.sock'}\n";
+
+    #[test]
+    fn the_installed_units_are_enough_for_a_plain_configuration() {
+        let drop_ins = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
+        assert_eq!(drop_ins, DropIns(BTreeMap::new()));
+        assert!(drop_ins.print(Path::new("/x")).contains("all that this configuration needs"));
+    }
+
+    #[test]
+    fn a_configuration_gets_the_lanes_rights_and_paths_that_it_needs() {
+        let drop_ins = DropIns::of(&settings(LANES), Path::new("/home/robot/100% \"bridge\".yaml"));
+        let lines = |unit: &str| drop_ins.0[unit].lines().skip(1).map(str::to_owned).collect::<Vec<_>>();
+        assert_eq!(lines("adaptive-bridge.target"), ["[Unit]", "Wants=adaptive-bridge-egress@rviz.service"]);
+        let common = [
+            "[Service]",
+            r#"Environment="ADAPTIVE_BRIDGE_CONFIG=/home/robot/100%% \"bridge\".yaml""#,
+            "ProtectHome=read-only",
+            r#"ReadWritePaths="/srv/bridge""#,
+        ];
+        assert_eq!(lines("adaptive-bridge-ingress.service"), common);
+        assert_eq!(lines(&egress("rviz")), common);
+        assert_eq!(lines(&egress("critical"))[4..], ["LimitRTPRIO=80"]);
+        let real_time =
+            ["LimitRTPRIO=7", "RestrictRealtime=no", "LimitRTTIME=500ms:1s", "LimitMEMLOCK=infinity"];
+        assert_eq!(lines(&egress("noncritical"))[4..], real_time);
+        assert_eq!(lines("adaptive-bridge-control.service")[4..], [r#"ReadWritePaths="/run/metrics""#]);
+    }
+
+    #[test]
+    fn what_a_former_configuration_needed_is_removed_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let rich = DropIns::of(&settings(LANES), Path::new(config::DEFAULT_PATH));
+        let plain = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
+        assert!(plain.are_in(folder.path()) && !rich.are_in(folder.path()));
+        assert!(rich.write(folder.path()).unwrap().contains("daemon-reload"));
+        assert!(!plain.are_in(folder.path()) && rich.are_in(folder.path()));
+        assert_eq!(rich.write(folder.path()).unwrap(), "everything is as the configuration needs it\n");
+        let own = folder.path().join("adaptive-bridge.target.d/mine.conf");
+        fs::write(&own, "").unwrap();
+        plain.write(folder.path()).unwrap();
+        assert!(plain.are_in(folder.path()) && own.exists());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

@@ -1,0 +1,220 @@
+//! A machine with a systemd of its own, in a container of systemd-nspawn: this machine's files, below a layer
+//! that is gone with it; its own processes, `/dev/shm` and users; the network of a [`Host`].
+
+use std::fmt::Write as _;
+use std::fs;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::netns::Host;
+use super::process::Process;
+use super::{bridge, netns, wait_for, wait_until};
+
+/// The hierarchies in which a container of systemd needs a control group of its own.
+const CGROUPS: [&str; 2] = ["/sys/fs/cgroup/systemd", "/sys/fs/cgroup/unified"];
+
+/// systemd shuts down in order (systemd(1): SIGRTMIN+4).
+const POWER_OFF: &str = "RTMIN+4";
+
+/// What runs between the start and systemd-nspawn: in a mount namespace of its own, so that its mounts go
+/// with it.
+const PREPARE: &str = "\
+set -e
+mount -t tmpfs -o mode=755 tmpfs $1
+mkdir $1/upper $1/work $1/root
+mount -t overlay overlay -o lowerdir=/,upperdir=$1/upper,workdir=$1/work $1/root
+od -An -N16 -tx1 /dev/urandom | tr -d ' \\n' >$1/root/etc/machine-id
+rm -rf $1/root/etc/systemd/system $1/root/etc/adaptive-bridge
+cp -a $2/. $1/root/
+for group in $3; do mkdir -p $group; echo $$ >$group/cgroup.procs; done
+exec systemd-nspawn --quiet --machine=$5 --directory=$1/root --network-namespace-path=$4 --register=no --keep-unit \
+    --resolv-conf=off --timezone=off --link-journal=no --console=pipe --boot -- --unit=basic.target";
+
+/// Why no such machine can be had here.
+fn missing() -> Option<String> {
+    netns::requires_root().or_else(|| {
+        let runs =
+            |program: &str| Command::new(program).arg("--version").stdout(Stdio::null()).status().is_ok();
+        let lacking = ["systemd-nspawn", "systemd-analyze"].into_iter().find(|program| !runs(program));
+        lacking.map(|program| format!("{program} is not installed (make setup)"))
+    })
+}
+
+/// Why tests with machines can't run here.
+pub fn machine_missing() -> Option<String> {
+    super::testbed_missing().or_else(missing)
+}
+
+/// A running machine. Dropping it switches it off.
+pub struct Machine {
+    nspawn: Process,
+    leader: i32,
+    cgroups: Vec<PathBuf>,
+    _folder: TempDir,
+}
+
+impl Machine {
+    /// Boots a machine on a host. `stage` puts files into a folder that becomes part of its root.
+    pub fn boot(host: &Host, stage: impl FnOnce(&Path)) -> Machine {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let folder = tempfile::tempdir().unwrap();
+        let [disk, staged] = ["disk", "staged"].map(|name| folder.path().join(name));
+        fs::create_dir(&disk).unwrap();
+        fs::create_dir(&staged).unwrap();
+        stage(&staged);
+        let name = format!("ab-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
+        let hierarchies = CGROUPS.iter().map(Path::new).filter(|path| path.is_dir());
+        let cgroups: Vec<PathBuf> = hierarchies.map(|path| path.join(&name)).collect();
+        let groups = cgroups.iter().fold(String::new(), |mut list, group| {
+            write!(list, " {}", group.display()).unwrap();
+            list
+        });
+        let mut command = Command::new("unshare");
+        command.args(["--mount", "--propagation", "private", "sh", "-c", PREPARE, "sh"]);
+        command.arg(&disk).arg(&staged).arg(groups).arg(format!("/run/netns/{}", host.namespace())).arg(name);
+        let nspawn = Process::spawn("systemd-nspawn", command);
+        let leader = wait_for("the first process of the machine", || child_of(nspawn.pid().as_raw()));
+        let machine = Machine { nspawn, leader, cgroups, _folder: folder };
+        wait_until("a machine that has booted", || {
+            let state = machine.try_run(&["systemctl", "is-system-running"]);
+            matches!(String::from_utf8_lossy(&state.stdout).trim(), "running" | "degraded")
+        });
+        machine
+    }
+
+    /// A command that will run in the machine.
+    pub fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new("nsenter");
+        command
+            .args(["-t", &self.leader.to_string(), "-m", "-p", "-n", "-u", "-i", "-C", "--"])
+            .args(arguments);
+        command.env("SYSTEMD_PAGER", "").env("NO_COLOR", "1");
+        command
+    }
+
+    /// Runs a program to its end, whatever its exit code.
+    pub fn try_run(&self, arguments: &[&str]) -> Output {
+        self.command(arguments).output().unwrap()
+    }
+
+    /// Runs a program to its end, which must be a good one; yields what it prints.
+    pub fn run(&self, arguments: &[&str]) -> String {
+        let output = self.try_run(arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{arguments:?}: {}\n{said}", output.status);
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    /// Writes a file.
+    pub fn write(&self, path: &str, text: &str) {
+        let mut command = self.command(&["tee", path]);
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+        child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        assert!(child.wait().unwrap().success(), "{path} can't be written");
+    }
+
+    /// A property of a unit, as `systemctl show` has it.
+    pub fn property(&self, unit: &str, property: &str) -> String {
+        self.run(&["systemctl", "show", "--property", property, "--value", unit]).trim().to_owned()
+    }
+
+    /// Waits until a property of a unit has a value; shows the unit and its log when it does not get it.
+    pub fn wait_property(&self, unit: &str, property: &str, value: &str) {
+        let deadline = std::time::Instant::now() + super::patience();
+        while self.property(unit, property) != value {
+            if std::time::Instant::now() > deadline {
+                let status = self.try_run(&["systemctl", "status", "--lines=40", unit]);
+                let is = self.property(unit, property);
+                panic!(
+                    "{property} of {unit} is {is}, not {value}\n{}",
+                    String::from_utf8_lossy(&status.stdout)
+                );
+            }
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+    }
+
+    /// The main process of a unit, by its number in the machine.
+    pub fn main_pid(&self, unit: &str) -> String {
+        self.property(unit, "MainPID")
+    }
+
+    /// What `adaptive-bridge status --json` says there, if the bridge runs.
+    pub fn try_status(&self) -> Option<Value> {
+        let user = ["runuser", "-u", "adaptive-bridge", "--"];
+        let status = ["adaptive-bridge", "status", "--json", "--interval-ms", "50"];
+        let output = self.try_run(&[user.as_slice(), &status].concat());
+        serde_json::from_slice(&output.stdout).ok()
+    }
+
+    /// The log of a unit, an entry with all its fields on each line.
+    pub fn journal(&self, unit: &str) -> Vec<Value> {
+        let lines = self.run(&["journalctl", "--output=json", "--all", "--unit", unit]);
+        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    }
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        let _ = Command::new("kill").args(["-s", POWER_OFF, &self.leader.to_string()]).status();
+        let deadline = std::time::Instant::now() + super::patience();
+        while self.nspawn.is_running() && std::time::Instant::now() < deadline {
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        if self.nspawn.is_running() {
+            self.nspawn.signal_group(Signal::SIGKILL);
+        }
+        for group in &self.cgroups {
+            remove_groups(group);
+        }
+    }
+}
+
+/// The only child of a process.
+fn child_of(pid: i32) -> Option<i32> {
+    let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).ok()?;
+    let child: i32 = children.trim().parse().ok()?;
+    // Until it is systemd it is a child of the shell, or nspawn on its way.
+    let name = fs::read_to_string(format!("/proc/{child}/comm")).ok()?;
+    (name.trim() == "systemd").then_some(child)
+}
+
+/// Removes a control group with all below it. Files there go by themselves.
+fn remove_groups(group: &Path) {
+    for entry in fs::read_dir(group).into_iter().flatten().flatten() {
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            remove_groups(&entry.path());
+        }
+    }
+    let _ = fs::remove_dir(group);
+}
+
+/// Puts the program and its units where a package would.
+pub fn install(root: &Path) {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd");
+    let units = root.join("usr/lib/systemd/system");
+    for entry in fs::read_dir(&source).unwrap().flatten() {
+        let name = entry.file_name().into_string().unwrap();
+        let to = match name.as_str() {
+            "sysusers.d" | "tmpfiles.d" => root.join("usr/lib").join(&name),
+            _ => units.join(&name),
+        };
+        fs::create_dir_all(to.parent().unwrap()).unwrap();
+        if entry.path().is_dir() {
+            fs::create_dir_all(&to).unwrap();
+            for file in fs::read_dir(entry.path()).unwrap().flatten() {
+                fs::copy(file.path(), to.join(file.file_name())).unwrap();
+            }
+        } else {
+            fs::copy(entry.path(), to).unwrap();
+        }
+    }
+    fs::create_dir_all(root.join("usr/bin")).unwrap();
+    fs::copy(bridge::program(), root.join("usr/bin/adaptive-bridge")).unwrap();
+}

@@ -1,0 +1,395 @@
+//! The bridge as services of a real systemd: hardened, supervised, restarted. Machines in containers, real
+//! signals, real DDS peers on hosts of their own.
+
+mod support;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Instant;
+
+use serde_json::Value;
+use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::machine::{Machine, install, machine_missing};
+use support::netns::Net;
+use support::peer::{Peer, Received, RunningPeer, Sent};
+
+const TARGET: &str = "adaptive-bridge.target";
+const INGRESS: &str = "adaptive-bridge-ingress.service";
+const EGRESS_CRITICAL: &str = "adaptive-bridge-egress@critical.service";
+const EGRESS_NONCRITICAL: &str = "adaptive-bridge-egress@noncritical.service";
+const CONTROL: &str = "adaptive-bridge-control.service";
+const UNITS: [&str; 4] = [INGRESS, EGRESS_CRITICAL, EGRESS_NONCRITICAL, CONTROL];
+const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
+
+const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";
+
+/// Tenths: `systemd-analyze security` shows 2.0 for 20.
+const MAX_EXPOSURE: &str = "--threshold=20";
+
+/// A machine with the bridge, and hosts around it. Fields are dropped in this order.
+struct Bed {
+    machine: Machine,
+    net: Net,
+}
+
+impl Bed {
+    fn boot(test: &str, yaml: &str) -> Option<Self> {
+        if let Some(reason) = machine_missing() {
+            support::skip(test, &reason);
+            return None;
+        }
+        let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+        let machine = Machine::boot(net.host("bridge"), |root| {
+            install(root);
+            let config = root.join(CONFIG.trim_start_matches('/'));
+            fs::create_dir_all(config.parent().unwrap()).unwrap();
+            fs::write(config, yaml).unwrap();
+        });
+        Some(Self { machine, net })
+    }
+
+    /// Starts the bridge, and yields when every process says that it is ready.
+    fn start(&self) {
+        self.machine.run(&["systemctl", "start", TARGET]);
+        for unit in UNITS {
+            self.machine.wait_property(unit, "ActiveState", "active");
+        }
+    }
+
+    /// Stops it, and yields when every process has ended.
+    fn stop(&self) {
+        self.machine.run(&["systemctl", "stop", TARGET]);
+        for unit in UNITS {
+            self.machine.wait_property(unit, "ActiveState", "inactive");
+            assert_eq!(self.machine.property(unit, "Result"), "success", "{unit}");
+        }
+    }
+
+    fn flow(&self) -> Flow {
+        let subscriber = |host: &str, peer: Peer, topic: &str| {
+            peer.subscriber().topic(topic).start_on(self.net.host(host))
+        };
+        let critical = subscriber("critical", Peer::fast().keep_all(), CRITICAL);
+        let slow = subscriber("slow", Peer::fast().best_effort(), NONCRITICAL);
+        // KEEP_LAST, as ROS 2 has it: a KEEP_ALL writer waits for an ingress that is stopped, until that is
+        // restarted.
+        let publisher = Peer::cyclone().rate_hz(200.0).publisher().topic(INPUT).wait_match(1);
+        let publisher = publisher.start_on(self.net.host("publisher"));
+        critical.wait_received(50);
+        slow.wait_received(3);
+        Flow { publisher, critical, slow }
+    }
+
+    /// Waits until a unit was restarted so often, and is active again.
+    fn wait_restarts(&self, unit: &str, restarts: usize) {
+        self.machine.wait_property(unit, "NRestarts", &restarts.to_string());
+        self.machine.wait_property(unit, "ActiveState", "active");
+    }
+}
+
+/// A publisher at 200 Hz, a critical and a remote subscriber.
+struct Flow {
+    publisher: RunningPeer,
+    critical: RunningPeer,
+    slow: RunningPeer,
+}
+
+impl Flow {
+    /// Waits until samples that are sent from now on reach both subscribers.
+    fn wait_on(&self) {
+        let (critical, slow) = (self.critical.received(), self.slow.received());
+        self.critical.wait_received(critical + 20);
+        self.slow.wait_received(slow + 3);
+    }
+
+    /// Ends it: nothing held up the publisher, and what came was sound.
+    fn end(self) -> (Sent, Received) {
+        let sent: Sent = self.publisher.end();
+        assert_eq!(sent.failed, 0, "{sent:?}");
+        let longest_ms = sent.call_us.map_or(0.0, |calls| calls.max / 1e3);
+        println!(
+            "publisher: {} samples, {:.1} Hz, {} ticks skipped, longest write {longest_ms:.1} ms",
+            sent.ok, sent.rate_hz, sent.skipped_ticks
+        );
+        let received: Received = self.critical.end();
+        received.assert_sound();
+        self.slow.end::<Received>().assert_sound();
+        (sent, received)
+    }
+}
+
+#[test]
+fn the_units_are_sound_and_hardened() {
+    let test = "the_units_are_sound_and_hardened";
+    if Command::new("systemd-analyze").arg("--version").output().is_err() {
+        support::skip(test, "systemd-analyze is not installed (make setup)");
+        return;
+    }
+    // Units of this machine that ours refer to, and the programs that they start.
+    let root = tempfile::tempdir().unwrap();
+    install(root.path());
+    let units = root.path().join("usr/lib/systemd/system");
+    for unit in ["basic", "multi-user", "network", "shutdown", "sysinit"] {
+        fs::write(units.join(format!("{unit}.target")), "[Unit]\nDescription=Here\n").unwrap();
+    }
+    fs::copy("/bin/kill", root.path().join("usr/bin/kill")).unwrap();
+    let analyze = |arguments: &[&str], unit: &str| {
+        let mut command = Command::new("systemd-analyze");
+        command.arg(format!("--root={}", root.path().display())).args(arguments).arg(unit);
+        let output = command.output().unwrap();
+        let said = [output.stdout, output.stderr].concat();
+        assert!(output.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&said));
+    };
+    for unit in UNITS.into_iter().chain([RESPONDER]) {
+        analyze(&["security", "--offline=true", MAX_EXPOSURE], unit);
+    }
+    for unit in UNITS.into_iter().chain([RESPONDER, TARGET, "adaptive-bridge-critical.slice"]) {
+        analyze(&["verify", "--recursive-errors=one", "--man=no"], unit);
+    }
+}
+
+#[test]
+fn a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody() {
+    let test = "a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody";
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    bed.start();
+    let flow = bed.flow();
+    for unit in UNITS {
+        for (restarts, signal) in [(1, "KILL"), (2, "STOP")] {
+            let began = Instant::now();
+            bed.machine.run(&["kill", "-s", signal, &bed.machine.main_pid(unit)]);
+            bed.wait_restarts(unit, restarts);
+            let active = began.elapsed();
+            flow.wait_on();
+            println!(
+                "{unit}: SIG{signal} to active {:.2} s, to flow on every lane {:.2} s",
+                active.as_secs_f64(),
+                began.elapsed().as_secs_f64()
+            );
+        }
+    }
+    flow.end();
+    bed.stop();
+}
+
+#[test]
+fn the_critical_lane_needs_nothing_that_is_not_critical() {
+    let test = "the_critical_lane_needs_nothing_that_is_not_critical";
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    bed.machine.run(&["systemctl", "mask", "--runtime", EGRESS_NONCRITICAL, CONTROL]);
+    bed.machine.run(&["systemctl", "start", TARGET]);
+    for unit in [INGRESS, EGRESS_CRITICAL] {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+    }
+    let critical = Peer::cyclone().subscriber().topic(CRITICAL).start_on(bed.net.host("critical"));
+    let publisher =
+        Peer::cyclone().publisher().topic(INPUT).wait_match(1).start_on(bed.net.host("publisher"));
+    critical.wait_received(50);
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "{sent:?}");
+    bed.machine.run(&["systemctl", "stop", TARGET]);
+}
+
+#[test]
+fn a_bad_configuration_is_not_tried_again_and_a_good_one_starts() {
+    let test = "a_bad_configuration_is_not_tried_again_and_a_good_one_starts";
+    let Some(bed) = Bed::boot(test, "topics: nonsense\n") else { return };
+    bed.machine.run(&["systemctl", "start", "--no-block", TARGET]);
+    for unit in UNITS {
+        bed.machine.wait_property(unit, "ActiveState", "failed");
+        assert_eq!(bed.machine.property(unit, "ExecMainStatus"), "78", "{unit}");
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+        let log = bed.machine.journal(unit);
+        let says = |text: &str| {
+            log.iter().any(|entry| entry["MESSAGE"].as_str().is_some_and(|message| message.contains(text)))
+        };
+        assert!(says("topics"), "{unit}: {log:?}");
+    }
+    bed.machine.write(CONFIG, SCAN);
+    bed.start();
+    bed.flow().end();
+    bed.stop();
+}
+
+#[test]
+fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
+    let test = "systemd_knows_what_the_bridge_does_and_stop_leaves_nothing";
+    let yaml = "topics:\n  - {id: scan, input_topic: /scan, max_sample_bytes: 65536}\n";
+    let Some(bed) = Bed::boot(test, yaml) else { return };
+    bed.start();
+    let says = |unit: &str, text: &str| {
+        support::wait_until(&format!("'{text}' in the status of {unit}"), || {
+            bed.machine.property(unit, "StatusText").contains(text)
+        });
+    };
+    says(INGRESS, "reading 0 of 1 routes, 0.0 samples/s; no publisher found yet of /scan");
+    says(EGRESS_CRITICAL, "type not known yet of route scan");
+    says(CONTROL, "safety mode normal");
+    let flow = bed.flow();
+    says(INGRESS, "reading 1 of 1 routes");
+    says(EGRESS_CRITICAL, "mode normal; forwarding 1");
+    says(EGRESS_NONCRITICAL, "superseded");
+
+    // Structured fields, and a reload that is refused.
+    let reading = |entry: &Value| {
+        entry["BRIDGE_ROUTE"] == "scan"
+            && entry["MESSAGE"].as_str().is_some_and(|text| text.starts_with("reading route=scan"))
+    };
+    let log = bed.machine.journal(INGRESS);
+    assert!(log.iter().any(reading), "{log:?}");
+    bed.machine.write(CONFIG, &format!("{yaml}nonsense: 1\n"));
+    bed.machine.run(&["systemctl", "reload", INGRESS]);
+    says(INGRESS, "the changed configuration file is bad and not in force; reading 1 of 1");
+    bed.machine.write(CONFIG, yaml);
+    bed.machine.run(&["systemctl", "reload", INGRESS]);
+    support::wait_until("the end of the remark", || {
+        bed.machine.property(INGRESS, "StatusText").starts_with("reading 1 of 1")
+    });
+    bed.machine.wait_property(INGRESS, "ActiveState", "active");
+    assert_eq!(bed.machine.property(INGRESS, "NRestarts"), "0");
+    flow.end();
+
+    bed.stop();
+    let left = || bed.machine.run(&["sh", "-c", "ls /dev/shm /run/adaptive-bridge"]);
+    assert!(!left().contains("ab1_") && !left().contains("default"), "{}", left());
+}
+
+#[test]
+fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
+    let test = "a_lane_of_the_users_own_runs_once_its_units_are_written";
+    let yaml = format!(
+        "{SCAN}lanes: {{rviz: {{scheduling: {{cpus: [1]}}}}, critical: {{scheduling: {{cpus: [0]}}}}}}\n"
+    );
+    let Some(bed) = Bed::boot(test, &yaml) else { return };
+    let doctor = |check: &str| {
+        let output = bed.machine.try_run(&["adaptive-bridge", "doctor", "--json"]);
+        let diagnosis: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let code = match diagnosis["severity"].as_str() {
+            Some("ok" | "note") => 0,
+            Some("warning") => 3,
+            _ => 4,
+        };
+        assert_eq!(output.status.code(), Some(code), "{diagnosis}");
+        let findings = diagnosis["findings"].as_array().unwrap();
+        let found = findings.iter().find(|finding| finding["check"] == check);
+        found.unwrap_or_else(|| panic!("{check} in {diagnosis}")).clone()
+    };
+    let units = doctor("units");
+    assert_eq!(units["severity"], "warning", "{units}");
+    let command = units["command"].as_str().unwrap().replace("sudo ", "");
+    let written = bed.machine.run(&command.split(' ').collect::<Vec<_>>());
+    assert!(written.contains("adaptive-bridge.target.d") && written.contains("daemon-reload"), "{written}");
+    // FIFO by a capability: a container may not be allowed to raise the limit that the units use.
+    let may =
+        "[Service]\nCapabilityBoundingSet=CAP_SYS_NICE\nAmbientCapabilities=CAP_SYS_NICE\nPrivateUsers=no\n";
+    bed.machine.run(&["mkdir", "-p", "/etc/systemd/system/adaptive-bridge-egress@critical.service.d"]);
+    bed.machine.write("/etc/systemd/system/adaptive-bridge-egress@critical.service.d/90-nice.conf", may);
+    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.start();
+    assert_eq!(doctor("units")["severity"], "ok");
+    assert_eq!(doctor("services")["severity"], "warning");
+    bed.machine.run(&["systemctl", "enable", TARGET]);
+    assert_eq!(doctor("services")["severity"], "ok");
+    let rviz = "adaptive-bridge-egress@rviz.service";
+    bed.machine.wait_property(rviz, "ActiveState", "active");
+    let shown = |unit: &str, field: &str| {
+        let path = format!("/proc/{}/status", bed.machine.main_pid(unit));
+        let status = bed.machine.run(&["cat", &path]);
+        let line = status.lines().find(|line| line.starts_with(field)).unwrap_or_default();
+        line.split_whitespace().nth(1).unwrap_or_default().to_owned()
+    };
+    assert_eq!(shown(rviz, "Cpus_allowed_list:"), "1");
+    assert_eq!(shown(EGRESS_CRITICAL, "Cpus_allowed_list:"), "0");
+    for unit in UNITS.into_iter().chain([rviz]).filter(|unit| *unit != EGRESS_CRITICAL) {
+        assert_eq!(shown(unit, "CapEff:"), "0000000000000000", "{unit}");
+    }
+    let scheduling = bed.machine.run(&["chrt", "-p", &bed.machine.main_pid(EGRESS_CRITICAL)]);
+    assert!(scheduling.contains("SCHED_FIFO") && scheduling.contains("priority: 10"), "{scheduling}");
+    let scheduling = bed.machine.run(&["chrt", "-p", &bed.machine.main_pid(rviz)]);
+    assert!(scheduling.contains("SCHED_OTHER"), "{scheduling}");
+
+    let out = Peer::cyclone().best_effort().subscriber().topic("rt/adaptive_bridge/rviz/scan");
+    let out = out.start_on(bed.net.host("slow"));
+    let flow = bed.flow();
+    out.wait_received(5);
+    flow.end();
+    bed.stop();
+    bed.machine.wait_property(rviz, "ActiveState", "inactive");
+    let written = bed.machine.run(&["adaptive-bridge", "units", "--write"]);
+    assert_eq!(written, "everything is as the configuration needs it\n");
+}
+
+/// Makes the package of the program under test, with that version.
+fn package(version: &str) -> Result<PathBuf, String> {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut command = Command::new(source.join("scripts/package.sh"));
+    command.args(["--deb-version", version]).env("PROGRAM", support::bridge::program());
+    let output = command.output().map_err(|error| error.to_string())?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    match String::from_utf8_lossy(&output.stdout).lines().last() {
+        Some(path) if output.status.success() => Ok(source.join(path)),
+        _ => Err(said.into_owned()),
+    }
+}
+
+#[test]
+fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
+    let test = "the_package_installs_upgrades_while_samples_flow_and_leaves_nothing";
+    let cargo_deb = Command::new("cargo").args(["deb", "--version"]).output();
+    let no_cargo_deb = (!cargo_deb.is_ok_and(|output| output.status.success()))
+        .then(|| "cargo-deb is not installed (make setup)".to_owned());
+    if let Some(reason) = machine_missing().or(no_cargo_deb) {
+        support::skip(test, &reason);
+        return;
+    }
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let [old, new] = ["0.0.1-1", "0.0.2-1"].map(|version| package(version).unwrap());
+    let contents = Command::new("dpkg-deb").arg("-c").arg(&new).output().unwrap();
+    let contents = String::from_utf8(contents.stdout).unwrap();
+    let help = Command::new(support::bridge::program()).arg("help").output().unwrap();
+    let help = String::from_utf8(help.stdout).unwrap();
+    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    let commands = commands.take_while(|line| !line.is_empty()).filter_map(|line| line.strip_prefix("  "));
+    // What a description that is too long for a line goes on with is indented further.
+    let commands = commands.filter(|line| !line.starts_with(' '));
+    let commands: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(commands.contains(&"egress"), "{help}");
+    for command in commands.iter().filter(|command| **command != "help") {
+        assert!(
+            contents.contains(&format!("man1/adaptive-bridge-{command}.1.gz\n")),
+            "{command}: {contents}"
+        );
+    }
+    for completions in ["completions/adaptive-bridge", "adaptive-bridge.fish", "_adaptive-bridge"] {
+        assert!(contents.contains(&format!("{completions}\n")), "{completions}: {contents}");
+    }
+
+    let machine = Machine::boot(net.host("bridge"), |root| {
+        fs::copy(&old, root.join("old.deb")).unwrap();
+        fs::copy(&new, root.join("new.deb")).unwrap();
+    });
+    let bed = Bed { machine, net };
+    bed.machine.run(&["dpkg", "-i", "/old.deb"]);
+    assert_eq!(bed.machine.property(TARGET, "ActiveState"), "inactive");
+    bed.machine.run(&["systemctl", "enable", "--now", TARGET]);
+    bed.start();
+    let flow = bed.flow();
+    let pids = UNITS.map(|unit| bed.machine.main_pid(unit));
+    bed.machine.run(&["dpkg", "-i", "/new.deb"]);
+    for (unit, pid) in UNITS.iter().zip(&pids) {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+        assert_ne!(bed.machine.main_pid(unit), *pid, "{unit} was not restarted");
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+    }
+    flow.wait_on();
+    flow.end();
+
+    bed.machine.run(&["dpkg", "-r", "adaptive-bridge"]);
+    let processes = bed.machine.try_run(&["pgrep", "-u", "adaptive-bridge"]);
+    assert!(processes.stdout.is_empty(), "processes are left: {processes:?}");
+    bed.machine.run(&["dpkg", "-P", "adaptive-bridge"]);
+    let find = "find /dev/shm /run /etc /usr/lib/systemd /usr/bin -name 'adaptive-bridge*' -o -name 'ab1_*'";
+    assert_eq!(bed.machine.run(&["sh", "-c", find]), "");
+    assert!(!bed.machine.try_run(&["id", "adaptive-bridge"]).status.success());
+}
