@@ -174,6 +174,45 @@ fn a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody() {
 }
 
 #[test]
+fn a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on() {
+    let test = "a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on";
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    bed.start();
+    let flow = bed.flow();
+    // The thread that takes samples; the one that keeps house, and feeds the watchdog, goes on.
+    bed.machine.freeze_thread(INGRESS, "RustDDS Partici");
+    bed.wait_restarts(INGRESS, 1);
+    let log = bed.machine.run(&["journalctl", "--unit", INGRESS]);
+    assert!(log.contains("Watchdog timeout"), "{log}");
+    flow.wait_on();
+    flow.end();
+    bed.stop();
+}
+
+#[test]
+fn a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on() {
+    let test = "a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on";
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    // Enough for all but the pool of samples, which ingress makes.
+    bed.machine.run(&["mount", "-t", "tmpfs", "-o", "size=4M,mode=1777", "tmpfs", "/dev/shm"]);
+    bed.machine.run(&["systemctl", "start", "--no-block", TARGET]);
+    support::wait_until("two restarts of ingress", || {
+        bed.machine.property(INGRESS, "NRestarts").parse::<u32>().unwrap() >= 2
+    });
+    for unit in [EGRESS_CRITICAL, EGRESS_NONCRITICAL, CONTROL] {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+    }
+    let log = bed.machine.run(&["journalctl", "--unit", INGRESS]);
+    assert!(log.contains("/dev/shm"), "{log}");
+    bed.machine.run(&["mount", "-o", "remount,size=64M", "/dev/shm"]);
+    bed.machine.wait_property(INGRESS, "ActiveState", "active");
+    let flow = bed.flow();
+    flow.end();
+    bed.stop();
+}
+
+#[test]
 fn the_critical_lane_needs_nothing_that_is_not_critical() {
     let test = "the_critical_lane_needs_nothing_that_is_not_critical";
     let Some(bed) = Bed::boot(test, SCAN) else { return };

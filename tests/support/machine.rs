@@ -9,6 +9,8 @@ use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use nix::sys::signal::Signal;
+use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
+use nix::unistd::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -143,6 +145,38 @@ impl Machine {
     /// The main process of a unit, by its number in the machine.
     pub fn main_pid(&self, unit: &str) -> String {
         self.property(unit, "MainPID")
+    }
+
+    /// Stops one thread of the main process of a unit, by the beginning of its name, while the others go on.
+    /// Until the calling thread ends, which traces it.
+    pub fn freeze_thread(&self, unit: &str, name: &str) {
+        let pid = self.main_pid(unit);
+        let own = fs::read_link(format!("/proc/{}/ns/pid", self.leader)).unwrap();
+        // Its number outside the machine, which is the first of those that it has.
+        let processes = fs::read_dir("/proc").unwrap().flatten().map(|entry| entry.path());
+        let is_it = |process: &PathBuf| {
+            let status = fs::read_to_string(process.join("status")).unwrap_or_default();
+            let numbers = status.lines().find_map(|line| line.strip_prefix("NSpid:")).unwrap_or_default();
+            numbers.split_whitespace().last() == Some(&pid)
+                && fs::read_link(process.join("ns/pid")).is_ok_and(|namespace| namespace == own)
+        };
+        let process = processes.into_iter().find(is_it).unwrap_or_else(|| panic!("{unit} has no process"));
+        let threads = fs::read_dir(process.join("task")).unwrap().flatten().map(|entry| entry.path());
+        let is_named = |thread: &PathBuf| {
+            fs::read_to_string(thread.join("comm")).is_ok_and(|thread_name| thread_name.starts_with(name))
+        };
+        let thread =
+            threads.into_iter().find(is_named).unwrap_or_else(|| panic!("{unit} has no thread {name}"));
+        let thread: i32 = thread.file_name().unwrap().to_str().unwrap().parse().unwrap();
+        let nothing = std::ptr::null_mut::<nix::libc::c_void>();
+        // SAFETY: attaching passes no memory to the kernel; nix has the call only with a feature of its own.
+        let attached = unsafe { nix::libc::ptrace(nix::libc::PTRACE_ATTACH, thread, nothing, nothing) };
+        assert_eq!(attached, 0, "{}", std::io::Error::last_os_error());
+        // A traced thread that has died is its tracer's to bury, and the process is not gone before.
+        std::thread::spawn(move || {
+            let wait = || waitpid(Pid::from_raw(thread), Some(WaitPidFlag::__WALL));
+            while !matches!(wait(), Ok(WaitStatus::Exited(..) | WaitStatus::Signaled(..)) | Err(_)) {}
+        });
     }
 
     /// What `adaptive-bridge status --json` says there, if the bridge runs.

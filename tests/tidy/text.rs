@@ -26,6 +26,8 @@ const UNSAFE: &[&str] = &[
     "benches/hop/children.rs",
     "src/cli/demo/children.rs",
     "tests/support/process.rs",
+    // A thread that is traced, and so stopped by itself.
+    "tests/support/machine.rs",
     // Scheduling of the benchmark, and an allocator that counts.
     "benches/hop/system.rs",
     "tests/allocations.rs",
