@@ -265,6 +265,9 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     says(INGRESS, "reading 0 of 1 routes, 0.0 samples/s; no publisher found yet of /scan");
     says(EGRESS_CRITICAL, "type not known yet of route scan");
     says(CONTROL, "safety mode normal");
+    bed.machine.run(&["systemctl", "start", RESPONDER]);
+    says(RESPONDER, "probes answered per s; 0 refused");
+    bed.machine.run(&["systemctl", "stop", RESPONDER]);
     let flow = bed.flow();
     says(INGRESS, "reading 1 of 1 routes");
     says(EGRESS_CRITICAL, "mode normal; forwarding 1");
@@ -290,6 +293,12 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     flow.end();
 
     bed.stop();
+    let up = ["--unit=whole", "--service-type=notify", "--uid=adaptive-bridge", "--property=WatchdogSec=5"];
+    let up = [["systemd-run"].as_slice(), &up, &["adaptive-bridge", "up"]].concat();
+    // It comes back when the service says that it is ready.
+    bed.machine.run(&up);
+    says("whole.service", "4 of 4 processes; in scan 0.0/s; out critical (normal) 0.0/s");
+    bed.machine.run(&["systemctl", "stop", "whole.service"]);
     let left = || bed.machine.run(&["sh", "-c", "ls /dev/shm /run/adaptive-bridge"]);
     assert!(!left().contains("ab1_") && !left().contains("default"), "{}", left());
 }
