@@ -11,7 +11,7 @@ use std::time::Instant;
 use serde_json::Value;
 use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::machine::{Machine, install, machine_missing};
-use support::netns::Net;
+use support::netns::{Host, Net};
 use support::peer::{Peer, Received, RunningPeer, Sent};
 
 const TARGET: &str = "adaptive-bridge.target";
@@ -35,12 +35,16 @@ struct Bed {
 
 impl Bed {
     fn boot(test: &str, yaml: &str) -> Option<Self> {
+        Self::boot_by(Machine::boot, test, yaml)
+    }
+
+    fn boot_by(boot: impl FnOnce(&Host, &dyn Fn(&Path)) -> Machine, test: &str, yaml: &str) -> Option<Self> {
         if let Some(reason) = machine_missing() {
             support::skip(test, &reason);
             return None;
         }
         let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
-        let machine = Machine::boot(net.host("bridge"), |root| {
+        let machine = boot(net.host("bridge"), &|root: &Path| {
             install(root);
             let config = root.join(CONFIG.trim_start_matches('/'));
             fs::create_dir_all(config.parent().unwrap()).unwrap();
@@ -101,6 +105,11 @@ impl Flow {
         let (critical, slow) = (self.critical.received(), self.slow.received());
         self.critical.wait_received(critical + 20);
         self.slow.wait_received(slow + 3);
+    }
+
+    /// Waits until so many more samples reach the critical subscriber.
+    fn wait_critical(&self, samples: u64) {
+        self.critical.wait_received(self.critical.received() + samples);
     }
 
     /// Ends it: nothing held up the publisher, and what came was sound.
@@ -185,6 +194,49 @@ fn a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on
     let log = bed.machine.run(&["journalctl", "--unit", INGRESS]);
     assert!(log.contains("Watchdog timeout"), "{log}");
     flow.wait_on();
+    flow.end();
+    bed.stop();
+}
+
+#[test]
+fn what_noncritical_lanes_may_take_is_limited_and_the_critical_one_flows() {
+    let test = "what_noncritical_lanes_may_take_is_limited_and_the_critical_one_flows";
+    let Some(bed) = Bed::boot_by(Machine::boot_with_limits, test, SCAN) else { return };
+    let slice = "adaptive-bridge-noncritical.slice";
+    bed.machine.run(&["mkdir", "-p", &format!("/etc/systemd/system/{slice}.d")]);
+    let less = "[Slice]\nCPUQuota=20%\nMemoryHigh=infinity\nMemoryMax=128M\n";
+    bed.machine.write(&format!("/etc/systemd/system/{slice}.d/90-less.conf"), less);
+    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.start();
+    let flow = bed.flow();
+    // What a lane would do that has gone mad.
+    let go_mad = |unit: &str, what: &str| {
+        let unit = format!("--unit={unit}");
+        bed.machine.run(&["systemd-run", &unit, &format!("--slice={slice}"), "sh", "-c", what]);
+    };
+    go_mad("spins.service", "while :; do :; done");
+    let ticks = || -> u64 {
+        let stat =
+            bed.machine.run(&["cat", &format!("/proc/{}/stat", bed.machine.main_pid("spins.service"))]);
+        stat.split_whitespace().skip(13).take(2).map(|ticks| ticks.parse::<u64>().unwrap()).sum()
+    };
+    let (began, before) = (Instant::now(), ticks());
+    flow.wait_critical(600);
+    // In hundredths of a second.
+    let share = (ticks() - before) as f64 / 100.0 / began.elapsed().as_secs_f64();
+    println!("of one CPU, a lane that spins has {share:.2}");
+    assert!(share < 0.3, "CPUQuota does not bite: {share}");
+    bed.machine.run(&["systemctl", "stop", "spins.service"]);
+
+    go_mad("grows.service", "head -c 400M /dev/zero | tail");
+    bed.machine.wait_property("grows.service", "ActiveState", "failed");
+    // What the shell says of a program that was killed: by the kernel, which has no more memory for the
+    // slice.
+    assert_eq!(bed.machine.property("grows.service", "ExecMainStatus"), "137");
+    flow.wait_critical(50);
+    for unit in [INGRESS, EGRESS_CRITICAL, CONTROL] {
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+    }
     flow.end();
     bed.stop();
 }
@@ -413,7 +465,7 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
         assert!(contents.contains(&format!("{completions}\n")), "{completions}: {contents}");
     }
 
-    let machine = Machine::boot(net.host("bridge"), |root| {
+    let machine = Machine::boot(net.host("bridge"), &|root: &Path| {
         fs::copy(&old, root.join("old.deb")).unwrap();
         fs::copy(&new, root.join("new.deb")).unwrap();
     });

@@ -21,6 +21,10 @@ use super::{bridge, netns, wait_for, wait_until};
 /// The hierarchies in which a container of systemd needs a control group of its own.
 const CGROUPS: [&str; 2] = ["/sys/fs/cgroup/systemd", "/sys/fs/cgroup/unified"];
 
+/// Those of version 1 in which it limits what services take. Without them it may have real-time processes:
+/// with `RT_GROUP_SCHED` a control group for the CPU has no time for those.
+const LIMITING: [&str; 3] = ["/sys/fs/cgroup/cpu", "/sys/fs/cgroup/cpuacct", "/sys/fs/cgroup/memory"];
+
 /// systemd shuts down in order (systemd(1): SIGRTMIN+4).
 const POWER_OFF: &str = "RTMIN+4";
 
@@ -63,7 +67,22 @@ pub struct Machine {
 
 impl Machine {
     /// Boots a machine on a host. `stage` puts files into a folder that becomes part of its root.
-    pub fn boot(host: &Host, stage: impl FnOnce(&Path)) -> Machine {
+    pub fn boot(host: &Host, stage: &dyn Fn(&Path)) -> Machine {
+        Self::boot_in(host, &CGROUPS, stage)
+    }
+
+    /// As [`boot`](Self::boot), with limits on CPU and memory that bite.
+    pub fn boot_with_limits(host: &Host, stage: &dyn Fn(&Path)) -> Machine {
+        let machine = Self::boot_in(host, &[CGROUPS.as_slice(), &LIMITING].concat(), stage);
+        // nspawn leaves these to be looked at only.
+        for hierarchy in LIMITING.iter().filter(|path| Path::new(path).is_dir()) {
+            machine.run(&["mount", "-o", "remount,bind,rw", hierarchy]);
+        }
+        machine.run(&["systemctl", "daemon-reexec"]);
+        machine
+    }
+
+    fn boot_in(host: &Host, hierarchies: &[&str], stage: &dyn Fn(&Path)) -> Machine {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let folder = tempfile::tempdir().unwrap();
         let [disk, staged] = ["disk", "staged"].map(|name| folder.path().join(name));
@@ -71,7 +90,7 @@ impl Machine {
         fs::create_dir(&staged).unwrap();
         stage(&staged);
         let name = format!("ab-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
-        let hierarchies = CGROUPS.iter().map(Path::new).filter(|path| path.is_dir());
+        let hierarchies = hierarchies.iter().map(Path::new).filter(|path| path.is_dir());
         let cgroups: Vec<PathBuf> = hierarchies.map(|path| path.join(&name)).collect();
         let groups = cgroups.iter().fold(String::new(), |mut list, group| {
             write!(list, " {}", group.display()).unwrap();
