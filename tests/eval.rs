@@ -6,7 +6,7 @@ mod support;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -229,13 +229,11 @@ fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
     }
     let Some(out) = folder(test) else { return };
     let _exclusive = exclusive();
-    let mut harness = Process::spawn(
-        "the harness",
-        command(out.path(), "run baseline_mild bridge_mild --quick --bed docker"),
-    );
-    let pid = harness.pid().as_raw();
-    let status = harness.wait();
-    assert!(status.success(), "{status}\n{}", harness.log());
+    let mut command = command(out.path(), "run baseline_mild bridge_mild --quick --bed docker");
+    let harness = command.stderr(Stdio::piped()).spawn().unwrap();
+    let pid = harness.id() as i32;
+    let output = harness.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let runs = fs::read_dir(out.path().join("runs")).unwrap();
     let names: Vec<String> = runs.map(|run| run.unwrap().file_name().into_string().unwrap()).collect();
     assert_eq!(names.len(), 2, "{names:?}");

@@ -182,7 +182,11 @@ fn what_is_impure_or_knows_a_library_is_found() {
         ("src/process/a.rs", "use ros2_client::dds::rustdds;", "only src/dds/ knows rustdds"),
         ("src/process/a.rs", "use ros2_client::Context;", "only src/dds/ knows ros2_client"),
         ("src/config/load.rs", "fn a() { granit_parser::parse() }", "only src/config/yaml/ knows granit"),
-        ("src/config/load.rs", "use serde_yaml;", "only src/config/yaml/, src/eval/scenario/ knows serde_yaml"),
+        (
+            "src/config/load.rs",
+            "use serde_yaml;",
+            "only src/config/yaml/, src/eval/scenario/ knows serde_yaml",
+        ),
     ] {
         let found = violations(path, text).join("\n");
         assert!(found.contains(what), "{path}: {text}: found: {found}");

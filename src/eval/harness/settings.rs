@@ -83,7 +83,7 @@ impl Settings {
         let found = folders.map(|folder| folder.join(&name)).find(|path| path.exists());
         found.ok_or_else(|| {
             let how = match library {
-                Library::Rust => "cargo build --features eval --examples",
+                Library::Rust => "make peers, or cargo build --example rust_peer",
                 _ => "make peers, and see what it says",
             };
             EvalError::new(format!("{name} is not in {}: {how}", self.peers.display()))
