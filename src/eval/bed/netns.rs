@@ -1,5 +1,5 @@
-//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge in
-//! a namespace of its own. They share all else with the machine.
+//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge
+//! in a namespace of its own. They share all else with the machine.
 
 use std::fs;
 use std::net::Ipv4Addr;

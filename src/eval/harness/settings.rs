@@ -56,8 +56,8 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// How long a publisher publishes before the measured window begins, in seconds: matching is over by then,
-    /// and the classifier has its first window of probes.
+    /// How long a publisher publishes before the measured window begins, in seconds: matching is over by
+    /// then, and the classifier has its first window of probes.
     pub const fn settle_s(&self) -> f64 {
         if self.quick { 1.0 } else { 10.0 }
     }
