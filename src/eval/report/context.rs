@@ -60,9 +60,13 @@ fn summary(results: &Results) -> String {
     let cells = results.cells().count();
     let repetitions: Vec<usize> = results.cells().map(|cell| cell.runs.len()).collect();
     let (least, most) = (repetitions.iter().min().unwrap_or(&0), repetitions.iter().max().unwrap_or(&0));
-    let repetitions = if least == most { format!("{most}") } else { format!("{least} to {most}") };
+    let repetitions = match (least, most) {
+        (1, 1) => "once".to_owned(),
+        (least, most) if least == most => format!("{most} times"),
+        (least, most) => format!("{least} to {most} times"),
+    };
     format!(
-        "{} runs: {cells} experiments, each {} times, with {} on {}. Each figure stands above the paper's value and how far it is \
+        "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value and how far it is \
          from that.",
         results.runs.len(),
         repetitions,

@@ -252,13 +252,15 @@ pub fn remote_hosts(run: &Run) -> Vec<String> {
 }
 
 /// Samples that the writer of a remote subscriber's topic had to hold for it, `(seconds, samples)`: right after
-/// each that was written, when they are most.
+/// each that was written, when they are most, and four times a second, as it may take none for long.
 pub fn backlog(run: &Run, subscriber: &Subscribed) -> Vec<(f64, usize)> {
     let publishers = run.published.iter().filter(|one| one.endpoint.route == subscriber.endpoint.route);
     let attempts = publishers.flat_map(|publisher| &publisher.attempts);
     let written: Vec<(f64, u64)> =
         attempts.filter(|attempt| attempt.ok).map(|attempt| (attempt.at_s, attempt.seq)).collect();
-    let times: Vec<f64> = written.iter().map(|(at_s, _)| *at_s).collect();
+    let quarters = (0..(run.length_s() * 4.0) as u32).map(|quarter| f64::from(quarter) / 4.0);
+    let mut times: Vec<f64> = written.iter().map(|(at_s, _)| *at_s).chain(quarters).collect();
+    times.sort_by(f64::total_cmp);
     let held = outstanding(&written, &subscriber.receptions, &times);
     let in_window = |(at_s, _): &(f64, usize)| (0.0..run.length_s()).contains(at_s);
     times.into_iter().zip(held).filter(in_window).collect()

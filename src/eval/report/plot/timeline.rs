@@ -100,7 +100,7 @@ impl Timeline<'_> {
         } else {
             Axis::linear((0.0, high * 1.05), (bottom, top))
         };
-        grid_y(svg, &y, 3);
+        grid_y(svg, &y, 4);
         if let Some(target) = panel.target {
             svg.line("line target", (LEFT, y.at(target)), (RIGHT, y.at(target)));
         }
