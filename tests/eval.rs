@@ -6,7 +6,7 @@ mod support;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -105,6 +105,36 @@ impl Run {
         endpoints.iter().find(|endpoint| endpoint["name"] == name).unwrap()
     }
 
+    /// Every key and every column is on the page that describes them.
+    fn assert_documented(&self) {
+        let page = include_str!("../docs/eval-results.md");
+        let documented = |name: &str| page.contains(&format!("`{name}`"));
+        let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        for key in keys(&self.manifest) {
+            let nested = ["machine", "software"].contains(&key.as_str());
+            let list = ["endpoints", "links", "ports", "problems", "command_line"].contains(&key.as_str());
+            let named = if list { format!("{key}[]") } else { key.clone() };
+            assert!(nested || documented(&named), "{key}");
+            for inner in if nested { keys(&self.manifest[&key]) } else { Vec::new() } {
+                assert!(documented(&format!("{key}.{inner}")), "{key}.{inner}");
+            }
+        }
+        for list in ["endpoints", "links"] {
+            for key in keys(&self.manifest[list][0]) {
+                assert!(documented(&key) || documented(&format!("{key}[]")), "{list}[].{key}");
+            }
+        }
+        for file in fs::read_dir(&self.folder).unwrap() {
+            let path = file.unwrap().path();
+            if path.extension().is_some_and(|extension| extension == "csv") {
+                let text = fs::read_to_string(&path).unwrap();
+                for column in text.lines().next().unwrap().split(',') {
+                    assert!(documented(column), "{column} of {}", path.display());
+                }
+            }
+        }
+    }
+
     /// What each file says fits what the programs said at their end, and the window.
     fn assert_consistent(&self) {
         let manifest = &self.manifest;
@@ -192,6 +222,7 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
     let made = run_of(BRIDGE);
     made.assert_consistent();
+    made.assert_documented();
     assert_eq!((&made.manifest["classifier"], &made.manifest["seed"]), (&true.into(), &3.into()));
     assert_eq!(made.endpoint("slow")["lane"], "noncritical");
     let status = fs::read_to_string(made.folder.join("status.jsonl")).unwrap();
@@ -229,13 +260,11 @@ fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
     }
     let Some(out) = folder(test) else { return };
     let _exclusive = exclusive();
-    let mut harness = Process::spawn(
-        "the harness",
-        command(out.path(), "run baseline_mild bridge_mild --quick --bed docker"),
-    );
-    let pid = harness.pid().as_raw();
-    let status = harness.wait();
-    assert!(status.success(), "{status}\n{}", harness.log());
+    let mut command = command(out.path(), "run baseline_mild bridge_mild --quick --bed docker");
+    let harness = command.stderr(Stdio::piped()).spawn().unwrap();
+    let pid = harness.id() as i32;
+    let output = harness.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let runs = fs::read_dir(out.path().join("runs")).unwrap();
     let names: Vec<String> = runs.map(|run| run.unwrap().file_name().into_string().unwrap()).collect();
     assert_eq!(names.len(), 2, "{names:?}");

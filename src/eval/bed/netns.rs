@@ -1,5 +1,5 @@
-//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge in
-//! a namespace of its own. They share all else with the machine.
+//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge
+//! in a namespace of its own. They share all else with the machine.
 
 use std::fs;
 use std::net::Ipv4Addr;
@@ -15,10 +15,14 @@ use crate::eval::scenario::Switch;
 /// Whether what passes a bridge of the present network namespace goes through netfilter.
 const BRIDGE_NETFILTER: &str = "/proc/sys/net/bridge/bridge-nf-call-iptables";
 
+/// How a user without rights gets a namespace of its own in which it is root, and where `ip` may keep others.
+const AS_USER: &str = "unshare --user --map-root-user --net --mount sh -c \
+                       'mount -t tmpfs none /run && adaptive-bridge-eval ...'";
+
 /// Why this machine can't; `None` when it can.
 pub(super) fn missing(switch: Switch) -> Option<String> {
     if !nix::unistd::geteuid().is_root() {
-        return Some("network namespaces need root".to_owned());
+        return Some(format!("network namespaces need root, if only that of a user namespace: {AS_USER}"));
     }
     let probe = stale::name("probe");
     let made = ip(&format!("netns add {probe}"));

@@ -4,6 +4,7 @@
 //! want to read goes to stdout, and nothing else does.
 
 mod impair;
+mod report;
 mod runs;
 
 use std::process::ExitCode;
@@ -28,6 +29,8 @@ enum Command {
     Run(runs::RunArguments),
     /// Run every scenario
     Matrix(runs::MatrixArguments),
+    /// Make the report of a folder of results: HTML, Markdown and CSV
+    Report(report::Arguments),
     /// Lose and delay what this network namespace receives from one host, until SIGINT or SIGTERM
     Impair(impair::Arguments),
 }
@@ -41,6 +44,7 @@ pub fn main() -> ExitCode {
         Command::List(folder) => runs::list(&folder),
         Command::Run(arguments) => runs::run(&arguments),
         Command::Matrix(arguments) => runs::matrix(&arguments),
+        Command::Report(arguments) => report::run(&arguments),
         Command::Impair(arguments) => impair::run(&arguments),
     }
 }

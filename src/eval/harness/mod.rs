@@ -1,5 +1,5 @@
-//! Makes the runs of a matrix, one after the other: each in a folder of its own that is there when it is whole.
-//! docs/eval-results.md describes the folders.
+//! Makes the runs of a matrix, one after the other: each in a folder of its own that is there when it is
+//! whole. docs/eval-results.md describes the folders.
 
 mod bridge;
 mod capture;

@@ -18,8 +18,8 @@ const WRITER_MAX_SAMPLES: &str = "200";
 /// and so does the paper (section V-C). The longest that the peer takes is 1,000 s.
 const CYCLONE_MAX_BLOCKING_MS: &str = "1000000";
 
-/// The paper's settings of Cyclone DDS: data by unicast, and a writer's history cache of 600 KiB that does not
-/// adapt itself downwards.
+/// The paper's settings of Cyclone DDS: data by unicast, and a writer's history cache of 600 KiB that does
+/// not adapt itself downwards.
 const CYCLONE_URI: &str = "<General><AllowMulticast>spdp</AllowMulticast></General><Internal><Watermarks>\
      <WhcHigh>600 KiB</WhcHigh><WhcHighInit>600 KiB</WhcHighInit><WhcAdaptive>false</WhcAdaptive>\
      </Watermarks></Internal>";

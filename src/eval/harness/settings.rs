@@ -56,8 +56,8 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// How long a publisher publishes before the measured window begins, in seconds: matching is over by then,
-    /// and the classifier has its first window of probes.
+    /// How long a publisher publishes before the measured window begins, in seconds: matching is over by
+    /// then, and the classifier has its first window of probes.
     pub const fn settle_s(&self) -> f64 {
         if self.quick { 1.0 } else { 10.0 }
     }
@@ -83,7 +83,7 @@ impl Settings {
         let found = folders.map(|folder| folder.join(&name)).find(|path| path.exists());
         found.ok_or_else(|| {
             let how = match library {
-                Library::Rust => "cargo build --features eval --examples",
+                Library::Rust => "make peers, or cargo build --example rust_peer",
                 _ => "make peers, and see what it says",
             };
             EvalError::new(format!("{name} is not in {}: {how}", self.peers.display()))

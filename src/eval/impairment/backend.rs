@@ -74,7 +74,8 @@ pub struct Opened {
 }
 
 /// Begins to impair what the present network namespace receives from `source`, or of that only what is for
-/// `destination`, where it passes packets on. `queue` is a number that no other program in the namespace uses.
+/// `destination`, where it passes packets on. `queue` is a number that no other program in the namespace
+/// uses.
 ///
 /// # Errors
 /// The machine can't, or what the link needs is in use.

@@ -1,4 +1,5 @@
-//! Scenarios: what is run, with what load, over what links, and what is done to it meanwhile. A YAML file each.
+//! Scenarios: what is run, with what load, over what links, and what is done to it meanwhile. A YAML file
+//! each.
 
 mod check;
 

@@ -5,6 +5,7 @@
 mod options;
 mod payload;
 mod publisher;
+mod record;
 mod subscriber;
 
 use std::io::Write;
@@ -51,6 +52,16 @@ fn emit(event: &Value) {
     let mut out = std::io::stdout().lock();
     // Without a reader there is nobody to tell.
     let _ = writeln!(out, "{event}").and_then(|()| out.flush());
+}
+
+/// The library that is built.
+const RUSTDDS: &str = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/third_party/rustdds/Cargo.toml"));
+
+/// The endpoints exist.
+fn emit_ready() {
+    let version = RUSTDDS.lines().find_map(|line| line.strip_prefix("version = "));
+    let library = format!("RustDDS {}", version.unwrap_or_default().trim_matches('"'));
+    emit(&json!({"event": "ready", "library": library}));
 }
 
 /// Microseconds, to a tenth.

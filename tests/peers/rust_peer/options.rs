@@ -72,6 +72,8 @@ pub struct Options {
     pub opaque: bool,
     #[arg(long)]
     pub summary: bool,
+    #[arg(long)]
+    pub record: Option<PathBuf>,
     #[arg(long, default_value = "0", value_parser = seconds)]
     pub stall_every: Duration,
     #[arg(long, default_value = "0", value_parser = seconds)]

@@ -10,7 +10,8 @@ use serde_json::json;
 
 use super::options::Options;
 use super::payload::{self, FRONT_BYTES, Front};
-use super::{Signals, distribution, emit, microseconds};
+use super::record::Record;
+use super::{Signals, distribution, emit, emit_ready, microseconds};
 
 /// How long a wait may be deaf to signals and to the library's events.
 const SLICE: Duration = Duration::from_millis(10);
@@ -41,8 +42,10 @@ pub fn publish(options: &Options, signals: &Signals) -> Result<(), String> {
             options.max_blocking_ms,
         )
         .map_err(|error| error.to_string())?;
-    emit(&json!({"event": "ready"}));
-    let mut publisher = Publisher { options, signals, writer, file, readers: 0, tally: Tally::default() };
+    let record = Record::create(options.record.as_deref(), "seq,time_ns,call_ns,ok")?;
+    emit_ready();
+    let tally = Tally::default();
+    let mut publisher = Publisher { options, signals, writer, file, record, readers: 0, tally };
     publisher.begin();
     publisher.run();
     let acknowledged = publisher.linger();
@@ -56,6 +59,7 @@ struct Publisher<'p> {
     writer: RawWriter,
     /// In place of a payload of its own.
     file: Option<Vec<u8>>,
+    record: Record,
     /// Matched at present.
     readers: u64,
     tally: Tally,
@@ -141,6 +145,8 @@ impl Publisher<'_> {
             self.writer.write(bytes.clone(), self.options.encap, SourceTimestamp::from_wall(source));
         let now_ns = clock::monotonic().0;
         let hash = payload::hash(&[&self.options.encap.0, &bytes[..]].concat());
+        let ok = u8::from(outcome.is_ok());
+        self.record.row(format_args!("{sequence},{},{},{ok}", front.sent_ns, now_ns - before_ns));
         self.tally.record(sequence, outcome.is_ok().then_some(hash), before_ns, now_ns);
         if !self.options.summary {
             let call_us = microseconds((now_ns - before_ns) as i64);

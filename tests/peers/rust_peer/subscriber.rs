@@ -14,7 +14,8 @@ use serde_json::{Value, json};
 
 use super::options::Options;
 use super::payload::{self, Verdict};
-use super::{Signals, distribution, emit, microseconds};
+use super::record::Record;
+use super::{Signals, distribution, emit, emit_ready, microseconds};
 
 const SLICE: Duration = Duration::from_millis(100);
 const PROGRESS_PERIOD_NS: u64 = 100_000_000;
@@ -37,10 +38,11 @@ pub fn subscribe(options: &Options, signals: &Signals) -> Result<(), String> {
     let reader = participant
         .create_reader(&options.topic, &options.type_name, &qos)
         .map_err(|error| error.to_string())?;
-    emit(&json!({"event": "ready"}));
+    let record = Record::create(options.record.as_deref(), "seq,time_ns,latency_ns")?;
+    emit_ready();
     let bell = Arc::new(Bell { rung: AtomicBool::new(false), thread: std::thread::current() });
     let waker = Waker::from(Arc::clone(&bell));
-    let mut subscriber = Subscriber::new(options, signals, reader);
+    let mut subscriber = Subscriber::new(options, signals, reader, record);
     while !subscriber.done() {
         subscriber.reader.arm(&waker);
         if subscriber.take_batch() < BATCH && !bell.rung.swap(false, Ordering::Acquire) {
@@ -70,6 +72,7 @@ struct Subscriber<'s> {
     options: &'s Options,
     signals: &'s Signals,
     reader: RawReader,
+    record: Record,
     /// The latest sample: its encapsulation header, and what follows.
     sample: Vec<u8>,
     /// Matched at present.
@@ -99,12 +102,13 @@ struct Subscriber<'s> {
 }
 
 impl<'s> Subscriber<'s> {
-    fn new(options: &'s Options, signals: &'s Signals, reader: RawReader) -> Self {
+    fn new(options: &'s Options, signals: &'s Signals, reader: RawReader, record: Record) -> Self {
         let begin_ns = clock::monotonic().0;
         Self {
             options,
             signals,
             reader,
+            record,
             sample: Vec::new(),
             writers: 0,
             begin_ns,
@@ -182,6 +186,9 @@ impl<'s> Subscriber<'s> {
         let stamp = |at| payload::word(payload, at).filter(|_| sequence.is_some());
         let latency_ns = stamp(8).map(|sent_ns| now_ns.wrapping_sub(sent_ns) as i64);
         self.latencies_ns.extend(latency_ns);
+        if let (Some(sequence), Some(latency_ns)) = (sequence, latency_ns) {
+            self.record.row(format_args!("{sequence},{now_ns},{latency_ns}"));
+        }
         let source_ns = source.to_wall().map_or(0, |wall| wall.0);
         if let Some(expected_ns) = stamp(16) {
             let kept = source_ns.abs_diff(expected_ns) <= SOURCE_TOLERANCE_NS;

@@ -1,0 +1,200 @@
+//! What surrounds the figures: on what they were measured, with what, and what is doubtful or missing.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, UNIX_EPOCH};
+
+use super::cells::{Results, reading_name};
+use super::format;
+use super::paper;
+use super::record::Run;
+
+/// Facts and warnings, as texts.
+pub struct Context {
+    /// The folder in a line.
+    pub summary: String,
+    /// What a reader must know before any figure.
+    pub warnings: Vec<String>,
+    /// Each with its values, of which there are several where runs differ.
+    pub facts: Vec<(&'static str, Vec<String>)>,
+    /// Runs that say of themselves that they are doubtful.
+    pub doubts: Vec<String>,
+    /// Scenarios of the paper that were not run somewhere.
+    pub not_run: Vec<String>,
+}
+
+impl Context {
+    /// Collects them.
+    pub fn of(results: &Results) -> Self {
+        let mut warnings = Vec::new();
+        if results.any_synthetic() {
+            warnings.push("Made-up data, for tests of this report. Nothing here was measured.".to_owned());
+        }
+        if results.any_quick() {
+            warnings.push(
+                "Smoke runs (--quick): they show that the evaluation works; no figure means anything."
+                    .to_owned(),
+            );
+        }
+        let doubts: Vec<String> = results
+            .runs
+            .iter()
+            .flat_map(|run| {
+                run.manifest.problems.iter().map(|problem| format!("{}: {problem}", run.manifest.run))
+            })
+            .collect();
+        if !doubts.is_empty() {
+            warnings
+                .push(format!("{} remarks of runs about themselves: see \"Doubtful\" below.", doubts.len()));
+        }
+        if !results.unusable.is_empty() {
+            warnings.push(format!("{} runs failed or could not be read.", results.unusable.len()));
+        }
+        Self { summary: summary(results), warnings, facts: facts(results), doubts, not_run: not_run(results) }
+    }
+}
+
+fn summary(results: &Results) -> String {
+    let libraries: BTreeSet<&str> = results.places().into_iter().map(|place| place.library_name()).collect();
+    let beds: BTreeSet<String> = results.places().into_iter().map(|place| place.bed_name()).collect();
+    let joined = |set: BTreeSet<&str>| set.into_iter().collect::<Vec<_>>().join(" and ");
+    let cells = results.cells().count();
+    let repetitions: Vec<usize> = results.cells().map(|cell| cell.runs.len()).collect();
+    let (least, most) = (repetitions.iter().min().unwrap_or(&0), repetitions.iter().max().unwrap_or(&0));
+    let repetitions = match (least, most) {
+        (1, 1) => "once".to_owned(),
+        (least, most) if least == most => format!("{most} times"),
+        (least, most) => format!("{least} to {most} times"),
+    };
+    format!(
+        "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value and how far it is \
+         from that.",
+        results.runs.len(),
+        repetitions,
+        joined(libraries),
+        beds.into_iter().collect::<Vec<_>>().join(" and ")
+    )
+}
+
+fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
+    /// More different values of a fact than these are told as a number.
+    const SHOWN: usize = 8;
+    let distinct = |of: &dyn Fn(&Run) -> Vec<String>| {
+        let mut values: Vec<String> = Vec::new();
+        for value in results.runs.iter().flat_map(of) {
+            if !values.contains(&value) {
+                values.push(value);
+            }
+        }
+        let more = values.len().saturating_sub(SHOWN);
+        values.truncate(SHOWN);
+        if more > 0 {
+            values.push(format!("and {more} more"));
+        }
+        values
+    };
+    let one = |of: fn(&Run) -> String| distinct(&|run| vec![of(run)]);
+    let mut facts = vec![
+        ("When", vec![span(results)]),
+        (
+            "Machine",
+            one(|run| {
+                let machine = &run.manifest.machine;
+                format!(
+                    "{}, {} CPUs, {}",
+                    machine.cpu,
+                    machine.cpus,
+                    format::bytes(machine.memory_bytes as f64)
+                )
+            }),
+        ),
+        ("System", one(|run| format!("{}, kernel {}", run.manifest.machine.os, run.manifest.machine.kernel))),
+        ("Load average before a run", vec![load(results)]),
+        (
+            "Commit",
+            one(|run| {
+                let software = &run.manifest.software;
+                let changes = if software.modified { ", with changes" } else { "" };
+                format!(
+                    "{}{changes} (version {})",
+                    software.commit.as_deref().unwrap_or("not from a checkout"),
+                    software.version
+                )
+            }),
+        ),
+        ("Bridge", distinct(&|run| run.manifest.software.bridge.iter().cloned().collect())),
+        ("DDS library of publishers and subscribers", one(|run| run.manifest.software.peer.clone())),
+        (
+            "Links impaired by",
+            distinct(&|run| {
+                let outcomes = run.manifest.links.iter().filter_map(|link| {
+                    let at = if link.before_switch { "before the switch" } else { "at the receiver" };
+                    let outcome = link.impairment.as_ref()?;
+                    Some(format!("{} {at} ({})", outcome.backend, outcome.reason))
+                });
+                outcomes.collect()
+            }),
+        ),
+        ("Seeds of the links", vec![seeds(results)]),
+        ("Command", one(|run| run.manifest.command_line.join(" "))),
+        (
+            "Measured window",
+            one(|run| format!("{} s: {}", format::count(run.manifest.duration_s), run.manifest.scenario)),
+        ),
+        (
+            "Programs",
+            distinct(&|run| {
+                let endpoint = |one: &super::record::Endpoint| {
+                    let environment: Vec<String> =
+                        one.environment.iter().map(|(name, value)| format!("{name}={value}")).collect();
+                    format!("{} {}", environment.join(" "), one.command_line.join(" ")).trim().to_owned()
+                };
+                run.manifest.endpoints.iter().take(1).map(endpoint).collect()
+            }),
+        ),
+    ];
+    facts.retain(|(_, values)| !values.is_empty());
+    facts
+}
+
+fn span(results: &Results) -> String {
+    let begins = || results.runs.iter().map(|run| run.manifest.begin_unix_ms);
+    let text = |time_ms: u64| {
+        let time = UNIX_EPOCH.checked_add(Duration::from_millis(time_ms)).unwrap_or(UNIX_EPOCH);
+        humantime::format_rfc3339_seconds(time).to_string()
+    };
+    match (begins().min(), begins().max()) {
+        (Some(first), Some(last)) if first != last => format!("{} to {}", text(first), text(last)),
+        (Some(first), _) => text(first),
+        _ => String::new(),
+    }
+}
+
+fn load(results: &Results) -> String {
+    let loads = || results.runs.iter().map(|run| run.manifest.machine.load_before);
+    let (least, most) = (loads().fold(f64::INFINITY, f64::min), loads().fold(0.0, f64::max));
+    format!("{} to {}", format::number(least, 1), format::number(most, 1))
+}
+
+fn seeds(results: &Results) -> String {
+    let seeds = || results.runs.iter().map(|run| run.manifest.seed);
+    match (seeds().min(), seeds().max()) {
+        (Some(least), Some(most)) if least != most => format!("{least} to {most}"),
+        (Some(seed), _) => seed.to_string(),
+        _ => String::new(),
+    }
+}
+
+/// Scenarios of the paper that were not run at a place where others were.
+fn not_run(results: &Results) -> Vec<String> {
+    let mut missing = Vec::new();
+    for place in results.places() {
+        for reading in results.readings(place) {
+            for row in paper::TABLE_II.iter().chain(&paper::TABLE_III) {
+                if results.cell(place, &reading, row.scenario).is_none() {
+                    missing.push(format!("{} {}: {}", row.scenario, reading_name(&reading), place.name()));
+                }
+            }
+        }
+    }
+    missing
+}

@@ -1,0 +1,136 @@
+//! The figures as CSV, for programs.
+
+use super::cells::Results;
+use super::metrics::{METRICS, paper_value};
+use super::verdict::Finding;
+
+/// A line for each run, a column for each figure.
+pub fn runs(results: &Results) -> String {
+    let mut columns =
+        vec!["run", "scenario", "library", "reading", "bed", "switch", "repetition", "quick", "synthetic"];
+    columns.extend(METRICS.iter().map(|metric| metric.key));
+    let mut text = line(columns.iter().map(|column| (*column).to_owned()));
+    for cell in results.cells() {
+        for (index, measures) in cell.runs.iter().zip(&cell.measures) {
+            let Some(run) = results.runs.get(*index) else { continue };
+            let manifest = &run.manifest;
+            let mut fields = vec![
+                manifest.run.clone(),
+                manifest.scenario.clone(),
+                manifest.library.clone(),
+                manifest.reading.clone().unwrap_or_default(),
+                manifest.bed.clone(),
+                manifest.switch.clone(),
+                manifest.repetition.to_string(),
+                manifest.quick.to_string(),
+                manifest.synthetic.to_string(),
+            ];
+            fields.extend(METRICS.iter().map(|metric| optional((metric.of)(measures))));
+            text += &line(fields);
+        }
+    }
+    text
+}
+
+/// A line for each figure of each scenario in each setting, over its repetitions.
+pub fn figures(results: &Results) -> String {
+    const COLUMNS: [&str; 14] = [
+        "scenario",
+        "library",
+        "reading",
+        "bed",
+        "switch",
+        "figure",
+        "median",
+        "low",
+        "high",
+        "confidence",
+        "min",
+        "max",
+        "repetitions",
+        "paper",
+    ];
+    let mut text = line(COLUMNS.map(str::to_owned));
+    for cell in results.cells() {
+        for metric in &METRICS {
+            let Some(estimate) = cell.estimate(metric.of) else { continue };
+            let mut fields = vec![
+                cell.scenario.clone(),
+                cell.place.library.clone(),
+                cell.reading.clone().unwrap_or_default(),
+                cell.place.bed.clone(),
+                cell.place.switch.clone(),
+                metric.key.to_owned(),
+            ];
+            let numbers = [
+                estimate.median,
+                estimate.low,
+                estimate.high,
+                estimate.confidence,
+                estimate.min,
+                estimate.max,
+            ];
+            fields.extend(numbers.map(|number| optional(Some(number))));
+            fields.push(estimate.count.to_string());
+            fields.push(optional(paper_value(&cell.scenario, &cell.place.library, metric.key)));
+            text += &line(fields);
+        }
+    }
+    text
+}
+
+/// A line for each criterion of each verdict.
+pub fn verdicts(findings: &[Finding]) -> String {
+    const COLUMNS: [&str; 7] = ["hypothesis", "title", "verdict", "rule", "where", "found", "holds"];
+    let mut text = line(COLUMNS.map(str::to_owned));
+    for finding in findings {
+        let verdict = [finding.id.to_owned(), finding.title.clone(), finding.verdict.name().to_owned()];
+        if finding.criteria.is_empty() {
+            text += &line(verdict.iter().cloned().chain(std::iter::repeat_n(String::new(), 4)));
+        }
+        for criterion in &finding.criteria {
+            let of = [
+                criterion.rule.clone(),
+                criterion.place.clone(),
+                criterion.found.clone(),
+                criterion.holds.to_string(),
+            ];
+            text += &line(verdict.iter().cloned().chain(of));
+        }
+    }
+    text
+}
+
+fn optional(value: Option<f64>) -> String {
+    // Six digits behind the point are a nanosecond of what is in milliseconds.
+    value
+        .map(|value| format!("{:.6}", value).trim_end_matches('0').trim_end_matches('.').to_owned())
+        .unwrap_or_default()
+}
+
+/// A line, its fields quoted where RFC 4180 asks for it.
+fn line(fields: impl IntoIterator<Item = String>) -> String {
+    let quoted: Vec<String> = fields
+        .into_iter()
+        .map(|field| {
+            if field.contains([',', '"', '\n', '\r']) {
+                format!("\"{}\"", field.replace('"', "\"\""))
+            } else {
+                field
+            }
+        })
+        .collect();
+    quoted.join(",") + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fields_are_quoted_where_they_must() {
+        assert_eq!(line(["a".into(), "b, c".into(), "say \"d\"".into()]), "a,\"b, c\",\"say \"\"d\"\"\"\n");
+        let numbers = [Some(1.5), Some(30.0), Some(1e-9), Some(1_200.0), None].map(optional);
+        assert_eq!(numbers, ["1.5", "30", "0", "1200", ""]);
+    }
+}

@@ -1,0 +1,131 @@
+//! The report as Markdown: verdicts and tables, without figures.
+
+use std::fmt::Write as _;
+
+use super::cells::{Results, reading_name};
+use super::context::Context;
+use super::tables::{self, Field, Table};
+use super::verdict::{Finding, mechanism};
+
+/// Writes the page.
+pub fn page(results: &Results, findings: &[Finding], context: &Context) -> String {
+    let mut page = format!("# Adaptive Bridge: evaluation\n\n{}\n", plain(&context.summary));
+    for warning in &context.warnings {
+        let _ = write!(page, "\n**{}**\n", plain(warning));
+    }
+    if let Some(text) = tables::in_short(results) {
+        let _ = write!(page, "\n{}\n", plain(&text));
+    }
+    page.push_str("\n## Verdicts\n\n");
+    for finding in findings {
+        let (title, because) = (plain(&finding.title), plain(&finding.because));
+        let _ = writeln!(page, "- **{}: {}.** {title}. {because}", finding.id, finding.verdict.name());
+    }
+    table(&mut page, &tables::headline(results));
+    for reading in ["as-printed", "as-run"] {
+        table(&mut page, &tables::table_i(results, reading));
+    }
+    for place in results.places() {
+        for reading in results.readings(place) {
+            let _ = write!(page, "\n## {}, Table I {}\n", plain(&place.name()), reading_name(&reading));
+            table(&mut page, &tables::table_ii(results, place, &reading));
+            for level in ["mild", "moderate", "strong"] {
+                let scenario = format!("baseline_{level}");
+                if let Some(text) = results.cell(place, &reading, &scenario).and_then(mechanism) {
+                    let _ = write!(page, "\n{scenario}: {}\n", plain(&text));
+                }
+            }
+            table(&mut page, &tables::table_iii(results, place, &reading));
+            table(&mut page, &tables::beyond(results, place, &reading));
+            table(&mut page, &tables::remote(results, place, &reading));
+        }
+    }
+    let mut beds: Vec<(&str, &str)> =
+        results.places().into_iter().map(|place| (place.bed.as_str(), place.switch.as_str())).collect();
+    beds.dedup();
+    beds.sort_unstable();
+    beds.dedup();
+    page.push_str("\n## Both libraries\n");
+    for (bed, switch) in beds {
+        for reading in ["as-printed", "as-run"] {
+            if tables::has_table_iv(results, bed, switch, reading) {
+                table(&mut page, &tables::table_iv(results, bed, switch, reading));
+            }
+        }
+    }
+    page.push_str("\n## How the verdicts come about\n");
+    for finding in findings {
+        let _ =
+            write!(page, "\n### {}: {}\n\n{}\n\n", finding.id, plain(&finding.title), plain(finding.claim));
+        for criterion in &finding.criteria {
+            let holds = if criterion.holds { "holds" } else { "**does not hold**" };
+            let [rule, found, place] =
+                [&criterion.rule, &criterion.found, &criterion.place].map(|text| plain(text));
+            let _ = writeln!(page, "- {place}: {rule}: {holds}, {found}");
+        }
+        if !finding.missing.is_empty() {
+            let missing: Vec<String> = finding.missing.iter().map(|one| plain(one)).collect();
+            let _ = write!(page, "\nNot run: {}.\n", missing.join("; "));
+        }
+    }
+    page.push_str("\n## What was run, on what\n\n");
+    for (what, values) in &context.facts {
+        let values: Vec<String> = values.iter().map(|value| plain(value)).collect();
+        let _ = writeln!(page, "- {}: {}", plain(what), values.join("; "));
+    }
+    let unusable = results.unusable.iter().map(|(name, reason)| format!("{name}: {reason}"));
+    let lists = [
+        ("Doubtful", context.doubts.clone()),
+        ("Failed or unreadable", unusable.collect()),
+        ("Not run", context.not_run.clone()),
+    ];
+    for (title, items) in lists.iter().filter(|(_, items)| !items.is_empty()) {
+        let _ = write!(page, "\n### {title}\n\n");
+        for item in items {
+            let _ = writeln!(page, "- {}", plain(item));
+        }
+    }
+    page
+}
+
+fn table(page: &mut String, table: &Table) {
+    let _ = write!(page, "\n### {}\n\n", plain(&table.title));
+    let columns: Vec<String> = table.columns.iter().map(|column| plain(column)).collect();
+    let _ = writeln!(page, "| {} |", columns.join(" | "));
+    let _ = writeln!(page, "|{}", "---|".repeat(columns.len()));
+    for row in &table.rows {
+        let fields: Vec<String> = row.iter().map(field).collect();
+        let _ = writeln!(page, "| {} |", fields.join(" | "));
+    }
+    if !table.note.is_empty() {
+        let _ = write!(page, "\n{}\n", plain(&table.note));
+    }
+}
+
+fn field(field: &Field) -> String {
+    let mut text = plain(&field.text);
+    if let Some(interval) = &field.interval {
+        let _ = write!(text, " [{}]", plain(interval));
+    }
+    if let Some(paper) = &field.paper {
+        let deviation = field.deviation.as_ref().map(|text| format!(", {text}")).unwrap_or_default();
+        let _ = write!(text, " (paper {}{})", plain(paper), plain(&deviation));
+    }
+    text
+}
+
+/// Text that no markup is read into.
+fn plain(text: &str) -> String {
+    let mut plain = String::with_capacity(text.len());
+    for char in text.chars() {
+        match char {
+            '|' | '*' | '`' | '<' | '[' | ']' | '\\' => {
+                plain.push('\\');
+                plain.push(char);
+            }
+            char if char.is_control() => plain.push(' '),
+            char => plain.push(char),
+        }
+    }
+    plain
+}

@@ -1,0 +1,75 @@
+//! The report of a folder of results: the paper's tables and figures remade beside its own values, what it did
+//! not measure, and verdicts on its hypotheses.
+
+mod cells;
+mod context;
+mod csv;
+mod error;
+mod figures;
+mod format;
+mod html;
+#[cfg(test)]
+mod made_up;
+mod markdown;
+mod measures;
+mod metrics;
+mod paper;
+mod plot;
+mod record;
+mod tables;
+mod verdict;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+pub use error::ReportError;
+
+use cells::Results;
+use context::Context;
+use record::Folder;
+
+/// What was written.
+#[derive(Debug)]
+pub struct Written {
+    /// The files.
+    pub files: Vec<PathBuf>,
+    /// The verdicts, a line each.
+    pub verdicts: Vec<String>,
+    /// What a reader must know before any figure.
+    pub warnings: Vec<String>,
+    /// Runs that are not in the report, and why.
+    pub unusable: Vec<String>,
+}
+
+/// Reads the results in `results` and writes `report.html`, `report.md`, `figures.csv`, `runs.csv` and
+/// `verdicts.csv` into `out`, which is made if it isn't there.
+///
+/// # Errors
+/// There are no results, or a file can't be read or written. A run that can't be read is told in the report,
+/// and is no error.
+pub fn write(results: &Path, out: &Path) -> Result<Written, ReportError> {
+    let results = Results::new(Folder::read(results)?);
+    let findings = verdict::findings(&results);
+    let context = Context::of(&results);
+    fs::create_dir_all(out).map_err(ReportError::file(out))?;
+    let contents = [
+        ("report.html", html::page(&results, &findings, &context)),
+        ("report.md", markdown::page(&results, &findings, &context)),
+        ("figures.csv", csv::figures(&results)),
+        ("runs.csv", csv::runs(&results)),
+        ("verdicts.csv", csv::verdicts(&findings)),
+    ];
+    let mut files = Vec::new();
+    for (name, content) in contents {
+        let path = out.join(name);
+        fs::write(&path, content).map_err(ReportError::file(&path))?;
+        files.push(path);
+    }
+    let verdicts = findings.iter().map(|one| format!("{}: {}. {}", one.id, one.verdict.name(), one.because));
+    Ok(Written {
+        files,
+        verdicts: verdicts.collect(),
+        warnings: context.warnings,
+        unusable: results.unusable.iter().map(|(name, reason)| format!("{name}: {reason}")).collect(),
+    })
+}

@@ -1,0 +1,60 @@
+//! What plots have in common: a frame with marks, and a legend.
+
+use super::axis::Axis;
+use super::svg::{Anchor, Svg, TEXT, WIDTH, text_width};
+
+/// Left and right of the frame.
+pub const LEFT: f64 = 52.0;
+pub const RIGHT: f64 = WIDTH - 18.0;
+
+/// Room below a frame for the labels of its marks and of its axis.
+pub const BELOW: f64 = 2.0 * TEXT + 14.0;
+
+/// An entry of a legend: a text and the class of its swatch.
+pub struct Entry<'a> {
+    pub text: &'a str,
+    pub class: &'a str,
+    /// Drawn as a line, or else as a filled square.
+    pub is_line: bool,
+}
+
+/// Draws a legend from the top on, in as many lines as it takes; yields where it ends.
+pub fn legend(svg: &mut Svg, top: f64, entries: &[Entry]) -> f64 {
+    const SWATCH: f64 = 22.0;
+    const GAP: f64 = 14.0;
+    let (mut x, mut y) = (LEFT, top + TEXT);
+    for entry in entries {
+        let width = SWATCH + text_width(entry.text) + GAP;
+        if x > LEFT && x + width > RIGHT + GAP {
+            x = LEFT;
+            y += TEXT + 5.0;
+        }
+        if entry.is_line {
+            svg.line(&format!("line {}", entry.class), (x, y - 4.0), (x + SWATCH - 5.0, y - 4.0));
+        } else {
+            svg.rect(&format!("fill {}", entry.class), (x + 3.0, y - TEXT + 3.0), (11.0, 11.0), None);
+        }
+        svg.text("t", (x + SWATCH, y), Anchor::Start, entry.text);
+        x += width;
+    }
+    y + 9.0
+}
+
+/// Horizontal grid lines with their labels at the left.
+pub fn grid_y(svg: &mut Svg, axis: &Axis, most: usize) {
+    for mark in axis.marks(most) {
+        let y = axis.at(mark);
+        svg.line("grid", (LEFT, y), (RIGHT, y));
+        svg.text("t", (LEFT - 6.0, y + TEXT * 0.35), Anchor::End, &Axis::label(mark));
+    }
+}
+
+/// Vertical grid lines with their labels below, and what the axis is of.
+pub fn grid_x(svg: &mut Svg, axis: &Axis, most: usize, (top, bottom): (f64, f64), title: &str) {
+    for mark in axis.marks(most) {
+        let x = axis.at(mark);
+        svg.line("grid", (x, top), (x, bottom));
+        svg.text("t", (x, bottom + TEXT + 3.0), Anchor::Middle, &Axis::label(mark));
+    }
+    svg.text("t", ((LEFT + RIGHT) / 2.0, bottom + 2.0 * TEXT + 8.0), Anchor::Middle, title);
+}

@@ -1,0 +1,13 @@
+//! Plots as inline SVG. Written here, as no small library does what the report needs
+//! (docs/decisions/0008-report.md).
+
+mod axis;
+mod bars;
+mod cdf;
+mod frame;
+mod svg;
+mod timeline;
+
+pub use bars::{Bars, Series};
+pub use cdf::{Curve, cdf};
+pub use timeline::{Line, Panel, Strip, Timeline};

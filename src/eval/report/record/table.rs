@@ -1,0 +1,105 @@
+//! The CSV files of a run: a header line, commas, no quotes.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::Path;
+use std::str::FromStr;
+
+use super::super::error::ReportError;
+
+/// A line of a CSV file, with the columns that were asked for.
+pub struct Row<'a, const N: usize> {
+    path: &'a Path,
+    line: usize,
+    columns: [&'a str; N],
+    fields: [&'a str; N],
+}
+
+impl<'a, const N: usize> Row<'a, N> {
+    /// The text of a column, by its place among those asked for.
+    pub fn text(&self, column: usize) -> &'a str {
+        self.fields[column]
+    }
+
+    /// The number in a column.
+    pub fn number<T: FromStr>(&self, column: usize) -> Result<T, ReportError> {
+        self.fields[column].parse().map_err(|_| {
+            let problem = format!("{} is '{}', no number", self.columns[column], self.fields[column]);
+            ReportError::content(self.path, self.line, problem)
+        })
+    }
+}
+
+/// What `read` makes of each row of a file; columns that are not asked for may be there.
+pub fn read<T, const N: usize>(
+    path: &Path,
+    columns: [&str; N],
+    mut read: impl FnMut(Row<N>) -> Result<T, ReportError>,
+) -> Result<Vec<T>, ReportError> {
+    let text = fs::read_to_string(path).map_err(ReportError::file(path))?;
+    let mut lines = text.lines();
+    let header: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
+    let mut places = [0; N];
+    for (place, column) in places.iter_mut().zip(columns) {
+        let found = header.iter().position(|name| *name == column);
+        *place =
+            found.ok_or_else(|| ReportError::content(path, 1, format!("there is no column {column}")))?;
+    }
+    let mut rows = Vec::new();
+    let mut fields: Vec<&str> = Vec::with_capacity(header.len());
+    for (index, line) in lines.enumerate() {
+        fields.clear();
+        fields.extend(line.split(','));
+        if fields.len() != header.len() {
+            let problem = format!("{} fields, and the header has {}", fields.len(), header.len());
+            return Err(ReportError::content(path, index + 2, problem));
+        }
+        rows.push(read(Row { path, line: index + 2, columns, fields: places.map(|place| fields[place]) })?);
+    }
+    Ok(rows)
+}
+
+/// [`read`], of a file that need not be there.
+pub fn read_if_there<T, const N: usize>(
+    path: &Path,
+    columns: [&str; N],
+    row: impl FnMut(Row<N>) -> Result<T, ReportError>,
+) -> Result<Vec<T>, ReportError> {
+    match read(path, columns, row) {
+        Err(ReportError::File { source, .. }) if source.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        other => other,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rows(text: &str) -> Result<Vec<(u64, String)>, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.csv");
+        fs::write(&path, text).unwrap();
+        read(&path, ["seq", "what"], |row| Ok((row.number(0)?, row.text(1).to_owned())))
+            .map_err(|error| error.to_string().rsplit('/').next().unwrap_or_default().to_owned())
+    }
+
+    #[test]
+    fn columns_are_found_by_name() {
+        assert_eq!(rows("what,x,seq\na,,7\n,b,8\n"), Ok(vec![(7, "a".to_owned()), (8, String::new())]));
+        assert_eq!(rows("seq,what\n"), Ok(vec![]));
+    }
+
+    #[test]
+    fn what_is_wrong_is_told_with_its_line() {
+        assert_eq!(rows("seq\n1\n"), Err("a.csv:1: there is no column what".to_owned()));
+        assert_eq!(rows(""), Err("a.csv:1: there is no column seq".to_owned()));
+        assert_eq!(rows("seq,what\n1,a\n2\n"), Err("a.csv:3: 1 fields, and the header has 2".to_owned()));
+        assert_eq!(rows("seq,what\n-1,a\n"), Err("a.csv:2: seq is '-1', no number".to_owned()));
+    }
+
+    #[test]
+    fn a_file_may_be_missing_where_that_is_allowed() {
+        let none = read_if_there(Path::new("/nowhere/a.csv"), ["seq"], |row| row.number::<u64>(0));
+        assert!(none.unwrap().is_empty());
+    }
+}

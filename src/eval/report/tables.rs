@@ -1,0 +1,432 @@
+//! The report's tables, which HTML and Markdown both show.
+
+use super::cells::{Cell, Place, Results, reading_name};
+use super::format::{self, deviation, interval};
+use super::measures::Measures;
+use super::metrics::{self, paper_value};
+use super::paper;
+use crate::eval::impairment::{Level, Reading};
+use crate::eval::statistics::Estimate;
+
+/// A table.
+pub struct Table {
+    pub title: String,
+    pub note: String,
+    pub columns: Vec<String>,
+    pub rows: Vec<Vec<Field>>,
+}
+
+/// A field of a table.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Field {
+    /// What was found.
+    pub text: String,
+    /// The interval over repetitions.
+    pub interval: Option<String>,
+    /// The paper's value.
+    pub paper: Option<String>,
+    /// How far from it.
+    pub deviation: Option<String>,
+    /// Whether there is nothing to show.
+    pub is_missing: bool,
+}
+
+impl Field {
+    /// Words.
+    pub fn text(text: impl Into<String>) -> Self {
+        Self { text: text.into(), ..Self::default() }
+    }
+
+    /// Nothing, and why.
+    pub fn missing(why: &str) -> Self {
+        Self { text: why.to_owned(), is_missing: true, ..Self::default() }
+    }
+
+    fn with_paper(mut self, ours: Option<f64>, paper: Option<f64>, shown: fn(f64) -> String) -> Self {
+        self.paper = paper.map(shown);
+        self.deviation = ours.zip(paper).map(|(ours, paper)| deviation(ours, paper, shown));
+        self
+    }
+}
+
+/// A figure: its key among the metrics, and how it is written.
+struct Column {
+    title: &'static str,
+    key: &'static str,
+    shown: fn(f64) -> String,
+}
+
+impl Column {
+    const fn new(title: &'static str, key: &'static str, shown: fn(f64) -> String) -> Self {
+        Self { title, key, shown }
+    }
+}
+
+const P50: Column = Column::new("critical p50, ms", "critical_p50_ms", format::ms);
+const P95: Column = Column::new("critical p95, ms", "critical_p95_ms", format::ms);
+const P99: Column = Column::new("critical p99, ms", "critical_p99_ms", format::ms);
+const RATE: Column = Column::new("rate, Hz", "publisher_rate_hz", format::hz);
+const RATE_STD: Column = Column::new("rate std, Hz", "publisher_rate_std_hz", format::hz);
+const TRANSITIONS: Column = Column::new("transitions", "classifier_transitions", format::count);
+
+fn field(cell: Option<&Cell>, column: &Column, paper: Option<f64>) -> Field {
+    let Some(cell) = cell else { return Field::missing("not run").with_paper(None, paper, column.shown) };
+    let figure = metrics::METRICS.iter().find(|metric| metric.key == column.key).map(|metric| metric.of);
+    match figure.and_then(|figure| cell.estimate(figure)) {
+        Some(estimate) => {
+            estimated(&estimate, column.shown).with_paper(Some(estimate.median), paper, column.shown)
+        }
+        None => Field::missing("–").with_paper(None, paper, column.shown),
+    }
+}
+
+fn estimated(estimate: &Estimate, shown: fn(f64) -> String) -> Field {
+    Field { text: shown(estimate.median), interval: interval(estimate, shown), ..Field::default() }
+}
+
+/// Table I: what the links are to lose in a reading, and what they lost.
+pub fn table_i(results: &Results, reading: &str) -> Table {
+    let model_of = if reading == "as-run" { Reading::AsRun } else { Reading::AsPrinted };
+    let rows = paper::TABLE_I.iter().zip(paper::LOSS_AS_RUN_PERCENT).map(|(row, as_run)| {
+        let model = row.level.model(model_of);
+        let name = level_name(row.level);
+        let paper_percent = if model_of == Reading::AsRun { as_run } else { row.loss_percent };
+        let mut fields = vec![Field::text(name)];
+        let parameters = [model.p(), model.r(), model.loss_good(), model.loss_bad()];
+        fields.extend(parameters.into_iter().enumerate().map(|(index, ours)| {
+            let Some(paper) = row.parameters else { return Field::text("–") };
+            Field::text(format::percent(ours)).with_paper(
+                Some(ours),
+                Some(paper[index] / 100.0),
+                format::percent,
+            )
+        }));
+        let expected = Field::text(format::percent(model.stationary_loss()));
+        let shown = |percent: f64| format::percent(percent / 100.0);
+        fields.push(expected.with_paper(Some(model.stationary_loss() * 100.0), Some(paper_percent), shown));
+        fields.push(applied(results, reading, &name.to_lowercase()));
+        fields
+    });
+    Table {
+        title: format!("Table I, {}: impairment", reading_name(reading)),
+        note: format!(
+            "{} Applied: packets lost of those that the links judged, all runs of this reading together, with the 95 % interval \
+             of the correlated chain.",
+            if model_of == Reading::AsRun {
+                "The paper's harness passes the losses of the two states to netem in the wrong order, and its own counters \
+                 show what came of it; the paper's figures were measured so."
+            } else {
+                "The parameters as the paper prints them."
+            }
+        ),
+        columns: texts(&[
+            "scenario",
+            "good→bad",
+            "bad→good",
+            "loss in good",
+            "loss in bad",
+            "expected loss",
+            "applied loss",
+        ]),
+        rows: rows.collect(),
+    }
+}
+
+fn level_name(level: Level) -> &'static str {
+    match level {
+        Level::Clean => "Clean",
+        Level::Mild => "Mild",
+        Level::Moderate => "Moderate",
+        Level::Strong => "Strong",
+    }
+}
+
+/// The loss that links of a level really applied.
+fn applied(results: &Results, reading: &str, level: &str) -> Field {
+    let (mut judged, mut lost, mut variance) = (0_u64, 0_u64, 0.0);
+    let runs = results.runs.iter().map(|run| &run.manifest);
+    let of_reading = runs.filter(|one| one.reading.as_deref() == Some(reading) && one.level == level);
+    for link in of_reading.flat_map(|one| &one.links).filter(|link| link.direction == "forward") {
+        let Some(outcome) = &link.impairment else { continue };
+        judged += outcome.judged;
+        lost += outcome.lost;
+        let error = outcome.loss_standard_error.unwrap_or(0.0) * outcome.judged as f64;
+        variance += error * error;
+    }
+    if level == "clean" {
+        return Field::text("–");
+    }
+    if judged == 0 {
+        return Field::missing("not run");
+    }
+    let share = lost as f64 / judged as f64;
+    let error = 1.96 * variance.sqrt() / judged as f64;
+    Field {
+        text: format::percent(share),
+        interval: Some(format!("± {}", format::percent(error))),
+        ..Field::default()
+    }
+}
+
+/// Table II: the baselines at a place.
+pub fn table_ii(results: &Results, place: &Place, reading: &str) -> Table {
+    let rows = &paper::TABLE_II;
+    Table {
+        title: "Table II: no bridge".to_owned(),
+        note: of_fast_only(place),
+        ..scenario_table(results, place, reading, rows, &[P50, P95, P99, RATE, RATE_STD])
+    }
+}
+
+/// Table III: the bridge at a place.
+pub fn table_iii(results: &Results, place: &Place, reading: &str) -> Table {
+    let rows = &paper::TABLE_III;
+    Table {
+        title: "Table III: with the bridge".to_owned(),
+        note: of_fast_only(place),
+        ..scenario_table(results, place, reading, rows, &[P50, P95, P99, RATE, RATE_STD, TRANSITIONS])
+    }
+}
+
+fn of_fast_only(place: &Place) -> String {
+    if place.library == "fast" {
+        String::new()
+    } else {
+        "The paper has this table of Fast DDS only.".to_owned()
+    }
+}
+
+fn scenario_table(
+    results: &Results,
+    place: &Place,
+    reading: &str,
+    rows: &[paper::Row],
+    columns: &[Column],
+) -> Table {
+    let rows = rows.iter().map(|row| {
+        let cell = results.cell(place, reading, row.scenario);
+        let mut fields = vec![Field::text(row.title)];
+        let paper = |column: &Column| paper_value(row.scenario, &place.library, column.key);
+        fields.extend(columns.iter().map(|column| field(cell, column, paper(column))));
+        fields
+    });
+    let titles = columns.iter().map(|column| column.title);
+    Table {
+        title: String::new(),
+        note: String::new(),
+        columns: std::iter::once("scenario").chain(titles).map(str::to_owned).collect(),
+        rows: rows.collect(),
+    }
+}
+
+/// Table IV: the bridge on both libraries, in a test bed with a switch.
+pub fn table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -> Table {
+    let place =
+        |library: &str| Place { library: library.to_owned(), bed: bed.to_owned(), switch: switch.to_owned() };
+    let rows = paper::TABLE_IV.iter().map(|row| {
+        let mut fields = vec![Field::text(row.scenario)];
+        for column in [P99, RATE] {
+            for library in ["fast", "cyclone"] {
+                let cell = results.cell(&place(library), reading, row.scenario);
+                fields.push(field(cell, &column, paper_value(row.scenario, library, column.key)));
+            }
+        }
+        fields
+    });
+    Table {
+        title: format!("Table IV: both libraries, {} ({})", reading_name(reading), place("fast").bed_name()),
+        note: String::new(),
+        columns: texts(&[
+            "scenario",
+            "Fast DDS p99, ms",
+            "Cyclone p99, ms",
+            "Fast DDS rate, Hz",
+            "Cyclone rate, Hz",
+        ]),
+        rows: rows.collect(),
+    }
+}
+
+/// Whether something was run that Table IV shows.
+pub fn has_table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -> bool {
+    let shown = |cell: &Cell| {
+        paper::TABLE_IV.iter().any(|row| row.scenario == cell.scenario)
+            && (cell.place.bed.as_str(), cell.place.switch.as_str()) == (bed, switch)
+            && cell.reading.as_deref().unwrap_or(reading) == reading
+    };
+    results.cells().any(shown)
+}
+
+/// What the paper did not measure of the publisher and the critical subscriber, of every scenario at a place.
+pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
+    const COLUMNS: [Column; 10] = [
+        P95,
+        Column::new("critical max, ms", "critical_max_ms", format::ms),
+        Column::new("critical lost", "critical_lost", format::count),
+        Column::new("critical late", "critical_late", format::count),
+        Column::new("longest gap, ms", "critical_gap_ms", format::ms),
+        RATE,
+        Column::new("calls blocked", "publish_blocked", format::count),
+        Column::new("calls failed", "publish_failed", format::count),
+        Column::new("call p99, ms", "publish_call_p99_ms", format::ms),
+        Column::new("call max, ms", "publish_call_max_ms", format::ms),
+    ];
+    every_scenario(
+        results,
+        place,
+        reading,
+        "Publisher and critical subscriber, beyond the paper",
+        "Late: received when the next sample was due. Call: the publish call; blocked: longer than half a period at 30 Hz.",
+        &COLUMNS,
+    )
+}
+
+/// What the remote subscriber got, of every scenario at a place.
+pub fn remote(results: &Results, place: &Place, reading: &str) -> Table {
+    const COLUMNS: [Column; 9] = [
+        Column::new("rate, Hz", "noncritical_rate_hz", format::hz),
+        Column::new("p50, ms", "noncritical_p50_ms", format::ms),
+        Column::new("p95, ms", "noncritical_p95_ms", format::ms),
+        Column::new("bytes/s on the wire", "noncritical_wire_bytes_per_s", format::bytes),
+        Column::new("while impaired", "noncritical_wire_impaired_bytes_per_s", format::bytes),
+        Column::new("IP fragments", "noncritical_fragments", format::count),
+        Column::new("repair requests", "noncritical_acknacks", format::count),
+        Column::new("slowest demotion, s", "demote_max_s", format::hz),
+        Column::new("slowest promotion, s", "promote_max_s", format::hz),
+    ];
+    every_scenario(
+        results,
+        place,
+        reading,
+        "Remote subscriber",
+        "Of several the slowest. On the wire are all protocols. Repair requests: ACKNACK and NACK_FRAG of user data.",
+        &COLUMNS,
+    )
+}
+
+fn every_scenario(
+    results: &Results,
+    place: &Place,
+    reading: &str,
+    title: &str,
+    note: &str,
+    columns: &[Column],
+) -> Table {
+    let rows = results.cells_of(place, reading).into_iter().map(|cell| {
+        let mut fields = vec![Field::text(&cell.scenario)];
+        fields.extend(columns.iter().map(|column| field(Some(cell), column, None)));
+        fields
+    });
+    let titles = columns.iter().map(|column| column.title);
+    Table {
+        title: title.to_owned(),
+        note: note.to_owned(),
+        columns: std::iter::once("scenario").chain(titles).map(str::to_owned).collect(),
+        rows: rows.collect(),
+    }
+}
+
+/// What the processes used, of every bridge scenario at a place.
+pub fn usage(results: &Results, place: &Place, reading: &str) -> Table {
+    let mut rows = Vec::new();
+    for cell in results.cells_of(place, reading).into_iter().filter(|cell| cell.bridge) {
+        let mut names: Vec<&String> = cell.measures.iter().flat_map(|one| one.usage.keys()).collect();
+        names.sort();
+        names.dedup();
+        for name in names {
+            let of = |figure: fn(&super::measures::Usage) -> f64| {
+                Estimate::of(cell.measures.iter().filter_map(|one| one.usage.get(name)).map(figure))
+            };
+            let fields = [
+                of(|usage| usage.cpu_percent).map(|one| estimated(&one, format::hz)),
+                of(|usage| usage.rss_max_bytes as f64).map(|one| estimated(&one, format::bytes)),
+            ];
+            let mut row = vec![Field::text(&cell.scenario), Field::text(name)];
+            row.extend(fields.map(|field| field.unwrap_or_else(|| Field::missing("not measured"))));
+            rows.push(row);
+        }
+    }
+    Table {
+        title: "CPU and memory of each process".to_owned(),
+        note: "CPU: percent of one core, mean over the run. Memory: the most that was resident.".to_owned(),
+        columns: texts(&["scenario", "process", "CPU, %", "memory"]),
+        rows,
+    }
+}
+
+/// The hardest of the paper's impairments that was run without and with the bridge.
+fn hardest<'a>(
+    results: &'a Results,
+    place: &Place,
+    reading: &str,
+) -> Option<(&'static str, &'a Cell, &'a Cell)> {
+    ["strong", "moderate", "mild"].into_iter().find_map(|level| {
+        let cell = |variant: &str| results.cell(place, reading, &format!("{variant}_{level}"));
+        Some((level, cell("baseline")?, cell("bridge")?))
+    })
+}
+
+/// What the bridge changes, in a sentence: in the setting nearest to the paper's.
+pub fn in_short(results: &Results) -> Option<String> {
+    let (place, reading) = results.nearest_to_paper()?;
+    let (level, without, with) = hardest(results, place, &reading)?;
+    let rate = |cell: &Cell| cell.median(|one| one.rate_hz).map(format::hz);
+    let gap =
+        |cell: &Cell| cell.median(|one| one.critical_gap_ms).map(|gap_ms| format::number(gap_ms / 1e3, 2));
+    Some(format!(
+        "{}, {level} loss {}: without the bridge the publisher comes to {} Hz, and the critical subscriber waits up to {} s for a \
+         sample; with it, {} Hz and {} s.",
+        place.library_name(),
+        reading_name(&reading),
+        rate(without)?,
+        gap(without)?,
+        rate(with)?,
+        gap(with)?
+    ))
+}
+
+/// What the bridge changes at each place in the hardest of the paper's impairments.
+pub fn headline(results: &Results) -> Table {
+    let mut rows = Vec::new();
+    for place in results.places() {
+        for reading in results.readings(place) {
+            let Some((level, without, with)) = hardest(results, place, &reading) else { continue };
+            let change = |of: fn(&Measures) -> Option<f64>, shown: fn(f64) -> String| {
+                let one = |cell: &Cell| cell.median(of).map_or_else(|| "–".to_owned(), shown);
+                Field::text(format!("{} → {}", one(without), one(with)))
+            };
+            rows.push(vec![
+                Field {
+                    interval: Some(place.bed_name()),
+                    ..Field::text(format!(
+                        "{}, {level} loss {}",
+                        place.library_name(),
+                        reading_name(&reading)
+                    ))
+                },
+                change(|one| one.rate_hz, format::hz),
+                change(|one| one.critical_ms.quantile(0.95), format::ms),
+                change(|one| one.critical_gap_ms, format::ms),
+                change(|one| Some(one.critical.lost as f64), format::count),
+                change(|one| one.call_ms.max(), format::ms),
+            ]);
+        }
+    }
+    Table {
+        title: "Without → with the bridge".to_owned(),
+        note: "The hardest impairment that was run both ways. Medians over repetitions.".to_owned(),
+        columns: texts(&[
+            "where",
+            "publisher, Hz",
+            "critical p95, ms",
+            "longest gap, ms",
+            "critical lost",
+            "longest publish call, ms",
+        ]),
+        rows,
+    }
+}
+
+fn texts(texts: &[&str]) -> Vec<String> {
+    texts.iter().map(|text| (*text).to_owned()).collect()
+}

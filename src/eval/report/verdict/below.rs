@@ -1,0 +1,49 @@
+//! Not in the paper: that the lanes are not coupled below DDS either.
+
+use super::{Criterion, Finding, place_name};
+use crate::eval::report::cells::{Cell, Results};
+use crate::eval::report::format;
+
+const CLAIM: &str = "Not a hypothesis of the paper: lanes are not coupled by IP fragments either, which a host between may \
+                     have to hold for all of them. Rules, for each bridge scenario with loss: no IP fragment is sent towards \
+                     a remote subscriber (seen on the wire), and the host between gives up no datagram.";
+
+/// What the runs say.
+pub fn finding(results: &Results) -> Finding {
+    let mut criteria = Vec::new();
+    for cell in results.cells().filter(|cell| cell.bridge && cell.reading.is_some()) {
+        criteria.extend(none(cell, "no fragment is sent towards a remote subscriber", "fragments", |one| {
+            one.fragments_to_remote
+        }));
+        // A plain switch puts nothing together.
+        if cell.place.switch == "reassembling" {
+            criteria.extend(none(
+                cell,
+                "the host between gives up no datagram",
+                "datagrams given up",
+                |one| one.reassembly_failed,
+            ));
+        }
+    }
+    let mut missing = Vec::new();
+    if !criteria.iter().any(|criterion| criterion.rule.starts_with("the host between")) {
+        missing.push("a bridge scenario with loss and a host between that reassembles fragments".to_owned());
+    }
+    Finding::judged("Below DDS", "No coupling by IP fragments", CLAIM, criteria, missing)
+}
+
+fn none(
+    cell: &Cell,
+    rule: &str,
+    what: &str,
+    count: impl Fn(&crate::eval::report::measures::Measures) -> Option<u64>,
+) -> Option<Criterion> {
+    let counts: Vec<u64> = cell.measures.iter().filter_map(count).collect();
+    let total: u64 = counts.iter().sum();
+    (!counts.is_empty()).then(|| Criterion {
+        rule: rule.to_owned(),
+        place: place_name(cell),
+        found: format!("{} {what}", format::count(total as f64)),
+        holds: total == 0,
+    })
+}
