@@ -172,8 +172,8 @@ impl Results {
         self.cells.keys().map(|(place, _, _)| place).collect()
     }
 
-    /// The readings that were run at a place. Where nothing but scenarios without loss were, the one as printed
-    /// stands for them.
+    /// The readings that were run at a place. Where nothing but scenarios without loss were, the one as
+    /// printed stands for them.
     pub fn readings(&self, place: &Place) -> Vec<String> {
         let of_place = self.cells.keys().filter(|(known, _, _)| known == place);
         let mut readings: Vec<String> = of_place.filter_map(|(_, reading, _)| reading.clone()).collect();

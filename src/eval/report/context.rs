@@ -66,7 +66,8 @@ fn summary(results: &Results) -> String {
         (least, most) => format!("{least} to {most} times"),
     };
     format!(
-        "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value and how far it is \
+        "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value \
+             and how far it is \
          from that.",
         results.runs.len(),
         repetitions,

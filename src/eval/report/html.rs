@@ -1,5 +1,5 @@
-//! The report as one HTML file: inline style and SVG, no scripts, nothing that is loaded from elsewhere. It is
-//! also well-formed XML.
+//! The report as one HTML file: inline style and SVG, no scripts, nothing that is loaded from elsewhere. It
+//! is also well-formed XML.
 
 use std::fmt::Write as _;
 
@@ -18,16 +18,21 @@ const METHOD: [&str; 7] = [
      subscriber has it in hand, both on the same clock. A sample belongs to the measured window by its stamp.",
     "The rate is that of attempts to publish, over windows of 5 s that slide by 1 s and lie wholly within the measured \
      window: mean and population standard deviation over these windows, as the paper defines them.",
-    "Percentiles are interpolated linearly between the two nearest values. A cumulative distribution has the samples of \
+    "Percentiles are interpolated linearly between the two nearest values. A cumulative distribution has the \
+         samples of \
      all repetitions.",
-    "Of several repetitions the median is shown, with the interval of order statistics that contains the true median with \
-     95 % confidence. With fewer than six repetitions no such interval exists; then smallest to largest is shown, which \
+    "Of several repetitions the median is shown, with the interval of order statistics that contains the \
+         true median with \
+     95 % confidence. With fewer than six repetitions no such interval exists; then smallest to largest is \
+     shown, which \
      contains it with 94 % confidence for five, 75 % for three, 50 % for two.",
-    "A critical sample is lost when the publisher's writer took it and the subscriber never had it, and late when it came \
+    "A critical sample is lost when the publisher's writer took it and the subscriber never had it, and late \
+         when it came \
      after the next one was due.",
     "Samples held: those that the publisher's writer took and the remote subscriber has not yet received in order; a \
      RELIABLE writer must keep at least these.",
-    "The applied loss is that of the packets that the impaired links judged, with the standard error of a correlated chain.",
+    "The applied loss is that of the packets that the impaired links judged, with the standard error of a \
+         correlated chain.",
 ];
 
 /// Writes the page.
@@ -35,7 +40,8 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
     let mut page = String::new();
     let _ = write!(
         page,
-        "<!DOCTYPE html>\n<html xmlns=\"http://www.w3.org/1999/xhtml\" lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
+        "<!DOCTYPE html>\n<html xmlns=\"http://www.w3.org/1999/xhtml\" lang=\"en\">\n<head>\n<meta \
+             charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <title>Adaptive Bridge: evaluation</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n"
     );
@@ -156,7 +162,10 @@ fn setting(page: &mut String, results: &Results, place: &Place, reading: &str, i
 fn timelines(page: &mut String, results: &Results, place: &Place, reading: &str) {
     /// Shown at once, as they tell the story: the baseline at its worst, the bridge then, and the toggle.
     const OPEN: [&str; 3] = ["baseline_strong", "bridge_strong", "bridge_toggle"];
-    page.push_str("<h3>Time lines</h3>\n<p>The first repetition of each scenario; shaded while the link is impaired.</p>\n");
+    page.push_str(
+        "<h3>Time lines</h3>\n<p>The first repetition of each scenario; shaded while the link is \
+         impaired.</p>\n",
+    );
     let cells = results.cells_of(place, reading);
     page.push_str("<div class=\"figures\">\n");
     let shown = |cell: &&&Cell| OPEN.contains(&cell.scenario.as_str());
@@ -207,7 +216,10 @@ fn rules(page: &mut String, findings: &[Finding]) {
             escape(finding.claim),
         );
         if !finding.criteria.is_empty() {
-            page.push_str("<div class=\"scroll\"><table><thead><tr><th>holds</th><th>rule</th><th>found</th><th>where</th></tr></thead><tbody>\n");
+            page.push_str(
+                "<div class=\"scroll\"><table><thead>\
+                 <tr><th>holds</th><th>rule</th><th>found</th><th>where</th></tr></thead><tbody>\n",
+            );
             for criterion in &finding.criteria {
                 let (class, word) = if criterion.holds { ("good", "yes") } else { ("poor", "no") };
                 let [rule, found, place] =

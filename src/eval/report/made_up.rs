@@ -72,7 +72,8 @@ impl MadeUp {
         let loss = if level == "clean" { 0.0 } else { 0.1 };
         serde_json::from_value(json!({
             "format": 1, "run": format!("{}.{}.{}.netns.{}.r1", self.scenario, self.library, self.reading, self.switch),
-            "scenario": self.scenario, "title": "made up", "variant": if self.is_bridge() { "bridge" } else { "baseline" },
+            "scenario": self.scenario, "title": "made \
+                 up", "variant": if self.is_bridge() { "bridge" } else { "baseline" },
             "level": level, "library": self.library, "reading": Some(self.reading).filter(|name| !name.is_empty()),
             "bed": "netns", "switch": self.switch, "quick": self.quick, "repetition": 1, "seed": 1,
             "duration_s": self.length_s, "settle_s": 5, "begin_ns": 0, "end_ns": length_ns, "begin_unix_ms": 0,

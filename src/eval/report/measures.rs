@@ -251,8 +251,8 @@ pub fn remote_hosts(run: &Run) -> Vec<String> {
     hosts
 }
 
-/// Samples that the writer of a remote subscriber's topic had to hold for it, `(seconds, samples)`: right after
-/// each that was written, when they are most, and four times a second, as it may take none for long.
+/// Samples that the writer of a remote subscriber's topic had to hold for it, `(seconds, samples)`: right
+/// after each that was written, when they are most, and four times a second, as it may take none for long.
 pub fn backlog(run: &Run, subscriber: &Subscribed) -> Vec<(f64, usize)> {
     let publishers = run.published.iter().filter(|one| one.endpoint.route == subscriber.endpoint.route);
     let attempts = publishers.flat_map(|publisher| &publisher.attempts);
@@ -363,7 +363,8 @@ mod tests {
         assert_eq!(measures.critical, Received { samples: 597, lost: 3, late: 60, ..Received::default() });
         assert_eq!(measures.critical_ms.quantile(0.5), Some(0.5));
         assert_eq!(measures.critical_ms.max(), Some(40.0));
-        // Three samples are missing after a late one: four periods, less what that one was later than the next.
+        // Three samples are missing after a late one: four periods, less what that one was later than the
+        // next.
         let gap_ms = measures.critical_gap_ms.unwrap();
         assert!((gap_ms - (4000.0 / 30.0 - 39.5)).abs() < 1e-6, "{gap_ms}");
         assert_eq!((measures.wire_bytes_per_s, measures.wire_impaired_bytes_per_s), (Some(1e4), Some(1e4)));

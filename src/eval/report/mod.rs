@@ -1,5 +1,5 @@
-//! The report of a folder of results: the paper's tables and figures remade beside its own values, what it did
-//! not measure, and verdicts on its hypotheses.
+//! The report of a folder of results: the paper's tables and figures remade beside its own values, what it
+//! did not measure, and verdicts on its hypotheses.
 
 mod cells;
 mod context;

@@ -110,10 +110,12 @@ pub fn table_i(results: &Results, reading: &str) -> Table {
     Table {
         title: format!("Table I, {}: impairment", reading_name(reading)),
         note: format!(
-            "{} Applied: packets lost of those that the links judged, all runs of this reading together, with the 95 % interval \
+            "{} Applied: packets lost of those that the links judged, all runs of this reading together, \
+                 with the 95 % interval \
              of the correlated chain.",
             if model_of == Reading::AsRun {
-                "The paper's harness passes the losses of the two states to netem in the wrong order, and its own counters \
+                "The paper's harness passes the losses of the two states to netem in the wrong order, and \
+                     its own counters \
                  show what came of it; the paper's figures were measured so."
             } else {
                 "The parameters as the paper prints them."
@@ -276,7 +278,8 @@ pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
         place,
         reading,
         "Publisher and critical subscriber, beyond the paper",
-        "Late: received when the next sample was due. Call: the publish call; blocked: longer than half a period at 30 Hz.",
+        "Late: received when the next sample was due. Call: the publish call; blocked: longer than half a \
+             period at 30 Hz.",
         &COLUMNS,
     )
 }
@@ -374,7 +377,8 @@ pub fn in_short(results: &Results) -> Option<String> {
     let gap =
         |cell: &Cell| cell.median(|one| one.critical_gap_ms).map(|gap_ms| format::number(gap_ms / 1e3, 2));
     Some(format!(
-        "{}, {level} loss {}: without the bridge the publisher comes to {} Hz, and the critical subscriber waits up to {} s for a \
+        "{}, {level} loss {}: without the bridge the publisher comes to {} Hz, and the critical subscriber \
+             waits up to {} s for a \
          sample; with it, {} Hz and {} s.",
         place.library_name(),
         reading_name(&reading),

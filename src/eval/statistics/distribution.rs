@@ -114,7 +114,9 @@ mod tests {
     proptest! {
         #[test]
         fn quantiles_rise_and_stay_among_the_values(
-            values in proptest::collection::vec(-1e6..1e6_f64, 1..200), a in 0.0..=1.0_f64, b in 0.0..=1.0_f64,
+            values in proptest::collection::vec(-1e6..1e6_f64, 1..200),
+            a in 0.0..=1.0_f64,
+            b in 0.0..=1.0_f64,
         ) {
             let values = Distribution::new(values);
             let [low, high] = [a.min(b), a.max(b)].map(|q| values.quantile(q).unwrap());

@@ -1,8 +1,8 @@
 //! What is computed from the records of runs. Pure: numbers in, numbers out.
 //!
 //! Times are seconds since the run began to be measured; latencies and gaps are in the unit of what is handed
-//! in. Every definition that the paper gives is followed (section IV-D), and where it gives none the choice is
-//! told beside the function.
+//! in. Every definition that the paper gives is followed (section IV-D), and where it gives none the choice
+//! is told beside the function.
 
 mod distribution;
 mod repetitions;

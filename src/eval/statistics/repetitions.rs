@@ -48,7 +48,8 @@ impl Estimate {
     }
 }
 
-/// How many of the smallest and of the largest of `count` values lie outside the interval, and how sure it is.
+/// How many of the smallest and of the largest of `count` values lie outside the interval, and how sure it
+/// is.
 fn rank(count: usize) -> (usize, f64) {
     let n = count as f64;
     // P(Binomial(n, 1/2) = k), from k = 0 on.
@@ -77,8 +78,8 @@ mod tests {
 
     #[test]
     fn intervals_are_those_of_printed_tables() {
-        // Number of values, rank of the lower end counted from 1, confidence in percent (tables of the median's
-        // interval in textbooks of nonparametric statistics).
+        // Number of values, rank of the lower end counted from 1, confidence in percent (tables of the
+        // median's interval in textbooks of nonparametric statistics).
         for (count, expected, percent) in [
             (6, 1, 96.9),
             (7, 1, 98.4),

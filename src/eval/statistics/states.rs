@@ -22,8 +22,8 @@ pub struct Reaction {
     pub toggled_at_s: f64,
     /// Whether the link was impaired then (or else mended).
     pub impaired: bool,
-    /// From then to the state that answers it, in seconds; 0 when it was there already; `None` when it did not
-    /// come before the next toggle or the end of the run.
+    /// From then to the state that answers it, in seconds; 0 when it was there already; `None` when it did
+    /// not come before the next toggle or the end of the run.
     pub after_s: Option<f64>,
 }
 

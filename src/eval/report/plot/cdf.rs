@@ -18,8 +18,8 @@ pub struct Curve<'a> {
 }
 
 /// The curves over a logarithmic axis that reaches from `range_ms` to `range_ms`, so that two plots can be
-/// compared. Below them is the share of samples that came within a time; the tail of the last percent is where
-/// the curves leave the top.
+/// compared. Below them is the share of samples that came within a time; the tail of the last percent is
+/// where the curves leave the top.
 pub fn cdf(label: &str, curves: &[Curve], range_ms: (f64, f64)) -> String {
     let mut svg = Svg::default();
     let names: Vec<Entry> =

@@ -80,7 +80,8 @@ impl Svg {
         let (width, height) = (short(WIDTH), short(height));
         let label = escape(label);
         format!(
-            r#"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{}</svg>"#,
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" \
+             aria-label=\"{label}\">{}</svg>",
             self.body
         )
     }

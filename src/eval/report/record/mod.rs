@@ -240,7 +240,8 @@ impl Run {
         self.manifest.length_s()
     }
 
-    /// When links were switched, `(seconds, whether impaired)`; what happens to several at once is one toggle.
+    /// When links were switched, `(seconds, whether impaired)`; what happens to several at once is one
+    /// toggle.
     pub fn toggles(&self) -> Vec<(f64, bool)> {
         /// The harness switches the links of a host one after the other.
         const AT_ONCE_S: f64 = 1.0;
