@@ -89,7 +89,7 @@ fn endpoint(
     let topic = dds_topic(scenario, route, lane.as_deref());
     let (role_name, reliable, keep_all) = match role {
         Role::Publisher => ("publisher", true, true),
-        Role::Critical => ("critical", true, false),
+        Role::Critical => ("critical", true, workload.critical_history == ReaderHistory::KeepAll),
         // The noncritical lanes offer BEST_EFFORT.
         Role::Slow { .. } if lane.is_some() => ("slow", false, false),
         Role::Slow { .. } => ("slow", true, workload.slow_history == ReaderHistory::KeepAll),

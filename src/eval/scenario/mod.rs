@@ -105,6 +105,8 @@ pub struct Workload {
     pub message_type: String,
     /// History of remote subscribers of a baseline.
     pub slow_history: ReaderHistory,
+    /// History of the local, critical subscriber.
+    pub critical_history: ReaderHistory,
 }
 
 /// The paper's: a LaserScan at 30 Hz, of 720 rays.
@@ -116,6 +118,7 @@ impl Default for Workload {
             size_bytes: 2_948,
             message_type: "sensor_msgs/msg/LaserScan".to_owned(),
             slow_history: ReaderHistory::KeepAll,
+            critical_history: ReaderHistory::KeepLast10,
         }
     }
 }
@@ -442,6 +445,7 @@ mod tests {
             "workload.size_bytes",
             "workload.message_type",
             "workload.slow_history",
+            "workload.critical_history",
             "remotes",
             "remotes[].name",
             "remotes[].lane",
