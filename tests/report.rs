@@ -1,5 +1,5 @@
-//! The report from outside: of results that the harness recorded (tests/data/eval: smoke runs), read with a
-//! real XML parser, and of folders that are broken. Reads and writes files.
+//! The report from outside: of results that the harness recorded (tests/data/eval: smoke runs), read with
+//! a real XML parser, and of folders that are broken. Reads and writes files.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -127,8 +127,8 @@ fn text_in_plots_can_be_read_on_a_phone_and_stays_within() {
             }
             if node.tag_name().name() == "text" {
                 assert!(node.attribute("class").unwrap().split(' ').any(|class| class == "t"));
-                // No wide font: half the size for each character. The end may stand out of a frame, not of a
-                // plot.
+                // No wide font: half the size for each character. The end may stand out of a frame, not of
+                // a plot.
                 let width = node.text().unwrap_or_default().chars().count() as f64 * TEXT_PX * 0.5;
                 let x = number("x").unwrap();
                 let (left, right) = match node.attribute("text-anchor").unwrap() {

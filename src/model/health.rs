@@ -89,7 +89,7 @@ pub struct ProcessHealth {
     pub turns: u64,
     /// How often a process of this role was started in this bridge, this one included.
     pub starts: u64,
-    /// The mode that the process applies, as [`LaneMode`]'s number.
+    /// The mode that the process applies, as [`LaneMode`](super::modes::LaneMode)'s number.
     pub mode: u8,
     /// 1 when it ended as it was told to. A process that died could not say so.
     pub ended: u8,
@@ -120,14 +120,14 @@ pub struct LanePolicy {
     pub expires_at: MonotonicNs,
     /// When the epoch last grew.
     pub changed_at: MonotonicNs,
-    /// The mode that control decided on, as [`LaneMode`]'s number.
+    /// The mode that control decided on, as [`LaneMode`](super::modes::LaneMode)'s number.
     pub mode: u8,
-    /// The mildest mode that the safety supervisor allows, as [`LaneMode`]'s number. It holds against an
-    /// override, too.
+    /// The mildest mode that the safety supervisor allows, as [`LaneMode`](super::modes::LaneMode)'s number.
+    /// It holds against an override, too.
     pub safety_floor: u8,
     /// 1 while there is an override by hand.
     pub by_hand: u8,
-    /// The mode of that override, as [`LaneMode`]'s number.
+    /// The mode of that override, as [`LaneMode`](super::modes::LaneMode)'s number.
     pub mode_by_hand: u8,
     /// Always 0.
     pub reserved: [u8; 4],

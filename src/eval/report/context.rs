@@ -67,8 +67,7 @@ fn summary(results: &Results) -> String {
     };
     format!(
         "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value \
-             and how far it is \
-         from that.",
+         and how far it is from that.",
         results.runs.len(),
         repetitions,
         joined(libraries),

@@ -14,25 +14,24 @@ const STYLE: &str = include_str!("style.css");
 
 /// How figures are computed, for those who doubt them.
 const METHOD: [&str; 7] = [
-    "Latency is from the stamp that the publisher puts into the sample just before its publish call to the moment the \
-     subscriber has it in hand, both on the same clock. A sample belongs to the measured window by its stamp.",
-    "The rate is that of attempts to publish, over windows of 5 s that slide by 1 s and lie wholly within the measured \
-     window: mean and population standard deviation over these windows, as the paper defines them.",
+    "Latency is from the stamp that the publisher puts into the sample just before its publish call to the \
+     moment the subscriber has it in hand, both on the same clock. A sample belongs to the measured window \
+     by its stamp.",
+    "The rate is that of attempts to publish, over windows of 5 s that slide by 1 s and lie wholly within \
+     the measured window: mean and population standard deviation over these windows, as the paper defines \
+     them.",
     "Percentiles are interpolated linearly between the two nearest values. A cumulative distribution has the \
-         samples of \
-     all repetitions.",
+     samples of all repetitions.",
     "Of several repetitions the median is shown, with the interval of order statistics that contains the \
-         true median with \
-     95 % confidence. With fewer than six repetitions no such interval exists; then smallest to largest is \
-     shown, which \
-     contains it with 94 % confidence for five, 75 % for three, 50 % for two.",
+     true median with 95 % confidence. With fewer than six repetitions no such interval exists; then \
+     smallest to largest is shown, which contains it with 94 % confidence for five, 75 % for three, 50 % for \
+     two.",
     "A critical sample is lost when the publisher's writer took it and the subscriber never had it, and late \
-         when it came \
-     after the next one was due.",
-    "Samples held: those that the publisher's writer took and the remote subscriber has not yet received in order; a \
-     RELIABLE writer must keep at least these.",
+     when it came after the next one was due.",
+    "Samples held: those that the publisher's writer took and the remote subscriber has not yet received in \
+     order; a RELIABLE writer must keep at least these.",
     "The applied loss is that of the packets that the impaired links judged, with the standard error of a \
-         correlated chain.",
+     correlated chain.",
 ];
 
 /// Writes the page.
@@ -41,7 +40,7 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
     let _ = write!(
         page,
         "<!DOCTYPE html>\n<html xmlns=\"http://www.w3.org/1999/xhtml\" lang=\"en\">\n<head>\n<meta \
-             charset=\"utf-8\"/>\n\
+         charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <title>Adaptive Bridge: evaluation</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n"
     );
@@ -216,10 +215,11 @@ fn rules(page: &mut String, findings: &[Finding]) {
             escape(finding.claim),
         );
         if !finding.criteria.is_empty() {
-            page.push_str(
-                "<div class=\"scroll\"><table><thead>\
-                 <tr><th>holds</th><th>rule</th><th>found</th><th>where</th></tr></thead><tbody>\n",
-            );
+            page.push_str("<div class=\"scroll\"><table><thead><tr>");
+            for column in ["holds", "rule", "found", "where"] {
+                let _ = write!(page, "<th>{column}</th>");
+            }
+            page.push_str("</tr></thead><tbody>\n");
             for criterion in &finding.criteria {
                 let (class, word) = if criterion.holds { ("good", "yes") } else { ("poor", "no") };
                 let [rule, found, place] =

@@ -71,9 +71,10 @@ impl MadeUp {
         let lane = |name| self.is_bridge().then_some(name);
         let loss = if level == "clean" { 0.0 } else { 0.1 };
         serde_json::from_value(json!({
-            "format": 1, "run": format!("{}.{}.{}.netns.{}.r1", self.scenario, self.library, self.reading, self.switch),
-            "scenario": self.scenario, "title": "made \
-                 up", "variant": if self.is_bridge() { "bridge" } else { "baseline" },
+            "format": 1, "run": format!("{}.{}.{}.netns.{}.r1", self.scenario, self.library, self.reading,
+             self.switch),
+            "scenario": self.scenario, "title": "made up", "variant": if self.is_bridge() { "bridge" } else {
+             "baseline" },
             "level": level, "library": self.library, "reading": Some(self.reading).filter(|name| !name.is_empty()),
             "bed": "netns", "switch": self.switch, "quick": self.quick, "repetition": 1, "seed": 1,
             "duration_s": self.length_s, "settle_s": 5, "begin_ns": 0, "end_ns": length_ns, "begin_unix_ms": 0,
@@ -83,7 +84,8 @@ impl MadeUp {
             "command_line": [], "synthetic": true,
             "endpoints": [endpoint("publisher", None), endpoint("critical", lane("critical")),
                           endpoint("slow", lane("noncritical"))],
-            "links": [{"name": "", "direction": "forward", "impairment": {"backend": "", "reason": "", "delay_ms": 0.0,
+            "links": [{"name": "", "direction": "forward", "impairment": {"backend": "", "reason": "",
+             "delay_ms": 0.0,
                        "judged": 1000, "lost": (1000.0 * loss) as u64, "loss_expected": loss,
                        "loss_standard_error": 0.01}}],
         }))

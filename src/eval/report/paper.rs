@@ -1,5 +1,6 @@
-//! The paper's own figures: "Adaptive Bridge: A Proxy-Based Decoupling Layer for Mitigating DDS Backpressure
-//! in ROS 2", Tables I to IV and the text of section V. Nothing else of the source has one of them.
+//! The paper's own figures: "Adaptive Bridge: A Proxy-Based Decoupling Layer for Mitigating DDS
+//! Backpressure in ROS 2", Tables I to IV and the text of section V. Nothing else of the source has one of
+//! them.
 
 use crate::eval::impairment::Level;
 

@@ -111,12 +111,10 @@ pub fn table_i(results: &Results, reading: &str) -> Table {
         title: format!("Table I, {}: impairment", reading_name(reading)),
         note: format!(
             "{} Applied: packets lost of those that the links judged, all runs of this reading together, \
-                 with the 95 % interval \
-             of the correlated chain.",
+             with the 95 % interval of the correlated chain.",
             if model_of == Reading::AsRun {
                 "The paper's harness passes the losses of the two states to netem in the wrong order, and \
-                     its own counters \
-                 show what came of it; the paper's figures were measured so."
+                 its own counters show what came of it; the paper's figures were measured so."
             } else {
                 "The parameters as the paper prints them."
             }
@@ -279,7 +277,7 @@ pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
         reading,
         "Publisher and critical subscriber, beyond the paper",
         "Late: received when the next sample was due. Call: the publish call; blocked: longer than half a \
-             period at 30 Hz.",
+         period at 30 Hz.",
         &COLUMNS,
     )
 }
@@ -378,8 +376,7 @@ pub fn in_short(results: &Results) -> Option<String> {
         |cell: &Cell| cell.median(|one| one.critical_gap_ms).map(|gap_ms| format::number(gap_ms / 1e3, 2));
     Some(format!(
         "{}, {level} loss {}: without the bridge the publisher comes to {} Hz, and the critical subscriber \
-             waits up to {} s for a \
-         sample; with it, {} Hz and {} s.",
+         waits up to {} s for a sample; with it, {} Hz and {} s.",
         place.library_name(),
         reading_name(&reading),
         rate(without)?,

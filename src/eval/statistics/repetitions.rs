@@ -79,7 +79,8 @@ mod tests {
     #[test]
     fn intervals_are_those_of_printed_tables() {
         // Number of values, rank of the lower end counted from 1, confidence in percent (tables of the
-        // median's interval in textbooks of nonparametric statistics).
+        // median's
+        // interval in textbooks of nonparametric statistics).
         for (count, expected, percent) in [
             (6, 1, 96.9),
             (7, 1, 98.4),

@@ -109,9 +109,7 @@ mod tests {
     proptest! {
         #[test]
         fn marks_are_within_the_scale_and_few(
-            low in -1e4..1e4_f64,
-            extent in 1e-3..1e6_f64,
-            most in 2..10_usize,
+            low in -1e4..1e4_f64, extent in 1e-3..1e6_f64, most in 2..10_usize,
         ) {
             let axis = Axis::linear((low, low + extent), (0.0, 1.0));
             let marks = axis.marks(most);

@@ -78,12 +78,9 @@ impl Svg {
     /// The whole drawing, [`WIDTH`] wide; `label` tells those who can't see it what it shows.
     pub fn finish(self, height: f64, label: &str) -> String {
         let (width, height) = (short(WIDTH), short(height));
-        let label = escape(label);
-        format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" \
-             aria-label=\"{label}\">{}</svg>",
-            self.body
-        )
+        let attributes =
+            format!(r#"viewBox="0 0 {width} {height}" role="img" aria-label="{}""#, escape(label));
+        format!(r#"<svg xmlns="http://www.w3.org/2000/svg" {attributes}>{}</svg>"#, self.body)
     }
 
     fn put(&mut self, element: impl Display) {

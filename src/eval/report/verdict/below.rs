@@ -5,10 +5,9 @@ use crate::eval::report::cells::{Cell, Results};
 use crate::eval::report::format;
 
 const CLAIM: &str = "Not a hypothesis of the paper: lanes are not coupled by IP fragments either, which a \
-     host between may \
-                     have to hold for all of them. Rules, for each bridge scenario with loss: no IP fragment \
-                     is sent towards \
-                     a remote subscriber (seen on the wire), and the host between gives up no datagram.";
+                     host between may have to hold for all of them. Rules, for each bridge scenario with \
+                     loss: no IP fragment is sent towards a remote subscriber (seen on the wire), and the \
+                     host between gives up no datagram.";
 
 /// What the runs say.
 pub fn finding(results: &Results) -> Finding {

@@ -13,12 +13,10 @@ const LATENCY_TIMES: f64 = 10.0;
 const LEVELS: [&str; 3] = ["baseline_mild", "baseline_moderate", "baseline_strong"];
 
 const CLAIM: &str = "Without a bridge, bursty loss at one remote subscriber degrades the publisher's rate \
-     and the critical \
-                     subscriber's latency. Rule: in each impaired baseline the rate is at least 5 % below the clean \
-                     baseline's, and the critical p95 at least ten times the clean baseline's. Confirmed \
-                     where both hold for \
-                     mild, moderate and strong loss with Fast DDS, as the paper reports; partly where some \
-                     of it holds.";
+                     and the critical subscriber's latency. Rule: in each impaired baseline the rate is at \
+                     least 5 % below the clean baseline's, and the critical p95 at least ten times the clean \
+                     baseline's. Confirmed where both hold for mild, moderate and strong loss with Fast DDS, \
+                     as the paper reports; partly where some of it holds.";
 
 /// What was found at a place.
 struct AtPlace {
@@ -143,7 +141,7 @@ pub fn mechanism(cell: &Cell) -> Option<String> {
     let mut text = if failed + blocked == 0 {
         format!(
             "The writer's history did not fill: at most {held} samples waited for the remote subscriber, and \
-                 no publish call blocked or failed."
+             no publish call blocked or failed."
         )
     } else {
         format!(
@@ -160,8 +158,7 @@ pub fn mechanism(cell: &Cell) -> Option<String> {
     {
         text += &format!(
             " While calls fail, nothing is sent to anybody: the critical subscriber was without a sample for \
-                 up to {} s, and \
-             each sample that the writer took reached it within {} ms.",
+             up to {} s, and each sample that the writer took reached it within {} ms.",
             format::number(gap_ms / 1e3, 1),
             format::ms(max_ms)
         );

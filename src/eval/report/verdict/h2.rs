@@ -18,14 +18,12 @@ const RATE_HZ: f64 = 0.05;
 const IMPAIRED: [&str; 4] = ["bridge_mild", "bridge_moderate", "bridge_strong", "bridge_toggle"];
 
 const CLAIM: &str = "With the bridge, the critical subscribers and the publisher no longer notice. Rules, \
-     for each of the \
-                     paper's bridge scenarios, by the medians over repetitions: the rate is 30.0 Hz with a \
-                     standard deviation \
-                     of 0.0; no critical sample is lost, in any repetition; under loss the critical p95 is \
-                     at most 10 % above \
-                     that of the clean bridge; and that is at most 0.4 ms above the clean baseline's (the \
-                     paper: 0.6 ms). For \
-                     the whole verdict all four levels have to be run on Fast DDS and Cyclone DDS, in both readings.";
+                     for each of the paper's bridge scenarios, by the medians over repetitions: the rate is \
+                     30.0 Hz with a standard deviation of 0.0; no critical sample is lost, in any \
+                     repetition; under loss the critical p95 is at most 10 % above that of the clean bridge; \
+                     and that is at most 0.4 ms above the clean baseline's (the paper: 0.6 ms). For the \
+                     whole verdict all four levels have to be run on Fast DDS and Cyclone DDS, in both \
+                     readings.";
 
 /// What the runs say.
 pub fn finding(results: &Results) -> Finding {
