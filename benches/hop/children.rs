@@ -5,12 +5,13 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use adaptive_bridge::model::{DropCounts, DropReason, IngressCounters, LaneCounters, LatencyHistogram};
 use adaptive_bridge::shm::{Boards, Stage};
 use nix::sys::prctl::set_pdeathsig;
-use nix::sys::signal::Signal;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 
 use super::link::{self, INPUT, OUTPUT, Record, Route};
 use super::system::{self, FIFO_PRIORITY, Place, Scheduling};
@@ -167,7 +168,15 @@ impl Bridge {
 
 impl Drop for Bridge {
     fn drop(&mut self) {
+        // Asked to, the last of them removes their shared memory, 250 MB of it; one that is killed can't.
+        for process in &self.processes {
+            let _ = kill(Pid::from_raw(process.id().cast_signed()), Signal::SIGTERM);
+        }
+        let give_up_at = Instant::now() + Duration::from_secs(5);
         for process in &mut self.processes {
+            while matches!(process.try_wait(), Ok(None)) && Instant::now() < give_up_at {
+                std::thread::sleep(Duration::from_millis(10));
+            }
             let _ = process.kill();
             let _ = process.wait();
         }
