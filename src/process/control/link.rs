@@ -3,24 +3,15 @@
 use std::collections::VecDeque;
 
 use super::super::inbox::Inbox;
-use super::super::probes::{MAX_MESSAGE_BYTES, PROBE_TYPE, ProbeId, ProbeRequest, ProbeResponse, Trust};
+use super::super::probes::{
+    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse,
+    Trust,
+};
 use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter, ReaderQos, Take};
-use crate::model::{
-    Durability, Encapsulation, FixedText, History, MonotonicNs, ProbeRefusal, QosProfile, RefusalCounts,
-    Reliability, SourceTimestamp,
-};
-
-/// Probes are worth nothing when they are late: lost ones are what is counted.
-const REQUEST_QOS: QosProfile = QosProfile {
-    reliability: Reliability::BestEffort,
-    history: History::KeepLast { depth: 8 },
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+use crate::model::{Encapsulation, FixedText, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp};
 
 /// Responses that may wait for control; with 64 responders at 5 Hz it is three seconds' worth.
 const RESPONSES_WAITING: u32 = 1024;
@@ -51,6 +42,14 @@ pub(super) struct Response {
     pub arrived_at: MonotonicNs,
 }
 
+/// Responses that did not authenticate or answer no probe, by reason.
+#[derive(Debug, Default)]
+pub(super) struct Doubts {
+    pub refused: RefusalCounts,
+    /// Accepted all the same, because the trust mode is permissive.
+    pub accepted: RefusalCounts,
+}
+
 /// The probes of one network.
 pub(super) struct Link {
     writer: RawWriter,
@@ -66,13 +65,8 @@ impl Link {
     pub fn open(participant: &mut Participant, settings: &Settings) -> Result<Self, RoleError> {
         let probes = &settings.probes;
         let writer =
-            participant.create_writer(&probes.request_topic.to_dds(), PROBE_TYPE, &REQUEST_QOS, 8)?;
-        let qos = ReaderQos {
-            reliability: Reliability::BestEffort,
-            durability: Durability::Volatile,
-            depth: RESPONSES_WAITING,
-            deadline_ms: None,
-        };
+            participant.create_writer(&probes.request_topic.to_dds(), PROBE_TYPE, &PROBE_WRITER_QOS, 8)?;
+        let qos = ReaderQos { depth: RESPONSES_WAITING, ..PROBE_READER_QOS };
         let reader = participant.create_reader(&probes.response_topic.to_dds(), PROBE_TYPE, &qos)?;
         Ok(Self {
             writer,
@@ -116,7 +110,7 @@ impl Link {
     pub fn receive(
         &mut self,
         trust: &mut Trust,
-        refused: &mut RefusalCounts,
+        doubts: &mut Doubts,
         budget: &mut usize,
     ) -> Option<Response> {
         while *budget > 0 {
@@ -130,13 +124,13 @@ impl Link {
             });
             match take {
                 Take::Empty => return None,
-                Take::Malformed => refused.add(ProbeRefusal::Malformed),
+                Take::Malformed => doubts.refused.add(ProbeRefusal::Malformed),
                 Take::Sample(_) => {
                     let arrived_at = clock::monotonic();
                     match self.check(encapsulation, trust) {
                         Ok((response, doubt)) => {
                             if let Some(reason) = doubt {
-                                refused.add(reason);
+                                doubts.accepted.add(reason);
                             }
                             *budget -= 1;
                             return Some(Response {
@@ -145,7 +139,7 @@ impl Link {
                                 arrived_at,
                             });
                         }
-                        Err(reason) => refused.add(reason),
+                        Err(reason) => doubts.refused.add(reason),
                     }
                 }
             }

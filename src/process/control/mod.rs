@@ -14,11 +14,11 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use tracing::{error, info, warn};
+use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
 use super::notify::write_list;
-use super::probes::Trust;
+use super::probes::{RefusalWatch, Trust};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
@@ -32,16 +32,13 @@ use crate::policy::{LaneDecision, LaneReason, safety_floor};
 use crate::shm::{BoardWriter, ProcessRole};
 use diagnostics::Diagnostics;
 use intruders::Guard;
-use link::Link;
+use link::{Doubts, Link};
 use safety::Supervision;
 use subscribers::Subscribers;
 
 /// Responses looked at in a turn, of all links together. A flood waits for the next turn, and what it
 /// overwrites in the DDS reader meanwhile is its own.
 const RESPONSES_PER_TURN: usize = 2048;
-
-/// A refusal of one kind is logged at once, and at most every 10 s while it goes on.
-const REFUSAL_REPEAT_MS: u64 = 10_000;
 
 /// Runs the control process until `stop` is requested. `config` is the configuration file as the command line
 /// names it, for a secret that stands in it.
@@ -88,7 +85,9 @@ struct Control {
     trust: Option<Trust>,
     subscribers: Subscribers,
     supervision: Supervision,
-    refusals: RefusalLog,
+    doubts: Doubts,
+    refused: RefusalWatch,
+    accepted: RefusalWatch,
     /// What was decided last for each lane, to tell a change.
     decided: Vec<String>,
     probe_at: MonotonicNs,
@@ -135,7 +134,9 @@ impl Control {
             links,
             participants,
             record,
-            refusals: RefusalLog::default(),
+            doubts: Doubts::default(),
+            refused: RefusalWatch::of_refused(),
+            accepted: RefusalWatch::of_accepted(),
             decided: vec![String::new(); settings.lanes.len()],
             probe_at: now,
             evaluate_at: now,
@@ -154,14 +155,17 @@ impl Control {
             self.probe();
             self.probe_at = next(self.probe_at, self.settings.probes.rate_hz, now);
         }
+        let is_due = now >= self.evaluate_at || now >= self.supervise_at || now >= self.housekeeping_at;
         if now >= self.evaluate_at {
             self.evaluate(now);
             self.evaluate_at = next(self.evaluate_at, self.settings.classifier.evaluate_rate_hz, now);
         }
         if now >= self.supervise_at {
             self.supervision.evaluate(&self.role.boards, &self.settings, now);
-            self.decide(now);
             self.supervise_at = next(self.supervise_at, self.settings.safety.evaluate_rate_hz, now);
+        }
+        if is_due {
+            self.decide(now);
         }
         if now >= self.housekeeping_at {
             self.keep_house(now);
@@ -182,20 +186,25 @@ impl Control {
     fn receive(&mut self) {
         let Some(trust) = &mut self.trust else { return };
         let mut budget = RESPONSES_PER_TURN;
-        let (mut refused, mut accepted) = (RefusalCounts::default(), 0);
+        let (mut doubts, mut late, mut accepted) = (Doubts::default(), RefusalCounts::default(), 0);
         for (number, link) in self.links.iter_mut().enumerate() {
-            while let Some(response) = link.receive(trust, &mut refused, &mut budget) {
+            while let Some(response) = link.receive(trust, &mut doubts, &mut budget) {
                 match self.subscribers.answered(number, link, &response, &self.settings) {
                     Ok(()) => accepted += 1,
-                    Err(reason) => refused.add(reason),
+                    // It is what a bad link does, and counted as loss: nothing to warn of.
+                    Err(ProbeRefusal::Late) => late.add(ProbeRefusal::Late),
+                    Err(reason) => doubts.refused.add(reason),
                 }
             }
         }
-        if accepted + refused.total() > 0 {
+        let counts = [&doubts.refused, &doubts.accepted, &late];
+        if accepted > 0 || counts.iter().any(|counts| counts.total() > 0) {
             self.record.update(|record| {
                 record.responses_accepted += accepted;
-                record.refused.merge(&refused);
+                counts.iter().for_each(|counts| record.refused.merge(counts));
             });
+            self.doubts.refused.merge(&doubts.refused);
+            self.doubts.accepted.merge(&doubts.accepted);
         }
     }
 
@@ -213,12 +222,11 @@ impl Control {
         }
     }
 
-    /// One evaluation of the subscribers, and what follows for the lanes.
+    /// One evaluation of the subscribers.
     fn evaluate(&mut self, now: MonotonicNs) {
         for change in self.subscribers.evaluate(&self.settings, now) {
             self.diagnostics.decision(&change, &self.settings);
         }
-        self.decide(now);
         self.subscribers.show(&self.settings);
         self.diagnostics.states(&self.subscribers, &self.settings, now);
     }
@@ -282,10 +290,11 @@ impl Control {
             // With the modes that follow from it, and not an evaluation later.
             self.subscribers.show(&self.settings);
             self.diagnostics.adopt(&self.settings);
+            self.decide(now);
         }
         self.guard.keep_house(&mut self.participants, &self.settings, now);
-        self.decide(now);
-        self.refusals.look(&self.record.get().refused, now);
+        self.refused.look(&self.doubts.refused, now);
+        self.accepted.look(&self.doubts.accepted, now);
         self.show();
         self.role.turned(self.supervision.mode() as u8, 0);
         // The first turn is over, and with it everything is there.
@@ -345,30 +354,6 @@ fn decision_text(decision: &LaneDecision<'_>, safety_floor: LaneMode, safety: Sa
             format!("{mode}, because of {impaired} subscribers, {worst} among them")
         }
         reason => format!("{mode} ({})", reason.label()),
-    }
-}
-
-/// Refused responses in the log.
-#[derive(Default)]
-struct RefusalLog {
-    logged: [u64; ProbeRefusal::COUNT],
-    next_at: [MonotonicNs; ProbeRefusal::COUNT],
-}
-
-impl RefusalLog {
-    fn look(&mut self, counts: &RefusalCounts, now: MonotonicNs) {
-        for &reason in ProbeRefusal::ALL {
-            let refused = counts.get(reason).saturating_sub(self.logged[reason as usize]);
-            if refused == 0 || now < self.next_at[reason as usize] {
-                continue;
-            }
-            // A late one is what a bad link does, and is counted as loss.
-            if reason != ProbeRefusal::Late {
-                warn!(reason = reason.label(), refused, "probe responses refused: {}", reason.meaning());
-            }
-            self.logged[reason as usize] = counts.get(reason);
-            self.next_at[reason as usize] = now.plus_ms(REFUSAL_REPEAT_MS);
-        }
     }
 }
 
