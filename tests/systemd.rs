@@ -408,6 +408,16 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
     assert!(scheduling.contains("SCHED_FIFO") && scheduling.contains("priority: 10"), "{scheduling}");
     let scheduling = bed.machine.run(&["chrt", "-p", &bed.machine.main_pid(rviz)]);
     assert!(scheduling.contains("SCHED_OTHER"), "{scheduling}");
+    let nice_of = |unit: &str| {
+        let stat = bed.machine.run(&["cat", &format!("/proc/{}/stat", bed.machine.main_pid(unit))]);
+        // The name in brackets may have spaces; the nice value is the 17th field after it.
+        let after_name = stat.rsplit_once(')').map(|(_, rest)| rest.to_owned()).unwrap_or_default();
+        after_name.split_whitespace().nth(16).unwrap_or_default().to_owned()
+    };
+    assert_eq!(
+        (nice_of(rviz), nice_of("adaptive-bridge-ingress.service")),
+        ("10".to_owned(), "0".to_owned())
+    );
 
     let out = Peer::cyclone().best_effort().subscriber().topic("rt/adaptive_bridge/rviz/scan");
     let out = out.start_on(bed.net.host("slow"));

@@ -14,6 +14,10 @@ const MAX_LANES: usize = 32;
 /// The largest sample, in bytes.
 pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
+/// The nice value of noncritical lanes: where a sample wakes several lanes and there is a CPU for one, the
+/// critical one has it. The scheduler gives them a ninth of its weight.
+const NONCRITICAL_NICE: u8 = 10;
+
 pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
     ("other", SchedulingPolicy::Other),
     ("fifo", SchedulingPolicy::Fifo),
@@ -98,7 +102,13 @@ impl LaneReader<'_> {
                 TrafficClass::Critical => rates::refuse(field),
                 TrafficClass::Noncritical => self.policy.lane_rates(field),
             },
-            scheduling: scheduling(&field.section("scheduling")),
+            scheduling: scheduling(
+                &field.section("scheduling"),
+                match class {
+                    TrafficClass::Critical => 0,
+                    TrafficClass::Noncritical => NONCRITICAL_NICE,
+                },
+            ),
         };
         let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };
         LaneDraft { lane, qos }
@@ -124,8 +134,8 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
     }
 }
 
-/// A `scheduling` section.
-pub(super) fn scheduling(section: &Field<'_>) -> Scheduling {
+/// A `scheduling` section of a process that is `nice` unless told otherwise.
+pub(super) fn scheduling(section: &Field<'_>, nice: u8) -> Scheduling {
     let policy = section.get("policy");
     let priority = section.get("priority");
     let kind = policy.choice(SCHEDULING_POLICIES);
@@ -142,10 +152,12 @@ pub(super) fn scheduling(section: &Field<'_>) -> Scheduling {
             priority.whole(1..=99).unwrap_or(1)
         }
     };
+    let given_nice = section.get("nice").whole(0..=19).and_then(|nice| u8::try_from(nice).ok());
     let cpus = section.get("cpus").items().unwrap_or_default();
     Scheduling {
         policy: kind.unwrap_or_default(),
         priority: u8::try_from(priority).unwrap_or(0),
+        nice: given_nice.unwrap_or(nice),
         cpus: cpus.iter().filter_map(|cpu| cpu.count(0..=1023)).collect(),
         lock_memory: section.get("lock_memory").flag().unwrap_or(false),
     }

@@ -160,7 +160,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let (routes, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
     let processes = root.section("processes");
-    let process = |name: &str| lanes::scheduling(&processes.section(name).section("scheduling"));
+    let process = |name: &str| lanes::scheduling(&processes.section(name).section("scheduling"), 0);
     let security = control::security(root);
     let policy_hold_s = root.get("policy_hold_s").decimal(0.0..=3_600.0).unwrap_or(5.0);
     Settings {

@@ -183,6 +183,7 @@ fn scheduling(d: &mut Differ, of: &str, restart: Restart, old: &Scheduling, new:
     Scheduling {
         policy: d.keep(&key("policy"), restart.clone(), &old.policy, &new.policy),
         priority: d.keep(&key("priority"), restart.clone(), &old.priority, &new.priority),
+        nice: d.keep(&key("nice"), restart.clone(), &old.nice, &new.nice),
         cpus: d.keep(&key("cpus"), restart.clone(), &old.cpus, &new.cpus),
         lock_memory: d.keep(&key("lock_memory"), restart, &old.lock_memory, &new.lock_memory),
     }

@@ -188,6 +188,8 @@ pub struct Scheduling {
     pub policy: SchedulingPolicy,
     /// 1 to 99 for FIFO and round robin, 0 otherwise.
     pub priority: u8,
+    /// Nice value, 0 to 19: higher ones leave the CPU to others. Nothing to FIFO and round robin.
+    pub nice: u8,
     /// CPUs that the process may run on; empty for all.
     pub cpus: Vec<usize>,
     /// Whether to lock the process' memory (`mlockall`).

@@ -202,7 +202,7 @@ fn lanes_have_networks_and_scheduling_of_their_own() {
          lanes:\n\
          \x20 critical: {scheduling: {policy: fifo, priority: 80, cpus: [2, 3], lock_memory: true}}\n\
          \x20 noncritical: {domain_id: 9, networks: [wlan0]}\n\
-         \x20 fleet: {networks: []}\n\
+         \x20 fleet: {networks: [], scheduling: {nice: 3}}\n\
          processes: {ingress: {scheduling: {policy: rr, priority: 1}}}\n",
     );
     let name = |name: &str| NetworkSelector::Name(name.to_owned());
@@ -215,12 +215,19 @@ fn lanes_have_networks_and_scheduling_of_their_own() {
         DdsNetwork { domain_id: 9, interfaces: vec![name("wlan0")] }
     );
     assert_eq!(lane(&settings, "fleet").network, DdsNetwork { domain_id: 4, interfaces: vec![] });
-    let fifo =
-        Scheduling { policy: SchedulingPolicy::Fifo, priority: 80, cpus: vec![2, 3], lock_memory: true };
+    let fifo = Scheduling {
+        policy: SchedulingPolicy::Fifo,
+        priority: 80,
+        nice: 0,
+        cpus: vec![2, 3],
+        lock_memory: true,
+    };
     assert_eq!(lane(&settings, "critical").scheduling, fifo);
     let rr = Scheduling { policy: SchedulingPolicy::RoundRobin, priority: 1, ..Scheduling::default() };
     assert_eq!(settings.ingress_scheduling, rr);
     assert_eq!(settings.control_scheduling, Scheduling::default());
+    assert_eq!(lane(&settings, "noncritical").scheduling.nice, 10);
+    assert_eq!(lane(&settings, "fleet").scheduling.nice, 3);
 }
 
 #[test]

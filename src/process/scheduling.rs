@@ -24,6 +24,13 @@ pub(super) fn apply(scheduling: &Scheduling) {
             }
         }
     }
+    // Lower than it was started with takes a privilege, and whoever started it so knew why.
+    if scheduling.nice > 0 && i32::from(scheduling.nice) > current_nice() {
+        match set_nice(scheduling.nice) {
+            Ok(()) => info!(nice = scheduling.nice, "nice value set"),
+            Err(error) => warn!(nice = scheduling.nice, %error, "nice value not set"),
+        }
+    }
     let (policy, name, priority) = match scheduling.policy {
         SchedulingPolicy::Other => (libc::SCHED_FIFO, "fifo", default_priority()),
         SchedulingPolicy::Fifo => (libc::SCHED_FIFO, "fifo", Some(scheduling.priority)),
@@ -67,6 +74,19 @@ fn set_affinity(cpus: &[usize]) -> nix::Result<()> {
         set.set(cpu)?;
     }
     sched_setaffinity(Pid::from_raw(0), &set)
+}
+
+/// The nice value of this process.
+fn current_nice() -> i32 {
+    // SAFETY: the call takes two numbers and returns one. nix has no wrapper for it. An error is -1, as a nice
+    // value may be; both are below all that can be configured.
+    unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) }
+}
+
+fn set_nice(nice: u8) -> nix::Result<()> {
+    // SAFETY: the call takes numbers only. nix has no wrapper for it.
+    let outcome = unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, libc::c_int::from(nice)) };
+    Errno::result(outcome).map(drop)
 }
 
 fn set_policy(policy: libc::c_int, priority: u8) -> nix::Result<()> {

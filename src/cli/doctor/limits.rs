@@ -185,8 +185,13 @@ mod tests {
     #[test]
     fn what_is_configured_must_be_allowed() {
         let plain = Scheduling::default();
-        let fifo =
-            Scheduling { policy: SchedulingPolicy::Fifo, priority: 20, lock_memory: true, cpus: vec![3] };
+        let fifo = Scheduling {
+            policy: SchedulingPolicy::Fifo,
+            priority: 20,
+            lock_memory: true,
+            cpus: vec![3],
+            nice: 0,
+        };
         assert_eq!(real_time(&[&plain], &NONE).severity, Severity::Ok);
         assert_eq!(memory_lock(&[&plain], &NONE).severity, Severity::Ok);
         let refused = real_time(&[&plain, &fifo], &NONE);
