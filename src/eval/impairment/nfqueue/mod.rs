@@ -16,7 +16,9 @@ use nix::sys::socket::{
 use self::messages::Message;
 use self::rules::Rule;
 use super::backend::Backend;
+use super::delay::NormalDelay;
 use super::error::ImpairmentError;
+use super::gilbert_elliott::GilbertElliott;
 use super::link::{Counters, Fate, HELD_MAX, Impairment, Link, LinkState};
 use crate::model::MonotonicNs;
 
@@ -111,6 +113,11 @@ impl Backend for Nfqueue {
 
     fn switch(&mut self, state: LinkState) -> Result<(), ImpairmentError> {
         self.link.switch(state);
+        Ok(())
+    }
+
+    fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) -> Result<(), ImpairmentError> {
+        self.link.set(loss, delay);
         Ok(())
     }
 
