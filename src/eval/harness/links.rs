@@ -11,13 +11,14 @@ use super::settings::Settings;
 use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::impairment::Level;
-use crate::eval::scenario::{Action, Remote, Scenario};
+use crate::eval::scenario::{Action, FORWARD, RETURN, Remote, Scenario};
 
 /// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
 /// radio link has some such queue; a longer one delays more and drops less.
 const CAP_QUEUE: &str = "burst 16kb latency 200ms";
 
-const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped";
+const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped,overflowed,\
+                       lost_expected,trace_row";
 
 /// A program that impairs what a host receives from another.
 struct Link {
@@ -109,10 +110,22 @@ impl Links {
             if let Some((time, said)) = link.program.take("counters") {
                 let number = |key: &str| said[key].as_u64().unwrap_or(0);
                 let state = said["state"].as_str().unwrap_or("");
-                let counts =
-                    ["seen", "fragments", "judged", "lost", "cut", "held", "passed", "kernel_dropped"];
+                let counts = [
+                    "seen",
+                    "fragments",
+                    "judged",
+                    "lost",
+                    "cut",
+                    "held",
+                    "passed",
+                    "kernel_dropped",
+                    "overflowed",
+                ];
                 let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
-                self.csv.row(&[&time.0, &link.entry.name, &state, &counts.join(",")])?;
+                let expected = said["lost_expected"].as_f64().unwrap_or(0.0);
+                let trace_row = said["trace"]["row"].as_u64().map_or(String::new(), |row| row.to_string());
+                let counts = counts.join(",");
+                self.csv.row(&[&time.0, &link.entry.name, &state, &counts, &expected, &trace_row])?;
             }
             link.program.tell("counters");
         }
@@ -173,12 +186,12 @@ fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
     if remote.is_impaired() || is_cut {
         let (delay_ms, jitter_ms) = (remote.delay_ms, remote.jitter_ms);
         let (host, source) = (remote.name.as_str(), sender);
-        ways.push(Way { direction: "forward", host, source, level: remote.level, delay_ms, jitter_ms });
+        ways.push(Way { direction: FORWARD, host, source, level: remote.level, delay_ms, jitter_ms });
     }
-    if remote.returns_late() || is_cut {
+    if remote.is_impaired_back() || is_cut {
         let (delay_ms, jitter_ms) = (remote.return_delay_ms, remote.return_jitter_ms);
         let (host, source) = (sender, remote.name.as_str());
-        ways.push(Way { direction: "return", host, source, level: Level::Clean, delay_ms, jitter_ms });
+        ways.push(Way { direction: RETURN, host, source, level: Level::Clean, delay_ms, jitter_ms });
     }
     ways
 }
@@ -202,11 +215,19 @@ fn open(
     }
     command.args(["--backend", settings.backend_name(), "--queue", &number.to_string()]);
     command.args(["--source", &source.address.to_string()]);
-    command.args(["--level", way.level.name()]);
-    if let Some(reading) = plan.reading {
-        command.args(["--reading", reading.name()]);
+    if let Some(trace) = remote.trace_of(way.direction) {
+        command.arg("--trace").arg(folder.join(remote.trace_name(way.direction)));
+        command.args(["--trace-speed", &plan.speed(settings.quick).to_string()]);
+        if trace.repeat {
+            command.arg("--trace-repeat");
+        }
+    } else {
+        command.args(["--level", way.level.name()]);
+        if let Some(reading) = plan.reading {
+            command.args(["--reading", reading.name()]);
+        }
+        command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
     }
-    command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
     command.args(["--seed", &settings.seed.saturating_add(u64::from(number)).to_string()]);
     let name = format!("{}<-{}", way.host, way.source);
     let program =
