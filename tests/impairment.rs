@@ -14,6 +14,7 @@ use adaptive_bridge::eval::impairment::{
     Arrival, Fate, GilbertElliott, Impairment as Model, Level, Link, LinkState, NormalDelay, Reading,
 };
 use adaptive_bridge::model::MonotonicNs;
+use nix::sys::signal::Signal;
 use nix::sys::socket::{setsockopt, sockopt};
 use support::impairment::Impairment;
 use support::netns::{Host, Net};
@@ -439,6 +440,32 @@ fn only_the_source_is_impaired_and_a_large_burst_is_not_lost() {
     let counters = link.wait_seen(25 * 34);
     assert_eq!((&counters["kernel_dropped"], &counters["cut"]), (&0.into(), &0.into()));
     assert_eq!(numbers(&flow.received(receiver)).len(), 25);
+}
+
+#[test]
+fn what_a_link_is_too_slow_for_is_counted_apart_from_what_its_model_loses() {
+    let test = "what_a_link_is_too_slow_for_is_counted_apart_from_what_its_model_loses";
+    let Some((_net, publisher, slow)) = two_hosts(test) else { return };
+    // More than the queue holds, which is 100,000 or less.
+    const PACKETS: u64 = 110_000;
+    let mut link = Impairment::start(&slow, &publisher, "--level strong --reading as-printed --seed 6");
+    let mut flow = Flow::new(&publisher, &slow, 100);
+    let receiver = flow.receive();
+    link.signal(Signal::SIGSTOP);
+    flow.send(PACKETS as u32);
+    link.signal(Signal::SIGCONT);
+    let count = |counters: &serde_json::Value, key: &str| counters[key].as_u64().unwrap();
+    let counters = support::wait_for("a verdict on every packet", || {
+        let counters = link.counters();
+        let seen = count(&counters, "seen") + count(&counters, "kernel_dropped");
+        (seen == PACKETS).then_some(counters)
+    });
+    let received = numbers(&flow.received(receiver));
+    let (seen, unseen) = (count(&counters, "seen"), count(&counters, "kernel_dropped"));
+    assert!(seen > 0 && unseen > 0, "{counters}");
+    assert_eq!(count(&counters, "seen"), count(&counters, "lost") + count(&counters, "passed"), "{counters}");
+    // Those that came first were in the queue; of them the model loses what it would have lost anyway.
+    assert_eq!(received, passing(Level::Strong.model(Reading::AsPrinted), 6, seen as u32));
 }
 
 #[test]
