@@ -128,7 +128,8 @@ impl Run {
             let path = file.unwrap().path();
             if path.extension().is_some_and(|extension| extension == "csv") {
                 let text = fs::read_to_string(&path).unwrap();
-                for column in text.lines().next().unwrap().split(',') {
+                let header = text.lines().find(|line| !line.starts_with('#')).unwrap();
+                for column in header.split(',') {
                     assert!(documented(column), "{column} of {}", path.display());
                 }
             }
@@ -248,6 +249,64 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
         assert!(said.contains(&format!("other settings ({differs})")), "{said}");
     }
     assert!(!out.join(".partial").exists() && !out.join("failed").exists());
+}
+
+#[test]
+fn a_run_over_a_trace_keeps_it_and_says_what_each_of_its_rows_lost() {
+    let test = "a_run_over_a_trace_keeps_it_and_says_what_each_of_its_rows_lost";
+    let Some(out) = folder(test) else { return };
+    let _exclusive = exclusive();
+    // A scenario of one's own, with its trace beside it.
+    let own = tempfile::tempdir().unwrap();
+    let scenarios = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/scenarios");
+    for file in ["bridge_drive.yaml", "drive_away_and_back.csv"] {
+        fs::copy(scenarios.join(file), own.path().join(file)).unwrap();
+    }
+    let arguments = format!("run {}/bridge_drive.yaml --quick --backend nfqueue", own.path().display());
+    run_well(out.path(), &arguments);
+    let made = Run::read(out.path(), "bridge_drive.fast.none.netns.plain.r1");
+    made.assert_consistent();
+    made.assert_documented();
+    let trace = own.path().join("drive_away_and_back.csv");
+    let of_file = fs::read_to_string(&trace).unwrap();
+    let links = made.manifest["links"].as_array().unwrap();
+    assert_eq!(links.len(), 2);
+    for (link, direction) in links.iter().zip(["forward", "return"]) {
+        let file = format!("trace-slow-{direction}.csv");
+        assert_eq!(fs::read_to_string(made.folder.join(&file)).unwrap(), of_file);
+        let did = &link["impairment"];
+        let (played, rows) = (&did["trace"], did["trace"]["rows"].as_array().unwrap());
+        assert_eq!((&played["file"], &played["repeat"], rows.len()), (&file.into(), &true.into(), 120));
+        // 240 s in 20: two rounds of 10 s each, and what is behind the window.
+        assert_eq!((&played["speed"], &played["length_s"]), (&12.0.into(), &10.0.into()));
+        assert!(played["round"].as_u64() >= Some(2), "{played}");
+        let sum = |key: &str| rows.iter().map(|row| row[key].as_u64().unwrap()).sum::<u64>();
+        assert_eq!((Some(sum("judged")), Some(sum("lost"))), (did["judged"].as_u64(), did["lost"].as_u64()));
+        let number = |key: &str| did[key].as_f64().unwrap();
+        let expected: f64 =
+            rows.iter().map(|row| row["judged"].as_f64().unwrap() * row["loss"].as_f64().unwrap()).sum();
+        assert!((number("lost_expected") - expected).abs() < 1e-6, "{did}");
+        let off = (number("loss") - number("loss_expected")).abs();
+        assert!(sum("lost") > 0 && off <= 5.0 * number("loss_standard_error"), "{did}");
+        // Row 60 is the farthest and row 0 the nearest.
+        assert_eq!((&rows[60]["loss"], &rows[0]["loss"]), (&0.5778.into(), &0.0.into()));
+        assert_eq!(rows[0]["lost"], 0);
+    }
+    let rows = made.rows("links.csv");
+    let of_link = rows.iter().filter(|row| row["link"] == "slow<-bridge" && row["state"] == "on");
+    let places: BTreeSet<&String> = of_link.map(|row| &row["trace_row"]).collect();
+    assert!(places.len() > 5, "once a second a row: {places:?}");
+
+    // Another trace is another run.
+    fs::write(&trace, of_file.replace("0.5778", "0.6")).unwrap();
+    let output = run(out.path(), &arguments);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("other settings (a trace of a link)"), "{said}");
+    fs::write(&trace, of_file.replace("0.5778", "57.78")).unwrap();
+    let output = run(out.path(), &arguments);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let mistake = "drive_away_and_back.csv:65: loss is '57.78', and may be 0 to 1 (a share, not percent)";
+    assert!(!output.status.success() && said.contains(mistake), "{said}");
 }
 
 #[test]

@@ -14,6 +14,7 @@ use adaptive_bridge::eval::impairment::{
     Arrival, Fate, GilbertElliott, Impairment as Model, Level, Link, LinkState, NormalDelay, Reading,
 };
 use adaptive_bridge::model::MonotonicNs;
+use nix::sys::signal::Signal;
 use nix::sys::socket::{setsockopt, sockopt};
 use support::impairment::Impairment;
 use support::netns::{Host, Net};
@@ -303,6 +304,116 @@ fn a_link_is_switched_while_packets_flow() {
     );
 }
 
+/// A file with these lines that is there as long as the folder.
+fn trace_file(rows: &str) -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("trace.csv");
+    std::fs::write(&path, format!("time_s,loss,delay_ms\n{rows}")).unwrap();
+    let path = path.to_str().unwrap().to_owned();
+    (folder, path)
+}
+
+/// `judged` and `lost` of each row of a trace.
+fn counts_of_rows(ended: &serde_json::Value) -> Vec<(u32, u32)> {
+    let rows = ended["trace"]["rows"].as_array().unwrap().iter();
+    let number = |value: &serde_json::Value| value.as_u64().unwrap() as u32;
+    rows.map(|row| (number(&row["judged"]), number(&row["lost"]))).collect()
+}
+
+#[test]
+fn a_trace_is_played_row_by_row_and_loses_what_its_model_loses() {
+    let test = "a_trace_is_played_row_by_row_and_loses_what_its_model_loses";
+    let Some((_net, publisher, slow)) = two_hosts(test) else { return };
+    let rows = [(0.0, 0.0), (0.3, 5.0), (1.0, 0.0), (0.1, 30.0)];
+    let lines = rows.iter().enumerate().map(|(at, (loss, delay_ms))| format!("{at},{loss},{delay_ms}\n"));
+    let (_folder, path) = trace_file(&lines.collect::<String>());
+    // A busy machine may sleep through a row: it is given further chances.
+    support::wait_until("packets in every row of the trace", || {
+        let arguments = format!("--trace {path} --trace-speed 1.25 --seed 4 --state off");
+        let mut link = Impairment::start(&slow, &publisher, &arguments);
+        let mut flow = Flow::new(&publisher, &slow, 100);
+        let receiver = flow.receive();
+        assert_eq!(link.counters()["trace"]["row"], serde_json::Value::Null, "it has not begun");
+        link.on();
+        let mut behind = 0;
+        while behind < 50 {
+            flow.send(20);
+            std::thread::sleep(Duration::from_millis(5));
+            behind += u32::from(link.counters()["trace"]["row"] == 3);
+        }
+        let sent = flow.sent.len() as u32;
+        let counters = link.wait_seen(u64::from(sent));
+        let received = flow.received(receiver);
+        let ended = link.end();
+        let counts = counts_of_rows(&ended);
+        assert_eq!(counts.iter().map(|(judged, _)| judged).sum::<u32>(), sent, "{ended}");
+        assert_eq!((&ended["trace"]["repeat"], &ended["trace"]["length_s"]), (&false.into(), &3.2.into()));
+
+        // The same rows, in virtual time, with as many packets in each.
+        let model = |(loss, delay_ms): (f64, f64)| {
+            (GilbertElliott::independent(loss).unwrap(), NormalDelay::new(delay_ms, 0.0).unwrap())
+        };
+        let (loss, delay) = model(rows[0]);
+        let mut virtual_link = Link::new(&Model { loss, delay, seed: 4 });
+        let mut expected = BTreeSet::new();
+        let mut delays_ms = Vec::new();
+        for (row, (judged, lost)) in rows.iter().zip(&counts) {
+            let (loss, delay) = model(*row);
+            virtual_link.set(loss, delay);
+            for _ in 0..*judged {
+                let packet = delays_ms.len() as u32;
+                delays_ms.push(row.1);
+                let fate = virtual_link.arrive(Arrival { packet, bytes: 0, fragment: false }, MonotonicNs(0));
+                if fate != Fate::Drop {
+                    expected.insert(packet);
+                }
+            }
+            let share = f64::from(*lost) / f64::from((*judged).max(1));
+            let tolerance = 5.0 * loss.loss_standard_error(u64::from(*judged));
+            assert!((share - loss.stationary_loss()).abs() <= tolerance, "{row:?}: {lost} of {judged}");
+        }
+        assert_eq!(numbers(&received), expected);
+        for Received { number, sent, came } in received {
+            let (seen_ms, delay_ms) =
+                (came.duration_since(sent).as_secs_f64() * 1e3, delays_ms[number as usize]);
+            assert!(seen_ms >= delay_ms, "packet {number}: {seen_ms} of {delay_ms} ms");
+        }
+        let number = |key: &str| counters[key].as_f64().unwrap();
+        let off = (number("loss") - number("loss_expected")).abs();
+        assert!(off <= 5.0 * number("loss_standard_error"), "{counters}");
+        counts.iter().all(|(judged, _)| *judged >= 100)
+    });
+}
+
+#[test]
+fn a_trace_that_is_repeated_begins_anew_and_goes_on_while_the_link_is_off() {
+    let test = "a_trace_that_is_repeated_begins_anew_and_goes_on_while_the_link_is_off";
+    let Some((_net, publisher, slow)) = two_hosts(test) else { return };
+    let (_folder, path) = trace_file("0,0,0\n0.2,1,0\n");
+    let mut link = Impairment::start(&slow, &publisher, &format!("--trace {path} --trace-repeat"));
+    let mut flow = Flow::new(&publisher, &slow, 100);
+    let receiver = flow.receive();
+    let mut send_until_round = |link: &mut Impairment, round: u64| {
+        while link.counters()["trace"]["round"].as_u64() < Some(round) {
+            flow.send(10);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        link.wait_seen(flow.sent.len() as u64)
+    };
+    let round = send_until_round(&mut link, 5)["trace"]["round"].as_u64().unwrap();
+    let judged = link.off()["judged"].clone();
+    // It goes on.
+    assert_eq!(send_until_round(&mut link, round + 2)["judged"], judged);
+    let counters = link.counters();
+    let counts = counts_of_rows(&link.end());
+    assert_eq!(counts.iter().map(|(judged, _)| u64::from(*judged)).sum::<u64>(), judged.as_u64().unwrap());
+    let ((first, lost_of_first), (second, lost_of_second)) = (counts[0], counts[1]);
+    assert!(first > 0 && second > 0, "{counts:?}");
+    assert_eq!((lost_of_first, lost_of_second), (0, second), "all or nothing, by the row");
+    assert_eq!((&counters["lost"], &counters["lost_expected"]), (&second.into(), &f64::from(second).into()));
+    assert_eq!(flow.received(receiver).len(), flow.sent.len() - second as usize);
+}
+
 #[test]
 fn only_the_source_is_impaired_and_a_large_burst_is_not_lost() {
     let test = "only_the_source_is_impaired_and_a_large_burst_is_not_lost";
@@ -329,6 +440,32 @@ fn only_the_source_is_impaired_and_a_large_burst_is_not_lost() {
     let counters = link.wait_seen(25 * 34);
     assert_eq!((&counters["kernel_dropped"], &counters["cut"]), (&0.into(), &0.into()));
     assert_eq!(numbers(&flow.received(receiver)).len(), 25);
+}
+
+#[test]
+fn what_a_link_is_too_slow_for_is_counted_apart_from_what_its_model_loses() {
+    let test = "what_a_link_is_too_slow_for_is_counted_apart_from_what_its_model_loses";
+    let Some((_net, publisher, slow)) = two_hosts(test) else { return };
+    // More than the queue holds, which is 100,000 or less.
+    const PACKETS: u64 = 110_000;
+    let mut link = Impairment::start(&slow, &publisher, "--level strong --reading as-printed --seed 6");
+    let mut flow = Flow::new(&publisher, &slow, 100);
+    let receiver = flow.receive();
+    link.signal(Signal::SIGSTOP);
+    flow.send(PACKETS as u32);
+    link.signal(Signal::SIGCONT);
+    let count = |counters: &serde_json::Value, key: &str| counters[key].as_u64().unwrap();
+    let counters = support::wait_for("a verdict on every packet", || {
+        let counters = link.counters();
+        let seen = count(&counters, "seen") + count(&counters, "kernel_dropped");
+        (seen == PACKETS).then_some(counters)
+    });
+    let received = numbers(&flow.received(receiver));
+    let (seen, unseen) = (count(&counters, "seen"), count(&counters, "kernel_dropped"));
+    assert!(seen > 0 && unseen > 0, "{counters}");
+    assert_eq!(count(&counters, "seen"), count(&counters, "lost") + count(&counters, "passed"), "{counters}");
+    // Those that came first were in the queue; of them the model loses what it would have lost anyway.
+    assert_eq!(received, passing(Level::Strong.model(Reading::AsPrinted), 6, seen as u32));
 }
 
 #[test]
@@ -363,6 +500,7 @@ fn nothing_is_left_by_one_that_ends_and_one_that_is_killed_is_cleaned_up_after_b
 fn what_can_not_be_is_said() {
     let Some((_net, publisher, slow)) = two_hosts("what_can_not_be_is_said") else { return };
     let _link = Impairment::start(&slow, &publisher, "--queue 4");
+    let (_folder, bad) = trace_file("0,3,0\n");
     let run = |arguments: &str| {
         let mut command = slow.command(support::impairment::program());
         command.args(arguments.split_whitespace());
@@ -375,6 +513,16 @@ fn what_can_not_be_is_said() {
         ("impair --source 10.0.0.1 --delay-ms -1", 2, "unexpected argument"),
         ("impair --source 10.0.0.1 --jitter-ms 1e9", 2, "0 to 60000 ms"),
         ("impair --source 10.0.0.1 --level mild", 2, "--reading"),
+        ("impair --source 10.0.0.1 --trace /nowhere.csv", 2, "/nowhere.csv: No such file"),
+        (
+            &format!("impair --source 10.0.0.1 --trace {bad}"),
+            2,
+            "trace.csv:2: loss is '3', and may be 0 to 1",
+        ),
+        ("impair --source 10.0.0.1 --trace a.csv --level mild", 2, "cannot be used with"),
+        ("impair --source 10.0.0.1 --trace a.csv --delay-ms 3", 2, "cannot be used with"),
+        ("impair --source 10.0.0.1 --trace-repeat", 2, "--trace"),
+        ("impair --source 10.0.0.1 --trace a.csv --trace-speed 0", 2, "must be 0.001 to"),
         ("impair --source nowhere", 2, "invalid value 'nowhere'"),
         ("impair", 2, "--source"),
     ] {
@@ -397,9 +545,19 @@ fn every_key_of_the_output_is_documented_and_every_documented_key_exists() {
     let rows = page.lines().filter_map(|line| line.strip_prefix("| `")?.split(" |").next());
     let documented: BTreeSet<&str> =
         rows.flat_map(|cell| cell.split(',').map(|key| key.trim_matches([' ', '`']))).collect();
-    let counters = Impairment::start(&slow, &publisher, "--level mild --reading as-run").end();
-    let printed: BTreeSet<&str> = counters.as_object().unwrap().keys().map(String::as_str).collect();
+    let (_folder, trace) = trace_file("0,0.5,0\n");
+    let ended = Impairment::start(&slow, &publisher, &format!("--trace {trace}")).end();
+    let keys = |prefix: &str, value: &serde_json::Value| -> Vec<String> {
+        value.as_object().unwrap().keys().map(|key| format!("{prefix}{key}")).collect()
+    };
+    let mut printed: BTreeSet<String> = keys("", &ended).into_iter().collect();
+    printed.extend(keys("trace.", &ended["trace"]));
+    printed.extend(keys("trace.rows[].", &ended["trace"]["rows"][0]));
+    let documented: BTreeSet<String> = documented.into_iter().map(str::to_owned).collect();
     assert_eq!(printed, documented);
+    let counters = Impairment::start(&slow, &publisher, "--level mild --reading as-run").end();
+    assert_eq!(keys("", &counters), keys("", &ended), "a trace changes no key");
+    assert_eq!(counters["trace"], serde_json::Value::Null);
     assert_eq!((&counters["backend"], &counters["seed"]), (&"nfqueue".into(), &1.into()));
     assert_eq!(counters["loss"], serde_json::Value::Null);
 }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use nix::sys::signal::Signal;
 use serde_json::Value;
 
 use super::netns::Host;
@@ -68,6 +69,11 @@ impl Impairment {
         let status = self.process.terminate();
         assert!(status.success(), "impair ended with {status}\n{}", self.process.log());
         self.wait_for("ended")
+    }
+
+    /// Stops it (SIGSTOP), or lets it go on (SIGCONT).
+    pub fn signal(&self, signal: Signal) {
+        self.process.signal(signal);
     }
 
     /// Kills it (SIGKILL), so that it can't clean up.

@@ -1,26 +1,27 @@
 //! `impair`: an impaired link in the present network namespace, switched by words on stdin.
 
-use std::fmt;
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::Ipv4Addr;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::{TimeSpec, TimeValLike};
-use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use super::failed;
+use super::impair_report::{Event, Loss, Played, Report};
 use crate::clock;
 use crate::eval::impairment::{
-    self, Backend, BackendChoice, Counters, GilbertElliott, Impairment, ImpairmentError, Level, LinkState,
-    NormalDelay, Opened, Reading,
+    self, Backend, BackendChoice, GilbertElliott, Impairment, ImpairmentError, Level, LinkState, NormalDelay,
+    Opened, Reading, Replay, Trace, TraceRow,
 };
+use crate::model::MonotonicNs;
 
 /// The longest line that is read from stdin.
 const LINE_MAX_BYTES: usize = 256;
@@ -54,6 +55,20 @@ pub(super) struct Arguments {
     /// Standard deviation of the delay
     #[arg(long, value_name = "MS", default_value_t = 0.0)]
     jitter_ms: f64,
+    /// Loss and delay from time to time by a trace of a link, a CSV file: time_s,loss,delay_ms and, if need
+    /// be, jitter_ms (config/scenarios/README.md). It begins when the link is first on
+    #[arg(
+        long,
+        value_name = "FILE",
+        conflicts_with_all = ["level", "reading", "gilbert_elliott", "delay_ms", "jitter_ms"]
+    )]
+    trace: Option<PathBuf>,
+    /// Begin the trace anew at its end, rather than stay in its last row
+    #[arg(long, requires = "trace")]
+    trace_repeat: bool,
+    /// Play the trace so many times faster than it says, 0.001 to 100000
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed, requires = "trace")]
+    trace_speed: f64,
     /// The same losses and delays for the same seed (NFQUEUE only)
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -71,7 +86,21 @@ pub(super) struct Arguments {
     json: bool,
 }
 
+/// What a trace may be slowed down and sped up by.
+fn speed(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(speed) if (0.001..=100_000.0).contains(&speed) => Ok(speed),
+        _ => Err("must be 0.001 to 100000".to_owned()),
+    }
+}
+
 impl Arguments {
+    fn replay(&self) -> Result<Option<Replay>, ImpairmentError> {
+        let Some(path) = &self.trace else { return Ok(None) };
+        let (trace, _) = Trace::load(path)?;
+        Ok(Some(Replay::new(trace.at_speed(self.trace_speed), self.trace_repeat)))
+    }
+
     fn impairment(&self) -> Result<Impairment, ImpairmentError> {
         let loss = match self.gilbert_elliott.as_deref() {
             Some(&[p, r, good, bad]) => GilbertElliott::new(p, r, good, bad)?,
@@ -83,27 +112,37 @@ impl Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let impairment = match arguments.impairment() {
-        Ok(impairment) => impairment,
-        Err(error) => {
+    let (impairment, replay) = match (arguments.impairment(), arguments.replay()) {
+        (Ok(impairment), Ok(replay)) => (impairment, replay),
+        (Err(error), _) | (_, Err(error)) => {
             failed(&error);
             return ExitCode::from(2);
         }
     };
-    match impair(arguments, &impairment) {
+    match impair(arguments, impairment, replay) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(&error),
     }
 }
 
-fn impair(arguments: &Arguments, impairment: &Impairment) -> Result<(), ImpairmentError> {
+fn impair(
+    arguments: &Arguments,
+    model: Impairment,
+    mut replay: Option<Replay>,
+) -> Result<(), ImpairmentError> {
     // Before anything is set up, so that a signal always finds who removes it.
     let signals = signals().map_err(|error| ImpairmentError::system("signal handlers", error))?;
     let Opened { backend, reason } = {
         let Arguments { backend, source, destination, queue, .. } = arguments;
-        impairment::open(*backend, *source, *destination, *queue, impairment)?
+        // A trace holds its first row until it begins.
+        let begin = replay.as_ref().map(|replay| *replay.now());
+        let begin = begin.map_or(model, |TraceRow { loss, delay, .. }| Impairment { loss, delay, ..model });
+        impairment::open(*backend, *source, *destination, *queue, &begin)?
     };
-    let mut link = Running { arguments, impairment, backend, reason };
+    if let Some(replay) = replay.as_mut().filter(|_| arguments.state == LinkState::On) {
+        replay.begin(clock::monotonic());
+    }
+    let mut link = Running { arguments, model, replay, backend, reason };
     if arguments.state != LinkState::On {
         link.backend.switch(arguments.state)?;
     }
@@ -125,7 +164,9 @@ fn signals() -> io::Result<UnixStream> {
 
 struct Running<'a> {
     arguments: &'a Arguments,
-    impairment: &'a Impairment,
+    /// What it does without a trace.
+    model: Impairment,
+    replay: Option<Replay>,
     backend: Box<dyn Backend>,
     reason: String,
 }
@@ -153,7 +194,9 @@ impl Running<'_> {
                 let ready = |fd: Option<&PollFd>| fd.and_then(PollFd::any).unwrap_or(false);
                 (ready(fds.first()), ready(fds[..own].get(1)))
             };
-            self.backend.work(clock::monotonic())?;
+            let now = clock::monotonic();
+            self.play(now)?;
+            self.backend.work(now)?;
             if signal {
                 return Ok(());
             }
@@ -172,8 +215,21 @@ impl Running<'_> {
         }
     }
 
+    /// Goes on to the row of the trace that is on at `now`.
+    fn play(&mut self, now: MonotonicNs) -> Result<(), ImpairmentError> {
+        let Some(replay) = &mut self.replay else { return Ok(()) };
+        if replay.next_change().is_some_and(|change| change <= now) {
+            replay.count(&self.backend.counters()?);
+            let TraceRow { loss, delay, .. } = *replay.advance(now);
+            self.backend.set(loss, delay)?;
+        }
+        Ok(())
+    }
+
     fn timeout(&self) -> Option<TimeSpec> {
-        let wait_ns = self.backend.next_release()?.since(clock::monotonic());
+        let change = self.replay.as_ref().and_then(Replay::next_change);
+        let next = [self.backend.next_release(), change].into_iter().flatten().min()?;
+        let wait_ns = next.since(clock::monotonic());
         Some(TimeSpec::nanoseconds(i64::try_from(wait_ns).unwrap_or(i64::MAX)))
     }
 
@@ -184,6 +240,9 @@ impl Running<'_> {
             ("counters", _) => self.show(Event::Counters),
             (_, Ok(state)) => {
                 self.backend.switch(state)?;
+                if let Some(replay) = self.replay.as_mut().filter(|_| state == LinkState::On) {
+                    replay.begin(clock::monotonic());
+                }
                 self.show(Event::Changed)
             }
             (_, Err(_)) => {
@@ -195,6 +254,17 @@ impl Running<'_> {
 
     /// Prints what the link does; `false` when nobody reads it.
     fn show(&mut self, event: Event) -> Result<bool, ImpairmentError> {
+        let counters = self.backend.counters()?;
+        if let Some(replay) = &mut self.replay {
+            replay.count(&counters);
+        }
+        let (loss, delay) = match &self.replay {
+            Some(replay) => (replay.now().loss, replay.now().delay),
+            None => (self.model.loss, self.model.delay),
+        };
+        let file = self.arguments.trace.as_deref().and_then(Path::file_name).unwrap_or_default();
+        let file = file.to_string_lossy();
+        let speed = self.arguments.trace_speed;
         let report = Report {
             event,
             backend: self.backend.name(),
@@ -202,18 +272,21 @@ impl Running<'_> {
             source: self.arguments.source,
             destination: self.arguments.destination,
             state: self.backend.state(),
-            seed: self.backend.is_seeded().then_some(self.impairment.seed),
-            p: self.impairment.loss.p(),
-            r: self.impairment.loss.r(),
-            loss_good: self.impairment.loss.loss_good(),
-            loss_bad: self.impairment.loss.loss_bad(),
-            delay_ms: self.impairment.delay.mean_ms(),
-            jitter_ms: self.impairment.delay.sigma_ms(),
-            counters: self.backend.counters()?,
+            seed: self.backend.is_seeded().then_some(self.model.seed),
+            p: loss.p(),
+            r: loss.r(),
+            loss_good: loss.loss_good(),
+            loss_bad: loss.loss_bad(),
+            delay_ms: delay.mean_ms(),
+            jitter_ms: delay.sigma_ms(),
+            trace: self.replay.as_ref().map(|replay| Played::of(replay, &file, speed, event)),
+            counters,
             kernel_dropped: self.backend.kernel_dropped()?,
-            loss: Loss::default(),
+            loss: match &self.replay {
+                Some(replay) => Loss::of_trace(replay, &counters),
+                None => Loss::of_chain(&loss, &counters),
+            },
         };
-        let report = Report { loss: Loss::of(&self.impairment.loss, &report.counters), ..report };
         let text = if self.arguments.json {
             serde_json::to_string(&report)
                 .map_err(|error| ImpairmentError::Unexpected { what: format!("JSON: {error}") })?
@@ -226,94 +299,6 @@ impl Running<'_> {
             Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
             Err(error) => Err(ImpairmentError::system("stdout", error)),
         }
-    }
-}
-
-/// Why something is shown.
-#[derive(Clone, Copy, Debug, Serialize)]
-#[serde(rename_all = "lowercase")]
-enum Event {
-    /// The link is in place.
-    Ready,
-    /// It was switched.
-    Changed,
-    /// It was asked for.
-    Counters,
-    /// The link is about to be removed.
-    Ended,
-}
-
-/// A line of output; docs/eval-json.md describes it.
-#[derive(Debug, Serialize)]
-struct Report<'a> {
-    event: Event,
-    backend: &'static str,
-    reason: &'a str,
-    source: Ipv4Addr,
-    destination: Option<Ipv4Addr>,
-    state: LinkState,
-    seed: Option<u64>,
-    p: f64,
-    r: f64,
-    loss_good: f64,
-    loss_bad: f64,
-    delay_ms: f64,
-    jitter_ms: f64,
-    #[serde(flatten)]
-    counters: Counters,
-    kernel_dropped: u64,
-    #[serde(flatten)]
-    loss: Loss,
-}
-
-/// The loss that was applied while the link was on, and that of the model.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-struct Loss {
-    loss: Option<f64>,
-    loss_expected: f64,
-    loss_standard_error: Option<f64>,
-}
-
-impl Loss {
-    fn of(model: &GilbertElliott, counters: &Counters) -> Self {
-        let any = counters.judged > 0;
-        Self {
-            loss: any.then(|| counters.lost as f64 / counters.judged as f64),
-            loss_expected: model.stationary_loss(),
-            loss_standard_error: any.then(|| model.loss_standard_error(counters.judged)),
-        }
-    }
-}
-
-impl fmt::Display for Report<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { counters, loss, .. } = self;
-        if let Event::Ready = self.event {
-            let expected = loss.loss_expected * 100.0;
-            return write!(
-                f,
-                "{} from {}: {expected:.2} % lost in the long run, {} ± {} ms, by {} ({})",
-                self.state, self.source, self.delay_ms, self.jitter_ms, self.backend, self.reason
-            );
-        }
-        write!(f, "{}: {} packets seen, {} passed", self.state, counters.seen, counters.passed)?;
-        if let (Some(share), Some(error)) = (loss.loss, loss.loss_standard_error) {
-            let [share, error, expected] =
-                [share, 1.96 * error, loss.loss_expected].map(|share| share * 100.0);
-            let (lost, judged) = (counters.lost, counters.judged);
-            write!(f, ", {lost} of {judged} lost ({share:.2} % ± {error:.2}, {expected:.2} % expected)")?;
-        }
-        for (count, what) in [
-            (counters.cut, "lost while down"),
-            (counters.overflowed, "dropped as too many were on their way"),
-            (counters.held, "on their way"),
-            (self.kernel_dropped, "dropped by the kernel before the link"),
-        ] {
-            if count > 0 {
-                write!(f, ", {count} {what}")?;
-            }
-        }
-        Ok(())
     }
 }
 

@@ -4,6 +4,7 @@
 //! want to read goes to stdout, and nothing else does.
 
 mod impair;
+mod impair_report;
 mod report;
 mod runs;
 

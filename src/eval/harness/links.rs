@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::time::Duration;
 
+use serde_json::Value;
+
 use super::csv::Csv;
 use super::manifest::LinkEntry;
 use super::plan::Plan;
@@ -11,13 +13,19 @@ use super::settings::Settings;
 use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::impairment::Level;
-use crate::eval::scenario::{Action, Remote, Scenario};
+use crate::eval::scenario::{Action, FORWARD, RETURN, Remote, Scenario};
 
 /// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
 /// radio link has some such queue; a longer one delays more and drops less.
 const CAP_QUEUE: &str = "burst 16kb latency 200ms";
 
-const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped";
+/// A link is no program of a host, and must not wait for the CPU behind ten publishers: beside ten senders it
+/// lost 85 % of 1.9 million packets before it saw them, and none so (docs/decisions/0005-impaired-link.md).
+/// Where it may not be, `nice` says so and goes on.
+const NICENESS: &str = "-20";
+
+const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped,overflowed,\
+                       lost_expected,trace_row";
 
 /// A program that impairs what a host receives from another.
 struct Link {
@@ -109,10 +117,22 @@ impl Links {
             if let Some((time, said)) = link.program.take("counters") {
                 let number = |key: &str| said[key].as_u64().unwrap_or(0);
                 let state = said["state"].as_str().unwrap_or("");
-                let counts =
-                    ["seen", "fragments", "judged", "lost", "cut", "held", "passed", "kernel_dropped"];
+                let counts = [
+                    "seen",
+                    "fragments",
+                    "judged",
+                    "lost",
+                    "cut",
+                    "held",
+                    "passed",
+                    "kernel_dropped",
+                    "overflowed",
+                ];
                 let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
-                self.csv.row(&[&time.0, &link.entry.name, &state, &counts.join(",")])?;
+                let expected = said["lost_expected"].as_f64().unwrap_or(0.0);
+                let trace_row = said["trace"]["row"].as_u64().map_or(String::new(), |row| row.to_string());
+                let counts = counts.join(",");
+                self.csv.row(&[&time.0, &link.entry.name, &state, &counts, &expected, &trace_row])?;
             }
             link.program.tell("counters");
         }
@@ -134,14 +154,7 @@ impl Links {
                 problems.push(format!("the link {name} did not end as asked"));
             }
             let last = link.program.last_words("ended");
-            let lost_by_harness = ["kernel_dropped", "overflowed"]
-                .map(|key| last.as_ref().and_then(|last| last[key].as_u64()).unwrap_or(0));
-            if lost_by_harness != [0, 0] {
-                problems.push(format!(
-                    "the link {name} lost packets that it should not: {} before it saw them, {} for want of room",
-                    lost_by_harness[0], lost_by_harness[1]
-                ));
-            }
+            problems.extend(last.as_ref().and_then(|last| lost_beside_the_model(&name, last)));
             entries.push(LinkEntry { impairment: last, ..link.entry.clone() });
         }
         for cap in &self.caps {
@@ -163,6 +176,20 @@ impl Links {
     }
 }
 
+/// What a link lost that its model did not, of what it said at its end.
+fn lost_beside_the_model(name: &str, last: &Value) -> Option<String> {
+    let [seen, unseen, no_room] =
+        ["seen", "kernel_dropped", "overflowed"].map(|key| last[key].as_u64().unwrap_or(0));
+    let lost = unseen + no_room;
+    let percent = 100.0 * lost as f64 / (seen + unseen).max(1) as f64;
+    (lost > 0).then(|| {
+        format!(
+            "the link {name} lost {lost} packets ({percent:.2} %) that its model did not lose: {unseen} before \
+             it saw them, as its program did not keep up, and {no_room} for want of room"
+        )
+    })
+}
+
 /// What is impaired of a remote subscriber's link. One that is never switched and loses nothing needs no
 /// program.
 fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
@@ -173,12 +200,12 @@ fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
     if remote.is_impaired() || is_cut {
         let (delay_ms, jitter_ms) = (remote.delay_ms, remote.jitter_ms);
         let (host, source) = (remote.name.as_str(), sender);
-        ways.push(Way { direction: "forward", host, source, level: remote.level, delay_ms, jitter_ms });
+        ways.push(Way { direction: FORWARD, host, source, level: remote.level, delay_ms, jitter_ms });
     }
-    if remote.returns_late() || is_cut {
+    if remote.is_impaired_back() || is_cut {
         let (delay_ms, jitter_ms) = (remote.return_delay_ms, remote.return_jitter_ms);
         let (host, source) = (sender, remote.name.as_str());
-        ways.push(Way { direction: "return", host, source, level: Level::Clean, delay_ms, jitter_ms });
+        ways.push(Way { direction: RETURN, host, source, level: Level::Clean, delay_ms, jitter_ms });
     }
     ways
 }
@@ -195,18 +222,27 @@ fn open(
 ) -> Result<Link, EvalError> {
     let (host, source) = (bed.host(way.host)?, bed.host(way.source)?);
     let uplink = source.uplink.as_ref();
-    let mut command = uplink.unwrap_or(&host.network).command(&settings.harness);
+    let mut command = uplink.unwrap_or(&host.network).command(Path::new("nice"));
+    command.args(["-n", NICENESS]).arg(&settings.harness);
     command.args(["impair", "--json", "--state", "off"]);
     if uplink.is_some() {
         command.args(["--destination", &host.address.to_string()]);
     }
     command.args(["--backend", settings.backend_name(), "--queue", &number.to_string()]);
     command.args(["--source", &source.address.to_string()]);
-    command.args(["--level", way.level.name()]);
-    if let Some(reading) = plan.reading {
-        command.args(["--reading", reading.name()]);
+    if let Some(trace) = remote.trace_of(way.direction) {
+        command.arg("--trace").arg(folder.join(remote.trace_name(way.direction)));
+        command.args(["--trace-speed", &plan.speed(settings.quick).to_string()]);
+        if trace.repeat {
+            command.arg("--trace-repeat");
+        }
+    } else {
+        command.args(["--level", way.level.name()]);
+        if let Some(reading) = plan.reading {
+            command.args(["--reading", reading.name()]);
+        }
+        command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
     }
-    command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
     command.args(["--seed", &settings.seed.saturating_add(u64::from(number)).to_string()]);
     let name = format!("{}<-{}", way.host, way.source);
     let program =
@@ -221,4 +257,27 @@ fn open(
         impairment: None,
     };
     Ok(Link { remote: remote.name.clone(), entry, program })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn what_the_model_did_not_lose_is_told_as_that() {
+        let said = |unseen: u64, no_room: u64| {
+            let last = json!({"seen": 300, "lost": 50, "kernel_dropped": unseen, "overflowed": no_room});
+            lost_beside_the_model("slow<-publisher", &last)
+        };
+        assert_eq!(said(0, 0), None);
+        assert_eq!(
+            said(100, 20).as_deref(),
+            Some(
+                "the link slow<-publisher lost 120 packets (30.00 %) that its model did not lose: 100 before it saw \
+                 them, as its program did not keep up, and 20 for want of room"
+            )
+        );
+    }
 }

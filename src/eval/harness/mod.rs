@@ -148,6 +148,8 @@ fn check_same(plan: &Plan, settings: &Settings, done: &Path) -> Result<(), EvalE
         "--seed"
     } else if read("scenario.yaml") != plan.scenario.text {
         "its scenario file"
+    } else if plan.scenario.traces().any(|(name, trace)| read(&name) != trace.text) {
+        "a trace of a link"
     } else {
         return Ok(());
     };

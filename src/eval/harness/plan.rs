@@ -93,6 +93,11 @@ impl Plan {
         if quick { self.scenario.quick_s } else { self.scenario.duration_s }
     }
 
+    /// How much faster than in the scenario everything happens.
+    pub fn speed(&self, quick: bool) -> f64 {
+        self.scenario.duration_s / self.duration_s(quick)
+    }
+
     /// When an event is due, in seconds from the beginning of the window.
     pub fn at_s(&self, at_s: f64, quick: bool) -> f64 {
         at_s * self.duration_s(quick) / self.scenario.duration_s
@@ -151,5 +156,6 @@ mod tests {
         let plan = &dimensions().plans(&scenarios, Switch::Plain)[0];
         assert_eq!((plan.duration_s(false), plan.at_s(60.0, false)), (180.0, 60.0));
         assert_eq!((plan.duration_s(true), plan.at_s(60.0, true)), (9.0, 3.0));
+        assert_eq!((plan.speed(false), plan.speed(true)), (1.0, 20.0));
     }
 }

@@ -48,6 +48,10 @@ pub(super) fn run(
     let scenario_file = folder.join("scenario.yaml");
     fs::write(&scenario_file, &plan.scenario.text)
         .map_err(|error| EvalError::file(&scenario_file, &error))?;
+    for (name, trace) in plan.scenario.traces() {
+        let path = folder.join(name);
+        fs::write(&path, &trace.text).map_err(|error| EvalError::file(&path, &error))?;
+    }
     let machine = Machine::read();
     progress.phase("making the hosts");
     let shared = shared_folders(settings, folder);
@@ -176,7 +180,8 @@ impl<'a> Run<'a> {
             // Where nothing is impaired and no event changes that, there is nothing to tell.
             let mentioned =
                 self.plan.scenario.events.iter().any(|it| it.action.is_of_link() && it.to == remote.name);
-            let impaired = remote.is_impaired() || remote.returns_late() || remote.cap_kbit_per_s.is_some();
+            let impaired =
+                remote.is_impaired() || remote.is_impaired_back() || remote.cap_kbit_per_s.is_some();
             if remote.impaired_at_begin && (impaired || mentioned) {
                 self.act(&Event { at_s: 0.0, action: Action::LinkOn, to: remote.name.clone() })?;
             }

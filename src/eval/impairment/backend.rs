@@ -5,7 +5,9 @@ use std::os::fd::BorrowedFd;
 
 use clap::ValueEnum;
 
+use super::delay::NormalDelay;
 use super::error::ImpairmentError;
+use super::gilbert_elliott::GilbertElliott;
 use super::link::{Counters, Impairment, LinkState};
 use super::netem::Netem;
 use super::nfqueue::Nfqueue;
@@ -36,6 +38,12 @@ pub trait Backend {
     /// # Errors
     /// The operating system refused it; the state is the one before.
     fn switch(&mut self, state: LinkState) -> Result<(), ImpairmentError>;
+
+    /// Changes what the link does while it is on, for packets that come from now on.
+    ///
+    /// # Errors
+    /// The operating system refused it.
+    fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) -> Result<(), ImpairmentError>;
 
     /// The state of the link.
     fn state(&self) -> LinkState;

@@ -85,6 +85,11 @@ impl DelayLine {
         Self { delay, random: random::of_delay(seed), held: BinaryHeap::new(), taken: 0 }
     }
 
+    /// Packets that come from now on have other delays; those on their way keep theirs.
+    pub fn set(&mut self, delay: NormalDelay) {
+        self.delay = delay;
+    }
+
     /// Takes a packet in at `now`, and says when it will be released.
     pub fn push(&mut self, packet: u32, now: MonotonicNs) -> MonotonicNs {
         let release = now.plus_ns(self.delay.draw_ns(&mut self.random));

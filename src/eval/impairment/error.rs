@@ -1,6 +1,9 @@
 //! What can go wrong with an impairment, in the words of someone who has to mend it.
 
 use std::fmt;
+use std::path::PathBuf;
+
+use super::trace::TraceProblem;
 
 /// Why a link could not be impaired.
 #[derive(Debug)]
@@ -13,6 +16,13 @@ pub enum ImpairmentError {
         value: String,
         /// What it may be.
         allowed: &'static str,
+    },
+    /// A file is no trace of a link.
+    BadTrace {
+        /// Which one.
+        path: PathBuf,
+        /// What is wrong with it, line by line; at least one.
+        problems: Vec<TraceProblem>,
     },
     /// A program that sets up the network said no, or is not there.
     Command {
@@ -58,6 +68,13 @@ impl fmt::Display for ImpairmentError {
         match self {
             Self::BadParameter { name, value, allowed } => {
                 write!(f, "{name} is {value}, and may be {allowed}")
+            }
+            Self::BadTrace { path, problems } => {
+                for (at, TraceProblem { line, what }) in problems.iter().enumerate() {
+                    let end = if at > 0 { "\n" } else { "" };
+                    write!(f, "{end}{}:{line}: {what}", path.display())?;
+                }
+                Ok(())
             }
             Self::Command { command, said } => write!(f, "`{command}` failed: {said}"),
             Self::QueueTaken { queue } => {

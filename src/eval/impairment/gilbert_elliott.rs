@@ -37,6 +37,14 @@ impl GilbertElliott {
         Ok(Self { p, r, loss_good, loss_bad })
     }
 
+    /// Each packet is lost with the same probability, whatever became of others.
+    ///
+    /// # Errors
+    /// It is no probability.
+    pub fn independent(loss: f64) -> Result<Self, ImpairmentError> {
+        Self::new(0.0, 1.0, loss, loss)
+    }
+
     /// Constants of the paper.
     pub(super) const fn of_table(p: f64, r: f64, loss_good: f64, loss_bad: f64) -> Self {
         Self { p, r, loss_good, loss_bad }
@@ -124,6 +132,11 @@ impl Chain {
     /// A chain whose losses are always the same for a seed.
     pub fn new(model: GilbertElliott, seed: u64) -> Self {
         Self { model, bad: false, random: random::of_loss(seed) }
+    }
+
+    /// Goes on in the present state by another model. The numbers drawn are the same as without this.
+    pub fn set(&mut self, model: GilbertElliott) {
+        self.model = model;
     }
 
     /// Whether the next packet is lost: the state that it finds decides, and then the chain moves.

@@ -134,6 +134,13 @@ impl Link {
         self.state = state;
     }
 
+    /// Changes what it does while it is on, for packets that come from now on.
+    pub fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) {
+        self.chain.set(loss);
+        self.line.set(delay);
+        self.delays = !delay.is_none();
+    }
+
     /// Its state.
     pub fn state(&self) -> LinkState {
         self.state

@@ -89,6 +89,9 @@ fn loss(model: &GilbertElliott) -> String {
     if *model == GilbertElliott::CLEAN {
         return String::new();
     }
+    if model.loss_good() == model.loss_bad() {
+        return format!(" loss {}", percent(model.loss_good()));
+    }
     let [p, r, bad, good] = [model.p(), model.r(), model.loss_bad(), model.loss_good()].map(percent);
     format!(" loss gemodel {p} {r} {bad} {good}")
 }
@@ -231,6 +234,14 @@ impl Backend for Netem {
         Ok(())
     }
 
+    fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) -> Result<(), ImpairmentError> {
+        self.commands.impairment = Impairment { loss, delay, ..self.commands.impairment };
+        match self.state {
+            LinkState::On => run(&words(&self.commands.netem("change", LinkState::On))).map(drop),
+            LinkState::Off | LinkState::Down => Ok(()),
+        }
+    }
+
     fn state(&self) -> LinkState {
         self.state
     }
@@ -288,6 +299,17 @@ mod tests {
         ] {
             assert_eq!(line(level, Reading::AsPrinted), format!("{head}{printed}"));
             assert_eq!(line(level, Reading::AsRun), format!("{head}{run}"));
+        }
+    }
+
+    #[test]
+    fn a_row_of_a_trace_is_a_loss_without_states() {
+        let mut commands = commands(Level::Clean, Reading::AsRun, 40.5, 2.25);
+        let head =
+            "tc qdisc change dev abimpair7 root netem limit 20000 delay 40.5ms 2.25ms distribution normal";
+        for (loss, said) in [(0.0, ""), (0.0123, " loss 1.23%"), (1.0, " loss 100%")] {
+            commands.impairment.loss = GilbertElliott::independent(loss).expect("a probability");
+            assert_eq!(commands.netem("change", LinkState::On), format!("{head}{said}"));
         }
     }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, UNIX_EPOCH};
 use super::cells::{Results, reading_name};
 use super::format;
 use super::paper;
-use super::record::Run;
+use super::record::{Manifest, Run};
 
 /// Facts and warnings, as texts.
 pub struct Context {
@@ -134,6 +134,7 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
                 outcomes.collect()
             }),
         ),
+        ("Traces of links, and what was lost", distinct(&|run| traces(&run.manifest))),
         ("Seeds of the links", vec![seeds(results)]),
         ("Command", one(|run| run.manifest.command_line.join(" "))),
         (
@@ -154,6 +155,23 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
     ];
     facts.retain(|(_, values)| !values.is_empty());
     facts
+}
+
+/// What the links of a run lost that followed a trace, beside what the trace loses of the packets that came.
+fn traces(manifest: &Manifest) -> Vec<String> {
+    let outcomes = manifest.links.iter().filter_map(|link| {
+        let outcome = link.impairment.as_ref()?;
+        let trace = outcome.trace.as_ref()?;
+        let error = outcome.loss_standard_error.filter(|_| outcome.judged > 0)?;
+        let [lost, expected, error] =
+            [outcome.lost as f64 / outcome.judged as f64, outcome.loss_expected, 1.96 * error]
+                .map(format::percent);
+        Some(format!(
+            "{} {} by {}: {lost} of {} packets, expected {expected} ± {error}",
+            manifest.run, link.name, trace.file, outcome.judged
+        ))
+    });
+    outcomes.collect()
 }
 
 fn span(results: &Results) -> String {

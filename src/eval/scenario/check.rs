@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::{Action, Scenario, Variant};
+use crate::eval::impairment::Level;
 
 /// Names that are taken for hosts, endpoints and processes.
 const RESERVED: [&str; 6] = ["publisher", "bridge", "critical", "switch", "up", "control"];
@@ -38,6 +39,20 @@ pub(super) fn problems(scenario: &Scenario) -> Vec<String> {
     }
     for (at, event) in scenario.events.iter().enumerate() {
         range(&format!("events[{at}].at_s"), event.at_s, 0.0, scenario.duration_s);
+    }
+    for (at, remote) in scenario.remotes.iter().enumerate() {
+        let both = (remote.level != Level::Clean || remote.delay_ms > 0.0 || remote.jitter_ms > 0.0)
+            && remote.trace.is_some();
+        if both {
+            found.push(format!("remotes[{at}].trace takes the place of level, delay_ms and jitter_ms"));
+        }
+        let both =
+            (remote.return_delay_ms > 0.0 || remote.return_jitter_ms > 0.0) && remote.return_trace.is_some();
+        if both {
+            found.push(format!(
+                "remotes[{at}].return_trace takes the place of return_delay_ms and return_jitter_ms"
+            ));
+        }
     }
     if scenario.switches.is_empty() {
         found.push("switches is empty: plain, reassembling, or both".to_owned());

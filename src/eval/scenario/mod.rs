@@ -2,6 +2,7 @@
 //! each.
 
 mod check;
+mod trace;
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,6 +11,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
+pub use self::trace::{FORWARD, RETURN, TraceFile};
 use super::error::EvalError;
 use super::impairment::Level;
 
@@ -167,6 +169,12 @@ pub struct Remote {
     /// Its standard deviation.
     #[serde(default)]
     pub return_jitter_ms: f64,
+    /// What is lost and how long it takes on the way to it, from time to time, in place of the above.
+    #[serde(default)]
+    pub trace: Option<TraceFile>,
+    /// The same on the way back.
+    #[serde(default)]
+    pub return_trace: Option<TraceFile>,
     /// The bandwidth of the way to it.
     #[serde(default)]
     pub cap_kbit_per_s: Option<u64>,
@@ -178,12 +186,12 @@ pub struct Remote {
 impl Remote {
     /// Whether packets towards it are lost or delayed by more than a cap.
     pub fn is_impaired(&self) -> bool {
-        self.level != Level::Clean || self.delay_ms > 0.0 || self.jitter_ms > 0.0
+        self.level != Level::Clean || self.delay_ms > 0.0 || self.jitter_ms > 0.0 || self.trace.is_some()
     }
 
-    /// Whether packets from it are delayed.
-    pub fn returns_late(&self) -> bool {
-        self.return_delay_ms > 0.0 || self.return_jitter_ms > 0.0
+    /// Whether packets from it are delayed or lost.
+    pub fn is_impaired_back(&self) -> bool {
+        self.return_delay_ms > 0.0 || self.return_jitter_ms > 0.0 || self.return_trace.is_some()
     }
 }
 
@@ -249,21 +257,24 @@ impl Scenario {
         }
         let text = fs::read_to_string(path).map_err(|error| EvalError::file(path, &error))?;
         let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        Self::parse(&name, &text)
+        Self::parse_in(path.parent().unwrap_or(Path::new("")), &name, &text)
             .map_err(|problems| EvalError::new(format!("{}: {}", path.display(), problems.join("\n  "))))
     }
 
-    /// Reads a scenario of that name.
+    /// Reads a scenario of that name, whose files are in the present folder.
     ///
     /// # Errors
     /// What is wrong with it: that it is no scenario, or every value that can't be.
     pub fn parse(name: &str, text: &str) -> Result<Self, Vec<String>> {
+        Self::parse_in(Path::new(""), name, text)
+    }
+
+    fn parse_in(folder: &Path, name: &str, text: &str) -> Result<Self, Vec<String>> {
         let scenario: Self = serde_yaml::from_str(text).map_err(|error| vec![error.to_string()])?;
-        let scenario = Self { name: name.to_owned(), text: text.to_owned(), ..scenario };
-        match check::problems(&scenario) {
-            problems if problems.is_empty() => Ok(scenario),
-            problems => Err(problems),
-        }
+        let mut scenario = Self { name: name.to_owned(), text: text.to_owned(), ..scenario };
+        let mut problems = check::problems(&scenario);
+        problems.extend(scenario.read_traces(folder));
+        if problems.is_empty() { Ok(scenario) } else { Err(problems) }
     }
 
     /// All scenarios of a folder, by name.
@@ -402,6 +413,19 @@ mod tests {
             ("{name: slow}", "{name: slow, lane: critical}", "which is for the local subscriber"),
             ("{name: slow}", "{name: slow, delay_ms: -1}", "remotes[0].delay_ms is -1"),
             ("{name: slow}", "{name: slow, cap_kbit_per_s: 1}", "remotes[0].cap_kbit_per_s is 1"),
+            (
+                "{name: slow}",
+                "{name: slow, jitter_ms: 1, trace: {file: Cargo.toml}}",
+                "remotes[0].trace takes the place of level, delay_ms and jitter_ms",
+            ),
+            (
+                "{name: slow}",
+                "{name: slow, return_delay_ms: 1, return_trace: {file: Cargo.toml}}",
+                "remotes[0].return_trace takes the place of return_delay_ms and return_jitter_ms",
+            ),
+            ("{name: slow}", "{name: slow, trace: {file: Cargo.toml}}", "Cargo.toml:1: there is no header"),
+            ("{name: slow}", "{name: slow, trace: {file: nowhere.csv}}", "nowhere.csv: No such file"),
+            ("{name: slow}", "{name: slow, trace: {file: a.csv, loop: true}}", "loop"),
             ("title: a", "title: a\nswitches: []", "switches is empty"),
             ("title: a", "title: a\nworkload: {routes: 0}", "workload.routes is 0"),
             ("title: a", "title: a\nworkload: {message_type: LaserScan}", "workload.message_type"),
@@ -454,6 +478,10 @@ mod tests {
             "remotes[].jitter_ms",
             "remotes[].return_delay_ms",
             "remotes[].return_jitter_ms",
+            "remotes[].trace.file",
+            "remotes[].trace.repeat",
+            "remotes[].return_trace.file",
+            "remotes[].return_trace.repeat",
             "remotes[].cap_kbit_per_s",
             "remotes[].impaired_at_begin",
             "events",

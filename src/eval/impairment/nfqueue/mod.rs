@@ -16,11 +16,14 @@ use nix::sys::socket::{
 use self::messages::Message;
 use self::rules::Rule;
 use super::backend::Backend;
+use super::delay::NormalDelay;
 use super::error::ImpairmentError;
+use super::gilbert_elliott::GilbertElliott;
 use super::link::{Counters, Fate, HELD_MAX, Impairment, Link, LinkState};
 use crate::model::MonotonicNs;
 
-/// How many packets may wait in the kernel for a verdict: those on their way, and those not read yet.
+/// How many packets may wait in the kernel for a verdict: those on their way, and those not read yet. Linux
+/// 6.18 lets 65,536 wait at most.
 const QUEUE_MAX: u32 = 5 * HELD_MAX as u32;
 /// Room for so many that are not read yet, so that nothing is lost but what the link loses. The default of
 /// some 200 KB holds about 250 packets, less than one large sample has fragments.
@@ -111,6 +114,11 @@ impl Backend for Nfqueue {
 
     fn switch(&mut self, state: LinkState) -> Result<(), ImpairmentError> {
         self.link.switch(state);
+        Ok(())
+    }
+
+    fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) -> Result<(), ImpairmentError> {
+        self.link.set(loss, delay);
         Ok(())
     }
 

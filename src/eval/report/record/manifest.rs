@@ -95,6 +95,8 @@ pub enum Role {
 /// An impaired link.
 #[derive(Clone, Debug, Deserialize)]
 pub struct LinkRecord {
+    #[serde(default)]
+    pub name: String,
     pub direction: String,
     #[serde(default)]
     pub before_switch: bool,
@@ -111,6 +113,14 @@ pub struct LinkOutcome {
     pub lost: u64,
     pub loss_expected: f64,
     pub loss_standard_error: Option<f64>,
+    #[serde(default)]
+    pub trace: Option<TraceRecord>,
+}
+
+/// The trace that a link followed.
+#[derive(Clone, Debug, Deserialize)]
+pub struct TraceRecord {
+    pub file: String,
 }
 
 impl Manifest {
