@@ -88,12 +88,12 @@ impl Workspace {
             "adaptive_bridge\tsrc/adaptive_bridge\t(ros.cmake)",
             "what else is a package?"
         );
-        // What these tests are built of, so that cargo has next to nothing left to build.
-        let mut options = vec!["--all-features"];
-        options.truncate(usize::from(cfg!(feature = "eval")));
+        // What these tests are built of, so that cargo has nothing left to build: the same features, and
+        // those that the dependencies of tests and examples ask for.
+        let features = if cfg!(feature = "eval") { "--all-features;" } else { "" };
         run(workspace.colcon().args(["build", "--cmake-args", "-DCMAKE_BUILD_TYPE=Debug"]).args([
             format!("-DADAPTIVE_BRIDGE_TARGET_DIR={}", source().join("target").display()),
-            format!("-DADAPTIVE_BRIDGE_CARGO_OPTIONS={}", options.concat()),
+            format!("-DADAPTIVE_BRIDGE_CARGO_OPTIONS={features}--example;rust_peer"),
         ]));
         Some(workspace)
     }

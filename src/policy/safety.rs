@@ -11,8 +11,8 @@
 //!   data from others, which is what the bridge is there to prevent, and to suspend them wouldn't mend it;
 //! - a write that DDS refuses (`write_failed`): DEGRADED at most;
 //! - a publisher's clock: the lag from source to shared memory leads to DEGRADED at most, see [`SourceLag`];
-//! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that does
-//!   not turn doesn't count as its queue;
+//! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that
+//!   doesn't turn doesn't count as its queue;
 //! - a lane that waits for its token on purpose: the caller leaves that time out of its lag.
 
 use crate::model::{FixedText, MonotonicNs, SafetyMode, SafetyRules, TrafficClass};
