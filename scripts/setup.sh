@@ -60,6 +60,7 @@ check_all() {
     need "has cmake" cmake "tests of the package in a ROS 2 workspace"
     need "has colcon" "colcon|python3-colcon-core" "the same"
     need "has_python colcon_ros" python3-colcon-ros "the same"
+    need "has_python colcon_metadata" python3-colcon-metadata "the same"
     need "has_python ament_index_python" "python3-ament-index|python3-ament-index-python" "the same"
 }
 

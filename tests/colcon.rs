@@ -72,8 +72,9 @@ impl Workspace {
     fn build(test: &str) -> Option<Self> {
         let lacks = |program: &str| Command::new(program).arg("--help").output().is_err();
         let lacking = ["colcon", "cmake"].into_iter().find(|program| lacks(program));
-        let module =
-            ["colcon_ros", "ament_index_python"].into_iter().find(|module| python_with(module).is_none());
+        let module = ["colcon_ros", "colcon_metadata", "ament_index_python"]
+            .into_iter()
+            .find(|module| python_with(module).is_none());
         if let Some(what) = lacking.or(module) {
             support::skip(test, &format!("{what} is not installed (make setup)"));
             return None;
