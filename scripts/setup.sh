@@ -57,6 +57,11 @@ check_all() {
     need "has systemd-nspawn" systemd-container "tests of the services (a systemd of their own)"
     need "has systemd-analyze" systemd "tests of the service units"
     need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
+    need "has cmake" cmake "tests of the package in a ROS 2 workspace"
+    need "has colcon" "colcon|python3-colcon-core" "the same"
+    need "has_python colcon_ros" python3-colcon-ros "the same"
+    need "has_python colcon_metadata" python3-colcon-metadata "the same"
+    need "has_python ament_index_python" "python3-ament-index|python3-ament-index-python" "the same"
 }
 
 # The first of 'a|b' that the package lists know.

@@ -11,8 +11,8 @@
 //!   data from others, which is what the bridge is there to prevent, and to suspend them wouldn't mend it;
 //! - a write that DDS refuses (`write_failed`): DEGRADED at most;
 //! - a publisher's clock: the lag from source to shared memory leads to DEGRADED at most, see [`SourceLag`];
-//! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that is
-//!   silent doesn't count as its queue;
+//! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that
+//!   doesn't turn doesn't count as its queue;
 //! - a lane that waits for its token on purpose: the caller leaves that time out of its lag.
 
 use crate::model::{FixedText, MonotonicNs, SafetyMode, SafetyRules, TrafficClass};
@@ -22,6 +22,11 @@ pub const MAX_SOURCE_LAG_MS: f64 = 10_000.0;
 
 /// How long the least lag is remembered, once to twice.
 const BASELINE_MS: u64 = 60_000;
+
+/// Every process turns ten times a second. One that has not for so long hangs, is stopped or is gone, and a
+/// full queue is no sign of overload then: it fills within 0.3 s, while a watchdog takes 2 s. To stop other
+/// lanes, and in the end the restarted one, would only make the gap longer.
+const STALLED_MS: u64 = 500;
 
 /// The occupancy of a shorter queue says nothing: one sample under way would fill it.
 const MIN_QUEUE: u64 = 8;
@@ -361,6 +366,9 @@ impl Reading {
             let is_long = rules.emergency_silent_ms != 0 && silent_ms >= rules.emergency_silent_ms;
             let limit_ms = if is_long { rules.emergency_silent_ms } else { rules.silent_ms };
             return self.add(process, SafetyTrouble::Silent { silent_ms, limit_ms }, is_long);
+        }
+        if silent_ms >= STALLED_MS {
+            return;
         }
         if process.queue_capacity >= MIN_QUEUE {
             let occupancy = process.queued as f64 / process.queue_capacity as f64;

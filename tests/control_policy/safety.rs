@@ -176,6 +176,22 @@ fn a_restart_of_a_process_never_causes_emergency() {
 }
 
 #[test]
+fn a_lane_that_hangs_until_its_watchdog_restarts_it_stops_no_other_and_not_itself() {
+    // 200 Hz into a queue of 64, for the 2 s of the watchdog.
+    for begins_in in [Normal, Degraded] {
+        let mut bench = bench();
+        if begins_in == Degraded {
+            assert_eq!(bench.last(ProcessLoad { queued: 48, ..CRITICAL }, 3), Degraded);
+        }
+        for silent_ms in [300, 800, 1_300, 1_800, 2_300] {
+            let hangs = ProcessLoad { silent_ms, queued: silent_ms / 5, ..CRITICAL };
+            assert_eq!(bench.last(hangs, 1), begins_in, "{silent_ms} ms");
+        }
+        assert_eq!(bench.last(CRITICAL, 1), begins_in);
+    }
+}
+
+#[test]
 fn a_control_process_that_was_stopped_changes_nothing() {
     let mut bench = bench();
     let errors = ErrorCounts { queue_overflow: 400, write_failed: 100, ..ErrorCounts::default() };

@@ -1,7 +1,6 @@
 //! What this user may ask of the kernel, and what the kernel has.
 
 use std::fs;
-use std::thread::available_parallelism;
 
 use nix::sys::resource::{Resource, getrlimit};
 use nix::unistd::geteuid;
@@ -35,8 +34,10 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
         open_files(limit(Resource::RLIMIT_NOFILE)),
         real_time(&configured, &rights),
         memory_lock(&configured, &rights),
-        cpus(&configured, available_parallelism().map_or(1, usize::from)),
     ];
+    // Of the machine, and not of the CPUs that this process was left with.
+    let online = fs::read_to_string("/sys/devices/system/cpu/online").ok();
+    findings.extend(online.map(|online| cpus(&configured, online.trim())));
     findings.extend(number("/proc/sys/kernel/sched_rt_runtime_us").map(throttling));
     let source = "/sys/devices/system/clocksource/clocksource0";
     let read = |name: &str| fs::read_to_string(format!("{source}/{name}")).ok();
@@ -118,18 +119,26 @@ fn memory_lock(configured: &[&Scheduling], rights: &Rights) -> Finding {
     .mended_by(limits_line("memlock", "unlimited"))
 }
 
-fn cpus(configured: &[&Scheduling], online: usize) -> Finding {
+/// `online` as the kernel lists CPUs, such as `0-3,8`.
+fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
+    let is_online = |cpu: usize| {
+        online.split(',').any(|range| {
+            let (first, last) = range.split_once('-').unwrap_or((range, range));
+            let bound = |text: &str| text.parse::<usize>().ok();
+            bound(first).is_some_and(|first| first <= cpu) && bound(last).is_some_and(|last| cpu <= last)
+        })
+    };
     let mut lacking: Vec<usize> = configured.iter().flat_map(|how| how.cpus.iter().copied()).collect();
-    lacking.retain(|&cpu| cpu >= online);
+    lacking.retain(|&cpu| !is_online(cpu));
     lacking.sort_unstable();
     lacking.dedup();
     if lacking.is_empty() {
-        return Finding::ok("CPUs", format!("{online} here"));
+        return Finding::ok("CPUs", format!("this machine has {online}"));
     }
     Finding::new(
         "CPUs",
         Severity::Warning,
-        format!("CPUs {} are configured, and there are {online}", list(lacking)),
+        format!("CPUs {} are configured, and this machine has {online}", list(lacking)),
         "A process that may run on none of its CPUs runs on all.",
     )
 }
@@ -201,8 +210,14 @@ mod tests {
         assert_eq!(real_time(&[&fifo], &all).severity, Severity::Ok);
         assert_eq!(memory_lock(&[&fifo], &all).severity, Severity::Ok);
         assert_eq!(real_time(&[&fifo], &Rights { nice: true, ..NONE }).severity, Severity::Ok);
-        assert_eq!(cpus(&[&fifo], 4).severity, Severity::Ok);
-        assert_eq!(cpus(&[&fifo], 3).severity, Severity::Warning);
+        for (online, severity) in [
+            ("0-3", Severity::Ok),
+            ("0,3", Severity::Ok),
+            ("0-2", Severity::Warning),
+            ("0-2,4-7", Severity::Warning),
+        ] {
+            assert_eq!(cpus(&[&fifo], online).severity, severity, "{online}");
+        }
     }
 
     #[test]

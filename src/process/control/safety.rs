@@ -249,6 +249,8 @@ fn cause_text(cause: &SafetyCause) -> String {
     let who = cause.who.as_str();
     match cause.trouble {
         SafetyTrouble::Queue { queued, capacity } => {
+            // A lane that is stopped misses more than its queue holds.
+            let queued = queued.min(capacity);
             format!("{who}: {queued} of {capacity} samples wait in shared memory")
         }
         SafetyTrouble::Waiting { samples, limit } => {

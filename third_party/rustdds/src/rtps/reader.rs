@@ -1519,6 +1519,13 @@ impl Reader {
   fn send_preemptive_acknack_to(&self, writer_proxy: &mut RtpsWriterProxy) {
     let flags = BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Endianness);
     let acknack_count = writer_proxy.next_ack_nack_sequence_number();
+    // Fast DDS answers at once only what it sends itself here, a base of 0. A base
+    // of 1 it takes for an acknowledgement, and its HEARTBEAT comes a second later.
+    // Others may discard a base of 0 as invalid (RTPS 2.5, clause 8.3.5.5).
+    let base = match writer_proxy.remote_writer_guid.prefix.vendor_id() {
+      VendorId::EPROSIMA => SequenceNumber::new(0),
+      _ => SequenceNumber::new(1),
+    };
     let RtpsWriterProxy {
       remote_writer_guid,
       unicast_locator_list,
@@ -1529,7 +1536,7 @@ impl Reader {
       AckNack {
         reader_id: self.entity_id(),
         writer_id: remote_writer_guid.entity_id,
-        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(1)),
+        reader_sn_state: SequenceNumberSet::new_empty(base),
         count: acknack_count,
       },
       InfoDestination {

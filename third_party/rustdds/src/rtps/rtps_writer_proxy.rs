@@ -104,9 +104,9 @@ impl RtpsWriterProxy {
   }
 
   pub fn next_ack_nack_sequence_number(&mut self) -> i32 {
-    let c = self.sent_ack_nack_count;
+    // The first is 1: Fast DDS has counted 0 before anything came, and discards it.
     self.sent_ack_nack_count += 1;
-    c
+    self.sent_ack_nack_count
   }
 
   // Returns a bound, below which everything can be acknowledged, i.e.
