@@ -257,6 +257,8 @@ fn tables_have_the_figures_of_the_run() {
     );
     assert_eq!(cells(&readme, "| 2,948 B, bridge")[1..4], ["10,000", "29.5", "0.50"]);
     assert_eq!(cells(&readme, "1,000 Hz, bridge: ingress")[1..5], ["8.00", "80.0", "2,000", "2.00"]);
+    assert_eq!(cells(&readme, "1,000 Hz, relay ")[1..5], ["10.0", "100", "–", "2.00"]);
+    assert_eq!(cells(&readme, "1,000 Hz, all of the bridge")[1..5], ["16.0", "160", "1.60", "6.00"]);
     assert_eq!(cells(&readme, "| bridge: ingress, 100 Hz")[2..], ["3.00", "recvfrom 3.00"]);
     assert!(
         line(&readme, "Each further route costs").contains("2.00 µs of p50 and 1.00 µs of CPU"),

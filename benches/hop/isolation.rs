@@ -117,7 +117,9 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         for round in 0..options.repetitions.max(if options.quick { 1 } else { 4 }) {
             for condition in &wanted {
                 eprintln!("isolation: round {}, {}, {}", round + 1, condition.label(), scheduling.label());
-                let case = Case::lasting(condition.rate_hz(), SCAN, options.seconds(5.0), 0);
+                // Of fewer than 1,000 samples there is no p99.9.
+                let seconds = options.seconds(4.0).max(1.1);
+                let case = Case::lasting(condition.rate_hz(), SCAN, seconds, 0);
                 let one = measure_one(*condition, &case, &mut beds.0[0])?;
                 let of = Of {
                     section: "isolation",

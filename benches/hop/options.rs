@@ -154,7 +154,7 @@ impl Options {
                     continue;
                 }
                 // Those that the targets are about have twice the time; 20 samples are the least.
-                let seconds = self.seconds(if is_headline { 4.0 } else { 2.0 }).max(20.0 / rate_hz as f64);
+                let seconds = self.seconds(if is_headline { 3.0 } else { 1.4 }).max(20.0 / rate_hz as f64);
                 let case = Case::lasting(rate_hz, bytes, seconds, route);
                 if self.wants("latency", &case.name()) {
                     cases.push(case);

@@ -32,7 +32,7 @@ pub fn search(
     options: &Options,
     output: &mut Output,
 ) -> Result<(), String> {
-    let seconds = options.seconds(2.0);
+    let seconds = options.seconds(1.5);
     for bed in &mut beds.0 {
         let found = search_in(bytes, scheduling, seconds, bed)?;
         let case = payload(bytes);

@@ -23,6 +23,15 @@ pub fn number(value: Option<f64>) -> String {
     if rest.is_empty() { format!("{sign}{grouped}") } else { format!("{sign}{grouped}.{rest}") }
 }
 
+/// From the least to the most.
+pub fn range(values: &[f64]) -> String {
+    let of = |better: fn(f64, f64) -> f64| values.iter().copied().reduce(better);
+    match (of(f64::min), of(f64::max)) {
+        (Some(low), Some(high)) => format!("{} to {}", number(Some(low)), number(Some(high))),
+        _ => "–".to_owned(),
+    }
+}
+
 /// A count.
 pub fn count(value: u64) -> String {
     number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()

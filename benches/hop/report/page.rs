@@ -127,7 +127,13 @@ fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
         "throughput" => {
             plot("throughput.svg", "Highest rate without loss, by payload") + &tables::throughput(summary)?
         }
-        "resources" => plot("cpu.svg", "CPU per thousand samples") + &tables::resources(summary)?,
+        "resources" => {
+            plot("cpu.svg", "CPU per thousand samples")
+                + &tables::totals(summary)?
+                + "\n<details><summary>Each process</summary>\n\n"
+                + &tables::resources(summary)?
+                + "\n</details>\n"
+        }
         "calls" => tables::calls(summary)?,
         "routes" | "lanes" => {
             let alt = format!("Latency and CPU over the number of {name}");

@@ -2,7 +2,10 @@
 
 use std::fmt::Write as _;
 
-/// A table that grows by rows. The first column is flush left, the others flush right.
+/// A column with a longer cell than this is one of words.
+const MOST_FIGURE_CHARS: usize = 24;
+
+/// A table that grows by rows. The first column and those of words are flush left, the others flush right.
 pub struct Table {
     rows: Vec<Vec<String>>,
 }
@@ -29,20 +32,22 @@ impl Table {
             self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or_default().max(3)
         };
         let widths: Vec<usize> = (0..self.rows[0].len()).map(width).collect();
+        let left: Vec<bool> = widths
+            .iter()
+            .enumerate()
+            .map(|(column, width)| column == 0 || *width > MOST_FIGURE_CHARS)
+            .collect();
         let mut text = String::new();
         for (index, row) in self.rows.iter().enumerate() {
-            for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
-                let _ = if column == 0 {
-                    write!(text, "| {cell:<width$} ")
-                } else {
-                    write!(text, "| {cell:>width$} ")
-                };
+            for ((cell, width), left) in row.iter().zip(&widths).zip(&left) {
+                let _ =
+                    if *left { write!(text, "| {cell:<width$} ") } else { write!(text, "| {cell:>width$} ") };
             }
             text.push_str("|\n");
             if index == 0 {
-                for (column, width) in widths.iter().enumerate() {
-                    let dashes = "-".repeat(width - usize::from(column > 0));
-                    let _ = write!(text, "| {dashes}{} ", if column == 0 { "" } else { ":" });
+                for (width, left) in widths.iter().zip(&left) {
+                    let dashes = "-".repeat(width - usize::from(!left));
+                    let _ = write!(text, "| {dashes}{} ", if *left { "" } else { ":" });
                 }
                 text.push_str("|\n");
             }

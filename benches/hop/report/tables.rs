@@ -1,10 +1,9 @@
 //! The tables of each section, in Markdown; `None` where the run did not measure it.
 
-use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use super::format::{count, number};
-use super::summary::{Latency, Resource, Summary};
+use super::format::{count, number, range};
+use super::summary::{Call, Latency, Resource, Summary};
 use super::table::Table;
 use super::targets;
 
@@ -106,9 +105,6 @@ pub fn latencies(summary: &Summary, scheduling: &str) -> Option<String> {
     for (bytes, rate_hz) in cases(summary, scheduling) {
         for program in PROGRAMS {
             let Some(row) = latency(summary, scheduling, rate_hz, bytes, program) else { continue };
-            let each = &row.repetitions_p50_us;
-            let range = each.iter().copied().fold(f64::INFINITY, f64::min)
-                ..each.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             table.row([
                 format!("{} Hz of {}, {program}", count(rate_hz), payload(bytes)),
                 count(row.latency.samples),
@@ -118,7 +114,7 @@ pub fn latencies(summary: &Summary, scheduling: &str) -> Option<String> {
                 number(row.latency.max_us),
                 number(row.hop_p50_us),
                 number(row.hop_p99_us),
-                format!("{} to {}", number(Some(range.start)), number(Some(range.end))),
+                range(&row.repetitions_p50_us),
                 number(row.from_due.p99_us),
                 number(row.cpu_us_per_sample),
                 if program == "wake-up" { String::new() } else { count(row.missing) },
@@ -230,6 +226,58 @@ pub fn throughput(summary: &Summary) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
+/// What relay and bridge take in all.
+pub fn totals(summary: &Summary) -> Option<String> {
+    const PARTS: [(&str, &str, &[&str]); 3] = [
+        ("relay", "relay", &["relay"]),
+        ("bridge", "ingress and critical lane", &["ingress", "critical"]),
+        ("bridge", "all of the bridge", &["ingress", "critical", "noncritical", "control"]),
+    ];
+    let mut table = Table::new(&[
+        "",
+        "CPU, % of one",
+        "CPU per 1,000 samples, ms",
+        "of the relay",
+        "wake-ups/sample",
+        "system calls/sample",
+        "RSS, MiB",
+        "of it anonymous",
+    ]);
+    let mut rates: Vec<u64> = summary.resources.iter().map(|row| row.rate_hz).collect();
+    rates.sort_unstable();
+    rates.dedup();
+    for rate_hz in rates {
+        let mut of_relay = None;
+        for (program, name, processes) in PARTS {
+            let is_part = |row: &&Resource| {
+                row.rate_hz == rate_hz && row.program == program && processes.contains(&row.process.as_str())
+            };
+            let rows: Vec<&Resource> = summary.resources.iter().filter(is_part).collect();
+            let Some(first) = rows.first() else { continue };
+            let sum = |of: &dyn Fn(&Resource) -> f64| rows.iter().map(|row| of(row)).sum::<f64>();
+            let cpu_ms = sum(&|row| row.cpu_ms);
+            let share = cpu_ms / first.seconds.max(1e-9) / 10.0;
+            let relay = *of_relay.get_or_insert(share);
+            let calls: Option<f64> = rows.iter().map(|row| row.system_calls_per_sample).sum();
+            table.row([
+                format!("{}, {name}", load(rate_hz)),
+                number(Some(share)),
+                number(first.per_sample(cpu_ms * 1_000.0)),
+                number((program == "bridge" && relay > 0.0).then(|| share / relay)),
+                number(first.per_sample(sum(&|row| row.sleeps as f64))),
+                number(calls),
+                number(Some(sum(&|row| row.rss_kib as f64) / 1_024.0)),
+                number(Some(sum(&|row| row.anonymous_kib as f64) / 1_024.0)),
+            ]);
+        }
+    }
+    (!table.is_empty()).then(|| table.text())
+}
+
+fn load(rate_hz: u64) -> String {
+    if rate_hz == 0 { "idle".to_owned() } else { format!("{} Hz", count(rate_hz)) }
+}
+
 /// CPU, sleeps and memory of each process. What a process does when idle is part of its figures under load.
 pub fn resources(summary: &Summary) -> Option<String> {
     let mut table = Table::new(&[
@@ -249,10 +297,9 @@ pub fn resources(summary: &Summary) -> Option<String> {
     let mut rows: Vec<&Resource> = summary.resources.iter().collect();
     rows.sort_by_key(|row| row.rate_hz);
     for row in rows {
-        let load = if row.rate_hz == 0 { "idle".to_owned() } else { format!("{} Hz", count(row.rate_hz)) };
         let per_s = |value: f64| number((row.seconds > 0.0).then(|| value / row.seconds));
         table.row([
-            format!("{load}, {}: {}", row.program, row.process),
+            format!("{}, {}: {}", load(row.rate_hz), row.program, row.process),
             per_s(row.cpu_ms / 10.0),
             // ms for 1,000 samples is µs for one.
             number(row.per_sample(row.cpu_ms * 1_000.0)),
@@ -272,25 +319,30 @@ pub fn resources(summary: &Summary) -> Option<String> {
 /// System calls per sample, those that make at least a hundredth of a call.
 pub fn calls(summary: &Summary) -> Option<String> {
     let mut table = Table::new(&["", "samples", "calls/sample", "of them"]);
-    let mut processes: BTreeMap<(&str, &str, u64), Vec<(f64, &str)>> = BTreeMap::new();
-    let mut samples = BTreeMap::new();
-    for call in summary.calls.iter().filter(|call| call.samples > 0) {
-        let key = (call.program.as_str(), call.process.as_str(), call.rate_hz);
-        processes.entry(key).or_default().push((call.count as f64 / call.samples as f64, &call.call));
-        samples.insert(key, call.samples);
+    let mut processes: Vec<(&str, &str, u64)> = Vec::new();
+    for call in &summary.calls {
+        let process = (call.program.as_str(), call.process.as_str(), call.rate_hz);
+        if !processes.contains(&process) {
+            processes.push(process);
+        }
     }
-    for (key, mut calls) in processes {
-        calls.sort_by(|one, other| other.0.total_cmp(&one.0));
-        let all: f64 = calls.iter().map(|call| call.0).sum();
+    for (program, process, rate_hz) in processes {
+        let mut calls: Vec<&Call> = summary
+            .calls
+            .iter()
+            .filter(|call| call.program == program && call.process == process && call.rate_hz == rate_hz)
+            .collect();
+        calls.sort_by_key(|call| std::cmp::Reverse(call.count));
+        let per_sample = |call: &Call| call.count as f64 / call.samples.max(1) as f64;
         let each: Vec<String> = calls
             .iter()
-            .filter(|call| call.0 >= 0.01)
-            .map(|(share, name)| format!("{name} {}", number(Some(*share))))
+            .filter(|call| per_sample(call) >= 0.01)
+            .map(|call| format!("{} {}", call.call, number(Some(per_sample(call)))))
             .collect();
         table.row([
-            format!("{}: {}, {} Hz", key.0, key.1, key.2),
-            count(samples[&key]),
-            number(Some(all)),
+            format!("{program}: {process}, {rate_hz} Hz"),
+            count(calls.first().map_or(0, |call| call.samples)),
+            number(Some(calls.iter().map(|call| per_sample(call)).sum())),
             each.join(", "),
         ]);
     }
@@ -311,9 +363,6 @@ pub fn scale(summary: &Summary, of: &str) -> Option<String> {
         "missing",
     ]);
     for row in summary.scale.iter().filter(|row| row.of == of) {
-        let each = &row.repetitions_p50_us;
-        let low = each.iter().copied().fold(f64::INFINITY, f64::min);
-        let high = each.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let cpu: f64 = row.cpu_us_per_sample.values().sum();
         let by_process: Vec<String> = row
             .cpu_us_per_sample
@@ -328,7 +377,7 @@ pub fn scale(summary: &Summary, of: &str) -> Option<String> {
             number(row.latency.p50_us),
             number(row.latency.p99_us),
             number(row.latency.p999_us),
-            format!("{} to {}", number(Some(low)), number(Some(high))),
+            range(&row.repetitions_p50_us),
             number(known.then_some(cpu)),
             by_process.join(", "),
             number(known.then_some(memory as f64 / 1_024.0)),
@@ -390,9 +439,6 @@ pub fn isolation(summary: &Summary) -> Option<String> {
         "noncritical forwarded",
     ]);
     for row in &summary.isolation {
-        let rounds = &row.rounds_p999_us;
-        let low = rounds.iter().copied().fold(f64::INFINITY, f64::min);
-        let high = rounds.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let ratio = if row.condition == row.against { None } else { targets::against(summary, row) };
         table.row([
             format!("{}, {} Hz, {}", row.condition, count(row.rate_hz), row.scheduling),
@@ -401,7 +447,7 @@ pub fn isolation(summary: &Summary) -> Option<String> {
             number(row.latency.p99_us),
             number(row.latency.p999_us),
             number(row.latency.max_us),
-            format!("{} to {}", number(Some(low)), number(Some(high))),
+            range(&row.rounds_p999_us),
             number(ratio),
             count(row.missing),
             count(row.noncritical_forwarded),

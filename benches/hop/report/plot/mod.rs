@@ -1,15 +1,19 @@
 //! Plots as SVG files: the drawing is that of the evaluation's report, so that there is one of it; the
 //! charts are the bench's own.
 
-#[allow(dead_code, reason = "shared with the report of the evaluation, which uses all of it")]
+#[allow(
+    dead_code,
+    unused_imports,
+    reason = "shared with the report of the evaluation, which uses and tests it all"
+)]
 #[path = "../../../../src/eval/report/plot/axis.rs"]
 mod axis;
 mod bars;
-#[allow(dead_code, reason = "as above")]
+#[allow(dead_code, unused_imports, reason = "as above")]
 #[path = "../../../../src/eval/report/plot/frame.rs"]
 mod frame;
 mod lines;
-#[allow(dead_code, reason = "as above")]
+#[allow(dead_code, unused_imports, reason = "as above")]
 #[path = "../../../../src/eval/report/plot/svg.rs"]
 mod svg;
 
