@@ -29,8 +29,10 @@ demo: build
 package:
 	scripts/package.sh
 
+# What the bridge costs, beside the same without it: half an hour, kept in benches/runs. One that is quick, or a
+# part: cargo bench -- --quick, cargo bench -- --only isolation (benches/README.md).
 bench:
-	cargo bench --locked
+	cargo bench --locked -- --save
 
 fuzz:
 	scripts/fuzz.sh $(FUZZ_SECONDS)

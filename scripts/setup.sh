@@ -47,6 +47,7 @@ check_all() {
     need "has nsenter" util-linux "tests between hosts (network namespaces)"
     need "has iptables" iptables "tests with a lossy link, adaptive-bridge-eval impair"
     need "has tc" iproute2 "adaptive-bridge-eval impair (netem)"
+    need "has strace" strace "system calls per sample in make bench"
     need "has_faketime" faketime "tests with a wall clock that steps"
     if has docker; then
         need "docker compose version >/dev/null 2>&1 || has docker-compose" "docker-compose-v2|docker-compose" \

@@ -23,62 +23,61 @@ use bytes::{Bytes, BytesMut};
 
 use super::system::{Place, sleep_until};
 
-/// One topic with the sizes that it carries.
+/// One topic, by the largest sample that it carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Route {
-    /// A laser scan.
-    Scan,
-    /// A point cloud.
-    Cloud,
+pub struct Route {
+    pub index: usize,
+    pub max_sample_bytes: usize,
 }
 
-impl Route {
-    pub const ALL: [Self; 2] = [Self::Scan, Self::Cloud];
+/// The payloads of a laser scan; others are point clouds. The bridge never looks, only the names differ.
+const SCAN_BYTES: usize = 4096;
 
-    pub const fn id(self) -> &'static str {
-        match self {
-            Self::Scan => "scan",
-            Self::Cloud => "cloud",
-        }
+impl Route {
+    /// Those with these largest samples.
+    pub fn all(sizes: &[usize]) -> Vec<Self> {
+        sizes.iter().enumerate().map(|(index, &max_sample_bytes)| Self { index, max_sample_bytes }).collect()
+    }
+
+    pub fn id(self) -> String {
+        format!("r{}", self.index)
     }
 
     pub const fn message_type(self) -> &'static str {
-        match self {
-            Self::Scan => "sensor_msgs/msg/LaserScan",
-            Self::Cloud => "sensor_msgs/msg/PointCloud2",
+        if self.max_sample_bytes <= SCAN_BYTES {
+            "sensor_msgs/msg/LaserScan"
+        } else {
+            "sensor_msgs/msg/PointCloud2"
         }
     }
 
     const fn dds_type(self) -> &'static str {
-        match self {
-            Self::Scan => "sensor_msgs::msg::dds_::LaserScan_",
-            Self::Cloud => "sensor_msgs::msg::dds_::PointCloud2_",
-        }
-    }
-
-    pub const fn max_sample_bytes(self) -> usize {
-        match self {
-            Self::Scan => 4096,
-            Self::Cloud => 2 << 20,
+        if self.max_sample_bytes <= SCAN_BYTES {
+            "sensor_msgs::msg::dds_::LaserScan_"
+        } else {
+            "sensor_msgs::msg::dds_::PointCloud2_"
         }
     }
 
     /// Samples that may wait in a reader: as ingress has it, 32 MiB at most, 16 to 1,024 samples.
-    const fn reader_depth(self) -> u32 {
-        match self {
-            Self::Scan => 1024,
-            Self::Cloud => 16,
-        }
+    fn reader_depth(self) -> u32 {
+        ((32 << 20) / self.max_sample_bytes).clamp(16, 1024) as u32
     }
 
-    fn parse(text: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|route| route.id() == text)
+    /// As they cross the command line: their sizes.
+    pub fn to_argument(routes: &[Self]) -> String {
+        routes.iter().map(|route| route.max_sample_bytes.to_string()).collect::<Vec<_>>().join(",")
+    }
+
+    fn parse(text: &str) -> Result<Vec<Self>, String> {
+        let sizes: Result<Vec<usize>, _> = text.split(',').map(str::parse).collect();
+        Ok(Self::all(&sizes.map_err(|_| format!("{text} are no sizes"))?))
     }
 }
 
 /// The ROS 2 topics before and after relay or bridge.
 pub const INPUT: &str = "/bench/in/";
-pub const OUTPUT: &str = "/bench/out/";
+pub const OUTPUT: &str = "/bench/critical/";
 
 /// What may be unacknowledged, on every RELIABLE writer of the bench and in the bridge (its default).
 const WINDOW_SAMPLES: usize = 256;
@@ -106,6 +105,8 @@ pub fn run(role: &str, arguments: &[String]) -> ExitCode {
         "__publisher" => publisher(arguments),
         "__subscriber" => subscriber(arguments),
         "__relay" => relay(arguments),
+        "__drain" => drain(arguments),
+        "__spinner" => spinner(arguments),
         other => Err(format!("no such role: {other}")),
     };
     match outcome {
@@ -122,7 +123,9 @@ fn argument(arguments: &[String], index: usize) -> Result<&str, String> {
 }
 
 fn join(arguments: &[String], name: &str) -> Result<Participant, String> {
-    Place::parse(argument(arguments, 1)?)?.apply();
+    let place = Place::parse(argument(arguments, 1)?)?;
+    place.apply();
+    place.lock_memory();
     let domain_id = argument(arguments, 0)?.parse().map_err(|_| "the first argument is the domain")?;
     Participant::open(&ParticipantOptions {
         network: &DdsNetwork { domain_id, interfaces: Vec::new() },
@@ -140,9 +143,14 @@ fn writer(participant: &mut Participant, prefix: &str, route: Route) -> Result<R
         .map_err(|error| error.to_string())
 }
 
-fn reader(participant: &mut Participant, prefix: &str, route: Route) -> Result<RawReader, String> {
+fn reader(
+    participant: &mut Participant,
+    prefix: &str,
+    route: Route,
+    reliability: Reliability,
+) -> Result<RawReader, String> {
     let qos = ReaderQos {
-        reliability: Reliability::Reliable,
+        reliability,
         durability: Durability::Volatile,
         depth: route.reader_depth(),
         deadline_ms: None,
@@ -176,29 +184,30 @@ fn say(line: &str) {
     let _ = out.flush();
 }
 
-/// Sends when told: `send ROUTE RATE_HZ SAMPLES BYTES FIRST_NUMBER`, answered by `sent ACCEPTED REFUSED`.
+/// Sends when told: `send FIRST_ROUTE ROUTES RATE_HZ SAMPLES BYTES FIRST_NUMBER`, one route after the other,
+/// answered by `sent ACCEPTED REFUSED`.
 fn publisher(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "publisher")?;
     let mut writers = Vec::new();
-    for route in Route::ALL {
-        writers.push((route, writer(&mut participant, INPUT, route)?, Arena::new(route)));
+    for route in Route::parse(argument(arguments, 2)?)? {
+        writers.push((writer(&mut participant, INPUT, route)?, Arena::new(route)));
     }
-    wait_matched(&writers.iter().map(|(_, writer, _)| writer).collect::<Vec<_>>())?;
+    wait_matched(&writers.iter().map(|(writer, _)| writer).collect::<Vec<_>>())?;
     say("ready");
     for line in io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
-        let words: Vec<&str> = line.split(' ').collect();
-        let ["send", route, rate_hz, samples, bytes, first] = words[..] else {
+        let words: Option<Vec<u64>> = line
+            .strip_prefix("send ")
+            .and_then(|numbers| numbers.split(' ').map(|word| word.parse().ok()).collect());
+        let Some([first_route, routes, rate_hz, samples, bytes, first]) = words.as_deref() else {
             return Err(format!("not an order: {line}"));
         };
-        let number = |text: &str| text.parse::<u64>().map_err(|_| format!("{text} in: {line}"));
-        let route = Route::parse(route).ok_or_else(|| format!("no route in: {line}"))?;
-        let (rate_hz, samples) = (number(rate_hz)?, number(samples)?);
-        let (bytes, first) = (number(bytes)? as usize, number(first)?);
-        let (_, writer, arena) = writers.iter_mut().find(|(of, ..)| *of == route).ok_or("no writer")?;
+        let (first_route, routes, bytes) = (*first_route as usize, *routes as usize, *bytes as usize);
+        let chosen = writers.get_mut(first_route..first_route + routes).ok_or("no such route")?;
         let (mut accepted, mut refused) = (0u64, 0u64);
         let start = clock::monotonic().0 + 20_000_000;
-        for sample in 0..samples {
+        for sample in 0..*samples {
+            let (writer, arena) = &mut chosen[sample as usize % routes];
             let due_at = start + sample * 1_000_000_000 / rate_hz;
             let mut payload = arena.buffer(bytes);
             payload[..8].copy_from_slice(&(first + sample).to_ne_bytes());
@@ -278,14 +287,15 @@ impl Inlet {
 /// come for so long, and is answered by `samples N DAMAGED` and a line for each.
 fn subscriber(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "subscriber")?;
-    let boards = match arguments.get(3) {
+    let boards = match arguments.get(4) {
         Some(path) => Some(boards(Path::new(path))?),
         None => None,
     };
-    let prefix = argument(arguments, 2)?.to_owned();
+    let prefix = argument(arguments, 3)?.to_owned();
     let mut inlets = Vec::new();
-    for (index, route) in Route::ALL.into_iter().enumerate() {
-        inlets.push((index, Inlet::new(reader(&mut participant, &prefix, route)?)));
+    for route in Route::parse(argument(arguments, 2)?)? {
+        let reader = reader(&mut participant, &prefix, route, Reliability::Reliable)?;
+        inlets.push((route.index, Inlet::new(reader)));
     }
     let orders = orders();
     let mut records: Vec<Record> = Vec::with_capacity(200_000);
@@ -405,9 +415,10 @@ fn orders() -> Receiver<String> {
 fn relay(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "relay")?;
     let mut lines = Vec::new();
-    for route in Route::ALL {
+    for route in Route::parse(argument(arguments, 2)?)? {
         let outlet = writer(&mut participant, OUTPUT, route)?;
-        lines.push((Inlet::new(reader(&mut participant, INPUT, route)?), outlet, Arena::new(route)));
+        let inlet = Inlet::new(reader(&mut participant, INPUT, route, Reliability::Reliable)?);
+        lines.push((inlet, outlet, Arena::new(route)));
     }
     let orders = orders();
     say("ready");
@@ -438,6 +449,43 @@ fn relay(arguments: &[String]) -> Result<(), String> {
     }
 }
 
+/// Subscribes to what noncritical lanes send, on topics that begin with one of the prefixes, and forgets it.
+fn drain(arguments: &[String]) -> Result<(), String> {
+    let mut participant = join(arguments, "drain")?;
+    let mut inlets = Vec::new();
+    for prefix in argument(arguments, 3)?.split(',') {
+        for route in Route::parse(argument(arguments, 2)?)? {
+            inlets.push(Inlet::new(reader(&mut participant, prefix, route, Reliability::BestEffort)?));
+        }
+    }
+    let orders = orders();
+    say("ready");
+    loop {
+        for inlet in &inlets {
+            while inlet.take(&mut |_, _| {}).is_some() {}
+        }
+        if orders.try_recv() == Err(TryRecvError::Disconnected) {
+            return Ok(());
+        }
+        std::thread::park_timeout(Duration::from_millis(100));
+    }
+}
+
+/// Burns every CPU until it is killed: as many threads as there are, in a loop that does nothing.
+fn spinner(arguments: &[String]) -> Result<(), String> {
+    Place::parse(argument(arguments, 1)?)?.apply();
+    for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+        std::thread::spawn(|| {
+            loop {
+                std::hint::spin_loop();
+            }
+        });
+    }
+    say("ready");
+    for _ in io::stdin().lock().lines() {}
+    Ok(())
+}
+
 /// Buffers that are used again when the DDS library has let go of what was in them.
 struct Arena {
     chunk_bytes: usize,
@@ -447,7 +495,7 @@ struct Arena {
 
 impl Arena {
     fn new(route: Route) -> Self {
-        let chunk_bytes = route.max_sample_bytes().max(256 * 1024);
+        let chunk_bytes = route.max_sample_bytes.max(256 * 1024);
         Self { chunk_bytes, current: BytesMut::with_capacity(chunk_bytes), filled: VecDeque::new() }
     }
 

@@ -6,10 +6,12 @@ use std::process::Command;
 use nix::errno::Errno;
 use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
+use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::time::{ClockId, ClockNanosleepFlags, clock_nanosleep};
 use nix::unistd::Pid;
 
-use super::Options;
+use super::options::Options;
+use super::report::Machine;
 
 /// Which CPU each stage of a sample's way has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,9 +89,9 @@ pub struct Place {
 
 impl Place {
     /// For one end of the eventfd: always the two CPUs, unless nothing is pinned.
-    pub fn of(options: &Options, end: usize) -> Self {
+    pub fn of(options: &Options, scheduling: Scheduling, end: usize) -> Self {
         let cpu = (options.placement != Placement::Free).then_some(end);
-        Self { cpu, scheduling: options.scheduling }
+        Self { cpu, scheduling }
     }
 
     pub fn to_argument(self) -> String {
@@ -125,6 +127,76 @@ impl Place {
         }
         let _ = nix::sys::prctl::set_timerslack(1);
     }
+
+    /// With FIFO the memory of the process is locked, as the bridge's is.
+    pub fn lock_memory(self) {
+        if self.scheduling == Scheduling::Fifo
+            && let Err(error) = mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE)
+        {
+            eprintln!("bench: memory not locked: {error}");
+        }
+    }
+}
+
+/// Whether this process may have SCHED_FIFO; tried on a thread that ends at once.
+pub fn has_fifo() -> bool {
+    let tried = std::thread::spawn(|| {
+        // SAFETY: as above; it is a thread that does nothing else.
+        let outcome = unsafe {
+            let mut param: libc::sched_param = std::mem::zeroed();
+            param.sched_priority = FIFO_PRIORITY;
+            libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param)
+        };
+        outcome == 0
+    });
+    tried.join().unwrap_or(false)
+}
+
+/// What a process has taken so far, all its threads together, and its memory at present.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Taken {
+    pub cpu_ns: u64,
+    /// Times that a thread went to sleep (`voluntary_ctxt_switches`).
+    pub sleeps: u64,
+    /// Times that a thread was taken off its CPU (`nonvoluntary_ctxt_switches`).
+    pub preemptions: u64,
+    pub rss_kib: u64,
+    pub anonymous_kib: u64,
+    pub shared_kib: u64,
+    pub file_kib: u64,
+}
+
+impl Taken {
+    pub fn by(pid: u32) -> Self {
+        let read = |path: String| fs::read_to_string(path).unwrap_or_default();
+        let memory = read(format!("/proc/{pid}/status"));
+        let mut taken = Self {
+            cpu_ns: cpu_ns(pid),
+            rss_kib: field(&memory, "VmRSS:"),
+            anonymous_kib: field(&memory, "RssAnon:"),
+            shared_kib: field(&memory, "RssShmem:"),
+            file_kib: field(&memory, "RssFile:"),
+            ..Self::default()
+        };
+        for task in fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {
+            let status = fs::read_to_string(task.path().join("status")).unwrap_or_default();
+            taken.sleeps += field(&status, "voluntary_ctxt_switches:");
+            taken.preemptions += field(&status, "nonvoluntary_ctxt_switches:");
+        }
+        taken
+    }
+}
+
+/// The number behind a name in a file of /proc.
+fn field(text: &str, name: &str) -> u64 {
+    let value =
+        text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next()?.parse().ok());
+    value.unwrap_or(0)
+}
+
+/// Open files of a process.
+pub fn descriptors(pid: u32) -> usize {
+    fs::read_dir(format!("/proc/{pid}/fd")).map_or(0, Iterator::count)
 }
 
 /// What the threads of a process had of the CPUs, in nanoseconds (the first number of their schedstat).
@@ -149,44 +221,30 @@ pub fn sleep_until(instant_ns: u64) {
 }
 
 /// What the figures depend on.
-#[derive(Clone, Debug, serde::Serialize)]
-pub struct Machine {
-    pub cpu: String,
-    pub cpus: usize,
-    pub kernel: String,
-    pub commit: String,
-    pub command: String,
-    pub load_average: String,
-    pub rmem_max: String,
-}
-
-impl Machine {
-    pub fn look() -> Self {
-        let read =
-            |path: &str| fs::read_to_string(path).map(|text| text.trim().to_owned()).unwrap_or_default();
-        let cpu = read("/proc/cpuinfo")
-            .lines()
-            .find_map(|line| {
-                line.strip_prefix("model name")?.split(':').nth(1).map(|name| name.trim().to_owned())
-            })
-            .unwrap_or_default();
-        let git = |arguments: &[&str]| {
-            let output =
-                Command::new("git").args(arguments).output().ok().filter(|output| output.status.success());
-            output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned()).unwrap_or_default()
-        };
-        let changed = !git(&["status", "--porcelain", "--untracked-files=no"]).is_empty();
-        Self {
-            cpu,
-            cpus: std::thread::available_parallelism().map_or(0, usize::from),
-            kernel: read("/proc/sys/kernel/osrelease"),
-            commit: git(&["rev-parse", "--short=12", "HEAD"]) + if changed { " with changes" } else { "" },
-            command: std::iter::once("cargo bench --".to_owned())
-                .chain(std::env::args().skip(1).filter(|argument| argument != "--bench"))
-                .collect::<Vec<_>>()
-                .join(" "),
-            load_average: read("/proc/loadavg"),
-            rmem_max: read("/proc/sys/net/core/rmem_max"),
-        }
+pub fn machine() -> Machine {
+    let read = |path: &str| fs::read_to_string(path).map(|text| text.trim().to_owned()).unwrap_or_default();
+    let cpu = read("/proc/cpuinfo")
+        .lines()
+        .find_map(|line| {
+            line.strip_prefix("model name")?.split(':').nth(1).map(|name| name.trim().to_owned())
+        })
+        .unwrap_or_default();
+    let git = |arguments: &[&str]| {
+        let output =
+            Command::new("git").args(arguments).output().ok().filter(|output| output.status.success());
+        output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned()).unwrap_or_default()
+    };
+    let changed = !git(&["status", "--porcelain", "--untracked-files=no"]).is_empty();
+    Machine {
+        cpu,
+        cpus: std::thread::available_parallelism().map_or(0, usize::from),
+        kernel: read("/proc/sys/kernel/osrelease"),
+        commit: git(&["rev-parse", "--short=12", "HEAD"]) + if changed { " with changes" } else { "" },
+        command: std::iter::once("cargo bench --".to_owned())
+            .chain(std::env::args().skip(1).filter(|argument| argument != "--bench"))
+            .collect::<Vec<_>>()
+            .join(" "),
+        load_average: read("/proc/loadavg"),
+        rmem_max: read("/proc/sys/net/core/rmem_max"),
     }
 }

@@ -5,13 +5,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use nix::sys::eventfd::{EfdFlags, EventFd};
 
-use super::system::{self, Place};
-use super::{Case, Options};
+use super::options::{Case, Options};
+use super::system::{self, Place, Scheduling};
 use adaptive_bridge::clock;
 
 /// Latencies in nanoseconds of as many wake-ups as the case has samples, at its rate: from before the write
 /// to after the read.
-pub fn eventfd(case: &Case, options: &Options) -> Result<Vec<u64>, String> {
+pub fn eventfd(case: &Case, options: &Options, scheduling: Scheduling) -> Result<Vec<u64>, String> {
     let say = |error: nix::errno::Errno| format!("eventfd: {error}");
     let event = Arc::new(EventFd::from_flags(EfdFlags::EFD_SEMAPHORE).map_err(say)?);
     let (samples, rate_hz) = (case.samples, case.rate_hz);
@@ -19,7 +19,7 @@ pub fn eventfd(case: &Case, options: &Options) -> Result<Vec<u64>, String> {
     let written_at: Arc<[AtomicU64]> = (0..samples).map(|_| AtomicU64::new(0)).collect();
     let sleeper = {
         let (event, written_at) = (Arc::clone(&event), Arc::clone(&written_at));
-        let place = Place::of(options, 1);
+        let place = Place::of(options, scheduling, 1);
         std::thread::spawn(move || {
             place.apply();
             let mut latencies = Vec::with_capacity(samples);
@@ -33,7 +33,7 @@ pub fn eventfd(case: &Case, options: &Options) -> Result<Vec<u64>, String> {
             latencies
         })
     };
-    let place = Place::of(options, 0);
+    let place = Place::of(options, scheduling, 0);
     let waker = std::thread::spawn(move || {
         place.apply();
         let start = clock::monotonic().0 + 10_000_000;

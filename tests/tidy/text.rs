@@ -23,7 +23,7 @@ const UNSAFE: &[&str] = &[
     // System calls without a safe wrapper.
     "src/process/scheduling.rs",
     // What a child does between fork and exec.
-    "benches/hop/children.rs",
+    "benches/hop/beds.rs",
     "src/cli/demo/children.rs",
     "tests/support/process.rs",
     // A thread that is traced, and so stopped by itself.

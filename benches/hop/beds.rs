@@ -1,0 +1,634 @@
+//! The test beds: direct, relay and bridge, each a set of child processes on a DDS domain of its own.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use adaptive_bridge::model::{DropCounts, DropReason};
+use adaptive_bridge::shm::{Boards, Stage};
+use nix::sys::prctl::set_pdeathsig;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use super::histogram::Buckets;
+use super::link::{self, INPUT, OUTPUT, Record, Route};
+use super::options::{Case, Options};
+use super::system::{self, FIFO_PRIORITY, Place, Scheduling};
+
+/// The first domain of the beds: below the ephemeral ports, and none that the tests use.
+const FIRST_DOMAIN: u16 = 94;
+
+/// Beds that may be up at once: their domains are 94 to 99.
+const MOST_BEDS: usize = 6;
+
+/// The critical lane is the first one of every bridge.
+const CRITICAL: usize = 0;
+
+/// What stands for the slices of the services, whose CPUWeight is 1000 and 20: this nice value has a 46th of
+/// the share of CPU that 0 has.
+pub const NONCRITICAL_NICE: &str = "17";
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    Direct,
+    Relay,
+    Bridge,
+}
+
+impl Kind {
+    pub const ALL: [Self; 3] = [Self::Direct, Self::Relay, Self::Bridge];
+
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Direct => "direct",
+            Self::Relay => "relay",
+            Self::Bridge => "bridge",
+        }
+    }
+}
+
+/// What a bed is made of.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    pub kind: Kind,
+    pub scheduling: Scheduling,
+    /// The largest sample of each route.
+    pub routes: Vec<usize>,
+    /// The noncritical lanes of a bridge, all routes on each.
+    pub lanes: usize,
+    /// Whether these lanes run, with a subscriber, or are only offered samples.
+    pub lanes_run: bool,
+    /// Whether control runs.
+    pub control: bool,
+    /// Rate of the noncritical lanes.
+    pub noncritical_rate_hz: u64,
+}
+
+impl Plan {
+    /// Ingress and the critical lane of a bridge as users have it, whose noncritical lane does not run.
+    pub fn new(kind: Kind, scheduling: Scheduling, routes: &[usize]) -> Self {
+        let routes = routes.to_vec();
+        Self { kind, scheduling, routes, lanes: 1, lanes_run: false, control: false, noncritical_rate_hz: 10 }
+    }
+
+    /// A bridge with all its processes.
+    pub fn whole(scheduling: Scheduling, routes: &[usize]) -> Self {
+        Self { lanes_run: true, control: true, ..Self::new(Kind::Bridge, scheduling, routes) }
+    }
+
+    fn lane_names(&self) -> Vec<String> {
+        (0..self.lanes)
+            .map(|lane| if lane == 0 { "noncritical".to_owned() } else { format!("lane{lane}") })
+            .collect()
+    }
+}
+
+/// What one repetition of one case gave.
+pub struct Run {
+    pub kind: Kind,
+    pub accepted: u64,
+    /// Refused by the publisher's own writer.
+    pub refused: u64,
+    pub records: Vec<Record>,
+    /// Samples whose content was not what was sent.
+    pub damaged: u64,
+    /// Refused by the relay's writer.
+    pub relay_refused: u64,
+    /// What each process between publisher and subscriber had of the CPUs meanwhile.
+    pub cpu_ns: BTreeMap<String, u64>,
+    pub bridge: Option<BridgeRun>,
+}
+
+/// What the bridge counted meanwhile.
+pub struct BridgeRun {
+    pub lost_upstream: u64,
+    pub forwarded: u64,
+    pub by_reference: u64,
+    /// Drops by ingress and by the critical lane, by name.
+    pub drops: Vec<(String, u64)>,
+    /// `received = forwarded + every named drop`.
+    pub whole: bool,
+    /// From ingress' publishing to the lane having taken the sample.
+    pub shm: Buckets,
+    /// What the lane takes to hand a sample to its DDS writer.
+    pub hand_over: Buckets,
+    /// What the first noncritical lane forwarded.
+    pub noncritical_forwarded: u64,
+}
+
+/// A program of ours that takes orders.
+pub struct Program {
+    child: Child,
+    orders: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Program {
+    pub fn start(role: &str, domain: u16, place: Place, more: &[&str]) -> Result<Self, String> {
+        let executable = std::env::current_exe().map_err(|error| error.to_string())?;
+        // Programs on the noncritical side have as little of the CPUs as its lanes.
+        let is_noncritical = ["__drain", "__spinner"].contains(&role);
+        let mut command = if is_noncritical {
+            let mut command = Command::new("nice");
+            command.args(["-n", NONCRITICAL_NICE]).arg(executable);
+            command
+        } else {
+            Command::new(executable)
+        };
+        command.arg(role).arg(domain.to_string()).arg(place.to_argument()).args(more);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = spawn(&mut command)?;
+        let (Some(orders), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
+            return Err(format!("{role} has no pipes"));
+        };
+        Ok(Self { child, orders, answers: BufReader::new(answers) })
+    }
+
+    fn order(&mut self, line: &str) -> Result<(), String> {
+        writeln!(self.orders, "{line}").map_err(|error| format!("a program of the bench died: {error}"))
+    }
+
+    fn answer(&mut self) -> Result<String, String> {
+        let mut line = String::new();
+        match self.answers.read_line(&mut line) {
+            Ok(0) => Err("a program of the bench ended unasked; see above".to_owned()),
+            Ok(_) => Ok(line.trim_end().to_owned()),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// The numbers of an answer that begins with `word`.
+    pub fn numbers(&mut self, word: &str) -> Result<Vec<u64>, String> {
+        let answer = self.answer()?;
+        let mut words = answer.split(' ');
+        if words.next() != Some(word) {
+            return Err(format!("not an answer: {answer}"));
+        }
+        Ok(words.filter_map(|number| number.parse().ok()).collect())
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Starts a child that does not outlive this process.
+fn spawn(command: &mut Command) -> Result<Child, String> {
+    for variable in [
+        "ROS_DOMAIN_ID",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_STATIC_PEERS",
+        "ADAPTIVE_BRIDGE_FIFO_PRIORITY",
+    ] {
+        command.env_remove(variable);
+    }
+    // SAFETY: prctl is async-signal-safe, and nothing else is done between fork and exec.
+    unsafe {
+        command.pre_exec(|| set_pdeathsig(Signal::SIGKILL).map_err(std::io::Error::from));
+    }
+    command.spawn().map_err(|error| format!("{:?}: {error}", command.get_program()))
+}
+
+/// One of direct, relay, bridge.
+pub struct Bed {
+    kind: Kind,
+    routes: usize,
+    publisher: Program,
+    subscriber: Program,
+    /// Subscribes to the noncritical lanes as long as the bed is up.
+    _drain: Option<Program>,
+    relay: Option<Program>,
+    pub bridge: Option<Bridge>,
+    next_number: u64,
+}
+
+/// The processes of a bridge.
+pub struct Bridge {
+    processes: Vec<Process>,
+    boards: Boards,
+    folder: PathBuf,
+    config: PathBuf,
+    executable: PathBuf,
+    domain: u16,
+    plan: Plan,
+    places: [Place; 2],
+}
+
+/// A process of a bridge and the role that it has.
+pub struct Process {
+    pub role: String,
+    pub child: Child,
+}
+
+impl Process {
+    fn start(executable: &Path, role: &str, config: &Path) -> Result<Self, String> {
+        let is_noncritical = !["ingress", "critical", "control"].contains(&role);
+        let mut command = if is_noncritical {
+            let mut command = Command::new("nice");
+            command.args(["-n", NONCRITICAL_NICE]).arg(executable);
+            command
+        } else {
+            Command::new(executable)
+        };
+        match role {
+            "ingress" | "control" => command.arg(role),
+            lane => command.args(["egress", "--lane", lane]),
+        };
+        command.arg("--config").arg(config).stdin(Stdio::null()).stdout(Stdio::null());
+        if std::env::var_os("RUST_LOG").is_none() {
+            command.env("RUST_LOG", "error");
+        }
+        Ok(Self { role: role.to_owned(), child: spawn(&mut command)? })
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        let _ = kill(Pid::from_raw(self.child.id().cast_signed()), signal);
+    }
+}
+
+impl Bridge {
+    fn start(domain: u16, plan: &Plan, places: [Place; 2], executable: &Path) -> Result<Self, String> {
+        let name = format!("adaptive-bridge-bench-{}-{domain}", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        fs::create_dir_all(&folder).map_err(|error| error.to_string())?;
+        let config = folder.join("bridge.yaml");
+        let text = configuration(domain, &folder, plan, places);
+        fs::write(&config, text).map_err(|error| error.to_string())?;
+        let mut roles = vec!["ingress".to_owned(), "critical".to_owned()];
+        if plan.lanes_run {
+            roles.extend(plan.lane_names());
+        }
+        if plan.control {
+            roles.push("control".to_owned());
+        }
+        let mut processes = Vec::new();
+        for role in roles {
+            processes.push(Process::start(executable, &role, &config)?);
+        }
+        // Ingress sets up the pools, some ms for each route of some MB.
+        std::thread::sleep(Duration::from_millis(700));
+        let boards = link::boards(&config)?;
+        let executable = executable.to_owned();
+        Ok(Self { processes, boards, folder, config, executable, domain, plan: plan.clone(), places })
+    }
+
+    fn check(&mut self) -> Result<(), String> {
+        for process in &mut self.processes {
+            if let Ok(Some(status)) = process.child.try_wait() {
+                return Err(format!("{} of the bridge ended unasked: {status}", process.role));
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes the process of a role away, for somebody who kills it.
+    pub fn take(&mut self, role: &str) -> Option<Process> {
+        let at = self.processes.iter().position(|process| process.role == role)?;
+        Some(self.processes.remove(at))
+    }
+
+    /// Gives a process back.
+    pub fn give(&mut self, process: Process) {
+        self.processes.push(process);
+    }
+
+    /// What starts another process of a role, from another thread.
+    pub fn starter(&self, role: &str) -> impl Fn() -> Result<Process, String> + Send + use<> {
+        let (executable, role, config) = (self.executable.clone(), role.to_owned(), self.config.clone());
+        move || Process::start(&executable, &role, &config)
+    }
+
+    pub fn signal(&self, role: &str, signal: Signal) {
+        for process in self.processes.iter().filter(|process| process.role == role) {
+            process.signal(signal);
+        }
+    }
+
+    /// Sets the rate of the noncritical lanes as a user does: file and reload.
+    pub fn set_noncritical_rate(&mut self, rate_hz: u64) -> Result<(), String> {
+        self.plan.noncritical_rate_hz = rate_hz;
+        let text = configuration(self.domain, &self.folder, &self.plan, self.places);
+        fs::write(&self.config, text).map_err(|error| error.to_string())?;
+        let mut command = Command::new(&self.executable);
+        let output = command.arg("reload").arg("--config").arg(&self.config).output();
+        let output = output.map_err(|error| error.to_string())?;
+        if output.status.success() {
+            return Ok(());
+        }
+        Err(format!("reload: {}", String::from_utf8_lossy(&output.stderr).trim()))
+    }
+}
+
+impl Drop for Bridge {
+    fn drop(&mut self) {
+        // Asked to, the last of them removes their shared memory, up to 1 GB of it; one that is killed can't.
+        for process in &self.processes {
+            process.signal(Signal::SIGCONT);
+            process.signal(Signal::SIGTERM);
+        }
+        let give_up_at = Instant::now() + Duration::from_secs(5);
+        for process in &mut self.processes {
+            while matches!(process.child.try_wait(), Ok(None)) && Instant::now() < give_up_at {
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            let _ = process.child.kill();
+            let _ = process.child.wait();
+        }
+        let _ = fs::remove_dir_all(&self.folder);
+    }
+}
+
+/// Some beds, up at the same time.
+pub struct Beds(pub Vec<Bed>);
+
+impl Beds {
+    pub fn start(plans: &[Plan], options: &Options) -> Result<Self, String> {
+        assert!(plans.len() <= MOST_BEDS, "a domain for each");
+        let mut beds = Vec::new();
+        for (plan, domain) in plans.iter().zip(FIRST_DOMAIN..) {
+            eprintln!(
+                "starting {}, {} routes, scheduling {}",
+                plan.kind.label(),
+                plan.routes.len(),
+                plan.scheduling.label()
+            );
+            beds.push(Bed::start(plan, domain, options)?);
+        }
+        // Discovery goes on for a while after the endpoints have found each other.
+        std::thread::sleep(Duration::from_secs(2));
+        Ok(Self(beds))
+    }
+
+    /// Direct, relay and bridge with these routes.
+    pub fn three(scheduling: Scheduling, routes: &[usize], options: &Options) -> Result<Self, String> {
+        Self::start(&Kind::ALL.map(|kind| Plan::new(kind, scheduling, routes)), options)
+    }
+}
+
+impl Bed {
+    fn start(plan: &Plan, domain: u16, options: &Options) -> Result<Self, String> {
+        let kind = plan.kind;
+        let stages = match kind {
+            Kind::Direct => 2,
+            Kind::Relay => 3,
+            Kind::Bridge => 4,
+        };
+        let place = |stage| Place { cpu: options.placement.cpu(stage, stages), scheduling: plan.scheduling };
+        let all = Route::all(&plan.routes);
+        let routes = Route::to_argument(&all);
+        let (mut relay, mut bridge, mut config, mut drain) = (None, None, None, None);
+        match kind {
+            Kind::Direct => {}
+            Kind::Relay => {
+                let mut program = Program::start("__relay", domain, place(1), &[&routes])?;
+                program.numbers("ready")?;
+                relay = Some(program);
+            }
+            Kind::Bridge => {
+                let started = Bridge::start(domain, plan, [place(1), place(2)], &options.bridge)?;
+                config = Some(started.config.to_string_lossy().into_owned());
+                bridge = Some(started);
+            }
+        }
+        if plan.lanes_run && plan.lanes > 0 {
+            let prefixes: Vec<String> =
+                plan.lane_names().iter().map(|lane| format!("/bench/{lane}/")).collect();
+            let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
+            let mut program = Program::start("__drain", domain, anywhere, &[&routes, &prefixes.join(",")])?;
+            program.numbers("ready")?;
+            drain = Some(program);
+        }
+        let prefix = if kind == Kind::Direct { INPUT } else { OUTPUT };
+        let mut more = vec![routes.as_str(), prefix];
+        more.extend(config.as_deref());
+        let mut subscriber = Program::start("__subscriber", domain, place(stages - 1), &more)?;
+        subscriber.numbers("ready")?;
+        let mut publisher = Program::start("__publisher", domain, place(0), &[&routes])?;
+        publisher.numbers("ready")?;
+        let routes = all.len();
+        let mut bed =
+            Self { kind, routes, publisher, subscriber, _drain: drain, relay, bridge, next_number: 0 };
+        bed.warm_up()?;
+        Ok(bed)
+    }
+
+    pub fn name(&self) -> &'static str {
+        self.kind.label()
+    }
+
+    pub fn kind(&self) -> Kind {
+        self.kind
+    }
+
+    /// Sends until everything arrives on every route: the writers in the middle are matched a little later
+    /// than the first one.
+    fn warm_up(&mut self) -> Result<(), String> {
+        let routes = self.routes;
+        let case = Case { rate_hz: 100, bytes: 64, samples: 25.max(2 * routes), first_route: 0, routes };
+        for _ in 0..20 {
+            let run = self.measure_with_patience(&case, 500)?;
+            if run.records.len() == case.samples {
+                return Ok(());
+            }
+        }
+        Err(format!("{}: samples do not arrive", self.kind.label()))
+    }
+
+    /// Every process with its id: publisher, subscriber, and those between them.
+    pub fn processes(&self) -> Vec<(String, u32)> {
+        let program = |name: &str, program: &Program| (name.to_owned(), program.child.id());
+        let mut all = vec![program("publisher", &self.publisher), program("subscriber", &self.subscriber)];
+        all.extend(self.between());
+        all
+    }
+
+    /// Those between publisher and subscriber.
+    pub fn between(&self) -> Vec<(String, u32)> {
+        let relay = self.relay.iter().map(|relay| ("relay".to_owned(), relay.child.id()));
+        let bridge = self.bridge.iter().flat_map(|bridge| &bridge.processes);
+        relay.chain(bridge.map(|process| (process.role.clone(), process.child.id()))).collect()
+    }
+
+    fn cpu_ns(&self) -> BTreeMap<String, u64> {
+        self.between().into_iter().map(|(name, pid)| (name, system::cpu_ns(pid))).collect()
+    }
+
+    pub fn measure(&mut self, case: &Case) -> Result<Run, String> {
+        // A RELIABLE writer repairs within a heartbeat period, a second at most.
+        self.measure_with_patience(case, 3_000)
+    }
+
+    /// Gives up on missing samples when none has come for so long.
+    pub fn measure_with_patience(&mut self, case: &Case, patience_ms: u64) -> Result<Run, String> {
+        let routes = case.first_route..case.first_route + case.routes;
+        if let Some(bridge) = &mut self.bridge {
+            bridge.check()?;
+        }
+        let before = self.bridge.as_ref().map(|bridge| Counted::read(&bridge.boards, routes.clone()));
+        self.subscriber.order("begin")?;
+        std::thread::sleep(Duration::from_millis(150));
+        let cpu_before = self.cpu_ns();
+        self.publisher.order(&format!(
+            "send {} {} {} {} {} {}",
+            case.first_route, case.routes, case.rate_hz, case.samples, case.bytes, self.next_number
+        ))?;
+        let sent = self.publisher.numbers("sent")?;
+        let earlier = |name: &String| cpu_before.get(name).copied().unwrap_or_default();
+        let cpu_ns = self
+            .cpu_ns()
+            .into_iter()
+            .map(|(name, ns)| (name.clone(), ns.saturating_sub(earlier(&name))))
+            .collect();
+        let [accepted, refused] = sent[..] else { return Err("the publisher does not say".to_owned()) };
+        self.subscriber.order(&format!("end {accepted} {patience_ms}"))?;
+        let head = self.subscriber.numbers("samples")?;
+        let [count, damaged] = head[..] else { return Err("the subscriber does not say".to_owned()) };
+        let mut records = Vec::with_capacity(count as usize);
+        for _ in 0..count {
+            let line = self.subscriber.answer()?;
+            let mut words = line.split(' ').filter_map(|word| word.parse().ok());
+            let mut word = || words.next().unwrap_or(0);
+            let record = Record {
+                number: word(),
+                due_at: word(),
+                written_at: word(),
+                arrived_at: word(),
+                taken_at: word(),
+                handed_at: word(),
+            };
+            // What came late from the repetition before is not of this one.
+            if record.number >= self.next_number {
+                records.push(record);
+            }
+        }
+        self.next_number += case.samples as u64;
+        let relay_refused = match &mut self.relay {
+            Some(relay) => {
+                relay.order("refused")?;
+                relay.numbers("refused")?.first().copied().unwrap_or(0)
+            }
+            None => 0,
+        };
+        let bridge = match (&self.bridge, before) {
+            (Some(bridge), Some(before)) => Some(Counted::read(&bridge.boards, routes).since(&before)),
+            _ => None,
+        };
+        Ok(Run { kind: self.kind, accepted, refused, records, damaged, relay_refused, cpu_ns, bridge })
+    }
+}
+
+fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Place; 2]) -> String {
+    let scheduling = |place: Place| {
+        let cpus = place.cpu.map_or(String::new(), |cpu| cpu.to_string());
+        let policy = match place.scheduling {
+            Scheduling::Other => "policy: other, priority: 0, lock_memory: false".to_owned(),
+            Scheduling::Fifo => format!("policy: fifo, priority: {FIFO_PRIORITY}, lock_memory: true"),
+        };
+        format!("{{{policy}, cpus: [{cpus}]}}")
+    };
+    let mut text = format!(
+        "instance: bench\nros:\n  domain_id: {domain}\nshared_memory:\n  root_path: {}\nprocesses:\n  ingress:\n    \
+         scheduling: {}\nlanes:\n  critical:\n    scheduling: {}\n",
+        folder.display(),
+        scheduling(ingress),
+        scheduling(egress)
+    );
+    let (lanes, rate_hz) = (plan.lane_names(), plan.noncritical_rate_hz);
+    for lane in &lanes {
+        text.push_str(&format!(
+            "  {lane}:\n    max_rate_hz: {rate_hz}\n    degraded_rate_hz: {rate_hz}\n    queue_samples: 64\n"
+        ));
+    }
+    let on = std::iter::once("critical").chain(lanes.iter().map(String::as_str)).collect::<Vec<_>>();
+    text.push_str("topics:\n");
+    for route in Route::all(&plan.routes) {
+        let id = route.id();
+        text.push_str(&format!(
+            "  - id: {id}\n    input_topic: {INPUT}{id}\n    message_type: {}\n    max_sample_bytes: {}\n    \
+             lanes: [{}]\n    outputs:\n      critical: {OUTPUT}{id}\n",
+            route.message_type(),
+            route.max_sample_bytes,
+            on.join(", ")
+        ));
+        for lane in &lanes {
+            text.push_str(&format!("      {lane}: /bench/{lane}/{id}\n"));
+        }
+    }
+    text
+}
+
+/// The counters and latencies of some routes at one instant.
+struct Counted {
+    lost_upstream: u64,
+    forwarded: u64,
+    by_reference: u64,
+    noncritical_forwarded: u64,
+    drops: BTreeMap<String, u64>,
+    whole: bool,
+    shm: Buckets,
+    hand_over: Buckets,
+}
+
+impl Counted {
+    fn read(boards: &Boards, routes: std::ops::Range<usize>) -> Self {
+        let mut counted = Self {
+            lost_upstream: 0,
+            forwarded: 0,
+            by_reference: 0,
+            noncritical_forwarded: 0,
+            drops: BTreeMap::new(),
+            whole: true,
+            shm: Buckets::default(),
+            hand_over: Buckets::default(),
+        };
+        for route in routes {
+            let ingress = boards.ingress(route).unwrap_or_default();
+            let lane = boards.lane(CRITICAL, route).unwrap_or_default();
+            counted.lost_upstream += ingress.lost_upstream;
+            counted.forwarded += lane.forwarded;
+            counted.by_reference += lane.by_reference;
+            counted.noncritical_forwarded += noncritical(boards, route);
+            counted.whole &= lane.is_whole();
+            counted.shm.add(&boards.histogram(Stage::Shm(CRITICAL), route));
+            counted.hand_over.add(&boards.histogram(Stage::DdsOut(CRITICAL), route));
+            let mut add = |process: &str, drops: &DropCounts| {
+                for &reason in DropReason::ALL {
+                    *counted.drops.entry(format!("{process} {}", reason.label())).or_default() +=
+                        drops.get(reason);
+                }
+            };
+            add("ingress", &ingress.drops);
+            add("critical", &lane.drops);
+        }
+        counted
+    }
+
+    fn since(&self, before: &Self) -> BridgeRun {
+        let earlier = |name: &String| before.drops.get(name).copied().unwrap_or_default();
+        let drops =
+            self.drops.iter().map(|(name, count)| (name.clone(), count.saturating_sub(earlier(name))));
+        BridgeRun {
+            lost_upstream: self.lost_upstream - before.lost_upstream,
+            forwarded: self.forwarded - before.forwarded,
+            by_reference: self.by_reference - before.by_reference,
+            drops: drops.filter(|(_, count)| *count > 0).collect(),
+            whole: self.whole,
+            shm: self.shm.since(&before.shm),
+            hand_over: self.hand_over.since(&before.hand_over),
+            noncritical_forwarded: self.noncritical_forwarded.saturating_sub(before.noncritical_forwarded),
+        }
+    }
+}
+
+/// What the first noncritical lane has forwarded; a bridge without one has no board for it.
+fn noncritical(boards: &Boards, route: usize) -> u64 {
+    boards.lane(CRITICAL + 1, route).map_or(0, |lane| lane.forwarded)
+}

@@ -1,0 +1,231 @@
+//! The sweep over rates and payloads, and the runs that must lose nothing. Wake-up, direct, relay and bridge
+//! take turns.
+
+use std::collections::BTreeMap;
+
+use super::beds::{Beds, Kind, Run};
+use super::histogram::Buckets;
+use super::options::{Case, Options, SCAN, SWEEP_ROUTES};
+use super::out::{Of, Output};
+use super::report::statistics::median;
+use super::report::{Latency, Loss, Quantiles};
+use super::system::Scheduling;
+use super::throughput;
+use super::wakeup;
+
+/// Latencies of one program in one case, over the repetitions.
+#[derive(Default)]
+struct Program {
+    latency: Vec<f64>,
+    from_due: Vec<f64>,
+    /// Of each repetition.
+    each: Vec<Quantiles>,
+    missing: u64,
+    cpu_ns: u64,
+    accepted: u64,
+    dds_in: Vec<f64>,
+    dds_out: Vec<f64>,
+    shm: Buckets,
+    hand_over: Buckets,
+    copies: Option<(u64, u64)>,
+}
+
+pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
+    for scheduling in options.schedulings() {
+        let (cases, losses) = (options.sweep(), options.loss_checks());
+        let searches =
+            if scheduling == options.first_scheduling() { throughput::payloads(options) } else { Vec::new() };
+        if cases.is_empty() && losses.is_empty() && searches.is_empty() {
+            continue;
+        }
+        let mut beds = Beds::three(scheduling, &SWEEP_ROUTES, options)?;
+        sweep(&cases, scheduling, &mut beds, options, output)?;
+        for case in losses {
+            for bed in &mut beds.0 {
+                eprintln!("loss: {} {}, {}", case.name(), bed.name(), scheduling.label());
+                let run = bed.measure(&case)?;
+                output.summary.loss.push(loss(&case, scheduling, &run));
+            }
+        }
+        for bytes in searches {
+            throughput::search(bytes, scheduling, &mut beds, options, output)?;
+        }
+    }
+    Ok(())
+}
+
+fn sweep(
+    cases: &[Case],
+    scheduling: Scheduling,
+    beds: &mut Beds,
+    options: &Options,
+    output: &mut Output,
+) -> Result<(), String> {
+    let mut programs: BTreeMap<(usize, &'static str), Program> = BTreeMap::new();
+    for repetition in 0..options.repetitions {
+        for (index, case) in cases.iter().enumerate() {
+            let name = case.name();
+            eprintln!(
+                "latency {} of {}: {name}, {}",
+                repetition + 1,
+                options.repetitions,
+                scheduling.label()
+            );
+            let of = |program| Of {
+                section: "latency",
+                scheduling: scheduling.label(),
+                case: &name,
+                program,
+                repetition,
+            };
+            // A wake-up carries nothing: once for each rate is enough.
+            if is_first_of_rate(cases, index) {
+                let us: Vec<f64> = wakeup::eventfd(case, options, scheduling)?
+                    .iter()
+                    .map(|ns| *ns as f64 / 1_000.0)
+                    .collect();
+                let program = programs.entry((index, "wake-up")).or_default();
+                program.each.push(Quantiles::of(&us));
+                output.raw_quantiles(of("wake-up"), "wake-up", &Quantiles::of(&us));
+                program.latency.extend(us);
+            }
+            for bed in &mut beds.0 {
+                let run = bed.measure(case)?;
+                let program = programs.entry((index, bed.name())).or_default();
+                add(program, &run, of(bed.name()), output);
+            }
+        }
+    }
+    for (index, case) in cases.iter().enumerate() {
+        for name in ["wake-up", "direct", "relay", "bridge"] {
+            let direct = programs.get(&(index, "direct")).map(|direct| direct.each.clone());
+            if let Some(program) = programs.get(&(index, name)) {
+                output.summary.latency.push(row(
+                    case,
+                    scheduling,
+                    name,
+                    program,
+                    &direct.unwrap_or_default(),
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether no earlier case of the sweep has the rate; of equals, the laser scan has it, as it has most
+/// samples.
+fn is_first_of_rate(cases: &[Case], index: usize) -> bool {
+    let rate_hz = cases[index].rate_hz;
+    let mut same = cases.iter().enumerate().filter(|(_, case)| case.rate_hz == rate_hz);
+    let scan = same.clone().find(|(_, case)| case.bytes == SCAN);
+    scan.or_else(|| same.next()).is_some_and(|(first, _)| first == index)
+}
+
+fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
+    let us = |from: u64, to: u64| {
+        if from == 0 || to == 0 { f64::NAN } else { (to as f64 - from as f64) / 1_000.0 }
+    };
+    let (mut latency, mut from_due) = (Vec::new(), Vec::new());
+    for record in &run.records {
+        latency.push(us(record.written_at, record.arrived_at));
+        from_due.push(us(record.due_at, record.arrived_at));
+        let dds_in = us(record.written_at, record.taken_at);
+        let dds_out = us(record.handed_at, record.arrived_at);
+        program.dds_in.push(dds_in);
+        program.dds_out.push(dds_out);
+        let late = us(record.due_at, record.written_at);
+        output.sample(of, record.number, [late, us(record.written_at, record.arrived_at), dds_in, dds_out]);
+    }
+    let cpu_ns: u64 = run.cpu_ns.values().sum();
+    let missing = (run.accepted + run.refused).saturating_sub(run.records.len() as u64);
+    let quantiles = Quantiles::of(&latency);
+    output.raw_quantiles(of, "latency", &quantiles);
+    output.raw_quantiles(of, "from due", &Quantiles::of(&from_due));
+    output.raw(of, "missing", missing as f64);
+    if run.kind != Kind::Direct {
+        output.raw(of, "cpu us/sample", cpu_ns as f64 / 1_000.0 / run.accepted.max(1) as f64);
+    }
+    if let Some(bridge) = &run.bridge {
+        output.raw_quantiles(of, "shared memory", &bridge.shm.quantiles());
+        output.raw_quantiles(of, "hand-over", &bridge.hand_over.quantiles());
+        program.shm.merge(&bridge.shm);
+        program.hand_over.merge(&bridge.hand_over);
+        let copies = program.copies.get_or_insert_default();
+        copies.0 += bridge.forwarded;
+        copies.1 += bridge.by_reference;
+    }
+    program.each.push(quantiles);
+    program.latency.extend(latency);
+    program.from_due.extend(from_due);
+    program.missing += missing;
+    program.cpu_ns += cpu_ns;
+    program.accepted += run.accepted;
+}
+
+fn row(case: &Case, scheduling: Scheduling, name: &str, program: &Program, direct: &[Quantiles]) -> Latency {
+    let hop = |of: fn(&Quantiles) -> Option<f64>| {
+        let pairs = program.each.iter().zip(direct);
+        let hops: Vec<f64> = pairs.filter_map(|(with, without)| Some(of(with)? - of(without)?)).collect();
+        (!hops.is_empty() && ["relay", "bridge"].contains(&name)).then(|| median(&hops))
+    };
+    let mut stages = BTreeMap::new();
+    if program.copies.is_some() {
+        stages.insert("DDS in".to_owned(), Quantiles::of(&program.dds_in));
+        stages.insert("shared memory".to_owned(), program.shm.quantiles());
+        stages.insert("hand-over".to_owned(), program.hand_over.quantiles());
+        stages.insert("DDS out".to_owned(), Quantiles::of(&program.dds_out));
+    }
+    Latency {
+        scheduling: scheduling.label().to_owned(),
+        rate_hz: case.rate_hz,
+        bytes: case.bytes,
+        program: name.to_owned(),
+        missing: program.missing,
+        latency: Quantiles::of(&program.latency),
+        from_due: Quantiles::of(&program.from_due),
+        repetitions_p50_us: program.each.iter().filter_map(|each| each.p50_us).collect(),
+        hop_p50_us: hop(|quantiles| quantiles.p50_us),
+        hop_p99_us: hop(|quantiles| quantiles.p99_us),
+        cpu_us_per_sample: (program.cpu_ns > 0)
+            .then(|| program.cpu_ns as f64 / 1_000.0 / program.accepted.max(1) as f64),
+        stages,
+        // One into shared memory, and another where the lane did not hand the sample on by reference.
+        copies: program
+            .copies
+            .map(|(forwarded, by_reference)| 2.0 - by_reference as f64 / forwarded.max(1) as f64),
+    }
+}
+
+/// What became of the samples of a run.
+pub fn loss(case: &Case, scheduling: Scheduling, run: &Run) -> Loss {
+    let mut numbers: Vec<u64> = run.records.iter().map(|record| record.number).collect();
+    let disordered = numbers.windows(2).filter(|pair| pair[1] <= pair[0]).count() as u64;
+    numbers.sort_unstable();
+    numbers.dedup();
+    let received = numbers.len() as u64;
+    let mut drops: BTreeMap<String, u64> = BTreeMap::new();
+    if run.relay_refused > 0 {
+        drops.insert("relay window_full".to_owned(), run.relay_refused);
+    }
+    if let Some(bridge) = &run.bridge {
+        drops.extend(bridge.drops.iter().cloned());
+        if bridge.lost_upstream > 0 {
+            drops.insert("ingress lost_upstream".to_owned(), bridge.lost_upstream);
+        }
+    }
+    Loss {
+        scheduling: scheduling.label().to_owned(),
+        rate_hz: case.rate_hz,
+        bytes: case.bytes,
+        program: run.kind.label().to_owned(),
+        accepted: run.accepted,
+        refused: run.refused,
+        received,
+        lost: run.accepted.saturating_sub(received),
+        disordered,
+        damaged: run.damaged,
+        drops,
+        whole: run.bridge.as_ref().map(|bridge| bridge.whole),
+    }
+}

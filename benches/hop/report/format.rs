@@ -1,0 +1,38 @@
+//! How values are written.
+
+/// For attributes and text of SVG.
+pub fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// With three digits that say something, and a comma between thousands; a dash for what is not known.
+pub fn number(value: Option<f64>) -> String {
+    let Some(value) = value.filter(|value| value.is_finite()) else { return "–".to_owned() };
+    let magnitude = value.abs();
+    let decimals = if magnitude < 10.0 { 2 } else { usize::from(magnitude < 100.0) };
+    let text = format!("{value:.decimals$}");
+    let (whole, rest) = text.split_once('.').map_or((text.as_str(), ""), |(whole, rest)| (whole, rest));
+    let (sign, digits) = whole.strip_prefix('-').map_or(("", whole), |digits| ("-", digits));
+    let mut grouped = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            grouped.push(',');
+        }
+        grouped.push(digit);
+    }
+    if rest.is_empty() { format!("{sign}{grouped}") } else { format!("{sign}{grouped}.{rest}") }
+}
+
+/// From the least to the most.
+pub fn range(values: &[f64]) -> String {
+    let of = |better: fn(f64, f64) -> f64| values.iter().copied().reduce(better);
+    match (of(f64::min), of(f64::max)) {
+        (Some(low), Some(high)) => format!("{} to {}", number(Some(low)), number(Some(high))),
+        _ => "–".to_owned(),
+    }
+}
+
+/// A count.
+pub fn count(value: u64) -> String {
+    number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()
+}

@@ -1,0 +1,69 @@
+//! Lines over a number, in panels above each other.
+
+use super::axis::Axis;
+use super::file;
+use super::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
+use super::svg::{Anchor, Svg, TEXT};
+
+const PANEL: f64 = 130.0;
+
+/// A line of a panel.
+pub struct Line<'a> {
+    pub name: &'a str,
+    /// `a` to `f`; with ` tail` behind it, thin, dashed, and not in the legend.
+    pub class: String,
+    pub points: Vec<(f64, f64)>,
+}
+
+/// Lines with axes in common.
+pub struct Panel<'a> {
+    pub title: String,
+    pub lines: Vec<Line<'a>>,
+}
+
+/// Panels with one x axis. `logarithmic` is for both axes; a linear y axis begins at 0.
+pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) -> String {
+    let mut svg = Svg::default();
+    let finite = |panels: &[Panel], of: fn(&(f64, f64)) -> f64| {
+        let values = panels.iter().flat_map(|panel| &panel.lines).flat_map(|line| &line.points).map(of);
+        values.filter(|value| value.is_finite()).fold(None, |range: Option<(f64, f64)>, value| {
+            Some(range.map_or((value, value), |(low, high)| (low.min(value), high.max(value))))
+        })
+    };
+    let range = finite(panels, |point| point.0).unwrap_or((1.0, 10.0));
+    let x = if logarithmic {
+        Axis::decades(range, (LEFT, RIGHT))
+    } else {
+        Axis::linear((0.0, range.1), (LEFT, RIGHT))
+    };
+    let (mut top, mut bottom) = (0.0, 0.0);
+    for panel in panels {
+        svg.text("t strong", (LEFT, top + TEXT), Anchor::Start, &panel.title);
+        let shown = panel.lines.iter().filter(|line| !line.class.contains("tail"));
+        let entries: Vec<Entry> =
+            shown.map(|line| Entry { text: line.name, class: &line.class, is_line: true }).collect();
+        top = legend(&mut svg, top + TEXT + 4.0, &entries) + 4.0;
+        bottom = top + PANEL;
+        let range = finite(std::slice::from_ref(panel), |point| point.1).unwrap_or((1.0, 10.0));
+        let y = if logarithmic {
+            Axis::decades(range, (bottom, top))
+        } else {
+            Axis::linear((0.0, range.1 * 1.05), (bottom, top))
+        };
+        grid_y(&mut svg, &y, 5);
+        for line in &panel.lines {
+            let points: Vec<(f64, f64)> = line
+                .points
+                .iter()
+                .filter(|point| point.1.is_finite())
+                .map(|point| (x.at(point.0), y.at(point.1)))
+                .collect();
+            if !points.is_empty() {
+                svg.polyline(&format!("line {}", line.class), &points);
+            }
+        }
+        top = bottom + 12.0;
+    }
+    grid_x(&mut svg, &x, 8, (bottom, bottom + 4.0), x_title);
+    file(&svg.finish(bottom + BELOW, label))
+}

@@ -1,0 +1,186 @@
+//! What the overhead should be, and whether it is.
+
+use super::format::number;
+use super::statistics::growth;
+use super::summary::{Isolation, Latency, SoakSeries, Summary};
+use super::table::Table;
+use super::tables::payload;
+
+/// One thing to reach.
+struct Target {
+    what: String,
+    limit: String,
+    value: String,
+    /// Not known where the run does not say.
+    met: Option<bool>,
+}
+
+impl Target {
+    /// Met when the value is at most the limit.
+    fn at_most(what: String, limit: f64, unit: &str, value: Option<f64>) -> Self {
+        let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+        Self {
+            what,
+            limit: format!("at most {limit:.2}{unit}").replace(".00", ""),
+            value: number(value) + if value.is_some() { &unit } else { "" },
+            met: value.map(|value| value <= limit),
+        }
+    }
+}
+
+/// The table of all that the run can say something about; `None` where that is nothing.
+pub fn table(summary: &Summary) -> Option<String> {
+    let mut targets = Vec::new();
+    for scheduling in ["other", "fifo"] {
+        latency(summary, scheduling, &mut targets);
+    }
+    for row in &summary.loss {
+        let lost = row.lost + row.refused;
+        let what = format!(
+            "{}: lost at {} Hz of {}, {}",
+            row.program,
+            row.rate_hz,
+            payload(row.bytes),
+            row.scheduling
+        );
+        if row.program == "bridge" {
+            targets.push(Target::at_most(what, 0.0, "", Some(lost as f64)));
+        }
+    }
+    if !summary.resources.is_empty() {
+        let of = |program: &str, process: Option<&str>| {
+            let rows = summary.resources.iter().filter(|row| {
+                row.program == program
+                    && row.rate_hz == 1_000
+                    && process.map_or(!["publisher", "subscriber"].contains(&row.process.as_str()), |only| {
+                        row.process == only
+                    })
+            });
+            let each: Vec<f64> = rows.filter_map(|row| row.per_sample(row.cpu_ms)).collect();
+            (!each.is_empty()).then(|| each.iter().sum::<f64>())
+        };
+        let ratio = of("bridge", None).zip(of("relay", Some("relay"))).map(|(bridge, relay)| bridge / relay);
+        let what = "CPU of all processes of the bridge / CPU of the relay, 1 kHz".to_owned();
+        targets.push(Target::at_most(what, 1.5, "", ratio));
+    }
+    for row in summary.isolation.iter().filter(|row| row.condition != row.against) {
+        let what = format!(
+            "critical p99.9, noncritical lane {} / {}, {}",
+            row.condition, row.against, row.scheduling
+        );
+        // The same twice is no target; it says how far two runs of the same differ.
+        if row.condition != "repeat" {
+            targets.push(Target::at_most(what, 1.1, "", against(summary, row)));
+        }
+    }
+    for series in summary.soak.iter().flat_map(|soak| &soak.series).filter(|series| series.unit == "KiB") {
+        let (trend, kib_per_hour) = trend(series);
+        targets.push(Target {
+            what: format!("growth of the memory of {}", series.name),
+            limit: format!("at most {} KiB/h", number(Some(MOST_KIB_PER_HOUR))),
+            value: match trend {
+                Trend::TooShort => "too short to tell".to_owned(),
+                _ => number(kib_per_hour) + " KiB/h",
+            },
+            met: match trend {
+                Trend::Flat => Some(true),
+                Trend::Grows => Some(false),
+                Trend::TooShort => None,
+            },
+        });
+    }
+    let mut table = Table::new(&["", "to reach", "measured", ""]);
+    for target in targets {
+        let met = match target.met {
+            Some(true) => "met",
+            Some(false) => "**missed**",
+            None => "not known",
+        };
+        table.row([target.what, target.limit, target.value, met.to_owned()]);
+    }
+    (!table.is_empty()).then(|| table.text())
+}
+
+fn latency(summary: &Summary, scheduling: &str, targets: &mut Vec<Target>) {
+    let row = |rate_hz: u64, bytes: usize, program: &str| -> Option<&Latency> {
+        summary.latency.iter().find(|row| {
+            row.scheduling == scheduling
+                && row.rate_hz == rate_hz
+                && row.program == program
+                && (row.bytes == bytes || program == "wake-up")
+        })
+    };
+    let hop = |rate_hz, bytes, program| row(rate_hz, bytes, program)?.hop_p50_us;
+    for (rate_hz, bytes, most) in
+        [(1_000, 2_948, 1.0), (100, 2_948, 1.25), (10, 1 << 20, 1.0), (30, 1 << 20, 1.0), (100, 1 << 20, 1.0)]
+    {
+        let Some(bridge) = hop(rate_hz, bytes, "bridge") else { continue };
+        let ratio = hop(rate_hz, bytes, "relay").and_then(|relay| hop_ratio(bridge, relay));
+        let what =
+            format!("hop of the bridge / hop of the relay, {rate_hz} Hz of {}, {scheduling}", payload(bytes));
+        targets.push(Target::at_most(what, most, "", ratio));
+    }
+    // What a C++ router of one process adds on such a machine.
+    for (rate_hz, most_us) in [(1_000, 75.0), (100, 145.0)] {
+        let Some(bridge) = hop(rate_hz, 2_948, "bridge") else { continue };
+        let what = format!("hop of the bridge, {rate_hz} Hz of 2,948 B, {scheduling}");
+        targets.push(Target::at_most(what, most_us, "µs", Some(bridge)));
+    }
+    for rate_hz in [1_000, 100] {
+        let Some(bridge) = row(rate_hz, 2_948, "bridge") else { continue };
+        let stage = bridge.stages.get("shared memory").and_then(|stage| stage.p50_us);
+        let floor = row(rate_hz, 2_948, "wake-up").and_then(|row| row.latency.p50_us);
+        let ratio = stage.zip(floor).map(|(stage, floor)| stage / floor);
+        let what = format!("shared memory / eventfd wake-up, {rate_hz} Hz of 2,948 B, {scheduling}");
+        targets.push(Target::at_most(what, 1.3, "", ratio));
+    }
+}
+
+/// The hop of the bridge over that of the relay; none where the relay's is lost in the noise.
+pub fn hop_ratio(bridge_us: f64, relay_us: f64) -> Option<f64> {
+    (relay_us > 0.0).then(|| bridge_us / relay_us)
+}
+
+/// The p99.9 of a condition over that of what it is compared with.
+pub fn against(summary: &Summary, row: &Isolation) -> Option<f64> {
+    let other = summary
+        .isolation
+        .iter()
+        .find(|other| other.scheduling == row.scheduling && other.condition == row.against)?;
+    Some(row.latency.p999_us? / other.latency.p999_us?)
+}
+
+/// More than this is growth: 24 MiB a day.
+pub const MOST_KIB_PER_HOUR: f64 = 1_024.0;
+
+/// Growth below this in all the time looked at is not told from the steps in which an allocator takes memory.
+const STEPS_KIB: f64 = 256.0;
+
+/// This share of the time, at the beginning, is not looked at: caches and pools fill.
+const WARM_UP: f64 = 0.2;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trend {
+    Flat,
+    Grows,
+    /// Flat as far as can be seen, and a growth that counts could not be seen.
+    TooShort,
+}
+
+/// Whether the memory grows, and the slope in KiB per hour.
+pub fn trend(series: &SoakSeries) -> (Trend, Option<f64>) {
+    let end = series.points.last().map_or(0.0, |point| point.0);
+    let looked_at: Vec<(f64, f64)> =
+        series.points.iter().copied().filter(|point| point.0 >= end * WARM_UP).collect();
+    let Some(kib_per_second) = growth(&looked_at) else { return (Trend::TooShort, None) };
+    let seconds = end - looked_at.first().map_or(0.0, |point| point.0);
+    let kib_per_hour = kib_per_second * 3_600.0;
+    let trend = if kib_per_second * seconds > STEPS_KIB {
+        if kib_per_hour > MOST_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
+    } else if STEPS_KIB / seconds * 3_600.0 > MOST_KIB_PER_HOUR {
+        Trend::TooShort
+    } else {
+        Trend::Flat
+    };
+    (trend, Some(kib_per_hour))
+}

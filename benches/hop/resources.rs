@@ -1,0 +1,271 @@
+//! What each process takes: CPU, sleeps, memory, system calls; idle and under load.
+
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use super::beds::{Bed, Beds, Kind, Plan};
+use super::options::{Case, Options, SCAN};
+use super::out::{Of, Output};
+use super::report::{Call, Resource};
+use super::system::Taken;
+
+const LOADS_HZ: [u64; 2] = [100, 1_000];
+
+/// strace makes every call several times as long: only at this rate does what it counts stay what it is
+/// without.
+const TRACED_HZ: u64 = 100;
+
+pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
+    if !options.wants("resources", "") {
+        return Ok(());
+    }
+    let scheduling = options.first_scheduling();
+    let plans = [
+        Plan::new(Kind::Direct, scheduling, &[4096]),
+        Plan::new(Kind::Relay, scheduling, &[4096]),
+        Plan::whole(scheduling, &[4096]),
+    ];
+    let mut beds = Beds::start(&plans, options)?;
+    eprintln!("resources: idle");
+    idle(&beds, options.seconds(10.0), output);
+    for rate_hz in LOADS_HZ {
+        let case = Case::lasting(rate_hz, SCAN, options.seconds(5.0), 0);
+        for repetition in 0..options.repetitions {
+            for bed in &mut beds.0 {
+                eprintln!("resources: {} {}", case.name(), bed.name());
+                load(bed, &case, repetition, output)?;
+            }
+        }
+        for bed in &mut beds.0 {
+            count_calls(bed, &case, output)?;
+        }
+    }
+    merge(&mut output.summary.resources);
+    let case = Case::lasting(TRACED_HZ, SCAN, options.seconds(5.0), 0);
+    for bed in &mut beds.0 {
+        eprintln!("system calls: {} {}", case.name(), bed.name());
+        trace(bed, &case, output)?;
+    }
+    Ok(())
+}
+
+fn idle(beds: &Beds, seconds: f64, output: &mut Output) {
+    let all: Vec<(&'static str, String, u32, Taken)> = beds
+        .0
+        .iter()
+        .flat_map(|bed| {
+            bed.processes().into_iter().map(|(name, pid)| (bed.name(), name, pid, Taken::by(pid)))
+        })
+        .collect();
+    let began = Instant::now();
+    std::thread::sleep(Duration::from_secs_f64(seconds));
+    let seconds = began.elapsed().as_secs_f64();
+    for (program, process, pid, before) in all {
+        let row = row((program, &process), 0, seconds, 0, before, Taken::by(pid));
+        output.summary.resources.push(row);
+    }
+}
+
+fn load(bed: &mut Bed, case: &Case, repetition: usize, output: &mut Output) -> Result<(), String> {
+    let before: Vec<(String, u32, Taken)> =
+        bed.processes().into_iter().map(|(name, pid)| (name, pid, Taken::by(pid))).collect();
+    let began = Instant::now();
+    let run = bed.measure(case)?;
+    let seconds = began.elapsed().as_secs_f64();
+    let name = case.name();
+    for (process, pid, before) in before {
+        let row = row((bed.name(), &process), case.rate_hz, seconds, run.accepted, before, Taken::by(pid));
+        let program = format!("{} {process}", bed.name());
+        let of = Of { section: "resources", scheduling: "", case: &name, program: &program, repetition };
+        output.raw(of, "cpu ms", row.cpu_ms);
+        output.raw(of, "sleeps", row.sleeps as f64);
+        output.raw(of, "preemptions", row.preemptions as f64);
+        output.raw(of, "rss KiB", row.rss_kib as f64);
+        output.raw(of, "samples", row.samples as f64);
+        output.raw(of, "seconds", row.seconds);
+        output.summary.resources.push(row);
+    }
+    Ok(())
+}
+
+fn row(
+    (program, process): (&str, &str),
+    rate_hz: u64,
+    seconds: f64,
+    samples: u64,
+    before: Taken,
+    after: Taken,
+) -> Resource {
+    Resource {
+        program: program.to_owned(),
+        process: process.to_owned(),
+        rate_hz,
+        seconds,
+        samples,
+        cpu_ms: after.cpu_ns.saturating_sub(before.cpu_ns) as f64 / 1e6,
+        sleeps: after.sleeps.saturating_sub(before.sleeps),
+        preemptions: after.preemptions.saturating_sub(before.preemptions),
+        system_calls_per_sample: None,
+        rss_kib: after.rss_kib,
+        anonymous_kib: after.anonymous_kib,
+        shared_kib: after.shared_kib,
+        file_kib: after.file_kib,
+    }
+}
+
+/// Adds the repetitions of a process at a rate up; its memory is that of the last one.
+fn merge(rows: &mut Vec<Resource>) {
+    let mut merged: Vec<Resource> = Vec::new();
+    for row in rows.drain(..) {
+        let same = |one: &&mut Resource| {
+            (&one.program, &one.process, one.rate_hz) == (&row.program, &row.process, row.rate_hz)
+        };
+        match merged.iter_mut().find(same) {
+            Some(one) => {
+                *one = Resource {
+                    seconds: one.seconds + row.seconds,
+                    samples: one.samples + row.samples,
+                    cpu_ms: one.cpu_ms + row.cpu_ms,
+                    sleeps: one.sleeps + row.sleeps,
+                    preemptions: one.preemptions + row.preemptions,
+                    ..row
+                };
+            }
+            None => merged.push(row),
+        }
+    }
+    *rows = merged;
+}
+
+/// A tool that looks at a process of the bed until it is told to stop.
+struct Watcher {
+    child: Child,
+    process: String,
+    file: tempfile::NamedTempFile,
+}
+
+impl Watcher {
+    /// `-o FILE` and `-p PID` are added.
+    fn start(tool: &str, arguments: &[&str], process: &str, pid: u32) -> Result<Self, String> {
+        let file = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
+        let mut command = Command::new(tool);
+        command.args(arguments).arg("-o").arg(file.path()).arg("-p").arg(pid.to_string());
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let child = command.spawn().map_err(|error| format!("{tool}: {error}"))?;
+        Ok(Self { child, process: process.to_owned(), file })
+    }
+
+    /// What it wrote.
+    fn stop(mut self) -> (String, String) {
+        let _ = kill(Pid::from_raw(self.child.id().cast_signed()), Signal::SIGINT);
+        let _ = self.child.wait();
+        let text = std::fs::read_to_string(self.file.path()).unwrap_or_default();
+        (self.process, text)
+    }
+}
+
+/// Runs a load while a tool watches each process between publisher and subscriber; what it wrote of each, and
+/// the samples. An error says that the tool is not there.
+fn watched(
+    bed: &mut Bed,
+    case: &Case,
+    tool: &str,
+    arguments: &[&str],
+) -> Result<(Vec<(String, String)>, u64), String> {
+    let mut watchers = Vec::new();
+    for (process, pid) in bed.between() {
+        watchers.push(Watcher::start(tool, arguments, &process, pid)?);
+    }
+    // It takes the tool a moment to attach to all threads.
+    std::thread::sleep(Duration::from_millis(500));
+    let run = bed.measure(case);
+    let texts = watchers.into_iter().map(Watcher::stop).collect();
+    Ok((texts, run?.accepted))
+}
+
+/// Counts system calls with perf, which costs a process next to nothing.
+fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> {
+    if bed.kind() == Kind::Direct {
+        return Ok(());
+    }
+    let arguments = ["stat", "-x", ",", "-e", "raw_syscalls:sys_enter"];
+    let (texts, samples) = match watched(bed, case, "perf", &arguments) {
+        Ok(watched) => watched,
+        Err(error) => {
+            skip(output, format!("system calls by perf: {error}"));
+            return Ok(());
+        }
+    };
+    for (process, text) in texts {
+        let count =
+            text.lines().find(|line| line.contains("raw_syscalls")).and_then(|line| line.split(',').next());
+        let Some(count) = count.and_then(|count| count.parse::<f64>().ok()) else {
+            skip(
+                output,
+                format!("system calls by perf: {}", text.lines().last().unwrap_or("it wrote nothing")),
+            );
+            continue;
+        };
+        let rows = output.summary.resources.iter_mut();
+        let rows = rows
+            .filter(|row| row.program == bed.name() && row.process == process && row.rate_hz == case.rate_hz);
+        // One of the repetitions' rows bears it until they are added up; `merge` keeps the last.
+        if let Some(row) = rows.last() {
+            row.system_calls_per_sample = Some(count / samples.max(1) as f64);
+        }
+    }
+    Ok(())
+}
+
+/// Counts system calls by name with strace; what it wrote is kept.
+fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> {
+    if bed.kind() == Kind::Direct {
+        return Ok(());
+    }
+    let (texts, samples) = match watched(bed, case, "strace", &["-c", "-f", "-q"]) {
+        Ok(watched) => watched,
+        Err(error) => {
+            skip(output, format!("system calls by strace: {error}"));
+            return Ok(());
+        }
+    };
+    for (process, text) in texts {
+        if !text.contains("syscall") {
+            skip(output, format!("system calls of {process}: strace counted nothing"));
+        }
+        for (call, count) in counted(&text) {
+            output.summary.calls.push(Call {
+                program: bed.name().to_owned(),
+                process: process.clone(),
+                rate_hz: case.rate_hz,
+                call,
+                count,
+                samples,
+            });
+        }
+        output.file(&format!("strace-{}-{process}.txt", bed.name()), text);
+    }
+    Ok(())
+}
+
+fn skip(output: &mut Output, line: String) {
+    eprintln!("bench: {line}");
+    if !output.summary.skipped.contains(&line) {
+        output.summary.skipped.push(line);
+    }
+}
+
+/// Lines of `strace -c`: `% time, seconds, usecs/call, calls, [errors,] syscall`.
+fn counted(text: &str) -> Vec<(String, u64)> {
+    let line = |line: &str| {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let call = *words.last()?;
+        words.first()?.parse::<f64>().ok()?;
+        let calls = words.get(3)?.parse().ok()?;
+        (call != "total").then(|| (call.to_owned(), calls))
+    };
+    text.lines().filter_map(line).collect()
+}

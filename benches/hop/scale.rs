@@ -1,0 +1,106 @@
+//! The same samples over more routes, and beside more noncritical lanes.
+
+use std::collections::BTreeMap;
+
+use super::beds::{Beds, Kind, Plan, Run};
+use super::options::{Case, Options, SCAN};
+use super::out::{Of, Output};
+use super::report::{Quantiles, Scale};
+use super::system::Taken;
+
+const ROUTES: [usize; 4] = [1, 4, 16, 64];
+
+/// Of all routes together, so that the number of routes is all that differs.
+const RATE_HZ: u64 = 640;
+
+/// The critical lane and 0, 1, 3 and 7 others.
+const LANES: [usize; 4] = [1, 2, 4, 8];
+
+pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
+    let scheduling = options.first_scheduling();
+    for count in ROUTES {
+        if !options.wants("scale", &format!("{count} routes")) || (options.quick && count != 16) {
+            continue;
+        }
+        let mut beds = Beds::three(scheduling, &vec![4096; count], options)?;
+        let samples = (RATE_HZ as f64 * options.seconds(3.0)) as usize;
+        let case = Case { rate_hz: RATE_HZ, bytes: SCAN, samples, first_route: 0, routes: count };
+        take_turns(("routes", &[count; 3]), &case, &mut beds, options, output)?;
+    }
+    let counts: Vec<usize> = LANES
+        .into_iter()
+        .filter(|count| options.wants("scale", &format!("{count} lanes")))
+        .filter(|count| !options.quick || [1, 4].contains(count))
+        .collect();
+    if counts.is_empty() {
+        return Ok(());
+    }
+    let plan = |count: &usize| Plan {
+        lanes: count - 1,
+        lanes_run: true,
+        ..Plan::new(Kind::Bridge, scheduling, &[4096])
+    };
+    let plans: Vec<Plan> = counts.iter().map(plan).collect();
+    let mut beds = Beds::start(&plans, options)?;
+    let case = Case::lasting(1_000, SCAN, options.seconds(5.0), 0);
+    take_turns(("lanes", &counts), &case, &mut beds, options, output)
+}
+
+/// Each bed with its count, one after the other, again and again.
+fn take_turns(
+    (of, counts): (&str, &[usize]),
+    case: &Case,
+    beds: &mut Beds,
+    options: &Options,
+    output: &mut Output,
+) -> Result<(), String> {
+    let mut runs: Vec<Vec<Run>> = beds.0.iter().map(|_| Vec::new()).collect();
+    let name = case.name();
+    for repetition in 0..options.repetitions {
+        for ((bed, count), runs) in beds.0.iter_mut().zip(counts).zip(&mut runs) {
+            eprintln!("scale: {count} {of}, {}, {name}", bed.name());
+            let run = bed.measure(case)?;
+            let case = format!("{count} {of}");
+            let of = Of { section: "scale", scheduling: "", case: &case, program: bed.name(), repetition };
+            output.raw_quantiles(of, "latency", &Quantiles::of(&latencies_us(&run)));
+            for (process, ns) in &run.cpu_ns {
+                let us = *ns as f64 / 1_000.0 / run.accepted.max(1) as f64;
+                output.raw(of, &format!("{process} cpu us/sample"), us);
+            }
+            runs.push(run);
+        }
+    }
+    for ((bed, count), runs) in beds.0.iter().zip(counts).zip(&runs) {
+        let all: Vec<f64> = runs.iter().flat_map(latencies_us).collect();
+        let accepted: u64 = runs.iter().map(|run| run.accepted).sum();
+        let sent: u64 = runs.iter().map(|run| run.accepted + run.refused).sum();
+        let received: u64 = runs.iter().map(|run| run.records.len() as u64).sum();
+        let mut cpu_us_per_sample: BTreeMap<String, f64> = BTreeMap::new();
+        for (process, ns) in runs.iter().flat_map(|run| &run.cpu_ns) {
+            *cpu_us_per_sample.entry(process.clone()).or_default() +=
+                *ns as f64 / 1_000.0 / accepted.max(1) as f64;
+        }
+        output.summary.scale.push(Scale {
+            of: of.to_owned(),
+            count: *count,
+            program: bed.name().to_owned(),
+            rate_hz: case.rate_hz,
+            bytes: case.bytes,
+            missing: sent.saturating_sub(received),
+            latency: Quantiles::of(&all),
+            repetitions_p50_us: runs
+                .iter()
+                .filter_map(|run| Quantiles::of(&latencies_us(run)).p50_us)
+                .collect(),
+            cpu_us_per_sample,
+            rss_kib: bed.between().into_iter().map(|(name, pid)| (name, Taken::by(pid).rss_kib)).collect(),
+        });
+    }
+    Ok(())
+}
+
+/// From the write to the subscriber's decoder.
+pub fn latencies_us(run: &Run) -> Vec<f64> {
+    let us = |from: u64, to: u64| to.saturating_sub(from) as f64 / 1_000.0;
+    run.records.iter().map(|record| us(record.written_at, record.arrived_at)).collect()
+}

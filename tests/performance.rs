@@ -1,0 +1,377 @@
+//! What the bench makes of its figures, with made-up ones: quantiles, growth, targets, tables, plots, and the
+//! page docs/performance.md. Pure: reads files of the project, measures nothing.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+#[allow(dead_code, unused_imports, reason = "the bench uses the rest")]
+#[path = "../benches/hop/report/mod.rs"]
+mod report;
+
+use report::statistics::{growth, median, quantile};
+use report::{
+    Attempt, Call, Isolation, Latency, Loss, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
+    Throughput, figures, fill, readme, runs_named, soak_failures,
+};
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn quantiles(p50_us: f64, p999_us: f64) -> Quantiles {
+    Quantiles {
+        samples: 5_000,
+        p50_us: Some(p50_us),
+        p99_us: Some(p50_us * 2.0),
+        p999_us: Some(p999_us),
+        max_us: Some(p999_us * 2.0),
+    }
+}
+
+fn latency(program: &str, p50_us: f64, hop_us: Option<f64>) -> Latency {
+    let mut stages = BTreeMap::new();
+    if program == "bridge" {
+        stages.insert("shared memory".to_owned(), quantiles(26.0, 90.0));
+    }
+    Latency {
+        scheduling: "other".to_owned(),
+        rate_hz: 1_000,
+        bytes: 2_948,
+        program: program.to_owned(),
+        latency: quantiles(p50_us, 900.0),
+        from_due: quantiles(p50_us, 950.0),
+        repetitions_p50_us: vec![p50_us - 1.0, p50_us + 1.0],
+        hop_p50_us: hop_us,
+        stages,
+        ..Latency::default()
+    }
+}
+
+/// A run that has something of every section.
+fn made_up() -> Summary {
+    let resource = |program: &str, process: &str, cpu_ms: f64| Resource {
+        program: program.to_owned(),
+        process: process.to_owned(),
+        rate_hz: 1_000,
+        seconds: 5.0,
+        samples: 5_000,
+        cpu_ms,
+        sleeps: 10_000,
+        rss_kib: 20_480,
+        ..Resource::default()
+    };
+    let isolation = |condition: &str, against: &str, p999_us: f64| Isolation {
+        scheduling: "fifo".to_owned(),
+        condition: condition.to_owned(),
+        against: against.to_owned(),
+        rate_hz: 1_000,
+        latency: quantiles(200.0, p999_us),
+        rounds_p999_us: vec![p999_us],
+        ..Isolation::default()
+    };
+    let scale = |of: &str, count: usize, program: &str, p50_us: f64| Scale {
+        of: of.to_owned(),
+        count,
+        program: program.to_owned(),
+        rate_hz: 640,
+        latency: quantiles(p50_us, 800.0),
+        repetitions_p50_us: vec![p50_us],
+        cpu_us_per_sample: BTreeMap::from([("ingress".to_owned(), 50.0 + count as f64)]),
+        rss_kib: BTreeMap::from([("ingress".to_owned(), 10_240)]),
+        ..Scale::default()
+    };
+    Summary {
+        date: "2026-01-02T03-04-05Z".to_owned(),
+        latency: vec![
+            latency("wake-up", 20.0, None),
+            latency("direct", 100.0, None),
+            latency("relay", 180.0, Some(80.0)),
+            latency("bridge", 176.0, Some(76.0)),
+        ],
+        loss: vec![Loss {
+            scheduling: "other".to_owned(),
+            rate_hz: 5_000,
+            bytes: 2_948,
+            program: "bridge".to_owned(),
+            accepted: 50_000,
+            received: 49_998,
+            lost: 2,
+            drops: BTreeMap::from([("critical queue_overflow".to_owned(), 2)]),
+            whole: Some(true),
+            ..Loss::default()
+        }],
+        throughput: ["direct", "bridge"]
+            .map(|program| Throughput {
+                bytes: 2_948,
+                program: program.to_owned(),
+                rate_hz: Some(if program == "direct" { 20_000.0 } else { 10_000.0 }),
+                limit: "12000 Hz: 7 lost".to_owned(),
+                attempts: vec![Attempt { rate_hz: 12_000.0, failure: Some("7 lost".to_owned()) }],
+                ..Throughput::default()
+            })
+            .to_vec(),
+        resources: vec![
+            resource("relay", "relay", 500.0),
+            resource("relay", "publisher", 9_000.0),
+            resource("bridge", "ingress", 400.0),
+            resource("bridge", "critical", 300.0),
+            resource("bridge", "control", 100.0),
+        ],
+        calls: vec![Call {
+            program: "bridge".to_owned(),
+            process: "ingress".to_owned(),
+            rate_hz: 100,
+            call: "recvfrom".to_owned(),
+            count: 1_500,
+            samples: 500,
+        }],
+        scale: vec![
+            scale("routes", 1, "bridge", 100.0),
+            scale("routes", 5, "bridge", 108.0),
+            scale("lanes", 1, "bridge", 100.0),
+            scale("lanes", 3, "bridge", 100.0),
+        ],
+        isolation: vec![
+            isolation("undisturbed", "undisturbed", 500.0),
+            isolation("stopped", "undisturbed", 540.0),
+            isolation("spinning", "undisturbed", 600.0),
+            isolation("repeat", "undisturbed", 700.0),
+        ],
+        soak: Some(Soak {
+            seconds: 3_600.0,
+            load: "1 kHz of 2,948 B".to_owned(),
+            accepted: 3_600_000,
+            missing: 0,
+            series: vec![series("ingress", 0.0, 3_600.0), series("critical", 1.0, 3_600.0)],
+        }),
+        ..Summary::default()
+    }
+}
+
+/// Memory that grows by so many KiB a second.
+fn series(name: &str, kib_per_second: f64, seconds: f64) -> SoakSeries {
+    let points = (0..=100).map(|point| {
+        let at_s = seconds * f64::from(point) / 100.0;
+        // Now and then an outlier, as a reader of the memory causes.
+        let outlier = if point % 17 == 0 { 3_000.0 } else { 0.0 };
+        (at_s, 20_000.0 + at_s * kib_per_second + outlier)
+    });
+    SoakSeries { name: name.to_owned(), unit: "KiB".to_owned(), points: points.collect() }
+}
+
+fn line<'a>(text: &'a str, words: &str) -> &'a str {
+    text.lines()
+        .find(|line| line.contains(words))
+        .unwrap_or_else(|| panic!("no line with {words} in:\n{text}"))
+}
+
+/// The cells of a line of a table, without their padding.
+fn cells(text: &str, words: &str) -> Vec<String> {
+    line(text, words).trim_matches('|').split('|').map(|cell| cell.trim().to_owned()).collect()
+}
+
+#[test]
+fn quantiles_are_of_the_nearest_rank() {
+    let thousand: Vec<f64> = (1..=1_000).rev().map(f64::from).collect();
+    assert_eq!(
+        [0.0, 0.5, 0.99, 0.999, 1.0].map(|share| quantile(&thousand, share)),
+        [1.0, 500.0, 990.0, 999.0, 1_000.0]
+    );
+    assert_eq!(quantile(&[7.0, f64::NAN], 0.5), 7.0);
+    assert!(quantile(&[], 0.5).is_nan() && median(&[f64::NAN]).is_nan());
+    assert_eq!([median(&[3.0, 1.0, 2.0]), median(&[4.0, 1.0, 2.0, 3.0])], [2.0, 2.5]);
+}
+
+#[test]
+fn a_tail_of_too_few_samples_is_not_told() {
+    let of = |count: u32| Quantiles::of(&(0..count).map(f64::from).collect::<Vec<_>>());
+    assert_eq!((of(0).p50_us, of(0).max_us), (None, None));
+    assert_eq!((of(99).p99_us, of(99).max_us), (None, Some(98.0)));
+    assert_eq!((of(999).p99_us, of(999).p999_us), (Some(989.0), None));
+    assert_eq!(of(1_000).p999_us, Some(998.0));
+}
+
+#[test]
+fn growth_is_not_moved_by_outliers() {
+    let slope = |kib_per_second: f64| growth(&series("", kib_per_second, 3_600.0).points).unwrap();
+    assert!(slope(0.0).abs() < 1e-9);
+    assert!((slope(0.5) - 0.5).abs() < 0.01, "{}", slope(0.5));
+    assert!((slope(-2.0) + 2.0).abs() < 0.02);
+    assert_eq!(growth(&[(0.0, 1.0), (1.0, 2.0)]), None);
+    // More points than are looked at.
+    let many: Vec<(f64, f64)> = (0..5_000).map(|at| (f64::from(at), 3.0 * f64::from(at))).collect();
+    assert_eq!(growth(&many), Some(3.0));
+}
+
+#[test]
+fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
+    let judged = |kib_per_second: f64, seconds: f64| {
+        let soak = Soak { series: vec![series("ingress", kib_per_second, seconds)], ..Soak::default() };
+        let summary = Summary { soak: Some(soak), ..Summary::default() };
+        let readme = readme(&summary);
+        let word = cells(&readme, "| ingress").pop().unwrap();
+        (word, soak_failures(&summary).len())
+    };
+    assert_eq!(judged(0.0, 3_600.0), ("flat".to_owned(), 0));
+    // 0.2 KiB/s are 720 KiB in an hour, 0.4 KiB/s 1,440.
+    assert_eq!(judged(0.2, 3_600.0), ("flat".to_owned(), 0));
+    assert_eq!(judged(0.4, 3_600.0), ("**grows**".to_owned(), 1));
+    // In a minute even 4 KiB/s are less than an allocator takes at once.
+    assert_eq!(judged(4.0, 60.0), ("too short to tell".to_owned(), 0));
+    assert_eq!(judged(40.0, 60.0), ("**grows**".to_owned(), 1));
+    let lost = Summary { soak: Some(Soak { missing: 3, ..Soak::default() }), ..Summary::default() };
+    assert_eq!(soak_failures(&lost), ["3 samples are missing"]);
+}
+
+#[test]
+fn targets_are_met_or_missed() {
+    let readme = readme(&made_up());
+    let row = |words: &str| {
+        let cells = cells(&readme, words);
+        (cells[2].clone(), cells[3].clone())
+    };
+    let met = |value: &str| (value.to_owned(), "met".to_owned());
+    let missed = |value: &str| (value.to_owned(), "**missed**".to_owned());
+    assert_eq!(row("hop of the bridge / hop of the relay, 1000 Hz"), met("0.95"));
+    assert_eq!(row("hop of the bridge, 1000 Hz"), missed("76.0 µs"));
+    assert_eq!(row("shared memory / eventfd wake-up, 1000 Hz"), met("1.30"));
+    assert_eq!(row("bridge: lost at 5000 Hz"), missed("2.00"));
+    // 800 of 500: the publisher's CPU is not the relay's.
+    assert_eq!(row("CPU of all processes of the bridge"), missed("1.60"));
+    assert_eq!(row("noncritical lane stopped / undisturbed"), met("1.08"));
+    assert_eq!(row("noncritical lane spinning / undisturbed"), missed("1.20"));
+    assert!(!readme.contains("noncritical lane repeat / undisturbed"), "what is no target is one");
+    assert_eq!(row("growth of the memory of ingress"), met("0.00 KiB/h"));
+    assert_eq!(row("growth of the memory of critical").1, "**missed**");
+    // What was not measured is no target.
+    assert!(!readme.contains("100 Hz of 2,948 B, other"));
+}
+
+#[test]
+fn tables_have_the_figures_of_the_run() {
+    let readme = readme(&made_up());
+    assert_eq!(
+        cells(&readme, "| 1,000 Hz of 2,948 B ")[..7],
+        ["1,000 Hz of 2,948 B", "20.0", "100", "80.0", "76.0", "0.95", "900"]
+    );
+    assert_eq!(cells(&readme, "| 2,948 B, bridge")[1..4], ["10,000", "29.5", "0.50"]);
+    assert_eq!(cells(&readme, "1,000 Hz, bridge: ingress")[1..5], ["8.00", "80.0", "2,000", "2.00"]);
+    assert_eq!(cells(&readme, "1,000 Hz, relay ")[1..5], ["10.0", "100", "–", "2.00"]);
+    assert_eq!(cells(&readme, "1,000 Hz, all of the bridge")[1..5], ["16.0", "160", "1.60", "6.00"]);
+    assert_eq!(cells(&readme, "| bridge: ingress, 100 Hz")[2..], ["3.00", "recvfrom 3.00"]);
+    assert!(
+        line(&readme, "Each further route costs").contains("2.00 µs of p50 and 1.00 µs of CPU"),
+        "{readme}"
+    );
+    assert!(line(&readme, "Each further lane costs").contains("0.00 µs of p50"), "{readme}");
+    assert_eq!(cells(&readme, "| spinning, 1,000 Hz")[7], "1.20");
+    assert!(cells(&readme, "5,000 Hz of 2,948 B, bridge").contains(&"critical queue_overflow 2".to_owned()));
+}
+
+#[test]
+fn plots_are_well_formed_and_show_every_program() {
+    let files = figures(&made_up());
+    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(
+        names,
+        [
+            "latency-other.svg",
+            "isolation-fifo.svg",
+            "throughput.svg",
+            "cpu.svg",
+            "routes.svg",
+            "lanes.svg",
+            "soak.svg"
+        ]
+    );
+    for (name, svg) in &files {
+        let document = roxmltree::Document::parse(svg).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let drawn = document
+            .descendants()
+            .filter(|node| ["polyline", "rect"].contains(&node.tag_name().name()))
+            .filter(|node| node.attribute("class") != Some("back"));
+        assert!(drawn.count() >= 1, "{name} shows nothing");
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{name}");
+        for node in document.descendants().filter(|node| node.tag_name().name() == "polyline") {
+            for number in node.attribute("points").unwrap().split([' ', ',']) {
+                let at: f64 = number.parse().unwrap();
+                assert!((0.0..=2_000.0).contains(&at), "{name}: {at}");
+            }
+        }
+    }
+    let latency = &files[0].1;
+    for program in ["wake-up", "direct", "relay", "bridge"] {
+        assert!(latency.contains(&format!(">{program}</text>")), "{program}");
+    }
+    // Taller bars are higher up: throughput of direct above that of the bridge.
+    let throughput = roxmltree::Document::parse(&files[2].1).unwrap();
+    let top = |class: &str| -> f64 {
+        let mut bars = throughput.descendants().filter(|node| node.attribute("class") == Some(class));
+        bars.next_back().unwrap().attribute("y").unwrap().parse().unwrap()
+    };
+    assert!(top("fill c") < top("fill a"), "{} {}", top("fill c"), top("fill a"));
+    assert!(figures(&Summary::default()).is_empty());
+}
+
+const PAGE: &str = "# P\n\nWords.\n\n<!-- figures:runs -->\nold\n<!-- end -->\n\n<!-- figures:throughput -->\n\
+                    <!-- end -->\nMore words.\n";
+
+#[test]
+fn the_page_keeps_its_words_and_gets_the_figures() {
+    let run = ("2026-01-02T03-04-05Z".to_owned(), made_up());
+    let filled = fill(PAGE, std::slice::from_ref(&run)).unwrap();
+    assert!(filled.starts_with("# P\n\nWords.\n\n<!-- figures:runs -->\n"), "{filled}");
+    assert!(filled.ends_with("<!-- end -->\nMore words.\n"), "{filled}");
+    assert!(!filled.contains("old"));
+    assert!(filled.contains("(../benches/runs/2026-01-02T03-04-05Z/throughput.svg)"), "{filled}");
+    assert_eq!(runs_named(&filled), ["2026-01-02T03-04-05Z"]);
+    // Again, with the same or another run: nothing is left of before.
+    assert_eq!(fill(&filled, std::slice::from_ref(&run)).unwrap(), filled);
+    let empty = fill(&filled, &[]).unwrap();
+    assert!(empty.contains("Not measured yet.") && runs_named(&empty).is_empty(), "{empty}");
+    // Of two runs the first that has the section.
+    let second = ("b".to_owned(), made_up());
+    let first = ("a".to_owned(), Summary { throughput: Vec::new(), ..made_up() });
+    let filled = fill(PAGE, &[first, second]).unwrap();
+    assert!(filled.contains("(../benches/runs/b/throughput.svg)"), "{filled}");
+    assert_eq!(runs_named(&filled), ["a", "b"]);
+}
+
+#[test]
+fn a_page_that_cannot_be_filled_is_refused() {
+    for (page, what) in [
+        ("<!-- figures:thruput -->\n<!-- end -->\n", "thruput is no section"),
+        ("<!-- figures:loss -->\n", "loss has no end"),
+        ("<!-- figures:loss -->\n<!-- figures:soak -->\n<!-- end -->\n", "loss has no end"),
+    ] {
+        let error = fill(page, &[("a".to_owned(), made_up())]).unwrap_err();
+        assert!(error.contains(what), "{page}: {error}");
+    }
+}
+
+#[test]
+fn a_run_is_read_as_it_was_written() {
+    let text = serde_json::to_string(&made_up()).unwrap();
+    let read: Summary = serde_json::from_str(&text).unwrap();
+    assert_eq!(readme(&read), readme(&made_up()));
+}
+
+#[test]
+fn the_figures_of_the_page_are_those_of_its_runs() {
+    let page = fs::read_to_string(root().join("docs/performance.md")).unwrap();
+    let runs: Vec<(String, Summary)> = runs_named(&page)
+        .into_iter()
+        .map(|name| {
+            let path = root().join("benches/runs").join(&name).join("summary.json");
+            let text =
+                fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+            (name, serde_json::from_str(&text).unwrap())
+        })
+        .collect();
+    let filled = fill(&page, &runs).unwrap();
+    assert!(filled == page, "docs/performance.md: run `cargo bench -- --page` with its runs");
+    for section in ["runs", "targets", "latency-other", "throughput", "resources", "isolation", "soak"] {
+        assert!(page.contains(&format!("<!-- figures:{section} -->")), "the page has no {section}");
+    }
+}
