@@ -33,5 +33,5 @@ step make --no-print-directory peers
 step make --no-print-directory lint
 # Tests that load the machine or use network namespaces wait for each other (tests/support), so plain
 # parallel tests are right.
-step cargo test --locked --all-features
+step cargo test --locked --all-features --no-fail-fast
 step scripts/fuzz.sh "${FUZZ_SECONDS:-20}"

@@ -183,7 +183,7 @@ fn the_launch_file_of_a_built_workspace_starts_a_bridge_through_which_samples_fl
         .filter(|process| process["state"] == "running")
         .map(|process| process["name"].as_str().unwrap())
         .collect();
-    assert_eq!(processes, ["ingress", "egress-critical", "egress-noncritical", "control"], "{status}");
+    assert_eq!(processes, ["ingress", "control", "egress-critical", "egress-noncritical"], "{status}");
     let sent: Sent = publisher.end();
     assert_eq!(sent.failed, 0, "{sent:?}");
     critical.end::<Received>().assert_sound();
