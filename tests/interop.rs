@@ -4,6 +4,7 @@
 mod support;
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, missing_from};
 use support::peer::{Graph, Library, Peer, Received, Sent};
@@ -39,6 +40,35 @@ fn every_library_reaches_every_library_through_both_lanes() {
     }
     bed.wait_whole();
     bed.end();
+}
+
+#[test]
+fn hosts_that_have_nothing_to_say_are_quiet() {
+    let Some(bed) = Bed::start("hosts_that_have_nothing_to_say_are_quiet", SCAN) else { return };
+    for library in LIBRARIES {
+        let subscriber = bed.subscribe("critical", Peer::on(library), CRITICAL);
+        subscriber.wait_matched(1);
+        // Discovery is over.
+        std::thread::sleep(Duration::from_secs(3));
+        let before = packets(&bed);
+        std::thread::sleep(Duration::from_secs(4));
+        let spoken = packets(&bed) - before;
+        // Announcements of a few participants, which are seconds apart. A reader of Fast DDS that is left without a
+        // HEARTBEAT asks for it seven times a second, and each process of the bridge has several such writers.
+        assert!(spoken < 100, "{library:?}: {spoken} packets in 4 s");
+        subscriber.end::<Received>();
+    }
+    bed.end();
+}
+
+/// Packets that the host of the critical subscriber has sent.
+fn packets(bed: &Bed) -> u64 {
+    let output = bed.host("critical").command("cat").arg("/proc/net/dev").output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let lines = text.lines().filter_map(|line| line.split_once(':'));
+    let interfaces = lines.filter(|(name, _)| name.trim() != "lo");
+    // Of what was received there are eight columns, of which packets are the second; those sent follow.
+    interfaces.map(|(_, counts)| counts.split_whitespace().nth(9).unwrap().parse::<u64>().unwrap()).sum()
 }
 
 #[test]

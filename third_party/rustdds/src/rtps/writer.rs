@@ -1276,8 +1276,11 @@ impl Writer {
           // preemptive ACKNACK from a reader that matched us after our HEARTBEAT.
           // Answer now instead of at the next heartbeat period.
           // One that has asked for fragments does know; it is answered with those.
+          // A base of 0 acknowledges nothing: Fast DDS repeats it seven times a second
+          // until it has a HEARTBEAT, also of a writer that has nothing yet.
+          let knows_nothing = an.reader_sn_state.base() < SequenceNumber::from(1);
           if an.reader_sn_state.iter().next().is_none()
-            && reader_proxy.all_acked_before <= last_seq
+            && (knows_nothing || reader_proxy.all_acked_before <= last_seq)
             && !reader_proxy.repair_frags_requested()
           {
             let hb_message = MessageBuilder::new()
