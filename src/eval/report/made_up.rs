@@ -25,6 +25,7 @@ pub struct MadeUp {
     pub tail_ms: f64,
     /// So many samples in the middle of the run do not reach the critical subscriber.
     pub lost: u64,
+    pub lane_bytes_per_s: u64,
     pub wire_bytes_per_s: u64,
     pub fragments_per_s: u64,
     /// Seconds from each toggle to the classifier's answer.
@@ -45,6 +46,7 @@ impl Default for MadeUp {
             latency_ms: 0.5,
             tail_ms: 0.9,
             lost: 0,
+            lane_bytes_per_s: 8_000,
             wire_bytes_per_s: 10_000,
             fragments_per_s: 0,
             reaction_s: None,
@@ -119,6 +121,8 @@ impl MadeUp {
         bridge.subscribers.push(("slow".to_owned(), Default::default()));
         bridge.subscribers[0].1.transitions = states.len() as u64 - 1;
         bridge.subscribers[0].1.states = states;
+        bridge.noncritical_bytes =
+            seconds().map(|at_s| (at_s, at_s as u64 * self.lane_bytes_per_s)).collect();
         let events = self.toggles.iter().map(|(at_s, impaired)| Event {
             at_s: *at_s,
             event: if *impaired { "link_on" } else { "link_off" }.to_owned(),

@@ -43,6 +43,8 @@ pub struct Measures {
     pub reactions: Vec<Reaction>,
     /// The share of the impaired time in which the noncritical lane was degraded.
     pub degraded_share: Option<f64>,
+    /// Bytes of payload per second that the noncritical lanes sent while a link was impaired.
+    pub lane_impaired_bytes_per_s: Option<f64>,
     /// Bytes per second on the wire towards the remote hosts: while impaired, and in all.
     pub wire_impaired_bytes_per_s: Option<f64>,
     pub wire_bytes_per_s: Option<f64>,
@@ -144,6 +146,7 @@ impl Measures {
     fn measure_classifier(&mut self, run: &Run) {
         let Some(bridge) = &run.bridge else { return };
         self.not_whole = Some(bridge.not_whole);
+        self.lane_impaired_bytes_per_s = growth_per_s(&bridge.noncritical_bytes, &run.impaired_spans());
         if run.manifest.classifier != Some(true) {
             self.transitions = Some(0);
         } else {

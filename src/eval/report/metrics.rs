@@ -15,7 +15,7 @@ const fn metric(key: &'static str, of: fn(&Measures) -> Option<f64>) -> Metric {
 }
 
 /// All of them. Keys may be added, and are not renamed without a line in the changelog.
-pub const METRICS: [Metric; 35] = [
+pub const METRICS: [Metric; 36] = [
     metric("critical_p50_ms", |one| one.critical_ms.quantile(0.50)),
     metric("critical_p95_ms", |one| one.critical_ms.quantile(0.95)),
     metric("critical_p99_ms", |one| one.critical_ms.quantile(0.99)),
@@ -37,6 +37,7 @@ pub const METRICS: [Metric; 35] = [
     metric("noncritical_p50_ms", |one| one.noncritical_ms.quantile(0.50)),
     metric("noncritical_p95_ms", |one| one.noncritical_ms.quantile(0.95)),
     metric("noncritical_rate_hz", |one| one.noncritical_hz),
+    metric("noncritical_lane_impaired_bytes_per_s", |one| one.lane_impaired_bytes_per_s),
     metric("noncritical_wire_bytes_per_s", |one| one.wire_bytes_per_s),
     metric("noncritical_wire_impaired_bytes_per_s", |one| one.wire_impaired_bytes_per_s),
     metric("noncritical_fragments", |one| one.fragments_to_remote.map(|count| count as f64)),

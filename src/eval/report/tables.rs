@@ -284,10 +284,11 @@ pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
 
 /// What the remote subscriber got, of every scenario at a place.
 pub fn remote(results: &Results, place: &Place, reading: &str) -> Table {
-    const COLUMNS: [Column; 9] = [
+    const COLUMNS: [Column; 10] = [
         Column::new("rate, Hz", "noncritical_rate_hz", format::hz),
         Column::new("p50, ms", "noncritical_p50_ms", format::ms),
         Column::new("p95, ms", "noncritical_p95_ms", format::ms),
+        Column::new("lane's bytes/s while impaired", "noncritical_lane_impaired_bytes_per_s", format::bytes),
         Column::new("bytes/s on the wire", "noncritical_wire_bytes_per_s", format::bytes),
         Column::new("while impaired", "noncritical_wire_impaired_bytes_per_s", format::bytes),
         Column::new("IP fragments", "noncritical_fragments", format::count),
@@ -300,7 +301,8 @@ pub fn remote(results: &Results, place: &Place, reading: &str) -> Table {
         place,
         reading,
         "Remote subscriber",
-        "Of several the slowest. On the wire are all protocols. Repair requests: ACKNACK and NACK_FRAG of user data.",
+        "Of several the slowest. The lane's bytes are the payload that it sends; on the wire are all protocols, probes \
+         and discovery too, less what the link lost. Repair requests: ACKNACK and NACK_FRAG of user data.",
         &COLUMNS,
     )
 }

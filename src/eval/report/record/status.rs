@@ -19,6 +19,8 @@ pub struct BridgeRecord {
     pub lanes: Vec<(String, Vec<Change<String>>)>,
     /// Modes of the safety supervisor.
     pub safety: Vec<Change<String>>,
+    /// Bytes of payload that the noncritical lanes have handed to DDS, `(seconds, bytes)`.
+    pub noncritical_bytes: Vec<(f64, u64)>,
     /// Lanes of routes whose samples were not all accounted for, forwarded or dropped for a name, at the end.
     pub not_whole: usize,
 }
@@ -79,6 +81,8 @@ struct Route {
 
 #[derive(Deserialize)]
 struct RouteLane {
+    lane: String,
+    forwarded_bytes: u64,
     whole: bool,
 }
 
@@ -124,8 +128,10 @@ impl BridgeRecord {
                 record.transitions = subscriber.transitions.saturating_sub(before);
             }
         }
-        let lanes = status.routes.iter().flat_map(|route| &route.lanes);
-        self.not_whole = lanes.filter(|lane| !lane.whole).count();
+        let lanes = || status.routes.iter().flat_map(|route| &route.lanes);
+        let noncritical = lanes().filter(|lane| lane.lane != "critical");
+        self.noncritical_bytes.push((at_s, noncritical.map(|lane| lane.forwarded_bytes).sum()));
+        self.not_whole = lanes().filter(|lane| !lane.whole).count();
     }
 }
 

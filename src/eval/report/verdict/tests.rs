@@ -67,12 +67,12 @@ fn bridges() -> Vec<MadeUp> {
                 reading,
                 latency_ms: 0.8,
                 tail_ms: 1.25,
-                wire_bytes_per_s: 9_000,
+                lane_bytes_per_s: 9_000,
                 reaction_s: Some(2.0),
                 ..clean.clone()
             };
             runs.extend(["bridge_mild", "bridge_moderate", "bridge_strong"].map(bridge));
-            runs.push(MadeUp { wire_bytes_per_s: 30_000, reaction_s: None, ..bridge("bridge_ablation") });
+            runs.push(MadeUp { lane_bytes_per_s: 30_000, reaction_s: None, ..bridge("bridge_ablation") });
             let toggles = vec![(20.0, true), (40.0, false), (60.0, true)];
             runs.push(MadeUp { toggles, length_s: 80, reaction_s: Some(11.0), ..bridge("bridge_toggle") });
         }
@@ -129,13 +129,13 @@ fn each_rule_of_h2_can_fail() {
 }
 
 #[test]
-fn h3_takes_the_bytes_on_the_wire_and_every_toggle() {
+fn h3_takes_what_the_lane_sends_and_every_toggle() {
     let found = finding(&bridges(), 3);
     assert_eq!(found.verdict, Verdict::Confirmed, "{found:?}");
     assert!(found.criteria.iter().any(|one| one.found.starts_with("70 % saved")), "{:?}", found.criteria);
 
     let mut wasteful = bridges();
-    change(&mut wasteful, "bridge_moderate", |run| run.wire_bytes_per_s = 12_000);
+    change(&mut wasteful, "bridge_moderate", |run| run.lane_bytes_per_s = 12_000);
     assert_eq!(finding(&wasteful, 3).verdict, Verdict::Partly);
 
     let mut slow = bridges();
