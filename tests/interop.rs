@@ -53,8 +53,9 @@ fn hosts_that_have_nothing_to_say_are_quiet() {
         let before = packets(&bed);
         std::thread::sleep(Duration::from_secs(4));
         let spoken = packets(&bed) - before;
-        // Announcements of a few participants, which are seconds apart. A reader of Fast DDS that is left without a
-        // HEARTBEAT asks for it seven times a second, and each process of the bridge has several such writers.
+        // Announcements of a few participants, which are seconds apart. A reader of Fast DDS that is left
+        // without a HEARTBEAT asks for it seven times a second, and each process of the bridge has several
+        // such writers.
         assert!(spoken < 100, "{library:?}: {spoken} packets in 4 s");
         subscriber.end::<Received>();
     }

@@ -78,8 +78,8 @@ fn set_affinity(cpus: &[usize]) -> nix::Result<()> {
 
 /// The nice value of this process.
 fn current_nice() -> i32 {
-    // SAFETY: the call takes two numbers and returns one. nix has no wrapper for it. An error is -1, as a nice
-    // value may be; both are below all that can be configured.
+    // SAFETY: the call takes two numbers and returns one. nix has no wrapper for it. An error is -1, as a
+    // nice value may be, and below all that can be configured.
     unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) }
 }
 

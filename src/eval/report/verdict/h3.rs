@@ -8,11 +8,11 @@ use crate::eval::report::{format, paper};
 const SAVED: f64 = 0.65;
 
 const CLAIM: &str = "The classifier saves noncritical bandwidth while a link is impaired, beyond what \
-                     splitting the topic does. Rules: in the impaired time the noncritical lane sends at least 65 % \
-                     fewer bytes of payload than without the classifier (the paper: 70 %, of the time after the \
-                     demotion only; here the time that the classifier takes counts), and each toggle of the link is answered within 20 s, in every repetition. For the whole \
-                     verdict ablation, moderate loss and toggle have to be run on Fast DDS and Cyclone DDS, \
-                     in both readings.";
+                     splitting the topic does. Rules: in the impaired time the noncritical lane sends at least \
+                     65 % fewer bytes of payload than without the classifier (the paper: 70 %, of the time after \
+                     the demotion only; here the time that the classifier takes counts), and each toggle of the \
+                     link is answered within 20 s, in every repetition. For the whole verdict ablation, moderate \
+                     loss and toggle have to be run on Fast DDS and Cyclone DDS, in both readings.";
 
 /// What the runs say.
 pub fn finding(results: &Results) -> Finding {
