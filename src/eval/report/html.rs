@@ -99,7 +99,7 @@ const fn verdict_class(verdict: Verdict) -> &'static str {
         Verdict::Confirmed => "good",
         Verdict::Partly => "fair",
         Verdict::NotConfirmed => "poor",
-        Verdict::Incomplete | Verdict::NotTested => "none",
+        Verdict::Incomplete | Verdict::NotSeen | Verdict::NotTested => "none",
     }
 }
 

@@ -62,14 +62,12 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
     } else if places.iter().filter(on_fast).any(|at| at.levels == whole) {
         Verdict::NotConfirmed
     } else {
-        Verdict::Incomplete
+        Verdict::NotSeen
     };
     let sentences: Vec<String> = places.iter().map(AtPlace::sentence).collect();
     let because = match verdict {
         Verdict::NotTested => "No impaired baseline was run beside a clean one.".to_owned(),
-        Verdict::Incomplete => {
-            format!("Nothing of it was seen, but not all levels were run. {}", sentences.join(" "))
-        }
+        Verdict::NotSeen => format!("Not all levels were run. {}", sentences.join(" ")),
         _ => sentences.join(" "),
     };
     let mut scenarios = vec!["baseline_clean"];

@@ -24,6 +24,8 @@ pub enum Verdict {
     NotConfirmed,
     /// What was run holds; not all that it takes was run.
     Incomplete,
+    /// Nothing of it was seen; not all that it takes was run.
+    NotSeen,
     /// What it takes was not run, or only as a smoke run.
     NotTested,
 }
@@ -36,6 +38,7 @@ impl Verdict {
             Self::Partly => "partly confirmed",
             Self::NotConfirmed => "not confirmed",
             Self::Incomplete => "holds so far, incomplete",
+            Self::NotSeen => "not seen so far, incomplete",
             Self::NotTested => "not tested",
         }
     }
