@@ -15,14 +15,20 @@ use super::link::{Counters, HELD_MAX, Impairment, LinkState};
 use super::system::{run, words};
 use crate::model::MonotonicNs;
 
+/// Which of the devices are links of ours.
+const DEVICE: &str = "abimpair";
+
 /// Why this machine has no netem; `None` when it has. It is tried in the present network namespace, on a
-/// device of its own.
+/// device of its own, with a delay too: its distribution is a file that comes with `tc`, or does not.
 pub(super) fn missing(queue: u16) -> Option<String> {
     let device = format!("abprobe{queue}");
     let _ = run(&words(&format!("ip link del {device}")));
     let tried = [
         format!("ip link add {device} type ifb"),
-        format!("tc qdisc add dev {device} root netem limit 10 loss gemodel 1% 10% 50% 1%"),
+        format!(
+            "tc qdisc add dev {device} root netem limit 10 delay 1ms 1ms distribution normal \
+             loss gemodel 1% 10% 50% 1%"
+        ),
         format!("tc qdisc add dev {device} ingress"),
         format!(
             "tc filter add dev {device} parent ffff: protocol ip prio 1 u32 match ip src 192.0.2.1/32 \
@@ -40,11 +46,19 @@ struct Commands {
     device: String,
     /// The interface through which packets of the source arrive.
     interface: String,
+    /// Of the filter; another for each link at the interface, and never 0, which means any.
+    priority: u32,
     source: Ipv4Addr,
     impairment: Impairment,
 }
 
 impl Commands {
+    fn new(source: Ipv4Addr, interface: String, queue: u16, impairment: Impairment) -> Self {
+        // The largest would be 65,536, one too many.
+        let priority = (u32::from(queue) + 1).min(u32::from(u16::MAX));
+        Self { device: format!("{DEVICE}{queue}"), interface, priority, source, impairment }
+    }
+
     fn netem(&self, verb: &str, state: LinkState) -> String {
         let mut line = format!("tc qdisc {verb} dev {} root netem limit {HELD_MAX}", self.device);
         match state {
@@ -58,30 +72,64 @@ impl Commands {
         line
     }
 
-    /// Each with what undoes it, where that is not part of undoing another.
-    fn set_up(&self) -> Vec<(String, Option<String>)> {
-        let Self { device, interface, source, .. } = self;
-        vec![
+    /// Each with what undoes it, where that is not part of undoing another. The ingress discipline is there.
+    fn set_up(&self) -> [(String, Option<String>); 4] {
+        let Self { device, interface, priority, source, .. } = self;
+        let filter = format!("dev {interface} parent ffff: protocol ip prio {priority}");
+        [
             (format!("ip link add {device} type ifb"), Some(format!("ip link del {device}"))),
             (format!("ip link set {device} up"), None),
             (self.netem("add", LinkState::On), None),
             (
-                format!("tc qdisc add dev {interface} ingress"),
-                Some(format!("tc qdisc del dev {interface} ingress")),
-            ),
-            (
                 format!(
-                    "tc filter add dev {interface} parent ffff: protocol ip prio 1 u32 match ip src {source}/32 \
-                     action mirred egress redirect dev {device}"
+                    "tc filter add {filter} u32 match ip src {source}/32 action mirred egress redirect dev {device}"
                 ),
-                None,
+                Some(format!("tc filter del {filter}")),
             ),
         ]
+    }
+
+    /// All links at an interface share its ingress discipline, which may be there.
+    fn add_ingress(&self) -> Result<(), ImpairmentError> {
+        let interface = &self.interface;
+        let Err(error) = run(&words(&format!("tc qdisc add dev {interface} ingress"))) else { return Ok(()) };
+        let Ok(filters) = self.filters() else { return Err(error) };
+        if can_share(&filters, self.source) {
+            return Ok(());
+        }
+        let show = format!("`tc filter show dev {interface} parent ffff:` shows it");
+        let what =
+            format!("a filter at {interface} that is no link's, or is for {} too; {show}", self.source);
+        Err(ImpairmentError::Unexpected { what })
+    }
+
+    /// Whoever finds no filter left is the last.
+    fn remove_ingress(&self) -> Result<(), ImpairmentError> {
+        if self.filters()?.trim().is_empty() {
+            run(&words(&format!("tc qdisc del dev {} ingress", self.interface)))?;
+        }
+        Ok(())
+    }
+
+    fn filters(&self) -> Result<String, ImpairmentError> {
+        run(&words(&format!("tc filter show dev {} parent ffff:", self.interface)))
     }
 
     fn statistics(&self) -> String {
         format!("tc -s -j qdisc show dev {}", self.device)
     }
+}
+
+/// Whether all filters that `tc filter show` shows redirect to links of ours, and none what comes from this
+/// source: the first of two would take it from the other.
+fn can_share(filters: &str, source: Ipv4Addr) -> bool {
+    let to_link = format!("mirred (Egress Redirect to device {DEVICE}");
+    let of_source = format!("match {:08x}/", u32::from(source));
+    filters.lines().all(|line| match line.trim_start() {
+        line if line.starts_with("filter ") => line.contains(" u32 "),
+        line if line.starts_with("action ") => line.contains(&to_link),
+        line => !line.starts_with(&of_source),
+    })
 }
 
 /// netem takes the loss in the bad state before that in the good one: `p r 1-h 1-k` (tc-netem(8)).
@@ -148,22 +196,22 @@ pub struct Netem {
 
 impl Netem {
     /// Begins to impair what the present network namespace receives from `source`. What a former one with the
-    /// same number has left is removed; there is one to an interface.
+    /// same number has left is removed.
     ///
     /// # Errors
-    /// The machine can't, or the interface has an ingress discipline of another's.
+    /// The machine can't, or the interface has an ingress discipline with filters of another's.
     pub fn open(source: Ipv4Addr, queue: u16, impairment: &Impairment) -> Result<Self, ImpairmentError> {
         let route = run(&words(&format!("ip -j route get {source}")))?;
         let interface = interface_of(&route).ok_or_else(|| ImpairmentError::Unexpected {
             what: format!("no interface in the route to {source}: {}", route.trim()),
         })?;
-        let commands =
-            Commands { device: format!("abimpair{queue}"), interface, source, impairment: *impairment };
+        let commands = Commands::new(source, interface, queue, *impairment);
         if run(&words(&format!("ip link show {}", commands.device))).is_ok() {
             for undo in commands.set_up().into_iter().rev().filter_map(|(_, undo)| undo) {
                 let _ = run(&words(&undo));
             }
         }
+        commands.add_ingress()?;
         let set_up = commands.set_up();
         let mut netem = Self {
             commands,
@@ -263,6 +311,9 @@ impl Drop for Netem {
                 tracing::warn!(%error, "an impairment was not removed");
             }
         }
+        if let Err(error) = self.commands.remove_ingress() {
+            tracing::warn!(%error, "an ingress discipline was not removed");
+        }
     }
 }
 
@@ -279,12 +330,8 @@ mod tests {
 
     fn commands(level: Level, reading: Reading, mean_ms: f64, sigma_ms: f64) -> Commands {
         let delay = NormalDelay::new(mean_ms, sigma_ms).expect("in range");
-        Commands {
-            device: "abimpair7".to_owned(),
-            interface: "eth0".to_owned(),
-            source: Ipv4Addr::new(10, 1, 2, 3),
-            impairment: Impairment { loss: level.model(reading), delay, seed: 1 },
-        }
+        let impairment = Impairment { loss: level.model(reading), delay, seed: 1 };
+        Commands::new(Ipv4Addr::new(10, 1, 2, 3), "eth0".to_owned(), 7, impairment)
     }
 
     #[test]
@@ -327,21 +374,51 @@ mod tests {
 
     #[test]
     fn what_is_set_up_is_undone() {
-        let set_up = commands(Level::Clean, Reading::AsRun, 0.0, 0.0).set_up();
-        let (lines, undo): (Vec<_>, Vec<_>) = set_up.into_iter().unzip();
+        let commands = commands(Level::Clean, Reading::AsRun, 0.0, 0.0);
+        let (lines, undo): (Vec<_>, Vec<_>) = commands.set_up().into_iter().unzip();
         assert_eq!(
             lines,
             [
                 "ip link add abimpair7 type ifb",
                 "ip link set abimpair7 up",
                 "tc qdisc add dev abimpair7 root netem limit 20000",
-                "tc qdisc add dev eth0 ingress",
-                "tc filter add dev eth0 parent ffff: protocol ip prio 1 u32 match ip src 10.1.2.3/32 action \
+                "tc filter add dev eth0 parent ffff: protocol ip prio 8 u32 match ip src 10.1.2.3/32 action \
                  mirred egress redirect dev abimpair7",
             ]
         );
         let undo: Vec<String> = undo.into_iter().flatten().collect();
-        assert_eq!(undo, ["ip link del abimpair7", "tc qdisc del dev eth0 ingress"]);
+        assert_eq!(undo, ["ip link del abimpair7", "tc filter del dev eth0 parent ffff: protocol ip prio 8"]);
+        let of =
+            |queue| Commands::new(commands.source, "eth0".to_owned(), queue, commands.impairment).priority;
+        assert_eq!([0, 1, u16::MAX].map(of), [1, 2, 65_535], "tc takes 16 bits, and 0 for any");
+    }
+
+    #[test]
+    fn an_ingress_discipline_is_shared_with_links_of_other_sources_only() {
+        // As iproute2 6.1 shows a link.
+        let filter = |number: u32, action: &str| {
+            let priority = number + 1;
+            format!(
+                "filter protocol ip pref {priority} u32 chain 0 \n\
+                 filter protocol ip pref {priority} u32 chain 0 fh 80{number}: ht divisor 1 \n\
+                 filter protocol ip pref {priority} u32 chain 0 fh 80{number}::800 order 2048 key ht 80{number} \
+                 bkt 0 terminal flowid not_in_hw \n  match 0a01020{priority}/ffffffff at 12\n\
+                 \taction order 1: {action}\n\tindex {priority} ref 1 bind 1\n\n"
+            )
+        };
+        let redirect =
+            |number, to| filter(number, &format!("mirred (Egress Redirect to device {to}) stolen"));
+        let links = redirect(0, "abimpair0") + &redirect(1, "abimpair1");
+        let source = |last| Ipv4Addr::new(10, 1, 2, last);
+        assert!(can_share("", source(1)) && can_share(&links, source(3)));
+        assert!(!can_share(&links, source(1)) && !can_share(&links, source(2)));
+        for another in [
+            redirect(2, "eth1"),
+            filter(2, "gact action drop"),
+            "filter protocol all pref 9 matchall chain 0 \n".to_owned(),
+        ] {
+            assert!(!can_share(&(links.clone() + &another), source(9)), "{another}");
+        }
     }
 
     #[test]
