@@ -62,6 +62,7 @@ check_all() {
     need "has colcon" "colcon|python3-colcon-core" "the same"
     need "has_python colcon_ros" python3-colcon-ros "the same"
     need "has_python colcon_metadata" python3-colcon-metadata "the same"
+    need "has_python colcon_package_information" python3-colcon-package-information "the same"
     need "has_python ament_index_python" "python3-ament-index|python3-ament-index-python" "the same"
 }
 

@@ -72,7 +72,7 @@ impl Workspace {
     fn build(test: &str) -> Option<Self> {
         let lacks = |program: &str| Command::new(program).arg("--help").output().is_err();
         let lacking = ["colcon", "cmake"].into_iter().find(|program| lacks(program));
-        let module = ["colcon_ros", "colcon_metadata", "ament_index_python"]
+        let module = ["colcon_ros", "colcon_metadata", "colcon_package_information", "ament_index_python"]
             .into_iter()
             .find(|module| python_with(module).is_none());
         if let Some(what) = lacking.or(module) {
