@@ -131,14 +131,7 @@ impl Program {
     pub fn start(role: &str, domain: u16, place: Place, more: &[&str]) -> Result<Self, String> {
         let executable = std::env::current_exe().map_err(|error| error.to_string())?;
         // Programs on the noncritical side have as little of the CPUs as its lanes.
-        let is_noncritical = ["__drain", "__spinner"].contains(&role);
-        let mut command = if is_noncritical {
-            let mut command = Command::new("nice");
-            command.args(["-n", NONCRITICAL_NICE]).arg(executable);
-            command
-        } else {
-            Command::new(executable)
-        };
+        let mut command = program(&executable, ["__drain", "__spinner"].contains(&role));
         command.arg(role).arg(domain.to_string()).arg(place.to_argument()).args(more);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = spawn(&mut command)?;
@@ -177,6 +170,16 @@ impl Drop for Program {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// A program, with the nice value of its side.
+fn program(executable: &Path, is_noncritical: bool) -> Command {
+    if !is_noncritical {
+        return Command::new(executable);
+    }
+    let mut command = Command::new("nice");
+    command.args(["-n", NONCRITICAL_NICE]).arg(executable);
+    command
 }
 
 /// Starts a child that does not outlive this process.
@@ -230,14 +233,7 @@ pub struct Process {
 
 impl Process {
     fn start(executable: &Path, role: &str, config: &Path) -> Result<Self, String> {
-        let is_noncritical = !["ingress", "critical", "control"].contains(&role);
-        let mut command = if is_noncritical {
-            let mut command = Command::new("nice");
-            command.args(["-n", NONCRITICAL_NICE]).arg(executable);
-            command
-        } else {
-            Command::new(executable)
-        };
+        let mut command = program(executable, !["ingress", "critical", "control"].contains(&role));
         match role {
             "ingress" | "control" => command.arg(role),
             lane => command.args(["egress", "--lane", lane]),
