@@ -23,7 +23,6 @@ pub struct RowCounts {
 pub struct Replay {
     trace: Trace,
     repeat: bool,
-    length_ns: u64,
     begun: Option<MonotonicNs>,
     round: u64,
     row: usize,
@@ -34,20 +33,10 @@ pub struct Replay {
 impl Replay {
     /// One that waits to be begun, with its first row on.
     pub fn new(trace: Trace, repeat: bool) -> Self {
-        let length_ns = trace.length_ns();
         let counts = vec![RowCounts::default(); trace.rows().len()];
         // A single row has no end that it could be repeated after.
-        let repeat = repeat && length_ns > 0;
-        Self {
-            trace,
-            repeat,
-            length_ns,
-            begun: None,
-            round: 0,
-            row: 0,
-            counted: RowCounts::default(),
-            counts,
-        }
+        let repeat = repeat && trace.length_ns() > 0;
+        Self { trace, repeat, begun: None, round: 0, row: 0, counted: RowCounts::default(), counts }
     }
 
     /// Begins it, unless it has begun: a link that is switched off for a while misses that part.
@@ -63,10 +52,10 @@ impl Replay {
     /// When another row is on; `None` before it is begun and when the last row stays on.
     pub fn next_change(&self) -> Option<MonotonicNs> {
         let begun = self.begun?;
-        let before_ns = self.round.saturating_mul(self.length_ns);
+        let before_ns = self.round.saturating_mul(self.trace.length_ns());
         let in_round_ns = match self.trace.rows().get(self.row + 1) {
             Some(next) => next.at_ns,
-            None if self.repeat => self.length_ns,
+            None if self.repeat => self.trace.length_ns(),
             None => return None,
         };
         Some(begun.plus_ns(before_ns.saturating_add(in_round_ns)))
@@ -78,8 +67,8 @@ impl Replay {
         if let Some(begun) = self.begun {
             let mut since_ns = now.since(begun);
             if self.repeat {
-                self.round = since_ns / self.length_ns;
-                since_ns %= self.length_ns;
+                self.round = since_ns / self.trace.length_ns();
+                since_ns %= self.trace.length_ns();
             }
             // The first row is at 0.
             self.row = self.trace.rows().partition_point(|row| row.at_ns <= since_ns).saturating_sub(1);
