@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take, WriteError,
-    WriterEvent,
+    Discovery, Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take,
+    WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
@@ -123,6 +123,29 @@ fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
         }
         assert!(Instant::now() < give_up, "the present reader was not announced");
     }
+}
+
+#[test]
+fn a_newcomer_does_not_hear_of_readers_that_are_gone() {
+    let mut here = participant("here", 81);
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    for _ in 0..16 {
+        drop(here.create_reader("rt/gone", TYPE, &qos).unwrap());
+    }
+    let present = here.create_reader("rt/present", TYPE, &qos).unwrap();
+    let newcomer = participant("newcomer", 81);
+    let give_up = Instant::now() + Duration::from_secs(20);
+    let mut heard = Vec::new();
+    // SEDP announces in the order in which they were made, so the present one comes last.
+    while heard.last() != Some(&present.guid()) {
+        assert!(Instant::now() < give_up, "the present reader was not announced");
+        match newcomer.poll_discovery() {
+            Some(Discovery::Reader(reader)) if reader.topic.starts_with("rt/") => heard.push(reader.guid),
+            Some(_) => {}
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+    }
+    assert_eq!(heard, [present.guid()]);
 }
 
 #[test]

@@ -1,3 +1,4 @@
+pub(crate) mod announced;
 pub(crate) mod builtin_endpoint;
 pub(crate) mod content_filter_property;
 #[allow(clippy::module_inception)]

@@ -23,9 +23,10 @@ use crate::{
     statusevents::{DomainParticipantStatusEvent, LostReason, StatusChannelSender},
   },
   discovery::{
+    announced::Announced,
     discovery_db::{discovery_db_read, discovery_db_write, DiscoveredVia, DiscoveryDB},
     sedp_messages::{
-      DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData, Endpoint_GUID,
+      DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData,
       ParticipantMessageData, ParticipantMessageDataKind,
     },
     spdp_participant_data::{Participant_GUID, SpdpDiscoveredParticipantData},
@@ -253,6 +254,13 @@ pub(crate) struct Discovery {
 
   // DCPSParticipantMessage - used by participants to communicate liveness
   dcps_participant_message: with_key::DiscoveryTopicCDR<ParticipantMessageData>,
+
+  // What DCPSSubscription and DCPSPublication say of our endpoints
+  announced_readers: Announced,
+  announced_writers: Announced,
+
+  // A participant that died, for which goodbye is said until its lease ends.
+  dead_participant: Option<(GUID, std::time::Instant)>,
 
   // One timer shared by all periodic discovery tasks (replaces the former
   // per-topic timers and the separate participant/topic cleanup and secure
@@ -698,6 +706,9 @@ impl Discovery {
       dcps_participant_volatile_message_secure,
       #[cfg(feature = "security")]
       spdp_quick_response_sent: std::collections::HashSet::new(),
+      announced_readers: Announced::default(),
+      announced_writers: Announced::default(),
+      dead_participant: None,
     })
   }
 
@@ -795,11 +806,9 @@ impl Discovery {
                   discovery_db_write(&self.discovery_db).remove_local_topic_reader(guid);
                 }
                 DiscoveryCommand::DisposeParticipant { guid } => {
-                  self
-                    .dcps_participant
-                    .writer
-                    .dispose(&Participant_GUID(guid), None)
-                    .unwrap_or_else(|e| error!("Disposing participant {guid:?}: {e:?}"));
+                  let lease_end = std::time::Instant::now() + 5 * Self::SPDP_PUBLISH_PERIOD;
+                  self.dead_participant = Some((guid, lease_end));
+                  self.say_goodbye_for_the_dead();
                 }
                 DiscoveryCommand::ManualAssertLiveliness => {
                   self
@@ -868,6 +877,8 @@ impl Discovery {
                 DiscoveryTimerEvent::SendParticipantInfo { reschedule } => {
                   if let Some(dp) = self.domain_participant.clone().upgrade() {
                     self.spdp_publish(&dp);
+                    // Once more, now that they know who says so.
+                    self.say_goodbye_for_the_dead();
                   } else {
                     error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
                     return;
@@ -1144,13 +1155,30 @@ impl Discovery {
     self.spdp_quick_response_sent.remove(&participant_guidp);
   }
 
+  // Fast DDS takes a goodbye only from participants that it knows, and ours is new
+  // to it: so it is said after each of our announcements, until the lease of the
+  // dead one has ended anyway.
+  fn say_goodbye_for_the_dead(&mut self) {
+    let Some((guid, lease_end)) = self.dead_participant else {
+      return;
+    };
+    if std::time::Instant::now() > lease_end {
+      self.dead_participant = None;
+      return;
+    }
+    self
+      .dcps_participant
+      .writer
+      .dispose(&Participant_GUID(guid), None)
+      .unwrap_or_else(|e| error!("Disposing participant {guid:?}: {e:?}"));
+  }
+
   fn send_endpoint_dispose_message(&self, endpoint_guid: GUID) {
     let is_writer = endpoint_guid.entity_id.entity_kind.is_writer();
     if is_writer {
       self
-        .dcps_publication
-        .writer
-        .dispose(&Endpoint_GUID(endpoint_guid), None)
+        .announced_writers
+        .dispose(&self.dcps_publication.writer, endpoint_guid)
         .unwrap_or_else(|e| error!("Disposing local Writer: {e:?}"));
       #[cfg(feature = "security")]
       self
@@ -1161,9 +1189,8 @@ impl Discovery {
     } else {
       // is reader
       self
-        .dcps_subscription
-        .writer
-        .dispose(&Endpoint_GUID(endpoint_guid), None)
+        .announced_readers
+        .dispose(&self.dcps_subscription.writer, endpoint_guid)
         .unwrap_or_else(|e| error!("Disposing local Reader: {e:?}"));
       #[cfg(feature = "security")]
       self
@@ -1836,11 +1863,11 @@ impl Discovery {
     };
 
     if do_nonsecure_write {
-      match self
-        .dcps_subscription
-        .writer
-        .write(reader_data.clone(), None)
-      {
+      match self.announced_readers.announce(
+        &self.dcps_subscription.writer,
+        reader_data.reader_proxy.remote_reader_guid,
+        reader_data.clone(),
+      ) {
         Ok(()) => {
           debug!(
             "Published DCPSSubscription data on topic {}, reader guid {:?}, data {:?}",
@@ -1937,11 +1964,11 @@ impl Discovery {
     };
 
     if do_nonsecure_write {
-      match self
-        .dcps_publication
-        .writer
-        .write(writer_data.clone(), None)
-      {
+      match self.announced_writers.announce(
+        &self.dcps_publication.writer,
+        writer_data.writer_proxy.remote_writer_guid,
+        writer_data.clone(),
+      ) {
         Ok(()) => {
           debug!(
             "Published DCPSPublication data on topic {}, writer guid {:?}",

@@ -434,6 +434,14 @@ impl WriterSendBuffer {
     inner.first_seq = max(inner.first_seq, remove_before.min(written_before));
   }
 
+  /// Evicts one sample. Readers that lack it are told by a GAP.
+  pub fn remove(&self, sequence_number: SequenceNumber) {
+    let mut inner = self.shared.inner.lock().unwrap();
+    inner.changes.remove(&sequence_number);
+    let first = inner.changes.keys().next().copied();
+    inner.first_seq = first.unwrap_or_else(|| inner.last_seq.plus_1());
+  }
+
   // --- wait_for_acknowledgments support ---
 
   /// Has every matched reliable reader acknowledged everything up to and

@@ -820,6 +820,15 @@ where
     key: &<D as Keyed>::K,
     source_timestamp: Option<Timestamp>,
   ) -> WriteResult<(), ()> {
+    self.dispose_numbered(key, source_timestamp).map(|_| ())
+  }
+
+  /// Like [`dispose`](Self::dispose); yields the sample's sequence number.
+  pub(crate) fn dispose_numbered(
+    &self,
+    key: &<D as Keyed>::K,
+    source_timestamp: Option<Timestamp>,
+  ) -> WriteResult<SequenceNumber, ()> {
     let send_buffer = SA::key_to_bytes(key).map_err(|e| WriteError::Serialization {
       reason: format!("{e}"),
       data: (),
@@ -835,13 +844,23 @@ where
       .send_buffer
       .admit_blocking(WriteOptions::from(source_timestamp), ddsdata, timeout)
     {
-      Admission::Admitted(_seq) => {
+      Admission::Admitted(sequence_number) => {
         self.ring_doorbell();
         self.refresh_manual_liveliness();
-        Ok(())
+        Ok(sequence_number)
       }
       Admission::WouldBlock => Err(WriteError::WouldBlock { data: () }),
     }
+  }
+
+  /// Forgets a sample: who has not received it yet will not, nor who comes later.
+  pub(crate) fn retract(&self, sequence_number: SequenceNumber) {
+    self.send_buffer.remove(sequence_number);
+  }
+
+  /// Whether all readers that are matched have the sample.
+  pub(crate) fn is_acknowledged(&self, sequence_number: SequenceNumber) -> bool {
+    self.send_buffer.is_acked_through(sequence_number)
   }
 }
 
