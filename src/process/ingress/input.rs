@@ -12,8 +12,8 @@ use crate::clock;
 use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
-    DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, RouteInfo, SampleHeader,
-    TopicName,
+    DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability, RouteInfo,
+    SampleHeader, TopicName,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Slot, Stage};
 
@@ -50,6 +50,8 @@ pub(super) struct Input {
 struct Connection {
     inbox: Inbox,
     qos: ReaderQos,
+    /// Whether its last publisher is gone.
+    idle: bool,
 }
 
 impl Input {
@@ -80,7 +82,7 @@ impl Input {
 
     /// Whether a publisher was found and is read.
     pub fn is_connected(&self) -> bool {
-        self.connection.is_some()
+        self.connection.as_ref().is_some_and(|connection| !connection.idle)
     }
 
     /// What was done so far.
@@ -231,7 +233,7 @@ impl Input {
     }
 
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
-        if self.connection.is_some() && !std::mem::take(&mut self.source_changed) {
+        if self.is_connected() && !std::mem::take(&mut self.source_changed) {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
@@ -245,8 +247,12 @@ impl Input {
         let wanted = self.source.wanted(known_type, &self.route.input_qos, self.route.max_sample_bytes);
         match wanted {
             Wanted::Reader { dds_type, qos } => {
-                if self.connection.as_ref().is_some_and(|current| still_suits(&current.qos, &qos)) {
-                    return Ok(());
+                if let Some(current) = &mut self.connection {
+                    // What a TRANSIENT_LOCAL publisher wrote before, it sends to a reader that asks for it.
+                    let idle = std::mem::take(&mut current.idle);
+                    if still_suits(&current.qos, &qos) && !(idle && current.qos.durability < qos.durability) {
+                        return Ok(());
+                    }
                 }
                 self.read(participant, dds_type, qos)
             }
@@ -255,9 +261,14 @@ impl Input {
                 Ok(())
             }
             Wanted::Unknown => {
-                // The last publisher is gone. The next one may offer more, and nothing is lost by asking
-                // anew.
-                self.disconnect(participant);
+                // The last publisher is gone. The next one begins as soon as it finds a reader: a RELIABLE one
+                // stays for it, but behind a BEST_EFFORT one its first samples would not be repaired.
+                if let Some(current) = &mut self.connection {
+                    current.idle = true;
+                    if current.qos.reliability == Reliability::BestEffort {
+                        self.disconnect(participant);
+                    }
+                }
                 if now >= self.remind_at {
                     info!(
                         route = self.id,
@@ -291,7 +302,8 @@ impl Input {
             "reading"
         );
         self.settled_type = Some(dds_type);
-        self.connection = Some(Connection { inbox: Inbox::with_bell(reader, Arc::clone(&self.bell)), qos });
+        self.connection =
+            Some(Connection { inbox: Inbox::with_bell(reader, Arc::clone(&self.bell)), qos, idle: false });
         Ok(())
     }
 
