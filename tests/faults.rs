@@ -206,6 +206,25 @@ fn a_killed_ingress_comes_back_and_goes_on_counting() {
 }
 
 #[test]
+fn a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed() {
+    let test = "a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    // 200 samples are 6.7 s, less than the lease of the killed one, which is 15 s: a publisher that holds its
+    // samples for it until then has no room for more.
+    let publisher = bed.publish(Peer::fast().keep_all().max_samples(200).rate_hz(30.0), INPUT);
+    critical.wait_received(30);
+    signal(bed.pid("ingress"), Signal::SIGKILL);
+    support::wait_until("a restart", || bed.pids("ingress").len() == 2);
+    let before = critical.received();
+    critical.wait_received(before + 600);
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "{sent:?}");
+    critical.end::<Received>().assert_sound();
+    bed.end();
+}
+
+#[test]
 fn nothing_of_a_bridge_is_left_whose_processes_were_killed() {
     let test = "nothing_of_a_bridge_is_left_whose_processes_were_killed";
     let Some(mut bed) = Bed::start(test, SCAN) else { return };
