@@ -9,7 +9,7 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::model::{DropCounts, DropReason};
-use adaptive_bridge::shm::{Boards, Stage};
+use adaptive_bridge::shm::{Boards, ShmNode, Stage};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -217,6 +217,7 @@ pub struct Bed {
 pub struct Bridge {
     processes: Vec<Process>,
     boards: Boards,
+    _node: ShmNode,
     folder: PathBuf,
     config: PathBuf,
     executable: PathBuf,
@@ -271,9 +272,9 @@ impl Bridge {
         }
         // Ingress sets up the pools, some ms for each route of some MB.
         std::thread::sleep(Duration::from_millis(700));
-        let boards = link::boards(&config)?;
+        let (boards, _node) = link::boards(&config)?;
         let executable = executable.to_owned();
-        Ok(Self { processes, boards, folder, config, executable, domain, plan: plan.clone(), places })
+        Ok(Self { processes, boards, _node, folder, config, executable, domain, plan: plan.clone(), places })
     }
 
     fn check(&mut self) -> Result<(), String> {

@@ -287,10 +287,11 @@ impl Inlet {
 /// come for so long, and is answered by `samples N DAMAGED` and a line for each.
 fn subscriber(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "subscriber")?;
-    let boards = match arguments.get(4) {
+    let (boards, _node) = match arguments.get(4) {
         Some(path) => Some(boards(Path::new(path))?),
         None => None,
-    };
+    }
+    .unzip();
     let prefix = argument(arguments, 3)?.to_owned();
     let mut inlets = Vec::new();
     for route in Route::parse(argument(arguments, 2)?)? {
@@ -378,15 +379,14 @@ fn look_at_boards(boards: &Boards, route: usize, record: &mut Record) {
     record.handed_at = boards.lane(0, route).map_or(0, |lane| between(lane.last_forwarded_at.0));
 }
 
-/// The boards of the bridge with that configuration.
-pub fn boards(config: &Path) -> Result<Boards, String> {
+/// The boards of the bridge with that configuration, and the membership in it: whoever leaves last removes the
+/// bridge's files, so it is to last as long as the boards are read.
+pub fn boards(config: &Path) -> Result<(Boards, ShmNode), String> {
     let settings = config::load(Some(config), &|_| None).map_err(|error| error.to_string())?;
     let root = settings.shared_memory.root_path.clone().ok_or("the configuration names no root")?;
     let node = ShmNode::open(&root, &settings.instance, "bench").map_err(|error| error.to_string())?;
     let boards = node.boards(&BridgeShape::of(&settings)).map_err(|error| error.to_string())?;
-    // The membership is to last as long as the process.
-    std::mem::forget(node);
-    Ok(boards)
+    Ok((boards, node))
 }
 
 /// Lines of stdin, each announced to the calling thread.

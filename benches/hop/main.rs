@@ -56,6 +56,7 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Result<(), String> {
+    let _alone = system::alone()?;
     let mut options = options.clone();
     let mut summary = Summary {
         date: out::date(std::time::SystemTime::now()),

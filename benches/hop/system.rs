@@ -138,6 +138,21 @@ impl Place {
     }
 }
 
+/// Held while a bench runs.
+///
+/// # Errors
+/// Another one runs. Both would use the same DDS domains, and receive each other's samples.
+pub fn alone() -> Result<fs::File, String> {
+    let path = std::env::temp_dir().join("adaptive-bridge-bench.lock");
+    let held = fs::File::create(&path).map_err(|error| error.to_string());
+    held.and_then(|file| match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(fs::TryLockError::WouldBlock) => Err("another bench runs: wait until it has ended".to_owned()),
+        Err(fs::TryLockError::Error(error)) => Err(error.to_string()),
+    })
+    .map_err(|error| format!("{}: {error}", path.display()))
+}
+
 /// Whether this process may have SCHED_FIFO; tried on a thread that ends at once.
 pub fn has_fifo() -> bool {
     let tried = std::thread::spawn(|| {
