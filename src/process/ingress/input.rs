@@ -261,8 +261,8 @@ impl Input {
                 Ok(())
             }
             Wanted::Unknown => {
-                // The last publisher is gone. The next one begins as soon as it finds a reader: a RELIABLE one
-                // stays for it, but behind a BEST_EFFORT one its first samples would not be repaired.
+                // The last publisher is gone. The next one begins as soon as it finds a reader: a RELIABLE
+                // one stays for it, but behind a BEST_EFFORT one its first samples would not be repaired.
                 if let Some(current) = &mut self.connection {
                     current.idle = true;
                     if current.qos.reliability == Reliability::BestEffort {
