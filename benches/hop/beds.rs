@@ -66,13 +66,26 @@ pub struct Plan {
     pub control: bool,
     /// Rate of the noncritical lanes.
     pub noncritical_rate_hz: u64,
+    /// Samples of each route that may wait for the critical lane.
+    pub queue_depth: usize,
 }
+
+/// What a user has who names no depth.
+const DEFAULT_QUEUE_DEPTH: usize = 64;
 
 impl Plan {
     /// Ingress and the critical lane of a bridge as users have it, whose noncritical lane does not run.
     pub fn new(kind: Kind, scheduling: Scheduling, routes: &[usize]) -> Self {
-        let routes = routes.to_vec();
-        Self { kind, scheduling, routes, lanes: 1, lanes_run: false, control: false, noncritical_rate_hz: 10 }
+        Self {
+            kind,
+            scheduling,
+            routes: routes.to_vec(),
+            lanes: 1,
+            lanes_run: false,
+            control: false,
+            noncritical_rate_hz: 10,
+            queue_depth: DEFAULT_QUEUE_DEPTH,
+        }
     }
 
     /// A bridge with all its processes.
@@ -366,7 +379,18 @@ impl Beds {
 
     /// Direct, relay and bridge with these routes.
     pub fn three(scheduling: Scheduling, routes: &[usize], options: &Options) -> Result<Self, String> {
-        Self::start(&Kind::ALL.map(|kind| Plan::new(kind, scheduling, routes)), options)
+        Self::three_with_queues(DEFAULT_QUEUE_DEPTH, scheduling, routes, options)
+    }
+
+    /// Likewise, with room for so many samples of each route in front of the critical lane.
+    pub fn three_with_queues(
+        queue_depth: usize,
+        scheduling: Scheduling,
+        routes: &[usize],
+        options: &Options,
+    ) -> Result<Self, String> {
+        let plan = |kind| Plan { queue_depth, ..Plan::new(kind, scheduling, routes) };
+        Self::start(&Kind::ALL.map(plan), options)
     }
 }
 
@@ -533,10 +557,11 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
     };
     let mut text = format!(
         "instance: bench\nros:\n  domain_id: {domain}\nshared_memory:\n  root_path: {}\nprocesses:\n  ingress:\n    \
-         scheduling: {}\nlanes:\n  critical:\n    scheduling: {}\n",
+         scheduling: {}\nlanes:\n  critical:\n    scheduling: {}\n    queue_depth: {}\n",
         folder.display(),
         scheduling(ingress),
-        scheduling(egress)
+        scheduling(egress),
+        plan.queue_depth
     );
     let (lanes, rate_hz) = (plan.lane_names(), plan.noncritical_rate_hz);
     for lane in &lanes {
