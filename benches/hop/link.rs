@@ -379,8 +379,8 @@ fn look_at_boards(boards: &Boards, route: usize, record: &mut Record) {
     record.handed_at = boards.lane(0, route).map_or(0, |lane| between(lane.last_forwarded_at.0));
 }
 
-/// The boards of the bridge with that configuration, and the membership in it: whoever leaves last removes the
-/// bridge's files, so it is to last as long as the boards are read.
+/// The boards of the bridge with that configuration, and the membership in it: whoever leaves last removes
+/// the bridge's files, so it is to last as long as the boards are read.
 pub fn boards(config: &Path) -> Result<(Boards, ShmNode), String> {
     let settings = config::load(Some(config), &|_| None).map_err(|error| error.to_string())?;
     let root = settings.shared_memory.root_path.clone().ok_or("the configuration names no root")?;
