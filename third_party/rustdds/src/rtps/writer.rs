@@ -1742,13 +1742,16 @@ impl Writer {
   ) {
     let first_keeper = if !self.like_stateless {
       // Regular stateful writer behavior
-      // All readers have acked up to this point (SequenceNumber)
+      // All readers have acked up to this point (SequenceNumber). BestEffort ones
+      // never do, and are owed nothing: counting them would keep every
+      // announcement of the participant, one each 3 s, up to the resource limit.
       let acked_by_all_readers = self
         .readers
         .values()
+        .filter(|reader| self.is_reliable() && reader.qos().is_reliable())
         .map(RtpsReaderProxy::acked_up_to_before)
         .min()
-        .unwrap_or_else(SequenceNumber::zero);
+        .unwrap_or_else(|| self.send_buffer.last_change_sequence_number().plus_1());
       // If all readers have acked all up to before 5, and depth is 5, we need
       // to keep samples 0..4, i.e. from acked_up_to_before - depth .
       let depth_keeper = if let Some(depth) = depth {
@@ -3316,6 +3319,33 @@ mod tests {
         .map(|sn| i64::from(*sn))
         .collect();
       assert_eq!(gap, [4, 5]);
+    }
+
+    // Nobody acknowledges what a BestEffort writer sends.
+    #[test]
+    fn announcements_do_not_pile_up() {
+      let qos = Discovery::create_spdp_participant_qos();
+      let mut f = Fixture::new(
+        EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER,
+        qos.clone(),
+        EntityId::SPDP_BUILTIN_PARTICIPANT_READER,
+        &qos,
+        1000,
+        8,
+        None,
+      );
+      f.writer.handle_cache_cleaning();
+      // The depth of its History.
+      assert_eq!(f.writer.send_buffer.retained_len(), 8);
+    }
+
+    // A reliable reader that has not acknowledged may still ask for all of it.
+    #[test]
+    fn what_a_reliable_reader_lacks_is_kept() {
+      let mut f = Fixture::user(5, 8, None);
+      f.writer.qos_policies.history = Some(History::KeepLast { depth: 1 });
+      f.writer.handle_cache_cleaning();
+      assert_eq!(f.writer.send_buffer.retained_len(), 5);
     }
 
     // While the reader's send socket has queued control datagrams, a round
