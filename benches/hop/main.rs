@@ -35,7 +35,7 @@ use std::process::ExitCode;
 use options::Options;
 use out::Output;
 use report::Summary;
-use system::Scheduling;
+use system::{CpuTime, Scheduling};
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -57,6 +57,7 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Result<(), String> {
     let _alone = system::alone()?;
+    let began = CpuTime::now();
     let mut options = options.clone();
     let mut summary = Summary {
         date: out::date(std::time::SystemTime::now()),
@@ -89,6 +90,10 @@ fn measure(options: &Options) -> Result<(), String> {
         scale::measure(&options, &mut output)?;
         isolation::measure(&options, &mut output)?;
     }
+    let stolen_percent = CpuTime::now().stolen_percent_since(began);
+    let line =
+        format!("the hypervisor kept {stolen_percent:.0} % of the CPUs' time for others meanwhile (steal)");
+    output.summary.parameters.push(line);
     let folder = output.finish(&options)?;
     println!("raw data: {}", folder.display());
     let failures = report::soak_failures(&output.summary);
