@@ -32,10 +32,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use adaptive_bridge::telemetry::CpuTime;
 use options::Options;
 use out::Output;
 use report::Summary;
-use system::{CpuTime, Scheduling};
+use system::Scheduling;
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -167,31 +167,6 @@ pub fn has_fifo() -> bool {
     tried.join().unwrap_or(false)
 }
 
-/// Time of all CPUs since the machine started, in ticks.
-#[derive(Clone, Copy, Debug)]
-pub struct CpuTime {
-    all: u64,
-    /// When a thread wanted to run and the hypervisor ran somebody else.
-    stolen: u64,
-}
-
-impl CpuTime {
-    pub fn now() -> Self {
-        let text = fs::read_to_string("/proc/stat").unwrap_or_default();
-        let first = text.lines().next().unwrap_or_default();
-        // user, nice, system, idle, iowait, irq, softirq, steal; guests are within user (proc_stat(5)).
-        let ticks = first.split_whitespace().skip(1).take(8).filter_map(|word| word.parse().ok());
-        let ticks: Vec<u64> = ticks.collect();
-        Self { all: ticks.iter().sum(), stolen: ticks.get(7).copied().unwrap_or(0) }
-    }
-
-    /// What of the time since `earlier` was stolen, in percent.
-    pub fn stolen_percent_since(self, earlier: Self) -> f64 {
-        let all = self.all.saturating_sub(earlier.all).max(1);
-        100.0 * self.stolen.saturating_sub(earlier.stolen) as f64 / all as f64
-    }
-}
-
 /// What a process has taken so far, all its threads together, and its memory at present.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Taken {

@@ -1,5 +1,6 @@
 //! What the processes show: readings of the boards, what they mean, and logs.
 
+mod cpu_time;
 mod diagnostics;
 mod intervals;
 mod journal;
@@ -15,6 +16,7 @@ mod snapshot;
 mod table;
 mod text;
 
+pub use cpu_time::CpuTime;
 pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};

@@ -6,6 +6,8 @@ use std::process::{Command, Stdio};
 
 use serde::Serialize;
 
+use crate::telemetry::CpuTime;
+
 /// The machine.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Machine {
@@ -15,6 +17,9 @@ pub(super) struct Machine {
     pub cpus: usize,
     pub memory_bytes: u64,
     pub load_before: f64,
+    pub stolen_percent: f64,
+    #[serde(skip)]
+    read_at: CpuTime,
 }
 
 impl Machine {
@@ -31,7 +36,14 @@ impl Machine {
             cpus: std::thread::available_parallelism().map_or(0, Into::into),
             memory_bytes: kib * 1_024,
             load_before: load.split_whitespace().next().and_then(|load| load.parse().ok()).unwrap_or(0.0),
+            stolen_percent: 0.0,
+            read_at: CpuTime::now(),
         }
+    }
+
+    /// With what the hypervisor took since then.
+    pub fn read_again(self) -> Self {
+        Self { stolen_percent: CpuTime::now().stolen_percent_since(self.read_at), ..self }
     }
 }
 

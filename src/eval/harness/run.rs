@@ -64,7 +64,7 @@ pub(super) fn run(
     let (begin, end) = run.measure(progress)?;
     progress.phase("waiting for the last acknowledgements");
     run.await_publishers()?;
-    run.finish(&machine, begin, end)
+    run.finish(&machine.read_again(), begin, end)
 }
 
 /// The hosts of a scenario, in the order of their addresses.

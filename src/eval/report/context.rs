@@ -109,6 +109,7 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
         ),
         ("System", one(|run| format!("{}, kernel {}", run.manifest.machine.os, run.manifest.machine.kernel))),
         ("Load average before a run", vec![load(results)]),
+        ("CPU time that the hypervisor kept (steal)", vec![stolen(results)]),
         (
             "Commit",
             one(|run| {
@@ -191,6 +192,17 @@ fn load(results: &Results) -> String {
     let loads = || results.runs.iter().map(|run| run.manifest.machine.load_before);
     let (least, most) = (loads().fold(f64::INFINITY, f64::min), loads().fold(0.0, f64::max));
     format!("{} to {}", format::number(least, 1), format::number(most, 1))
+}
+
+fn stolen(results: &Results) -> String {
+    let stolen = || results.runs.iter().filter_map(|run| run.manifest.machine.stolen_percent);
+    let Some(least) = stolen().reduce(f64::min) else { return "not recorded".to_owned() };
+    let most = stolen().fold(0.0, f64::max);
+    let of = match results.runs.len() - stolen().count() {
+        0 => String::new(),
+        unknown => format!(", not recorded of {unknown} runs"),
+    };
+    format!("{} to {} %{of}", format::number(least, 0), format::number(most, 0))
 }
 
 fn seeds(results: &Results) -> String {

@@ -53,6 +53,9 @@ pub struct Machine {
     pub memory_bytes: u64,
     pub os: String,
     pub load_before: f64,
+    /// None in runs of before it was recorded.
+    #[serde(default)]
+    pub stolen_percent: Option<f64>,
 }
 
 /// What it ran with.
