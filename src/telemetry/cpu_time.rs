@@ -20,8 +20,8 @@ impl CpuTime {
         100.0 * self.stolen.saturating_sub(earlier.stolen) as f64 / all as f64
     }
 
-    /// The first line of `/proc/stat` is of all CPUs: user, nice, system, idle, iowait, irq, softirq and steal
-    /// (proc_stat(5)). What follows is within these.
+    /// The first line of `/proc/stat` is of all CPUs: user, nice, system, idle, iowait, irq, softirq and
+    /// steal (proc_stat(5)). What follows is within these.
     fn parse(stat: &str) -> Self {
         let first = stat.lines().next().unwrap_or_default();
         let ticks = first.split_whitespace().skip(1).take(8).filter_map(|word| word.parse::<u64>().ok());
