@@ -2220,7 +2220,7 @@ mod tests {
   use super::*;
   use crate::{
     dds::{adapters::no_key::DeserializerAdapter, ddsdata::DDSData},
-    discovery::sedp_messages::TopicBuiltinTopicData,
+    discovery::sedp_messages::{Endpoint_GUID, TopicBuiltinTopicData},
     messages::submessages::submessages::{InterpreterSubmessage, WriterSubmessage},
     network::{constant::*, udp_listener::UDPListener, udp_sender::UDPSender},
     rtps::submessage::*,
