@@ -1,6 +1,9 @@
 //! What a SEDP writer has announced, and takes back.
 
-use std::{cell::RefCell, collections::HashMap};
+use std::{
+  cell::RefCell,
+  collections::{HashMap, VecDeque},
+};
 
 use crate::{
   dds::{
@@ -20,9 +23,15 @@ use crate::{
 #[derive(Default)]
 pub(crate) struct Announced {
   present: RefCell<HashMap<GUID, SequenceNumber>>,
-  // Goodbyes, until all who heard of the endpoint have them.
-  former: RefCell<Vec<SequenceNumber>>,
+  // Goodbyes, the oldest first.
+  former: RefCell<VecDeque<SequenceNumber>>,
 }
+
+// Goodbyes that are kept though all have acknowledged them who are matched now. A
+// participant that we lost sight of, and that did not lose sight of us, asks for
+// them when it is back: without them it would wait for the acknowledgements of a
+// reader that is gone.
+const GOODBYES: usize = 64;
 
 impl Announced {
   /// Announces an endpoint, in place of what was said of it before.
@@ -53,14 +62,16 @@ impl Announced {
       writer.retract(former);
     }
     let mut goodbyes = self.former.borrow_mut();
-    goodbyes.retain(|goodbye| {
-      let pending = !writer.is_acknowledged(*goodbye);
-      if !pending {
-        writer.retract(*goodbye);
+    goodbyes.push_back(goodbye);
+    while goodbyes.len() > GOODBYES {
+      match goodbyes.front() {
+        Some(&oldest) if writer.is_acknowledged(oldest) => {
+          writer.retract(oldest);
+          goodbyes.pop_front();
+        }
+        _ => break,
       }
-      pending
-    });
-    goodbyes.push(goodbye);
+    }
     Ok(())
   }
 }

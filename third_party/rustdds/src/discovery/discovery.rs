@@ -312,9 +312,11 @@ pub(crate) struct Discovery {
 impl Discovery {
   const PARTICIPANT_CLEANUP_PERIOD: StdDuration = StdDuration::from_secs(2);
   const TOPIC_CLEANUP_PERIOD: StdDuration = StdDuration::from_secs(60); // timer for cleaning up inactive topics
-  // As Fast DDS announces by default. The lease is five times this: how long
-  // others wait for the acknowledgements of a participant that was killed.
+  // As Fast DDS announces by default.
   const SPDP_PUBLISH_PERIOD: StdDuration = StdDuration::from_secs(3);
+  // How long others wait for the acknowledgements of a participant that was
+  // killed: five announcements, so that two or three of them may be lost.
+  const LEASE: StdDuration = StdDuration::from_secs(15);
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -806,7 +808,7 @@ impl Discovery {
                   discovery_db_write(&self.discovery_db).remove_local_topic_reader(guid);
                 }
                 DiscoveryCommand::DisposeParticipant { guid } => {
-                  let lease_end = std::time::Instant::now() + 5 * Self::SPDP_PUBLISH_PERIOD;
+                  let lease_end = std::time::Instant::now() + Self::LEASE;
                   self.dead_participant = Some((guid, lease_end));
                   self.say_goodbye_for_the_dead();
                 }
@@ -1502,12 +1504,10 @@ impl Discovery {
   }
 
   fn spdp_publish(&self, local_dp: &DomainParticipant) {
-    // setting 5 times the duration so lease doesn't break if update fails once or
-    // twice
     let data = SpdpDiscoveredParticipantData::from_local_participant(
       local_dp,
       &self.security_opt,
-      5.0 * Duration::from(Self::SPDP_PUBLISH_PERIOD),
+      Duration::from(Self::LEASE),
     );
 
     #[cfg(feature = "security")]
