@@ -66,12 +66,9 @@ pub struct Plan {
     pub control: bool,
     /// Rate of the noncritical lanes.
     pub noncritical_rate_hz: u64,
-    /// Samples of each route that may wait for the critical lane.
-    pub queue_depth: usize,
+    /// Samples of each route that may wait for the critical lane; `None`: what a user has who names no depth.
+    pub queue_depth: Option<usize>,
 }
-
-/// What a user has who names no depth.
-const DEFAULT_QUEUE_DEPTH: usize = 64;
 
 impl Plan {
     /// Ingress and the critical lane of a bridge as users have it, whose noncritical lane does not run.
@@ -84,7 +81,7 @@ impl Plan {
             lanes_run: false,
             control: false,
             noncritical_rate_hz: 10,
-            queue_depth: DEFAULT_QUEUE_DEPTH,
+            queue_depth: None,
         }
     }
 
@@ -379,12 +376,12 @@ impl Beds {
 
     /// Direct, relay and bridge with these routes.
     pub fn three(scheduling: Scheduling, routes: &[usize], options: &Options) -> Result<Self, String> {
-        Self::three_with_queues(DEFAULT_QUEUE_DEPTH, scheduling, routes, options)
+        Self::three_with_queues(None, scheduling, routes, options)
     }
 
     /// Likewise, with room for so many samples of each route in front of the critical lane.
     pub fn three_with_queues(
-        queue_depth: usize,
+        queue_depth: Option<usize>,
         scheduling: Scheduling,
         routes: &[usize],
         options: &Options,
@@ -557,12 +554,14 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
     };
     let mut text = format!(
         "instance: bench\nros:\n  domain_id: {domain}\nshared_memory:\n  root_path: {}\nprocesses:\n  ingress:\n    \
-         scheduling: {}\nlanes:\n  critical:\n    scheduling: {}\n    queue_depth: {}\n",
+         scheduling: {}\nlanes:\n  critical:\n    scheduling: {}\n",
         folder.display(),
         scheduling(ingress),
         scheduling(egress),
-        plan.queue_depth
     );
+    if let Some(depth) = plan.queue_depth {
+        text.push_str(&format!("    queue_depth: {depth}\n"));
+    }
     let (lanes, rate_hz) = (plan.lane_names(), plan.noncritical_rate_hz);
     for lane in &lanes {
         text.push_str(&format!(

@@ -1,6 +1,9 @@
 //! Where and how the programs run, and what machine it is.
 
 use std::fs;
+use std::io::ErrorKind;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
 use std::process::Command;
 
 use nix::errno::Errno;
@@ -138,19 +141,17 @@ impl Place {
     }
 }
 
-/// Held while a bench runs.
+/// Held while a bench runs. The name is one of this network namespace, as the DDS domains are, and of no file
+/// that another user's bench could not open.
 ///
 /// # Errors
 /// Another one runs. Both would use the same DDS domains, and receive each other's samples.
-pub fn alone() -> Result<fs::File, String> {
-    let path = std::env::temp_dir().join("adaptive-bridge-bench.lock");
-    let held = fs::File::create(&path).map_err(|error| error.to_string());
-    held.and_then(|file| match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(fs::TryLockError::WouldBlock) => Err("another bench runs: wait until it has ended".to_owned()),
-        Err(fs::TryLockError::Error(error)) => Err(error.to_string()),
+pub fn alone() -> Result<UnixListener, String> {
+    let name = SocketAddr::from_abstract_name("adaptive-bridge-bench");
+    name.and_then(|name| UnixListener::bind_addr(&name)).map_err(|error| match error.kind() {
+        ErrorKind::AddrInUse => "another bench runs: wait until it has ended".to_owned(),
+        _ => format!("cannot see whether another bench runs: {error}"),
     })
-    .map_err(|error| format!("{}: {error}", path.display()))
 }
 
 /// Whether this process may have SCHED_FIFO; tried on a thread that ends at once.

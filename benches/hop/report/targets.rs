@@ -37,7 +37,7 @@ pub fn table(summary: &Summary) -> Option<String> {
     for row in &summary.loss {
         let lost = row.lost + row.refused;
         let what = format!(
-            "{}: lost at {} Hz of {}, {}",
+            "{}: lost or refused at {} Hz of {}, {}",
             row.program,
             row.rate_hz,
             payload(row.bytes),
