@@ -54,7 +54,6 @@ pub struct Machine {
     pub os: String,
     pub load_before: f64,
     /// None in runs of before it was recorded.
-    #[serde(default)]
     pub stolen_percent: Option<f64>,
 }
 
@@ -116,7 +115,6 @@ pub struct LinkOutcome {
     pub lost: u64,
     pub loss_expected: f64,
     pub loss_standard_error: Option<f64>,
-    #[serde(default)]
     pub trace: Option<TraceRecord>,
 }
 
