@@ -1277,10 +1277,13 @@ impl Writer {
           // Answer now instead of at the next heartbeat period.
           // One that has asked for fragments does know; it is answered with those.
           // A base of 0 acknowledges nothing: Fast DDS repeats it seven times a second
-          // until it has a HEARTBEAT, also of a writer that has nothing yet.
+          // until it has a HEARTBEAT, also of a writer that has nothing yet. Cyclone DDS
+          // has a base of 1 then, and a VOLATILE reader of it takes all that the first
+          // HEARTBEAT tells of for history: that must come before the first sample.
           let knows_nothing = an.reader_sn_state.base() < SequenceNumber::from(1);
+          let has_nothing = last_seq < SequenceNumber::from(1);
           if an.reader_sn_state.iter().next().is_none()
-            && (knows_nothing || reader_proxy.all_acked_before <= last_seq)
+            && (knows_nothing || has_nothing || reader_proxy.all_acked_before <= last_seq)
             && !reader_proxy.repair_frags_requested()
           {
             let hb_message = MessageBuilder::new()
@@ -1292,7 +1295,9 @@ impl Writer {
                 self.next_heartbeat_count(),
                 self.endianness,
                 reader_guid.entity_id,
-                false, // final_flag: request ACKNACK
+                // Ask for an ACKNACK, unless it could say nothing else than this one,
+                // and would be answered for ever.
+                has_nothing && !knows_nothing, // final_flag
                 false, // liveliness_flag
               )
               .add_header_and_build(self.my_guid.prefix);
@@ -3346,6 +3351,15 @@ mod tests {
       f.writer.qos_policies.history = Some(History::KeepLast { depth: 1 });
       f.writer.handle_cache_cleaning();
       assert_eq!(f.writer.send_buffer.retained_len(), 5);
+    }
+
+    // Cyclone DDS asks for a HEARTBEAT so, also a writer without samples.
+    #[test]
+    fn a_reader_that_asks_a_writer_without_samples_is_answered() {
+      let mut f = Fixture::user(0, 8, None);
+      let before = f.writer.next_heartbeat_count();
+      f.ack_nack([], 1);
+      assert_eq!(f.writer.next_heartbeat_count(), before + 2);
     }
 
     // While the reader's send socket has queued control datagrams, a round
