@@ -121,6 +121,17 @@ impl Bed {
     }
 }
 
+impl Drop for Bed {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            match self.bridge.try_status() {
+                Ok(status) => eprintln!("--- what the bridge counted: {}\n---", status["routes"]),
+                Err(error) => eprintln!("--- no status of the bridge: {error}"),
+            }
+        }
+    }
+}
+
 /// Whether every lane accounts for every sample of every route, and none waits.
 pub fn is_whole_and_quiet(status: &Value) -> bool {
     let mut outputs = outputs(status).peekable();

@@ -17,6 +17,7 @@ pub mod peer;
 pub mod process;
 pub mod prometheus;
 
+use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -31,7 +32,7 @@ pub fn patience() -> Duration {
 }
 
 /// Polls until `probe` yields a value; after [`patience`] panics and says `what` did not happen.
-pub fn wait_for<T>(what: &str, mut probe: impl FnMut() -> Option<T>) -> T {
+pub fn wait_for<T>(what: impl Display, mut probe: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + patience();
     loop {
         if let Some(value) = probe() {
@@ -43,7 +44,7 @@ pub fn wait_for<T>(what: &str, mut probe: impl FnMut() -> Option<T>) -> T {
 }
 
 /// As [`wait_for`], for a condition.
-pub fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
+pub fn wait_until(what: impl Display, mut condition: impl FnMut() -> bool) {
     wait_for(what, || condition().then_some(()));
 }
 

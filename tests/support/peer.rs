@@ -1,6 +1,7 @@
 //! The peers of `tests/peers`: publishers and subscribers on Cyclone DDS, Fast DDS and RustDDS.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::{self, Display, Formatter};
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -391,7 +392,7 @@ impl RunningPeer {
 
     /// Waits until a subscriber has received so many samples.
     pub fn wait_received(&self, samples: u64) {
-        super::wait_until(&format!("{samples} samples received"), || self.received() >= samples);
+        super::wait_until(Lacking { peer: self, samples }, || self.received() >= samples);
     }
 
     /// Waits until a publisher has sent all, and until all of it is acknowledged or 10 s have passed; yields
@@ -416,6 +417,31 @@ impl RunningPeer {
     fn summary<S: DeserializeOwned>(&self) -> S {
         let event = self.wait_for("the summary", |event| event["event"] == "summary");
         serde_json::from_value(event.clone()).unwrap_or_else(|error| panic!("{error} in {event}"))
+    }
+}
+
+/// What a subscriber was to receive, and which of it has come; said where it does not come.
+struct Lacking<'a> {
+    peer: &'a RunningPeer,
+    samples: u64,
+}
+
+impl Display for Lacking<'_> {
+    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
+        let Self { peer, samples } = self;
+        write!(formatter, "{samples} samples received by {}, {} so far", peer.name, peer.received())?;
+        let events = peer.events();
+        let received: BTreeSet<u64> = events
+            .iter()
+            .filter(|event| event["event"] == "sample")
+            .filter_map(|event| event["seq"].as_u64())
+            .collect();
+        // With --summary no sample is listed.
+        if !received.is_empty() {
+            let missing: Vec<u64> = (0..*samples).filter(|sequence| !received.contains(sequence)).collect();
+            write!(formatter, ", without {missing:?}")?;
+        }
+        Ok(())
     }
 }
 
