@@ -47,7 +47,7 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
             options.loss_checks().into_iter().partition(|case| is_small(case.bytes));
         if !fast.is_empty() || !small.is_empty() {
             let routes = SWEEP_ROUTES.into_iter().filter(|bytes| is_small(*bytes)).collect::<Vec<_>>();
-            let mut beds = Beds::three_with_queues(FAST_QUEUE_DEPTH, scheduling, &routes, options)?;
+            let mut beds = Beds::three_with_queues(Some(FAST_QUEUE_DEPTH), scheduling, &routes, options)?;
             drive(fast, small, scheduling, &mut beds, options, output)?;
         }
         if !cases.is_empty() || !heavy.is_empty() || !large.is_empty() {
