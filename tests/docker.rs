@@ -86,7 +86,7 @@ impl Deployment {
         fs::write(deployment.config(), SCAN).unwrap();
         run(deployment.compose().args(["up", "--detach", "--no-build"]));
         for container in CONTAINERS {
-            support::wait_until(&format!("a healthy {container}"), || {
+            support::wait_until(format!("a healthy {container}"), || {
                 deployment.inspect(container, "{{.State.Health.Status}}") == "healthy"
             });
         }
@@ -180,7 +180,7 @@ fn samples_flow_across_containers_whichever_dies_and_down_leaves_nothing() {
     for container in CONTAINERS {
         let pid = deployment.inspect(container, "{{.State.Pid}}");
         signal(pid.parse().unwrap(), Signal::SIGKILL);
-        support::wait_until(&format!("a restart of {container}"), || {
+        support::wait_until(format!("a restart of {container}"), || {
             let present = deployment.inspect(container, "{{.State.Pid}}");
             present != "0" && present != pid
         });

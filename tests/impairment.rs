@@ -121,7 +121,7 @@ struct Receiver {
 
 impl Receiver {
     fn wait_received(&self, datagrams: usize) {
-        support::wait_until(&format!("{datagrams} datagrams"), || {
+        support::wait_until(format!("{datagrams} datagrams"), || {
             self.count.load(Ordering::Acquire) >= datagrams
         });
     }

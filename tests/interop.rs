@@ -330,7 +330,7 @@ fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
             ("egress_critical", "writer", CRITICAL),
             ("egress_noncritical", "writer", NONCRITICAL),
         ] {
-            support::wait_until(&format!("{name} with its {kind} of {topic}"), || {
+            support::wait_until(format!("{name} with its {kind} of {topic}"), || {
                 let graph = viewer.graph();
                 let Some(node) = node_of(&graph, name) else { return false };
                 let gids = if kind == "reader" { &node.reader_gids } else { &node.writer_gids };

@@ -64,7 +64,7 @@ fn flow(bridge: &Bridge, domain_id: u16) -> Flow {
 
 /// Waits until the noncritical lane forwards at about that rate.
 fn wait_rate(bridge: &Bridge, hz: f64) {
-    wait_for(&format!("{hz} Hz"), || {
+    wait_for(format!("{hz} Hz"), || {
         let output = bridge.run("status --json --interval-ms 2000");
         let status: Value = serde_json::from_slice(&output.stdout).ok()?;
         let rate_hz = lane(&status, "noncritical")["rate_hz"].as_f64()?;

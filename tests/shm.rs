@@ -10,6 +10,7 @@ use std::cell::Cell;
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use adaptive_bridge::model::{InstanceName, LaneMode, LatencyHistogram, MonotonicNs, RouteId};
@@ -881,6 +882,10 @@ fn no_wake_is_missed() {
     for turn in 0..200_000 {
         // The other side falls asleep meanwhile, or has done so, or not yet.
         (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
+        if turn % 3 != 0 {
+            waker.announce();
+            (0..turn * 6_091 % 400).for_each(|_| std::hint::spin_loop());
+        }
         waker.wake();
         assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "turn {turn}");
     }
@@ -893,6 +898,29 @@ fn no_wake_is_missed() {
     let start = std::time::Instant::now();
     assert_eq!(sleeper.sleep(Duration::from_millis(30)), Woken::TimedOut);
     assert!(start.elapsed() >= Duration::from_millis(30), "the whole time is slept");
+}
+
+#[test]
+fn an_announcement_is_no_wake() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let (waker, mut sleeper) = (boards.waker(1), boards.sleeper(1));
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                waker.announce();
+            }
+        });
+        let start = std::time::Instant::now();
+        assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
+        assert!(start.elapsed() >= Duration::from_millis(100), "the whole time is slept");
+        waker.wake();
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "a wake counts among them");
+        done.store(true, Ordering::Relaxed);
+    });
 }
 
 #[test]

@@ -321,7 +321,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     let Some(bed) = Bed::boot(test, yaml) else { return };
     bed.start();
     let says = |unit: &str, text: &str| {
-        support::wait_until(&format!("'{text}' in the status of {unit}"), || {
+        support::wait_until(format!("'{text}' in the status of {unit}"), || {
             bed.machine.property(unit, "StatusText").contains(text)
         });
     };

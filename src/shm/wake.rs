@@ -5,6 +5,9 @@
 //! Both sides write before they read, sequentially consistent, so one of them sees the other: no wake is
 //! lost. No descriptor and no buffer is involved that could fill up while a lane is stopped.
 //! `docs/decisions/0004-shared-memory.md` has the measurements.
+//!
+//! A lane that sleeps on another CPU than ingress runs on can be told a moment ahead, and gets up while the
+//! sample is still being copied: `docs/decisions/0006-hand-overs.md`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -12,9 +15,14 @@ use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::libc;
+use nix::sched::sched_getcpu;
 
 use super::segment::Segment;
 use crate::clock;
+
+/// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample: far
+/// less than this up to 1 MiB. A sample that takes longer wakes the lane as if nothing had been announced.
+const ANNOUNCED_NS: u64 = 200_000;
 
 /// Why a [`LaneSleeper`] returned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,6 +45,7 @@ impl WakeWords {
         self.segment.half(self.at)
     }
 
+    /// 0 while the lane is up, else one more than the number of the CPU that it sleeps on.
     fn asleep(&self) -> &AtomicU32 {
         self.segment.half(self.at + 1)
     }
@@ -51,6 +60,15 @@ pub struct LaneWaker {
 impl LaneWaker {
     pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
         Self { words: WakeWords { segment, at } }
+    }
+
+    /// Says that a wake is about to come, so that a lane that sleeps on another CPU gets up meanwhile. On
+    /// this CPU it could only get in the way. Nothing has to follow.
+    pub fn announce(&self) {
+        let sleeps_on = self.words.asleep().load(Ordering::Relaxed);
+        if sleeps_on != 0 && sleeps_on != here() {
+            futex_wake(self.words.wakes());
+        }
     }
 
     /// Wakes the lane. Never blocks, also while the lane is stopped; several wakes before the lane looks are
@@ -68,6 +86,9 @@ impl LaneWaker {
 pub struct LaneSleeper {
     words: WakeWords,
     seen: u32,
+    /// Whether the last announcement was followed by a wake in time. After one that was not, the lane stays
+    /// up for no other until a wake has come: a flood of samples that come to nothing does not keep it busy.
+    trusts: bool,
 }
 
 impl LaneSleeper {
@@ -75,7 +96,7 @@ impl LaneSleeper {
         let words = WakeWords { segment, at };
         // What came before is unknown, so the first sleep ends at once.
         let seen = words.wakes().load(Ordering::SeqCst).wrapping_sub(1);
-        Self { words, seen }
+        Self { words, seen, trusts: true }
     }
 
     /// Sleeps until a wake, or for `timeout` at most. A wake that came since the last return ends it at once;
@@ -91,19 +112,39 @@ impl LaneSleeper {
             if left_ns == 0 {
                 break Woken::TimedOut;
             }
-            self.words.asleep().store(1, Ordering::SeqCst);
+            self.words.asleep().store(here(), Ordering::SeqCst);
             if self.look() {
                 break Woken::Woken;
             }
             // The kernel looks at the count once more, and sleeps only if it is still the one that we saw.
-            let interrupted = futex_wait(self.words.wakes(), self.seen, left_ns) == Err(Errno::EINTR);
-            if self.look() || interrupted {
+            let outcome = futex_wait(self.words.wakes(), self.seen, left_ns);
+            let is_announced = outcome.is_ok();
+            if self.look() || outcome == Err(Errno::EINTR) || (is_announced && self.await_announced()) {
                 break Woken::Woken;
             }
             left_ns = deadline.since(clock::monotonic());
         };
         self.words.asleep().store(0, Ordering::Relaxed);
+        self.trusts |= woken == Woken::Woken;
         woken
+    }
+
+    /// Stays up for a moment, as a wake was announced; whether it came.
+    fn await_announced(&mut self) -> bool {
+        if !std::mem::take(&mut self.trusts) {
+            return false;
+        }
+        self.words.asleep().store(0, Ordering::Relaxed);
+        let give_up_at = clock::monotonic().plus_ns(ANNOUNCED_NS);
+        loop {
+            if self.look() {
+                return true;
+            }
+            if clock::monotonic() >= give_up_at {
+                return false;
+            }
+            std::hint::spin_loop();
+        }
     }
 
     /// Whether there was a wake since the last look.
@@ -113,6 +154,13 @@ impl LaneSleeper {
         self.seen = wakes;
         woken
     }
+}
+
+/// One more than the number of this CPU.
+fn here() -> u32 {
+    let cpu = sched_getcpu().ok().and_then(|cpu| u32::try_from(cpu).ok());
+    // Without an answer all CPUs count as one, and nothing is announced.
+    cpu.map_or(1, |cpu| cpu.saturating_add(1))
 }
 
 fn futex_wait(word: &AtomicU32, expected: u32, timeout_ns: u64) -> Result<(), Errno> {

@@ -58,7 +58,7 @@ impl Impairment {
 
     /// Waits until it has seen so many packets and none is on its way; yields the counters.
     pub fn wait_seen(&mut self, packets: u64) -> Value {
-        super::wait_for(&format!("{packets} packets seen, and none on its way"), || {
+        super::wait_for(format!("{packets} packets seen, and none on its way"), || {
             let counters = self.counters();
             (counters["seen"].as_u64() >= Some(packets) && counters["held"] == 0).then_some(counters)
         })

@@ -352,7 +352,7 @@ impl RunningPeer {
 
     /// Waits until so many endpoints match it.
     pub fn wait_matched(&self, endpoints: u64) {
-        super::wait_until(&format!("{endpoints} matched endpoints"), || self.matched() == endpoints);
+        super::wait_until(format!("{endpoints} matched endpoints"), || self.matched() == endpoints);
     }
 
     /// Publishes a line, which has no line break in it and need not be UTF-8; see [`Peer::say`].
@@ -429,7 +429,7 @@ struct Lacking<'a> {
 impl Display for Lacking<'_> {
     fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
         let Self { peer, samples } = self;
-        write!(formatter, "{samples} samples received by {}, {} so far", peer.name, peer.received())?;
+        write!(formatter, "{samples} samples received, {} so far", peer.received())?;
         let events = peer.events();
         let received: BTreeSet<u64> = events
             .iter()

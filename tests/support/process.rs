@@ -194,7 +194,7 @@ impl Process {
 
     /// Waits until a line of its log contains `text`.
     pub fn wait_for_log(&self, text: &str) {
-        super::wait_until(&format!("'{text}' in the log of {}", self.name), || self.log().contains(text));
+        super::wait_until(format!("'{text}' in the log of {}", self.name), || self.log().contains(text));
     }
 }
 

@@ -25,7 +25,7 @@ use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::ProcessRole;
 use input::Input;
-use receiving::Receiving;
+use receiving::{Receiving, ServedLane};
 
 /// At a shutdown, how long ingress goes on taking what DDS has received, and what still comes.
 const LAST_SAMPLES_MS: u64 = 200;
@@ -84,16 +84,16 @@ impl Ingress {
             let bell = Arc::new(Bell::silent());
             inputs.push((Input::open(&role, settings, route, &bell)?, bell));
         }
-        let mut wakers = Vec::with_capacity(settings.lanes.len());
+        let mut lanes = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
             for (index, lane) in settings.lanes.iter().enumerate().filter(|(_, lane)| lane.class == class) {
                 let serves = (0..settings.routes.len())
                     .map(|route| lane.outputs.iter().any(|output| output.route == route))
                     .collect();
-                wakers.push((role.boards.waker(index), serves));
+                lanes.push(ServedLane { waker: role.boards.waker(index), class, serves });
             }
         }
-        let receiving = Arc::new(Receiving::new(inputs, wakers));
+        let receiving = Arc::new(Receiving::new(inputs, lanes));
         let on_received = {
             let receiving = Arc::clone(&receiving);
             move || receiving.turn()

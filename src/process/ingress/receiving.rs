@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::Bell;
 use super::input::Input;
+use crate::model::TrafficClass;
 use crate::shm::LaneWaker;
 
 /// Samples taken of one route before the next route, and the DDS library, have their turn.
@@ -22,19 +23,27 @@ struct Served {
     missed: AtomicBool,
 }
 
+/// A lane that samples are published to.
+pub(super) struct ServedLane {
+    pub waker: LaneWaker,
+    pub class: TrafficClass,
+    /// Of each route.
+    pub serves: Vec<bool>,
+}
+
 /// All routes, as the receiving thread and the main thread share them.
 pub(super) struct Receiving {
     routes: Vec<Served>,
-    /// Of the critical lanes first, each with the routes that it serves.
-    wakers: Vec<(LaneWaker, Vec<bool>)>,
+    /// The critical ones first.
+    lanes: Vec<ServedLane>,
     turns: AtomicU64,
 }
 
 impl Receiving {
-    pub fn new(inputs: Vec<(Input, Arc<Bell>)>, wakers: Vec<(LaneWaker, Vec<bool>)>) -> Self {
+    pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
         let served =
             |(input, bell)| Served { input: Mutex::new(input), bell, missed: AtomicBool::new(false) };
-        Self { routes: inputs.into_iter().map(served).collect(), wakers, turns: AtomicU64::new(0) }
+        Self { routes: inputs.into_iter().map(served).collect(), lanes, turns: AtomicU64::new(0) }
     }
 
     /// Takes and publishes what has arrived; on the receiving thread. Whether there may be more.
@@ -44,6 +53,7 @@ impl Receiving {
             if served.bell.is_rung()
                 && let Some(mut input) = served.try_enter()
             {
+                self.announce(route);
                 more |= self.drain(route, &mut input);
             }
         }
@@ -91,11 +101,21 @@ impl Receiving {
         true
     }
 
-    /// Wakes the lanes that serve the route, the critical ones first.
+    /// Lets the critical lanes that serve the route get up while its sample is taken. A noncritical one has
+    /// time.
+    fn announce(&self, route: usize) {
+        for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
+            if lane.serves[route] {
+                lane.waker.announce();
+            }
+        }
+    }
+
+    /// Wakes the lanes that serve the route.
     fn wake(&self, route: usize) {
-        for (waker, serves) in &self.wakers {
-            if serves[route] {
-                waker.wake();
+        for lane in &self.lanes {
+            if lane.serves[route] {
+                lane.waker.wake();
             }
         }
     }
