@@ -564,9 +564,7 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
     }
     let (lanes, rate_hz) = (plan.lane_names(), plan.noncritical_rate_hz);
     for lane in &lanes {
-        text.push_str(&format!(
-            "  {lane}:\n    max_rate_hz: {rate_hz}\n    degraded_rate_hz: {rate_hz}\n    queue_samples: 64\n"
-        ));
+        text.push_str(&format!("  {lane}:\n    max_rate_hz: {rate_hz}\n    degraded_rate_hz: {rate_hz}\n"));
     }
     let on = std::iter::once("critical").chain(lanes.iter().map(String::as_str)).collect::<Vec<_>>();
     text.push_str("topics:\n");
