@@ -32,6 +32,11 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
             let run = bed.measure(case)?;
             soak.accepted += run.accepted;
             soak.missing += (run.accepted + run.refused).saturating_sub(run.records.len() as u64);
+            let dropped = run.bridge.map(|bridge| bridge.drops).unwrap_or_default();
+            let refused = ("refused by the publisher's own writer".to_owned(), run.refused);
+            for (reason, count) in dropped.into_iter().chain([refused]).filter(|(_, count)| *count > 0) {
+                *soak.reasons.entry(reason).or_default() += count;
+            }
         }
         let at_s = began.elapsed().as_secs_f64();
         let of = Of { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };
@@ -47,7 +52,10 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
             }
         };
         for (process, pid) in bed.between() {
-            see(process.clone(), "KiB", Taken::by(pid).rss_kib as f64);
+            // Without the pool's slots, which count for a process once it has touched them: they have a
+            // series of their own.
+            let taken = Taken::by(pid);
+            see(process.clone(), "KiB", taken.rss_kib.saturating_sub(taken.shared_kib) as f64);
             see(process, "descriptors", descriptors(pid) as f64);
         }
         see("shared memory".to_owned(), "KiB", shared_kib(&bed.between()));

@@ -223,6 +223,8 @@ pub struct Soak {
     pub load: String,
     pub accepted: u64,
     pub missing: u64,
+    /// What became of those that are missing, as far as anybody said so: refused, or dropped by name.
+    pub reasons: BTreeMap<String, u64>,
     pub series: Vec<SoakSeries>,
 }
 

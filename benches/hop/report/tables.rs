@@ -479,12 +479,15 @@ pub fn soak(summary: &Summary) -> Option<String> {
             },
         ]);
     }
+    let reasons: String =
+        soak.reasons.iter().map(|(reason, samples)| format!("; {reason}: {}", count(*samples))).collect();
     Some(format!(
-        "{:.1} hours of {}: {} samples, {} missing.\n\n{}",
+        "{:.1} hours of {}: {} samples, {} missing{}.\n\n{}",
         soak.seconds / 3_600.0,
         soak.load,
         count(soak.accepted),
         count(soak.missing),
+        reasons,
         table.text()
     ))
 }
