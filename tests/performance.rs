@@ -143,6 +143,7 @@ fn made_up() -> Summary {
             load: "1 kHz of 2,948 B".to_owned(),
             accepted: 3_600_000,
             missing: 0,
+            reasons: BTreeMap::from([("critical queue_overflow".to_owned(), 7)]),
             series: vec![series("ingress", 0.0, 3_600.0), series("critical", 1.0, 3_600.0)],
         }),
         ..Summary::default()
@@ -222,6 +223,8 @@ fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
     assert_eq!(judged(40.0, 60.0), ("**grows**".to_owned(), 1));
     let lost = Summary { soak: Some(Soak { missing: 3, ..Soak::default() }), ..Summary::default() };
     assert_eq!(soak_failures(&lost), ["3 samples are missing"]);
+    let readme = readme(&made_up());
+    assert!(readme.contains("0 missing; critical queue_overflow: 7."), "what became of them: {readme}");
 }
 
 #[test]
