@@ -151,6 +151,15 @@ impl Program {
         Ok(Self { child, orders, answers: BufReader::new(answers) })
     }
 
+    /// Takes what the CPUs would halt in, until it is dropped: on a virtual machine each halt is a trip
+    /// through the hypervisor, which gives the CPU to others meanwhile.
+    pub fn keep_awake() -> Result<Self, String> {
+        let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
+        let mut program = Self::start("__awake", 0, anywhere, &[])?;
+        program.numbers("ready")?;
+        Ok(program)
+    }
+
     fn order(&mut self, line: &str) -> Result<(), String> {
         writeln!(self.orders, "{line}").map_err(|error| format!("a program of the bench died: {error}"))
     }

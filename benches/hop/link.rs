@@ -21,7 +21,7 @@ use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Rel
 use adaptive_bridge::shm::{Boards, BridgeShape, ShmNode};
 use bytes::{Bytes, BytesMut};
 
-use super::system::{Place, sleep_until};
+use super::system::{self, Place, sleep_until};
 
 /// One topic, by the largest sample that it carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -107,6 +107,7 @@ pub fn run(role: &str, arguments: &[String]) -> ExitCode {
         "__relay" => relay(arguments),
         "__drain" => drain(arguments),
         "__spinner" => spinner(arguments),
+        "__awake" => system::only_when_idle().and_then(|()| spinner(arguments)),
         other => Err(format!("no such role: {other}")),
     };
     match outcome {

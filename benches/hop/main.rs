@@ -33,6 +33,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use adaptive_bridge::telemetry::CpuTime;
+use beds::Program;
 use options::Options;
 use out::Output;
 use report::Summary;
@@ -58,17 +59,19 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Result<(), String> {
     let _alone = system::alone()?;
+    let _awake = if options.awake { Some(Program::keep_awake()?) } else { None };
     let began = CpuTime::now();
     let mut options = options.clone();
     let mut summary = Summary {
         date: out::date(std::time::SystemTime::now()),
         machine: system::machine(),
         parameters: vec![format!(
-            "placement {}, {} repetitions, durations times {}{}",
+            "placement {}, {} repetitions, durations times {}{}{}",
             options.placement.label(),
             options.repetitions,
             options.longer,
-            if options.quick { ", quick" } else { "" }
+            if options.quick { ", quick" } else { "" },
+            if options.awake { ", CPUs kept awake" } else { "" }
         )],
         ..Summary::default()
     };

@@ -60,6 +60,9 @@ pub struct Options {
     pub longer: f64,
     /// `--placement alternating|split|free`.
     pub placement: Placement,
+    /// `--awake`: a program that runs when nothing else does keeps the CPUs from halting, as `idle=poll`
+    /// does.
+    pub awake: bool,
     /// `--scheduling other|fifo`: only one of them.
     pub scheduling: Option<Scheduling>,
     /// `--only TEXT`, again and again: only what has one of the texts in its name, `SECTION CASE`.
@@ -81,6 +84,7 @@ impl Options {
             repetitions: 0,
             longer: 1.0,
             placement: Placement::Alternating,
+            awake: false,
             scheduling: None,
             only: Vec::new(),
             soak: None,
@@ -95,6 +99,7 @@ impl Options {
                 "--bench" => {}
                 "--quick" => options.quick = true,
                 "--save" => options.save = true,
+                "--awake" => options.awake = true,
                 "--bridge" => options.bridge = PathBuf::from(value()?),
                 "--only" => options.only.push(value()?.clone()),
                 "--repetitions" => options.repetitions = number(value()?)? as usize,

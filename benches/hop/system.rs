@@ -225,6 +225,16 @@ pub fn cpu_ns(pid: u32) -> u64 {
         .sum()
 }
 
+/// From here on this thread, and those that it starts, run only on a CPU that has nothing else to do.
+pub fn only_when_idle() -> Result<(), String> {
+    // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
+    let outcome = unsafe {
+        let param: libc::sched_param = std::mem::zeroed();
+        libc::sched_setscheduler(0, libc::SCHED_IDLE, &raw const param)
+    };
+    Errno::result(outcome).map(|_| ()).map_err(|error| format!("no SCHED_IDLE: {error}"))
+}
+
 /// Sleeps until that instant of CLOCK_MONOTONIC.
 pub fn sleep_until(instant_ns: u64) {
     let until = libc::timespec {
