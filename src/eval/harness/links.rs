@@ -243,7 +243,7 @@ fn open(
         }
         command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
     }
-    command.args(["--seed", &settings.seed.saturating_add(u64::from(number)).to_string()]);
+    command.args(["--seed", &settings.link_seed(plan.repetition, number).to_string()]);
     let name = format!("{}<-{}", way.host, way.source);
     let program =
         Program::start(&format!("link-{}-{}", way.host, way.source), command, &folder.join("logs"))?;

@@ -32,6 +32,9 @@ impl Library {
     }
 }
 
+/// How far the seeds of a repetition are from those of the next: more than a run has links.
+const SEEDS_OF_A_REPETITION: u64 = 1_000;
+
 /// What holds for all runs.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -71,6 +74,13 @@ impl Settings {
         }
     }
 
+    /// The seed of a link of a run, the links being numbered from 0. A repetition meets other losses than the one
+    /// before it, or it would say nothing of the spread; scenarios of the same repetition meet the same.
+    pub fn link_seed(&self, repetition: u32, link: u16) -> u64 {
+        let of_repetition = SEEDS_OF_A_REPETITION * u64::from(repetition.saturating_sub(1));
+        self.seed.wrapping_add(of_repetition).wrapping_add(u64::from(link))
+    }
+
     /// The program of a library's publishers and subscribers.
     ///
     /// # Errors
@@ -88,5 +98,31 @@ impl Settings {
             };
             EvalError::new(format!("{name} is not in {}: {how}", self.peers.display()))
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn no_two_links_of_any_repetition_have_the_same_seed() {
+        let settings = Settings {
+            out: PathBuf::new(),
+            harness: PathBuf::new(),
+            bridge: PathBuf::new(),
+            peers: PathBuf::new(),
+            quick: false,
+            seed: 1,
+            backend: BackendChoice::Auto,
+            pins: BTreeMap::new(),
+            command_line: Vec::new(),
+        };
+        let seeds = || (1..=1_000).flat_map(|repetition| (0..8).map(move |link| (repetition, link)));
+        let seeds: BTreeSet<u64> = seeds().map(|(run, link)| settings.link_seed(run, link)).collect();
+        assert_eq!(seeds.len(), 8_000);
+        assert_eq!(settings.link_seed(1, 0), 1);
     }
 }

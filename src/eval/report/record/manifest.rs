@@ -110,6 +110,8 @@ pub struct LinkRecord {
 pub struct LinkOutcome {
     pub backend: String,
     pub reason: String,
+    /// None where the back end takes none.
+    pub seed: Option<u64>,
     pub delay_ms: f64,
     pub judged: u64,
     pub lost: u64,

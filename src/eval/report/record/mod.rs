@@ -8,7 +8,7 @@ mod table;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-pub use manifest::{Endpoint, Manifest, Role};
+pub use manifest::{Endpoint, LinkOutcome, Manifest, Role};
 pub use status::BridgeRecord;
 
 use super::error::ReportError;
