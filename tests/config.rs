@@ -423,6 +423,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("lanes.rviz.by_reference_min_bytes", "65536", "0"),
     ("lanes.rviz.window_samples", "256", "255"),
     ("lanes.rviz.scheduling.nice", "10", "19"),
+    ("lanes.rviz.scheduling.slice_ms", "10", "5"),
     ("lanes.rviz.scheduling.cpus", "[]", "[1]"),
     ("lanes.rviz.scheduling.lock_memory", "false", "true"),
     ("lanes.noncritical.max_rate_hz", "10", "20"),

@@ -29,8 +29,8 @@ enum Condition {
     Undisturbed,
     /// SIGSTOP.
     Stopped,
-    /// Beside it, a program with its nice value burns every CPU, as the egress would if all of its threads
-    /// span. The egress has no switch for that, and gets none.
+    /// Beside it, a program with its nice value and time slice burns every CPU, as the egress would if all of
+    /// its threads span. The egress has no switch for that, and gets none.
     Spinning,
     /// `kill -9` and started again, every 300 ms.
     Killed,

@@ -235,6 +235,23 @@ pub fn only_when_idle() -> Result<(), String> {
     Errno::result(outcome).map(|_| ()).map_err(|error| format!("no SCHED_IDLE: {error}"))
 }
 
+/// Asks for the time slice that `config/default.yaml` gives a noncritical lane, 10 ms, for this thread and
+/// those that it starts.
+pub fn slice_of_a_noncritical_lane() -> Result<(), String> {
+    // SAFETY: `sched_attr` is plain data for which all zeroes are valid. The first call writes no more than
+    // the length that it is given, the second only reads.
+    let outcome = unsafe {
+        let mut attributes: libc::sched_attr = std::mem::zeroed();
+        let length = size_of::<libc::sched_attr>();
+        let got = libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attributes, length, 0);
+        Errno::result(got).and_then(|_| {
+            attributes.sched_runtime = 10_000_000;
+            Errno::result(libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0))
+        })
+    };
+    outcome.map(drop).map_err(|error| format!("no time slice: {error}"))
+}
+
 /// Sleeps until that instant of CLOCK_MONOTONIC.
 pub fn sleep_until(instant_ns: u64) {
     let until = libc::timespec {

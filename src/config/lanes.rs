@@ -18,6 +18,30 @@ pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 /// critical one has it. The scheduler gives them a ninth of its weight.
 const NONCRITICAL_NICE: u8 = 10;
 
+/// The shortest slice that Linux grants: whoever else has the CPU gives way when a sample comes
+/// (docs/decisions/0010-time-slices.md).
+const CRITICAL_SLICE_US: u32 = 100;
+
+/// Longer than the slice of any program that does not ask for one, which is 0.7 to 2.8 ms by the number of
+/// CPUs: all of them take the CPU from a noncritical lane when they wake. Short beside the 100 ms between its
+/// samples.
+const NONCRITICAL_SLICE_US: u32 = 10_000;
+
+/// How a process is scheduled unless told otherwise.
+pub(super) fn default_scheduling(class: Option<TrafficClass>) -> Scheduling {
+    match class {
+        Some(TrafficClass::Critical) => {
+            Scheduling { slice_us: Some(CRITICAL_SLICE_US), ..Scheduling::default() }
+        }
+        Some(TrafficClass::Noncritical) => Scheduling {
+            nice: NONCRITICAL_NICE,
+            slice_us: Some(NONCRITICAL_SLICE_US),
+            ..Scheduling::default()
+        },
+        None => Scheduling::default(),
+    }
+}
+
 pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
     ("other", SchedulingPolicy::Other),
     ("fifo", SchedulingPolicy::Fifo),
@@ -102,13 +126,7 @@ impl LaneReader<'_> {
                 TrafficClass::Critical => rates::refuse(field),
                 TrafficClass::Noncritical => self.policy.lane_rates(field),
             },
-            scheduling: scheduling(
-                &field.section("scheduling"),
-                match class {
-                    TrafficClass::Critical => 0,
-                    TrafficClass::Noncritical => NONCRITICAL_NICE,
-                },
-            ),
+            scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
         };
         let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };
         LaneDraft { lane, qos }
@@ -134,8 +152,8 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
     }
 }
 
-/// A `scheduling` section of a process that is `nice` unless told otherwise.
-pub(super) fn scheduling(section: &Field<'_>, nice: u8) -> Scheduling {
+/// A `scheduling` section; what it does not say is that of `default`.
+pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling {
     let policy = section.get("policy");
     let priority = section.get("priority");
     let kind = policy.choice(SCHEDULING_POLICIES);
@@ -153,11 +171,13 @@ pub(super) fn scheduling(section: &Field<'_>, nice: u8) -> Scheduling {
         }
     };
     let given_nice = section.get("nice").whole(0..=19).and_then(|nice| u8::try_from(nice).ok());
+    let slice_ms = section.get("slice_ms").decimal(0.1..=100.0);
     let cpus = section.get("cpus").items().unwrap_or_default();
     Scheduling {
         policy: kind.unwrap_or_default(),
         priority: u8::try_from(priority).unwrap_or(0),
-        nice: given_nice.unwrap_or(nice),
+        nice: given_nice.unwrap_or(default.nice),
+        slice_us: slice_ms.map(|ms| (ms * 1_000.0).round() as u32).or(default.slice_us),
         cpus: cpus.iter().filter_map(|cpu| cpu.count(0..=1023)).collect(),
         lock_memory: section.get("lock_memory").flag().unwrap_or(false),
     }

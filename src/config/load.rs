@@ -11,7 +11,7 @@ use super::problem::{ConfigError, Place, Problem, Problems};
 use super::qos::Profiles;
 use super::settings::{Settings, SharedMemory};
 use super::{control, keys, lanes, routes, yaml};
-use crate::model::InstanceName;
+use crate::model::{InstanceName, TrafficClass};
 
 /// The environment variable that names the file where the command line does not.
 pub const PATH_VARIABLE: &str = "ADAPTIVE_BRIDGE_CONFIG";
@@ -160,7 +160,10 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let (routes, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
     let processes = root.section("processes");
-    let process = |name: &str| lanes::scheduling(&processes.section(name).section("scheduling"), 0);
+    let process = |name: &str, class| {
+        let section = processes.section(name).section("scheduling");
+        lanes::scheduling(&section, lanes::default_scheduling(class))
+    };
     let security = control::security(root);
     let policy_hold_s = root.get("policy_hold_s").decimal(0.0..=3_600.0).unwrap_or(5.0);
     Settings {
@@ -170,8 +173,8 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         routes,
         shared_memory,
         policy_hold_ms: (policy_hold_s * 1_000.0).round() as u64,
-        ingress_scheduling: process("ingress"),
-        control_scheduling: process("control"),
+        ingress_scheduling: process("ingress", Some(TrafficClass::Critical)),
+        control_scheduling: process("control", None),
         classifier: control::classifier(root),
         probes: control::probes(root, security.max_probe_rate_hz),
         safety,

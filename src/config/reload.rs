@@ -180,10 +180,13 @@ fn shared_memory(d: &mut Differ, old: &SharedMemory, new: &SharedMemory) -> Shar
 
 fn scheduling(d: &mut Differ, of: &str, restart: Restart, old: &Scheduling, new: &Scheduling) -> Scheduling {
     let key = |name: &str| format!("{of}.scheduling.{name}");
+    let slice_ms = |of: &Scheduling| of.slice_us.map(|us| f64::from(us) / 1_000.0);
+    d.keep(&key("slice_ms"), restart.clone(), &slice_ms(old), &slice_ms(new));
     Scheduling {
         policy: d.keep(&key("policy"), restart.clone(), &old.policy, &new.policy),
         priority: d.keep(&key("priority"), restart.clone(), &old.priority, &new.priority),
         nice: d.keep(&key("nice"), restart.clone(), &old.nice, &new.nice),
+        slice_us: old.slice_us,
         cpus: d.keep(&key("cpus"), restart.clone(), &old.cpus, &new.cpus),
         lock_memory: d.keep(&key("lock_memory"), restart, &old.lock_memory, &new.lock_memory),
     }

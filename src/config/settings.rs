@@ -190,6 +190,10 @@ pub struct Scheduling {
     pub priority: u8,
     /// Nice value, 0 to 19: higher ones leave the CPU to others. Nothing to FIFO and round robin.
     pub nice: u8,
+    /// The time slice asked of the kernel's fair scheduler, in microseconds; `None` for the kernel's own. A
+    /// process that wakes takes the CPU at once from one with a longer slice. Nothing to FIFO and round
+    /// robin, nor to a kernel before 6.12.
+    pub slice_us: Option<u32>,
     /// CPUs that the process may run on; empty for all.
     pub cpus: Vec<usize>,
     /// Whether to lock the process' memory (`mlockall`).

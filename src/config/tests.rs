@@ -202,7 +202,7 @@ fn lanes_have_networks_and_scheduling_of_their_own() {
          lanes:\n\
          \x20 critical: {scheduling: {policy: fifo, priority: 80, cpus: [2, 3], lock_memory: true}}\n\
          \x20 noncritical: {domain_id: 9, networks: [wlan0]}\n\
-         \x20 fleet: {networks: [], scheduling: {nice: 3}}\n\
+         \x20 fleet: {networks: [], scheduling: {nice: 3, slice_ms: 2.5}}\n\
          processes: {ingress: {scheduling: {policy: rr, priority: 1}}}\n",
     );
     let name = |name: &str| NetworkSelector::Name(name.to_owned());
@@ -219,15 +219,23 @@ fn lanes_have_networks_and_scheduling_of_their_own() {
         policy: SchedulingPolicy::Fifo,
         priority: 80,
         nice: 0,
+        slice_us: Some(100),
         cpus: vec![2, 3],
         lock_memory: true,
     };
     assert_eq!(lane(&settings, "critical").scheduling, fifo);
-    let rr = Scheduling { policy: SchedulingPolicy::RoundRobin, priority: 1, ..Scheduling::default() };
+    let rr = Scheduling {
+        policy: SchedulingPolicy::RoundRobin,
+        priority: 1,
+        slice_us: Some(100),
+        ..Scheduling::default()
+    };
     assert_eq!(settings.ingress_scheduling, rr);
     assert_eq!(settings.control_scheduling, Scheduling::default());
     assert_eq!(lane(&settings, "noncritical").scheduling.nice, 10);
+    assert_eq!(lane(&settings, "noncritical").scheduling.slice_us, Some(10_000));
     assert_eq!(lane(&settings, "fleet").scheduling.nice, 3);
+    assert_eq!(lane(&settings, "fleet").scheduling.slice_us, Some(2_500));
 }
 
 #[test]

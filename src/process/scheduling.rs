@@ -5,7 +5,7 @@ use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::unistd::Pid;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 
 use crate::config::{Scheduling, SchedulingPolicy};
 
@@ -29,6 +29,14 @@ pub(super) fn apply(scheduling: &Scheduling) {
         match set_nice(scheduling.nice) {
             Ok(()) => info!(nice = scheduling.nice, "nice value set"),
             Err(error) => warn!(nice = scheduling.nice, %error, "nice value not set"),
+        }
+    }
+    if let Some(slice_us) = scheduling.slice_us.filter(|_| scheduling.policy == SchedulingPolicy::Other) {
+        match set_slice(slice_us) {
+            Ok(Some(granted)) if granted == slice_us => info!(slice_us, "time slice set"),
+            Ok(Some(_)) => debug!(slice_us, "time slice not set: Linux knows them since 6.12"),
+            Ok(None) => debug!("no time slice: the process was started with another scheduling policy"),
+            Err(error) => warn!(slice_us, %error, "time slice not set"),
         }
     }
     let (policy, name, priority) = match scheduling.policy {
@@ -87,6 +95,31 @@ fn set_nice(nice: u8) -> nix::Result<()> {
     // SAFETY: the call takes numbers only. nix has no wrapper for it.
     let outcome = unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, libc::c_int::from(nice)) };
     Errno::result(outcome).map(drop)
+}
+
+/// Asks the fair scheduler for a time slice, in microseconds; what it granted. `None` where somebody has
+/// started this process with another scheduler.
+fn set_slice(slice_us: u32) -> nix::Result<Option<u32>> {
+    let mut attributes = scheduling_attributes()?;
+    let fair = [libc::SCHED_OTHER, libc::SCHED_BATCH].map(|policy| policy as u32);
+    if !fair.contains(&attributes.sched_policy) {
+        return Ok(None);
+    }
+    attributes.sched_runtime = u64::from(slice_us) * 1_000;
+    // SAFETY: the call only reads the structure, whose `size` is its own. nix and libc have no wrapper.
+    Errno::result(unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0) })?;
+    Ok(u32::try_from(scheduling_attributes()?.sched_runtime / 1_000).ok())
+}
+
+fn scheduling_attributes() -> nix::Result<libc::sched_attr> {
+    // SAFETY: `sched_attr` is plain data for which all zeroes are valid, and the call writes no more than the
+    // length that it is given. nix and libc have no wrapper for it.
+    unsafe {
+        let mut attributes: libc::sched_attr = std::mem::zeroed();
+        let length = size_of::<libc::sched_attr>();
+        Errno::result(libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attributes, length, 0))?;
+        Ok(attributes)
+    }
 }
 
 fn set_policy(policy: libc::c_int, priority: u8) -> nix::Result<()> {

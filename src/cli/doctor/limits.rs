@@ -199,7 +199,7 @@ mod tests {
             priority: 20,
             lock_memory: true,
             cpus: vec![3],
-            nice: 0,
+            ..Scheduling::default()
         };
         assert_eq!(real_time(&[&plain], &NONE).severity, Severity::Ok);
         assert_eq!(memory_lock(&[&plain], &NONE).severity, Severity::Ok);

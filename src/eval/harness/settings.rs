@@ -74,8 +74,8 @@ impl Settings {
         }
     }
 
-    /// The seed of a link of a run, the links being numbered from 0. A repetition meets other losses than the one
-    /// before it, or it would say nothing of the spread; scenarios of the same repetition meet the same.
+    /// The seed of a link of a run, the links being numbered from 0. A repetition meets other losses than the
+    /// one before it, or it would say nothing of the spread; scenarios of the same repetition meet the same.
     pub fn link_seed(&self, repetition: u32, link: u16) -> u64 {
         let of_repetition = SEEDS_OF_A_REPETITION * u64::from(repetition.saturating_sub(1));
         self.seed.wrapping_add(of_repetition).wrapping_add(u64::from(link))

@@ -169,8 +169,8 @@ fn applied(results: &Results, reading: &str, level: &str) -> Field {
     }
 }
 
-/// Links whose losses have nothing to do with each other: of those with the same seed, whose losses are the same
-/// as far as they go, the one that judged the most packets.
+/// Links whose losses have nothing to do with each other: of those with the same seed, whose losses are the
+/// same as far as they go, the one that judged the most packets.
 fn independent<'a>(links: impl Iterator<Item = &'a LinkOutcome>) -> Vec<&'a LinkOutcome> {
     let mut independent: Vec<&LinkOutcome> = Vec::new();
     for link in links {
