@@ -38,6 +38,14 @@ fn healths(settings: &Settings) -> Option<[ProcessHealth; 3]> {
     healths.iter().all(|health| health.turns > 0).then_some(healths)
 }
 
+/// Waits until ingress and the two lanes show that these settings are in force. They answer `reload` first,
+/// and show it with their next turn.
+fn wait_in_force(shape: &Settings, fingerprint: u64) -> [ProcessHealth; 3] {
+    wait_for("the settings to be in force", || {
+        healths(shape).filter(|all| all.iter().all(|health| health.settings_fingerprint == fingerprint))
+    })
+}
+
 /// Starts the whole bridge; yields it when every process turns, with what the processes show then.
 fn up(bridge: &Bridge) -> (Process, [ProcessHealth; 3]) {
     let settings = settings(bridge);
@@ -191,9 +199,7 @@ fn what_needs_a_restart_is_named_and_left_as_it_is() {
         ],
     );
     let (in_force, _) = old.reloaded(settings(&bridge));
-    let after = healths(&old).unwrap();
-    assert_same_processes(&before, &after);
-    assert!(after.iter().all(|health| health.settings_fingerprint == in_force.fingerprint()), "{after:?}");
+    assert_same_processes(&before, &wait_in_force(&old, in_force.fingerprint()));
     // The command line reads the old shape of the bridge only with the old file.
     bridge.write_config(&file(112, "lanes: {noncritical: {max_rate_hz: 20}}"));
     wait_rate(&bridge, 20.0);
@@ -228,9 +234,7 @@ fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
     let last = settings(&bridge);
     let (code, said) = reload(&bridge);
     assert_eq!(code, Some(0), "{said}");
-    let after = healths(&last).unwrap();
-    assert_same_processes(&before, &after);
-    assert!(after.iter().all(|health| health.settings_fingerprint == last.fingerprint()), "{after:?}");
+    assert_same_processes(&before, &wait_in_force(&last, last.fingerprint()));
     flow.end_whole(&bridge);
 
     // Also while they stop.
