@@ -429,16 +429,17 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
         (nice_of(rviz), nice_of("adaptive-bridge-ingress.service")),
         ("10".to_owned(), "0".to_owned())
     );
-    // Where RestrictRealtime allows no more than the fair scheduler, too. A kernel before 6.12 has no slices
-    // to show.
-    let slice_of = |unit: &str| {
-        let sched = bed.machine.run(&["cat", &format!("/proc/{}/sched", bed.machine.main_pid(unit))]);
-        let line = sched.lines().find_map(|line| line.strip_prefix("se.slice").map(str::to_owned));
-        line.and_then(|line| line.trim_matches([' ', ':', '\t']).parse::<u64>().ok())
-    };
-    if slice_of("adaptive-bridge-control.service").is_some() {
-        assert_eq!(slice_of("adaptive-bridge-ingress.service"), Some(100_000));
-        assert_eq!(slice_of(rviz), Some(10_000_000));
+    // Where RestrictRealtime allows no more than the fair scheduler, too. Linux grants slices since 6.12.
+    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap();
+    let version: Vec<u32> = release.split('.').take(2).map(|number| number.parse().unwrap()).collect();
+    if version >= vec![6, 12] {
+        let slice_of = |unit: &str| -> u64 {
+            let sched = bed.machine.run(&["cat", &format!("/proc/{}/sched", bed.machine.main_pid(unit))]);
+            let line = sched.lines().find(|line| line.starts_with("se.slice")).unwrap();
+            line.rsplit(' ').next().unwrap().parse().unwrap()
+        };
+        assert_eq!(slice_of("adaptive-bridge-ingress.service"), 100_000);
+        assert_eq!(slice_of(rviz), 10_000_000);
     }
 
     let out = Peer::cyclone().best_effort().subscriber().topic("rt/adaptive_bridge/rviz/scan");

@@ -151,11 +151,12 @@ impl Program {
         Ok(Self { child, orders, answers: BufReader::new(answers) })
     }
 
-    /// Takes what the CPUs would halt in, until it is dropped: on a virtual machine each halt is a trip
-    /// through the hypervisor, which gives the CPU to others meanwhile.
-    pub fn keep_awake() -> Result<Self, String> {
+    /// A program that burns every CPU until it is dropped: as a noncritical lane (`__spinner`), or only where
+    /// a CPU would halt (`__awake`), for on a virtual machine each halt is a trip through the hypervisor,
+    /// which gives the CPU to others meanwhile.
+    pub fn burner(role: &str) -> Result<Self, String> {
         let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
-        let mut program = Self::start("__awake", 0, anywhere, &[])?;
+        let mut program = Self::start(role, 0, anywhere, &[])?;
         program.numbers("ready")?;
         Ok(program)
     }

@@ -18,7 +18,7 @@ use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
 use super::report::{Isolation, Quantiles};
 use super::scale::latencies_us;
-use super::system::{Place, Scheduling};
+use super::system::Scheduling;
 
 const LANE: &str = "noncritical";
 
@@ -196,12 +196,7 @@ impl Disturbance {
                 bridge.signal(LANE, Signal::SIGSTOP);
                 Self::Stopped
             }
-            Condition::Spinning => {
-                let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
-                let mut spinner = Program::start("__spinner", 0, anywhere, &[])?;
-                spinner.numbers("ready")?;
-                Self::Spinning(spinner)
-            }
+            Condition::Spinning => Self::Spinning(Program::burner("__spinner")?),
             Condition::Killed => {
                 let process = bridge.take(LANE).ok_or("no noncritical lane")?;
                 let (stop, start) = (Arc::new(AtomicBool::new(false)), bridge.starter(LANE));

@@ -106,8 +106,8 @@ pub fn run(role: &str, arguments: &[String]) -> ExitCode {
         "__subscriber" => subscriber(arguments),
         "__relay" => relay(arguments),
         "__drain" => drain(arguments),
-        "__spinner" => spinner(arguments),
-        "__awake" => awake(),
+        "__spinner" => system::slice_of_a_noncritical_lane().and_then(|()| spin()),
+        "__awake" => system::only_when_idle().and_then(|()| spin()),
         other => Err(format!("no such role: {other}")),
     };
     match outcome {
@@ -472,19 +472,7 @@ fn drain(arguments: &[String]) -> Result<(), String> {
     }
 }
 
-/// Burns every CPU until it is killed: as many threads as there are, in a loop that does nothing.
-fn spinner(arguments: &[String]) -> Result<(), String> {
-    Place::parse(argument(arguments, 1)?)?.apply();
-    system::slice_of_a_noncritical_lane()?;
-    spin()
-}
-
-fn awake() -> Result<(), String> {
-    system::only_when_idle()?;
-    spin()
-}
-
-/// A thread that spins for each CPU, until standard input ends.
+/// Burns every CPU until standard input ends: as many threads as there are, in a loop that does nothing.
 fn spin() -> Result<(), String> {
     for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
         std::thread::spawn(|| {

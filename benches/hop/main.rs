@@ -59,7 +59,7 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Result<(), String> {
     let _alone = system::alone()?;
-    let _awake = if options.awake { Some(Program::keep_awake()?) } else { None };
+    let _awake = if options.awake { Some(Program::burner("__awake")?) } else { None };
     let began = CpuTime::now();
     let mut options = options.clone();
     let mut summary = Summary {

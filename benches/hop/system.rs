@@ -117,16 +117,10 @@ impl Place {
                 eprintln!("bench: not pinned to CPU {cpu}: {error}");
             }
         }
-        if self.scheduling == Scheduling::Fifo {
-            // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
-            let outcome = unsafe {
-                let mut param: libc::sched_param = std::mem::zeroed();
-                param.sched_priority = FIFO_PRIORITY;
-                libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param)
-            };
-            if let Err(error) = Errno::result(outcome) {
-                eprintln!("bench: no SCHED_FIFO: {error}");
-            }
+        if self.scheduling == Scheduling::Fifo
+            && let Err(error) = set_policy(libc::SCHED_FIFO, FIFO_PRIORITY)
+        {
+            eprintln!("bench: no SCHED_FIFO: {error}");
         }
         let _ = nix::sys::prctl::set_timerslack(1);
     }
@@ -227,12 +221,17 @@ pub fn cpu_ns(pid: u32) -> u64 {
 
 /// From here on this thread, and those that it starts, run only on a CPU that has nothing else to do.
 pub fn only_when_idle() -> Result<(), String> {
+    set_policy(libc::SCHED_IDLE, 0).map_err(|error| format!("no SCHED_IDLE: {error}"))
+}
+
+fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
     // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
     let outcome = unsafe {
-        let param: libc::sched_param = std::mem::zeroed();
-        libc::sched_setscheduler(0, libc::SCHED_IDLE, &raw const param)
+        let mut param: libc::sched_param = std::mem::zeroed();
+        param.sched_priority = priority;
+        libc::sched_setscheduler(0, policy, &raw const param)
     };
-    Errno::result(outcome).map(|_| ()).map_err(|error| format!("no SCHED_IDLE: {error}"))
+    Errno::result(outcome).map(drop)
 }
 
 /// Asks for the time slice that `config/default.yaml` gives a noncritical lane, 10 ms, for this thread and

@@ -33,10 +33,12 @@ pub(super) fn apply(scheduling: &Scheduling) {
     }
     if let Some(slice_us) = scheduling.slice_us.filter(|_| scheduling.policy == SchedulingPolicy::Other) {
         match set_slice(slice_us) {
-            Ok(Some(granted)) if granted == slice_us => info!(slice_us, "time slice set"),
-            Ok(Some(_)) => debug!(slice_us, "time slice not set: Linux knows them since 6.12"),
+            Ok(Some(granted_us)) if granted_us == u64::from(slice_us) => info!(slice_us, "time slice set"),
+            Ok(Some(_)) => info!(slice_us, "time slice not set: Linux grants them since 6.12"),
             Ok(None) => debug!("no time slice: the process was started with another scheduling policy"),
-            Err(error) => warn!(slice_us, %error, "time slice not set"),
+            Err(error) => {
+                warn!(slice_us, %error, "time slice not set: the process must be allowed sched_setattr")
+            }
         }
     }
     let (policy, name, priority) = match scheduling.policy {
@@ -99,7 +101,7 @@ fn set_nice(nice: u8) -> nix::Result<()> {
 
 /// Asks the fair scheduler for a time slice, in microseconds; what it granted. `None` where somebody has
 /// started this process with another scheduler.
-fn set_slice(slice_us: u32) -> nix::Result<Option<u32>> {
+fn set_slice(slice_us: u32) -> nix::Result<Option<u64>> {
     let mut attributes = scheduling_attributes()?;
     let fair = [libc::SCHED_OTHER, libc::SCHED_BATCH].map(|policy| policy as u32);
     if !fair.contains(&attributes.sched_policy) {
@@ -108,7 +110,7 @@ fn set_slice(slice_us: u32) -> nix::Result<Option<u32>> {
     attributes.sched_runtime = u64::from(slice_us) * 1_000;
     // SAFETY: the call only reads the structure, whose `size` is its own. nix and libc have no wrapper.
     Errno::result(unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0) })?;
-    Ok(u32::try_from(scheduling_attributes()?.sched_runtime / 1_000).ok())
+    Ok(Some(scheduling_attributes()?.sched_runtime / 1_000))
 }
 
 fn scheduling_attributes() -> nix::Result<libc::sched_attr> {

@@ -136,7 +136,13 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
             }),
         ),
         ("Traces of links, and what was lost", distinct(&|run| traces(&run.manifest))),
-        ("Seeds of the links", vec![seeds(results)]),
+        (
+            "Seeds of the links",
+            distinct(&|run| {
+                let outcomes = run.manifest.links.iter().filter_map(|link| link.impairment.as_ref());
+                outcomes.filter_map(|outcome| Some(outcome.seed?.to_string())).collect()
+            }),
+        ),
         ("Command", one(|run| run.manifest.command_line.join(" "))),
         (
             "Measured window",
@@ -203,15 +209,6 @@ fn stolen(results: &Results) -> String {
         unknown => format!(", not recorded of {unknown} runs"),
     };
     format!("{} to {} %{of}", format::number(least, 0), format::number(most, 0))
-}
-
-fn seeds(results: &Results) -> String {
-    let seeds = || results.runs.iter().map(|run| run.manifest.seed);
-    match (seeds().min(), seeds().max()) {
-        (Some(least), Some(most)) if least != most => format!("{least} to {most}"),
-        (Some(seed), _) => seed.to_string(),
-        _ => String::new(),
-    }
 }
 
 /// Scenarios of the paper that were not run at a place where others were.

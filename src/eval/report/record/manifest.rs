@@ -25,7 +25,6 @@ pub struct Manifest {
     pub switch: String,
     pub quick: bool,
     pub repetition: u32,
-    pub seed: u64,
     pub duration_s: f64,
     pub begin_ns: u64,
     pub end_ns: u64,
