@@ -1070,11 +1070,11 @@ impl Writer {
     let first_change = self.send_buffer.first_change_sequence_number();
     let last_change = self.send_buffer.last_change_sequence_number();
 
-    if self
-      .readers
-      .values()
-      .all(|rp| last_change < rp.all_acked_before)
-    {
+    // A BestEffort reader never acknowledges, and is owed nothing.
+    let is_behind =
+      |rp: &RtpsReaderProxy| rp.qos().is_reliable() && rp.all_acked_before <= last_change;
+
+    if !self.readers.values().any(is_behind) {
       trace!("heartbeat tick: all readers have all available data.");
       false
     } else {
@@ -1102,27 +1102,25 @@ impl Writer {
         last_change,
       );
 
+      // Not to those who have everything, of whom each would answer, ten times a
+      // second as long as one other does not: for its lease, if that one was killed.
+      // An assertion of liveliness is for all.
+      let mut addressed = self
+        .readers
+        .values()
+        .filter(|rp| is_manual_assertion || is_behind(rp));
       // In the volatile key exchange topic we cannot send to multiple readers by any
       // means, so we handle that separately.
       if self.entity_id() == EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER {
-        for rp in self.readers.values() {
-          if last_change < rp.all_acked_before {
-            // Everything we have has been acknowledged already. Do nothing.
-          } else {
-            self.send_control_to_readers(
-              DeliveryMode::Unicast,
-              hb_message.clone(),
-              &mut std::iter::once(rp),
-            );
-          }
+        for rp in addressed {
+          self.send_control_to_readers(
+            DeliveryMode::Unicast,
+            hb_message.clone(),
+            &mut std::iter::once(rp),
+          );
         }
       } else {
-        // Normal case
-        self.send_control_to_readers(
-          DeliveryMode::Multicast,
-          hb_message,
-          &mut self.readers.values(),
-        );
+        self.send_control_to_readers(DeliveryMode::Unicast, hb_message, &mut addressed);
       }
       true
     }
@@ -2068,9 +2066,15 @@ impl Writer {
           }
         }
 
-        // Fixed extra unicast destinations (SPDP localhost peers): send the same
-        // datagram unconditionally, deduplicated against everything already sent.
-        send_legacy!(self.extra_unicast_destinations);
+        // Fixed extra unicast destinations (SPDP localhost peers): what is for
+        // everybody goes there, too, unless it was sent there already.
+        if preferred_mode == DeliveryMode::Multicast {
+          for locator in &self.extra_unicast_destinations {
+            if !sent_legacy.contains(locator) {
+              emit_unicast!(*locator);
+            }
+          }
+        }
       }
       Err(e) => error!("Failed to send message to readers. Encoding failed: {e:?}"),
     }
@@ -3360,6 +3364,67 @@ mod tests {
       let before = f.writer.next_heartbeat_count();
       f.ack_nack([], 1);
       assert_eq!(f.writer.next_heartbeat_count(), before + 2);
+    }
+
+    // Each datagram that a reader at `socket` has got, by now.
+    fn received(socket: &std::net::UdpSocket) -> usize {
+      socket
+        .set_read_timeout(Some(StdDuration::from_millis(200)))
+        .unwrap();
+      let mut buffer = [0; 4096];
+      std::iter::from_fn(|| socket.recv(&mut buffer).ok()).count()
+    }
+
+    #[test]
+    fn only_those_who_are_behind_get_heartbeats() {
+      let socket = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+      let (behind, done, best_effort) = (socket(), socket(), socket());
+      let proxy = |prefix: u8, socket: &std::net::UdpSocket, qos: &QosPolicies| {
+        let guid = GUID::new(GuidPrefix::new(&[prefix; 12]), EntityId::UNKNOWN);
+        let mut proxy = RtpsReaderProxy::new(guid, qos.clone(), false);
+        proxy.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+        proxy
+      };
+      let reliable = QosPolicyBuilder::new()
+        .reliability(policy::Reliability::Reliable {
+          max_blocking_time: Duration::ZERO,
+        })
+        .build();
+      let unreliable = QosPolicyBuilder::new()
+        .reliability(policy::Reliability::BestEffort)
+        .build();
+      let mut f = Fixture::user(5, 8, None);
+      let first = f.reader_guid;
+      f.writer.readers.remove(&first);
+      for (prefix, socket, qos) in [
+        (3, &behind, &reliable),
+        (4, &done, &reliable),
+        (5, &best_effort, &unreliable),
+      ] {
+        let proxy = proxy(prefix, socket, qos);
+        f.writer.readers.insert(proxy.remote_reader_guid, proxy);
+      }
+      let done_guid = GUID::new(GuidPrefix::new(&[4; 12]), EntityId::UNKNOWN);
+      f.writer
+        .readers
+        .get_mut(&done_guid)
+        .unwrap()
+        .all_acked_before = SequenceNumber::from(6);
+
+      assert!(f.writer.handle_heartbeat_tick(false), "one is behind");
+      let counts = [&behind, &done, &best_effort].map(received);
+      assert_eq!(counts, [1, 0, 0]);
+      assert!(f.writer.handle_heartbeat_tick(true));
+      let counts = [&behind, &done, &best_effort].map(received);
+      assert_eq!(counts, [1, 1, 1], "liveliness is for all");
+
+      let behind_guid = GUID::new(GuidPrefix::new(&[3; 12]), EntityId::UNKNOWN);
+      f.writer
+        .readers
+        .get_mut(&behind_guid)
+        .unwrap()
+        .all_acked_before = SequenceNumber::from(6);
+      assert!(!f.writer.handle_heartbeat_tick(false), "nobody is behind");
     }
 
     // While the reader's send socket has queued control datagrams, a round
