@@ -24,6 +24,7 @@ use crate::{
   },
   discovery::{
     announced::Announced,
+    builtin_endpoint::BuiltinEndpointSet,
     discovery_db::{discovery_db_read, discovery_db_write, DiscoveredVia, DiscoveryDB},
     sedp_messages::{
       DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData,
@@ -43,7 +44,7 @@ use crate::{
     guid::{EntityId, GuidPrefix, GUID},
     time::Timestamp,
   },
-  with_key::{DataReader, DataWriter, Sample},
+  with_key::{DataReader, DataWriter, Sample, WriteOptionsBuilder},
   DomainParticipant,
 };
 // This module implements the control logic of the Discovery process.
@@ -196,6 +197,8 @@ enum DiscoveryTimerEvent {
   SendParticipantInfo {
     reschedule: bool,
   },
+  // To those of `unanswered`, and to nobody else.
+  AnswerParticipants,
   ParticipantCleanup,
   TopicCleanup,
   PublishParticipantMessage,
@@ -259,6 +262,9 @@ pub(crate) struct Discovery {
   announced_readers: Announced,
   announced_writers: Announced,
 
+  // Participants that are new, to be told of this one when the timer ends.
+  unanswered: Vec<GuidPrefix>,
+
   // A participant that died, for which goodbye is said until its lease ends.
   dead_participant: Option<(GUID, std::time::Instant)>,
 
@@ -314,6 +320,9 @@ impl Discovery {
   const TOPIC_CLEANUP_PERIOD: StdDuration = StdDuration::from_secs(60); // timer for cleaning up inactive topics
   // As Fast DDS announces by default.
   const SPDP_PUBLISH_PERIOD: StdDuration = StdDuration::from_secs(3);
+  // For the event loop to know whom it is to send the answer to, and for one goodbye
+  // to do for all who are new at about the same time.
+  const ANSWER_DELAY: StdDuration = StdDuration::from_millis(10);
   // How long others wait for the acknowledgements of a participant that was
   // killed: five announcements, so that two or three of them may be lost.
   const LEASE: StdDuration = StdDuration::from_secs(15);
@@ -710,6 +719,7 @@ impl Discovery {
       spdp_quick_response_sent: std::collections::HashSet::new(),
       announced_readers: Announced::default(),
       announced_writers: Announced::default(),
+      unanswered: Vec::new(),
       dead_participant: None,
     })
   }
@@ -893,6 +903,13 @@ impl Discovery {
                       DiscoveryTimerEvent::SendParticipantInfo { reschedule: true },
                     );
                   }
+                }
+                DiscoveryTimerEvent::AnswerParticipants => {
+                  let Some(dp) = self.domain_participant.clone().upgrade() else {
+                    error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
+                    return;
+                  };
+                  self.answer_participants(&dp);
                 }
                 DiscoveryTimerEvent::ParticipantCleanup => {
                   self.participant_cleanup();
@@ -1106,13 +1123,26 @@ impl Discovery {
       // a previously unknown Participant, but this behavior is optional."
       //
       // But not to reply to self, because we know that we exist.
-      // TODO: Maybe add some rate-limiting to this to avoid packet storms.
       if guid_prefix != self.domain_participant.guid().prefix {
-        // One-shot quick SPDP response on the shared timer (does not reschedule).
-        self.discovery_timer.borrow_mut().set_timeout(
-          StdDuration::from_millis(10),
-          DiscoveryTimerEvent::SendParticipantInfo { reschedule: false },
-        );
+        let listens = participant_data
+          .available_builtin_endpoints
+          .contains(BuiltinEndpointSet::PARTICIPANT_DETECTOR);
+        // Security has announcements of its own, which go to all.
+        if listens && self.security_opt.is_none() {
+          if self.unanswered.is_empty() {
+            self
+              .discovery_timer
+              .borrow_mut()
+              .set_timeout(Self::ANSWER_DELAY, DiscoveryTimerEvent::AnswerParticipants);
+          }
+          self.unanswered.push(guid_prefix);
+        } else {
+          // One-shot quick SPDP response on the shared timer (does not reschedule).
+          self.discovery_timer.borrow_mut().set_timeout(
+            Self::ANSWER_DELAY,
+            DiscoveryTimerEvent::SendParticipantInfo { reschedule: false },
+          );
+        }
       }
 
       // This may be a rediscovery of a previously seen participant that
@@ -1503,12 +1533,36 @@ impl Discovery {
     }
   }
 
-  fn spdp_publish(&self, local_dp: &DomainParticipant) {
-    let data = SpdpDiscoveredParticipantData::from_local_participant(
+  // Tells those who are new, and nobody else, that we exist: all others know. To
+  // tell everybody is some fifteen datagrams at once (each multicast interface,
+  // each possible neighbour on this host), and everybody has to take them, on the
+  // thread that also receives samples.
+  fn answer_participants(&mut self, local_dp: &DomainParticipant) {
+    let data = self.announcement(local_dp);
+    for prefix in std::mem::take(&mut self.unanswered) {
+      let reader = GUID::new(prefix, EntityId::SPDP_BUILTIN_PARTICIPANT_READER);
+      let options = WriteOptionsBuilder::new().to_single_reader(reader).build();
+      self
+        .dcps_participant
+        .writer
+        .write_with_options(data.clone(), options)
+        .map(|_| ())
+        .unwrap_or_else(|e| error!("Discovery: Answering {prefix:?} failed: {e:?}"));
+    }
+    // Once more, now that they know who says so.
+    self.say_goodbye_for_the_dead();
+  }
+
+  fn announcement(&self, local_dp: &DomainParticipant) -> SpdpDiscoveredParticipantData {
+    SpdpDiscoveredParticipantData::from_local_participant(
       local_dp,
       &self.security_opt,
       Duration::from(Self::LEASE),
-    );
+    )
+  }
+
+  fn spdp_publish(&self, local_dp: &DomainParticipant) {
+    let data = self.announcement(local_dp);
 
     #[cfg(feature = "security")]
     if let Some(security) = self.security_opt.as_ref() {
@@ -2270,6 +2324,69 @@ mod tests {
       64,
       "SPDP keeps the default cache limit"
     );
+  }
+
+  // Whether an announcement of a participant is among what arrives until `until`.
+  fn hears_announcement(
+    socket: &std::net::UdpSocket,
+    of: GuidPrefix,
+    until: std::time::Instant,
+  ) -> bool {
+    let mut buffer = [0; 4096];
+    loop {
+      let left = until.saturating_duration_since(std::time::Instant::now());
+      if left.is_zero() {
+        return false;
+      }
+      socket.set_read_timeout(Some(left)).unwrap();
+      let Ok((length, _)) = socket.recv_from(&mut buffer) else {
+        return false;
+      };
+      let datagram = bytes::Bytes::copy_from_slice(&buffer[..length]);
+      let message = crate::rtps::Message::read_from_buffer(&datagram).unwrap();
+      let is_announcement = |submessage: &crate::rtps::Submessage| {
+        matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, _))
+          if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER)
+      };
+      if message.header.guid_prefix == of && message.submessages.iter().any(is_announcement) {
+        return true;
+      }
+    }
+  }
+
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn a_new_participant_is_answered_and_nobody_else() {
+    let domain = test_domain_id(48);
+    let bind = |port| std::net::UdpSocket::bind(("127.0.0.1", port)).unwrap();
+    let newcomer = bind(0);
+    let neighbour = bind(spdp_well_known_unicast_port(domain, 5));
+    let announcement = spdp_participant_msg_mod(newcomer.local_addr().unwrap().port())
+      .write_to_vec_with_ctx(Endianness::LittleEndian)
+      .unwrap();
+
+    for _ in 0..5 {
+      let participant = DomainParticipant::new(domain).expect("participant creation");
+      let prefix = participant.guid().prefix;
+      let in_20_s = std::time::Instant::now() + StdDuration::from_secs(20);
+      assert!(hears_announcement(&neighbour, prefix, in_20_s), "no announcement");
+      let next_at = std::time::Instant::now() + Discovery::SPDP_PUBLISH_PERIOD;
+      for participant_id in 0..5 {
+        let port = spdp_well_known_unicast_port(domain, participant_id);
+        newcomer.send_to(&announcement, ("127.0.0.1", port)).unwrap();
+      }
+      let answered = hears_announcement(&newcomer, prefix, next_at);
+      let until = next_at - StdDuration::from_secs(1);
+      let told = hears_announcement(&neighbour, prefix, until);
+      // The test was held up: what came may be the next announcement.
+      if std::time::Instant::now() > next_at - StdDuration::from_millis(500) {
+        continue;
+      }
+      assert!(answered, "the newcomer is not answered");
+      assert!(!told, "a neighbour is told once more");
+      return;
+    }
+    panic!("held up each time");
   }
 
   #[test]
