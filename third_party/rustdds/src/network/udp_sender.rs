@@ -17,6 +17,7 @@ use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 use crate::{
   network::util::get_local_multicast_ip_addrs_filtered,
   rtps::{
+    message::RTPS_MESSAGE_HEADER_SIZE,
     outbound::{ControlQueue, Datagram, SendOutcome, SocketId, CONTROL_QUEUE_WARN_LEN},
     transmit::InterfaceSelector,
   },
@@ -26,6 +27,9 @@ use crate::{
 // What an IPv4 datagram holds. How much a path carries without fragmentation is
 // the Writers' concern, and loopback carries this.
 const MAX_UDP_PAYLOAD: usize = 65_507;
+
+// Messages are put together up to this size, less than any Ethernet path fragments.
+const MAX_TOGETHER_BYTES: usize = 1_400;
 
 // We need one multicast sender socket per interface
 
@@ -44,6 +48,9 @@ pub struct UDPSender {
   // sent immediately. Drained on write readiness by `flush_control`.
   // (see src/rtps/nonblocking_transmit_design.md)
   control_queues: RefCell<HashMap<SocketId, ControlQueue>>,
+
+  // What `together` collects, in the order in which it is to be sent.
+  together: RefCell<Option<Vec<(SocketId, Datagram)>>>,
 }
 
 impl UDPSender {
@@ -174,6 +181,7 @@ impl UDPSender {
       unicast_socket: Arc::new(unicast_socket),
       multicast_sockets,
       control_queues: RefCell::new(HashMap::new()),
+      together: RefCell::new(None),
     };
     info!("UDPSender::new() --> {sender:?}");
     Ok(sender)
@@ -265,10 +273,59 @@ impl UDPSender {
 
   // --- nonblocking-transmit: control path (never dropped, high priority) -----
 
+  /// Sends the control messages of `work` when it has ended, those to the same
+  /// address in one datagram: a message is a header and submessages (RTPS 2.5,
+  /// clause 8.3.4), so messages with the same header are one message with the
+  /// submessages of all.
+  ///
+  /// All of them have to be for one participant: an INFO_DST holds for what follows
+  /// it, too. And none may be a sample: so does an INFO_TS.
+  pub(crate) fn together(&self, work: impl FnOnce()) {
+    self.together.replace(Some(Vec::new()));
+    work();
+    for (id, datagram) in self.together.take().unwrap_or_default() {
+      self.control_send_one(id, datagram.addr, &datagram.bytes);
+    }
+  }
+
+  // Whether `together` has taken it.
+  fn collect(&self, id: SocketId, addr: SocketAddr, buffer: &[u8]) -> bool {
+    let mut together = self.together.borrow_mut();
+    let Some(collected) = together.as_mut() else {
+      return false;
+    };
+    let header = buffer.get(..RTPS_MESSAGE_HEADER_SIZE);
+    // The last one to there, for their order to stay.
+    let last = collected
+      .iter_mut()
+      .rev()
+      .find(|(other, datagram)| *other == id && datagram.addr == addr)
+      .map(|(_, datagram)| datagram);
+    match (last, header) {
+      (Some(last), Some(header))
+        if last.bytes.starts_with(header)
+          && last.bytes.len() + buffer.len() - RTPS_MESSAGE_HEADER_SIZE <= MAX_TOGETHER_BYTES =>
+      {
+        last.bytes.extend_from_slice(&buffer[RTPS_MESSAGE_HEADER_SIZE..]);
+      }
+      _ => collected.push((
+        id,
+        Datagram {
+          addr,
+          bytes: buffer.to_vec(),
+        },
+      )),
+    }
+    true
+  }
+
   // Enqueue-or-send one control datagram to a single socket. If the socket
   // already has queued control we must preserve order and just enqueue;
   // otherwise we try an immediate send and only enqueue on WouldBlock.
   fn control_send_one(&self, id: SocketId, addr: SocketAddr, buffer: &[u8]) {
+    if self.collect(id, addr, buffer) {
+      return;
+    }
     let mut queues = self.control_queues.borrow_mut();
     let queue = queues.entry(id).or_default();
     if queue.is_empty() {
@@ -596,6 +653,58 @@ mod tests {
     assert_eq!(rec_data_1, data);
     assert_eq!(rec_data_2.len(), 6);
     assert_eq!(rec_data_2, data);
+  }
+
+  #[test]
+  fn messages_with_one_header_go_together() {
+    let listeners = [10501, 10502].map(|port| {
+      let listener = UdpSocket::bind(("127.0.0.1", port)).unwrap();
+      listener
+        .set_read_timeout(Some(std::time::Duration::from_millis(300)))
+        .unwrap();
+      listener
+    });
+    let [first, second] = [10501, 10502]
+      .map(|port| Locator::from(SocketAddr::from((Ipv4Addr::LOCALHOST, port))));
+    let received = |listener: &UdpSocket| {
+      let mut datagrams = Vec::new();
+      let mut buffer = [0; 4096];
+      while let Ok((length, _)) = listener.recv_from(&mut buffer) {
+        datagrams.push(buffer[..length].to_vec());
+      }
+      datagrams
+    };
+    let header = [1; RTPS_MESSAGE_HEADER_SIZE];
+    let message = |header: &[u8], content: &[u8]| [header, content].concat();
+    let sender = UDPSender::new(11501).expect("failed to create UDPSender");
+
+    sender.together(|| {
+      sender.send_to_locator(&message(&header, b"HEARTBEAT"), &first);
+      sender.send_to_locator(&message(&header, b"ACKNACK"), &second);
+      sender.send_to_locator(&message(&header, b"ACKNACK"), &first);
+      sender.send_to_locator(&message(&[2; RTPS_MESSAGE_HEADER_SIZE], b"of another"), &second);
+      // No message at all, and one that nothing fits.
+      sender.send_to_locator(b"short", &second);
+      sender.send_to_locator(&message(&header, &[3; MAX_TOGETHER_BYTES]), &second);
+      assert_eq!(received(&listeners[0]), Vec::<Vec<u8>>::new(), "sent at the end");
+    });
+    assert_eq!(
+      received(&listeners[0]),
+      [message(&header, b"HEARTBEATACKNACK")]
+    );
+    assert_eq!(
+      received(&listeners[1]),
+      [
+        message(&header, b"ACKNACK"),
+        message(&[2; RTPS_MESSAGE_HEADER_SIZE], b"of another"),
+        b"short".to_vec(),
+        message(&header, &[3; MAX_TOGETHER_BYTES]),
+      ]
+    );
+
+    sender.send_to_locator(&message(&header, b"HEARTBEAT"), &first);
+    sender.send_to_locator(&message(&header, b"ACKNACK"), &first);
+    assert_eq!(received(&listeners[0]).len(), 2, "each for itself again");
   }
 
   // The unicast socket is IPv4-only, so an IPv6 destination is unreachable and

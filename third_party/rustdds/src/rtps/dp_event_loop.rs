@@ -476,7 +476,17 @@ impl DPEventLoop {
           discovered_reader_data,
         } => self.remote_reader_discovered(&discovered_reader_data),
         ReaderLost { reader_guid } => self.remote_reader_lost(reader_guid),
-        ParticipantUpdated { guid_prefix } => self.update_participant(guid_prefix),
+        ParticipantUpdated { guid_prefix } => {
+          // A HEARTBEAT of each built-in writer, and an ACKNACK of each built-in reader
+          // to each of its addresses: sixteen datagrams with three interfaces.
+          // Not so with security, which may have encrypted them as whole messages.
+          if cfg!(feature = "security") {
+            self.update_participant(guid_prefix);
+          } else {
+            let udp_sender = Rc::clone(&self.udp_sender);
+            udp_sender.together(|| self.update_participant(guid_prefix));
+          }
+        }
         ParticipantLost { guid_prefix } => self.remote_participant_lost(guid_prefix),
         AssertTopicLiveliness {
           writer_guid,
