@@ -1,7 +1,7 @@
 //! The RTPS edge against itself: two participants of this process, over real sockets.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::task::{Wake, Waker};
 use std::time::{Duration, Instant};
 
@@ -10,19 +10,20 @@ use adaptive_bridge::dds::{
     Discovery, Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take,
     WriteError, WriterEvent,
 };
-use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp};
+use adaptive_bridge::model::{
+    Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
+};
 use bytes::Bytes;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
+fn options<'a>(name: &str, network: &'a DdsNetwork) -> ParticipantOptions<'a> {
+    let (namespace, node_name) = ("/adaptive_bridge".into(), name.into());
+    ParticipantOptions { network, namespace, node_name, graph_gid_bytes: 16 }
+}
+
 fn participant(name: &str, domain_id: u16) -> Participant {
-    Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
-        namespace: "/adaptive_bridge".into(),
-        node_name: name.into(),
-        graph_gid_bytes: 16,
-    })
-    .unwrap()
+    Participant::open(&options(name, &DdsNetwork { domain_id, interfaces: Vec::new() })).unwrap()
 }
 
 fn reader_qos(reliability: Reliability, durability: Durability) -> ReaderQos {
@@ -94,6 +95,50 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
         assert_eq!(encapsulation, Encapsulation(kind));
         assert_eq!(taken_timestamp, timestamp);
     }
+}
+
+#[test]
+fn a_whole_sample_is_told_of_before_it_is_there() {
+    let (arrived, received) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0)));
+    let expected = Arc::new(Mutex::new(None));
+    let on_arriving = {
+        let (arrived, expected) = (Arc::clone(&arrived), Arc::clone(&expected));
+        move |writer: Guid| {
+            let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == writer);
+            arrived.fetch_add(usize::from(is_expected), Ordering::AcqRel);
+        }
+    };
+    let on_received = {
+        let received = Arc::clone(&received);
+        move || {
+            received.fetch_add(1, Ordering::AcqRel);
+            false
+        }
+    };
+    let network = DdsNetwork { domain_id: 69, interfaces: Vec::new() };
+    let mut there =
+        Participant::open_receiving(&options("there", &network), on_arriving, on_received).unwrap();
+    let mut here = participant("here", 69);
+    let reader = there
+        .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    *expected.lock().unwrap() = Some(writer.guid());
+    let send = |length: usize| {
+        let payload = Bytes::from(vec![7; length]);
+        writer.write(payload, Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
+        assert_eq!(take_one(&reader).expect("nothing arrived").0.len(), length);
+    };
+    for count in 1..=20 {
+        send(2_948);
+        assert!(arrived.load(Ordering::Acquire) >= count, "sample {count} was not told of");
+    }
+    let before = arrived.load(Ordering::Acquire);
+    // Seventeen fragments, and which one is the last is not to be seen from outside.
+    send(1 << 20);
+    assert_eq!(arrived.load(Ordering::Acquire), before, "a fragment is no sample");
+    assert!(received.load(Ordering::Acquire) > 20);
 }
 
 #[test]

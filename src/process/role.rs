@@ -152,13 +152,15 @@ impl Role {
         Ok(participant)
     }
 
-    /// Like [`join`](Self::join), with what the thread that receives is to do.
+    /// Like [`join`](Self::join), with what the thread that receives is to do; see
+    /// [`Participant::open_receiving`].
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
+        on_arriving: impl FnMut(Guid) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
-        let participant = Participant::open_receiving(options, on_received)?;
+        let participant = Participant::open_receiving(options, on_arriving, on_received)?;
         self.joined(&participant);
         Ok(participant)
     }

@@ -121,6 +121,11 @@ impl Input {
         true
     }
 
+    /// Whether samples of `writer` have come before.
+    pub fn follows(&self, writer: Guid) -> bool {
+        self.followed.writers.iter().any(|(followed, _)| *followed == writer)
+    }
+
     fn publish(
         &mut self,
         slot: Result<Slot, LoanError>,

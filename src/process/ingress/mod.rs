@@ -94,6 +94,10 @@ impl Ingress {
             }
         }
         let receiving = Arc::new(Receiving::new(inputs, lanes));
+        let on_arriving = {
+            let receiving = Arc::clone(&receiving);
+            move |writer| receiving.expect(writer)
+        };
         let on_received = {
             let receiving = Arc::clone(&receiving);
             move || receiving.turn()
@@ -104,7 +108,7 @@ impl Ingress {
             node_name: "ingress".to_owned(),
             graph_gid_bytes: settings.graph_gid_bytes,
         };
-        let participant = role.join_receiving(&options, on_received)?;
+        let participant = role.join_receiving(&options, on_arriving, on_received)?;
         let (housekeeping_at, received) = (clock::monotonic(), Meter::default());
         let mut ingress = Self { receiving, participant, role, turns_seen: 0, housekeeping_at, received };
         ingress.keep_house(housekeeping_at)?;

@@ -5,12 +5,12 @@
 //! is done by the main thread, which holds a route's lock meanwhile. The receiving thread waits for no lock:
 //! it leaves the route alone, and is rung when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::Bell;
 use super::input::Input;
-use crate::model::TrafficClass;
+use crate::model::{Guid, TrafficClass};
 use crate::shm::LaneWaker;
 
 /// Samples taken of one route before the next route, and the DDS library, have their turn.
@@ -37,13 +37,34 @@ pub(super) struct Receiving {
     /// The critical ones first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
+    /// One more than the route whose lanes were told of a sample that is yet to be taken; 0 for none.
+    expected: AtomicUsize,
 }
 
 impl Receiving {
     pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
         let served =
             |(input, bell)| Served { input: Mutex::new(input), bell, missed: AtomicBool::new(false) };
-        Self { routes: inputs.into_iter().map(served).collect(), lanes, turns: AtomicU64::new(0) }
+        Self {
+            routes: inputs.into_iter().map(served).collect(),
+            lanes,
+            turns: AtomicU64::new(0),
+            expected: AtomicUsize::new(0),
+        }
+    }
+
+    /// A datagram has come that seems to hold a sample of `writer`; on the receiving thread. Lets the
+    /// critical lanes of its route get up while it is being looked at. Only once until a sample has come:
+    /// datagrams that only look like samples wake no lane again and again.
+    pub fn expect(&self, writer: Guid) {
+        if self.expected.load(Ordering::Relaxed) != 0 {
+            return;
+        }
+        let follows = |served: &Served| served.input.try_lock().is_ok_and(|input| input.follows(writer));
+        if let Some(route) = self.routes.iter().position(follows) {
+            self.announce(route);
+            self.expected.store(route + 1, Ordering::Relaxed);
+        }
     }
 
     /// Takes and publishes what has arrived; on the receiving thread. Whether there may be more.
@@ -53,7 +74,9 @@ impl Receiving {
             if served.bell.is_rung()
                 && let Some(mut input) = served.try_enter()
             {
-                self.announce(route);
+                if self.expected.swap(0, Ordering::Relaxed) != route + 1 {
+                    self.announce(route);
+                }
                 more |= self.drain(route, &mut input);
             }
         }

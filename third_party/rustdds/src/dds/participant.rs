@@ -39,7 +39,7 @@ use crate::{
   },
   network::{constant::*, udp_listener::UDPListener},
   polling::{
-    ready_channel, wake_channel, wake_channel_unbounded, LoopWaker, ReadySender, ReceivedHook,
+    ready_channel, wake_channel, wake_channel_unbounded, Hooks, LoopWaker, ReadySender,
     WakeReceiver, WakeSender, WakeUnboundedSender,
   },
   rtps::{
@@ -81,7 +81,7 @@ pub struct DomainParticipantBuilder {
   socket_receive_buffer_size: usize,
   socket_send_buffer_size: usize,
 
-  received_hook: Option<ReceivedHook>,
+  hooks: Hooks,
 
   #[cfg(feature = "security")]
   security_plugins: Option<SecurityPlugins>,
@@ -97,7 +97,7 @@ impl DomainParticipantBuilder {
       same_host_loopback: true,
       socket_receive_buffer_size: Self::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
       socket_send_buffer_size: Self::DEFAULT_SOCKET_SEND_BUFFER_SIZE,
-      received_hook: None,
+      hooks: Hooks::default(),
       #[cfg(feature = "security")]
       security_plugins: None,
       #[cfg(feature = "security")]
@@ -180,7 +180,16 @@ impl DomainParticipantBuilder {
   /// of the participant, of topics, publishers or subscribers may wait for the
   /// event loop, for ever.
   pub fn on_received(mut self, hook: impl FnMut() -> bool + Send + 'static) -> Self {
-    self.received_hook = Some(Box::new(hook));
+    self.hooks.on_received = Some(Box::new(hook));
+    self
+  }
+
+  /// Lets the participant's event loop call `hook` when it has a datagram that
+  /// holds a whole sample of a user's writer, before it looks who wants it: some
+  /// microseconds before that of [`Self::on_received`]. The writer is the one that
+  /// the datagram claims; nothing was checked. The rules for that hook hold.
+  pub fn on_sample_arriving(mut self, hook: impl FnMut(GUID) + Send + 'static) -> Self {
+    self.hooks.on_sample_arriving = Some(Box::new(hook));
     self
   }
 
@@ -365,7 +374,7 @@ impl DomainParticipantBuilder {
       self.only_networks,
       self.same_host_loopback,
       dp_waker,
-      self.received_hook,
+      self.hooks,
       discovery_sample_sender,
     )?;
 
@@ -1014,7 +1023,7 @@ impl DomainParticipantDisc {
     only_networks: Option<Vec<IpAddr>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
-    received_hook: Option<ReceivedHook>,
+    hooks: Hooks,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     let dpi = DomainParticipantInner::new(
@@ -1032,7 +1041,7 @@ impl DomainParticipantDisc {
       only_networks,
       same_host_loopback,
       dp_waker,
-      received_hook,
+      hooks,
       discovery_sample_sender,
     )?;
 
@@ -1283,7 +1292,7 @@ impl DomainParticipantInner {
     only_networks: Option<Vec<IpAddr>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
-    received_hook: Option<ReceivedHook>,
+    hooks: Hooks,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     #[cfg(not(feature = "security"))]
@@ -1463,7 +1472,7 @@ impl DomainParticipantInner {
           reader_ready_rx,
           writer_ready_rx,
           dp_waker,
-          received_hook,
+          hooks,
         ) {
           Ok(dp_event_loop) => {
             let _ = ev_ready_tx.send(Ok(()));

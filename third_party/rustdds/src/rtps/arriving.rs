@@ -1,0 +1,131 @@
+//! Whether a datagram holds a whole sample, and whose, told without reading it
+//! properly.
+//!
+//! An application that is to get up for a sample can begin to while it is being
+//! received; see `DomainParticipantBuilder::on_sample_arriving`.
+
+use crate::{
+  messages::submessages::submessage_kind::SubmessageKind,
+  rtps::message::{RTPS_MESSAGE_HEADER_SIZE, SUBMESSAGE_HEADER_SIZE},
+  structure::guid::{EntityKind, GUID},
+};
+
+// RTPS 2.5, clause 9.4.4: the header ends with the prefix of the sender's GUID.
+const PREFIX_BYTES: usize = 12;
+
+// Clause 9.3.1.2: three for the key, one for the kind.
+const ENTITY_ID_BYTES: usize = 4;
+
+// Clause 9.4.5.4: extra flags, octetsToInlineQos and the reader's id come before
+// the writer's, of which the last byte is its kind.
+const DATA_WRITER_AT: usize = 4 + ENTITY_ID_BYTES;
+
+// INFO_DST, INFO_TS and such come before a sample. A message may have any number of
+// submessages; what is not found among the first ones is not waited for.
+const SUBMESSAGES_LOOKED_AT: usize = 4;
+
+/// The user's writer of the first DATA submessage, if there is one. What is
+/// malformed has none.
+pub(crate) fn writer_of_sample(datagram: &[u8]) -> Option<GUID> {
+  if !datagram.starts_with(b"RTPS") {
+    return None;
+  }
+  let prefix = datagram.get(RTPS_MESSAGE_HEADER_SIZE - PREFIX_BYTES..RTPS_MESSAGE_HEADER_SIZE)?;
+  let mut rest = datagram.get(RTPS_MESSAGE_HEADER_SIZE..)?;
+  for _ in 0..SUBMESSAGES_LOOKED_AT {
+    // Clause 9.4.5.1: kind, flags, and the length of what follows.
+    let (&[kind, flags, low, high], content) =
+      rest.split_first_chunk::<SUBMESSAGE_HEADER_SIZE>()?;
+    if kind == u8::from(SubmessageKind::DATA) {
+      let id = content.get(DATA_WRITER_AT..DATA_WRITER_AT + ENTITY_ID_BYTES)?;
+      let mut guid = [0; PREFIX_BYTES + ENTITY_ID_BYTES];
+      guid[..PREFIX_BYTES].copy_from_slice(prefix);
+      guid[PREFIX_BYTES..].copy_from_slice(id);
+      let is_of_a_user = id.last().is_some_and(|kind| EntityKind::from(*kind).is_user_defined());
+      return is_of_a_user.then(|| GUID::from_bytes(guid));
+    }
+    let is_little_endian = flags & 1 == 1;
+    let length = if is_little_endian {
+      u16::from_le_bytes([low, high])
+    } else {
+      u16::from_be_bytes([low, high])
+    };
+    // The last one may say 0, and so do those that are empty.
+    rest = content.get(usize::from(length)..)?;
+  }
+  None
+}
+
+#[cfg(test)]
+mod tests {
+  use super::*;
+
+  const USER_WRITER: u8 = 0x03;
+  const BUILTIN_WRITER: u8 = 0xc3;
+
+  fn submessage(kind: SubmessageKind, flags: u8, content: &[u8]) -> Vec<u8> {
+    let length = content.len() as u16;
+    let length = if flags & 1 == 1 {
+      length.to_le_bytes()
+    } else {
+      length.to_be_bytes()
+    };
+    [&[u8::from(kind), flags], &length[..], content].concat()
+  }
+
+  fn data(flags: u8, writer_kind: u8) -> Vec<u8> {
+    let mut content = vec![0; 40];
+    content[DATA_WRITER_AT..][..ENTITY_ID_BYTES].copy_from_slice(&[1, 2, 3, writer_kind]);
+    submessage(SubmessageKind::DATA, flags, &content)
+  }
+
+  fn message(submessages: &[Vec<u8>]) -> Vec<u8> {
+    let header = [&b"RTPS"[..], &[2, 4, 1, 0], &[9; PREFIX_BYTES]].concat();
+    [header, submessages.concat()].concat()
+  }
+
+  #[test]
+  fn a_sample_is_found_behind_what_comes_before_it() {
+    let writer = [&[9; PREFIX_BYTES][..], &[1, 2, 3, USER_WRITER]].concat();
+    let writer = GUID::from_bytes(writer.try_into().unwrap());
+    for flags in [0, 1] {
+      let destination = submessage(SubmessageKind::INFO_DST, flags, &[7; 12]);
+      let timestamp = submessage(SubmessageKind::INFO_TS, flags, &[7; 8]);
+      let sample = data(flags, USER_WRITER);
+      let found = writer_of_sample(&message(&[sample.clone()]));
+      assert_eq!(found, Some(writer));
+      let found = writer_of_sample(&message(&[destination, timestamp, sample]));
+      assert_eq!(found, Some(writer));
+    }
+  }
+
+  #[test]
+  fn nothing_else_is_one() {
+    let heartbeat = submessage(SubmessageKind::HEARTBEAT, 1, &[0; 28]);
+    let fragment = submessage(SubmessageKind::DATA_FRAG, 1, &[USER_WRITER; 60]);
+    for other in [
+      message(&[]),
+      message(&[heartbeat.clone()]),
+      message(&[fragment]),
+      message(&[data(1, BUILTIN_WRITER)]),
+      [b"HTTP".to_vec(), message(&[data(1, USER_WRITER)])[4..].to_vec()].concat(),
+      message(&[vec![heartbeat; SUBMESSAGES_LOOKED_AT].concat(), data(1, USER_WRITER)]),
+    ] {
+      assert_eq!(writer_of_sample(&other), None, "{other:?}");
+    }
+  }
+
+  #[test]
+  fn no_cut_of_a_message_is_too_short_to_be_looked_at() {
+    let whole = message(&[
+      submessage(SubmessageKind::INFO_TS, 1, &[7; 8]),
+      data(1, USER_WRITER),
+    ]);
+    let first = (0..=whole.len()).find(|length| writer_of_sample(&whole[..*length]).is_some());
+    // Behind the writer's id.
+    assert_eq!(first, Some(RTPS_MESSAGE_HEADER_SIZE + 12 + 4 + DATA_WRITER_AT + ENTITY_ID_BYTES));
+    let padding = submessage(SubmessageKind::PAD, 1, &[0; 9]);
+    assert_eq!(writer_of_sample(&message(&[padding])), None);
+    assert_eq!(writer_of_sample(&message(&[vec![0x09, 1, 0xff, 0xff]])), None);
+  }
+}
