@@ -14,6 +14,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 
 use super::beds::{Bed, Beds, Plan, Process, Program};
+use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
 use super::report::{Isolation, Quantiles};
@@ -87,8 +88,12 @@ const UNLIMITED_HZ: u64 = 100_000;
 /// More than a restart of the services takes, and a start never gets beyond discovery.
 const KILL_EVERY: Duration = Duration::from_millis(300);
 
+/// Fewer than six rounds tell nothing, and a dozen tell 20 %.
+const ROUNDS_PER_REPETITION: usize = 4;
+
 #[derive(Default)]
 struct Seen {
+    records: Vec<Record>,
     latency_us: Vec<f64>,
     rounds_p999_us: Vec<f64>,
     missing: u64,
@@ -114,7 +119,8 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         let plan = Plan { control: false, ..Plan::whole(scheduling, &[4096]) };
         let mut beds = Beds::start(&[plan], options)?;
         let mut seen: BTreeMap<Condition, Seen> = BTreeMap::new();
-        for round in 0..options.repetitions.max(if options.quick { 1 } else { 4 }) {
+        let rounds = options.repetitions * if options.quick { 1 } else { ROUNDS_PER_REPETITION };
+        for round in 0..rounds {
             for condition in &wanted {
                 eprintln!("isolation: round {}, {}, {}", round + 1, condition.label(), scheduling.label());
                 // Of fewer than 1,000 samples there is no p99.9.
@@ -129,6 +135,9 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
                     repetition: round,
                 };
                 output.raw_quantiles(of, "latency", &Quantiles::of(&one.latency_us));
+                for record in &one.records {
+                    output.sample(of, record);
+                }
                 output.raw(of, "missing", one.missing as f64);
                 output.raw(of, "noncritical forwarded", one.noncritical_forwarded as f64);
                 output.raw(of, "kills", one.kills as f64);
@@ -173,6 +182,7 @@ fn measure_one(condition: Condition, case: &Case, bed: &mut Bed) -> Result<Seen,
         latency_us: latencies_us(&run),
         rounds_p999_us: Vec::new(),
         missing: (run.accepted + run.refused).saturating_sub(run.records.len() as u64),
+        records: run.records,
         noncritical_forwarded: run.bridge.as_ref().map_or(0, |bridge| bridge.noncritical_forwarded),
         kills,
     })

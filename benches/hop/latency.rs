@@ -150,19 +150,13 @@ fn is_first_of_rate(cases: &[Case], index: usize) -> bool {
 }
 
 fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
-    let us = |from: u64, to: u64| {
-        if from == 0 || to == 0 { f64::NAN } else { (to as f64 - from as f64) / 1_000.0 }
-    };
     let (mut latency, mut from_due) = (Vec::new(), Vec::new());
     for record in &run.records {
-        latency.push(us(record.written_at, record.arrived_at));
-        from_due.push(us(record.due_at, record.arrived_at));
-        let dds_in = us(record.written_at, record.taken_at);
-        let dds_out = us(record.handed_at, record.arrived_at);
-        program.dds_in.push(dds_in);
-        program.dds_out.push(dds_out);
-        let late = us(record.due_at, record.written_at);
-        output.sample(of, record.number, [late, us(record.written_at, record.arrived_at), dds_in, dds_out]);
+        latency.push(record.latency_us());
+        from_due.push(record.since_due_us());
+        program.dds_in.push(record.dds_in_us());
+        program.dds_out.push(record.dds_out_us());
+        output.sample(of, record);
     }
     let cpu_ns: u64 = run.cpu_ns.values().sum();
     let missing = (run.accepted + run.refused).saturating_sub(run.records.len() as u64);

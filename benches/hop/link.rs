@@ -99,6 +99,34 @@ pub struct Record {
     pub handed_at: u64,
 }
 
+/// From one instant to another in microseconds; `NaN` if one is not known.
+fn us(from: u64, to: u64) -> f64 {
+    if from == 0 || to == 0 { f64::NAN } else { (to as f64 - from as f64) / 1_000.0 }
+}
+
+impl Record {
+    /// How much later than it was due it was written.
+    pub fn late_us(&self) -> f64 {
+        us(self.due_at, self.written_at)
+    }
+
+    pub fn latency_us(&self) -> f64 {
+        us(self.written_at, self.arrived_at)
+    }
+
+    pub fn since_due_us(&self) -> f64 {
+        us(self.due_at, self.arrived_at)
+    }
+
+    pub fn dds_in_us(&self) -> f64 {
+        us(self.written_at, self.taken_at)
+    }
+
+    pub fn dds_out_us(&self) -> f64 {
+        us(self.handed_at, self.arrived_at)
+    }
+}
+
 /// Runs the program that the hidden argument names.
 pub fn run(role: &str, arguments: &[String]) -> ExitCode {
     let outcome = match role {

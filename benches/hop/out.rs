@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::SystemTime;
 
+use super::link::Record;
 use super::options::Options;
 use super::report::{Quantiles, Summary, figures, readme};
 
@@ -34,7 +35,8 @@ impl Output {
         Self {
             summary,
             raw: "section,scheduling,case,program,repetition,figure,value\n".to_owned(),
-            samples: "scheduling,case,program,repetition,number,late_us,latency_us,dds_in_us,dds_out_us\n"
+            samples: "section,scheduling,case,program,repetition,written_at_ns,late_us,latency_us,dds_in_us,\
+                      dds_out_us\n"
                 .to_owned(),
             files: Vec::new(),
         }
@@ -65,13 +67,16 @@ impl Output {
         }
     }
 
-    pub fn sample(&mut self, of: Of, number: u64, us: [f64; 4]) {
-        let [late, latency, dds_in, dds_out] = us.map(short);
-        let Of { scheduling, case, program, repetition, .. } = of;
-        let case = case.replace(',', "");
+    /// One sample. When it was written is by CLOCK_MONOTONIC, as a trace of the kernel has it with the clock
+    /// `mono`.
+    pub fn sample(&mut self, of: Of, record: &Record) {
+        let [late, latency, dds_in, dds_out] =
+            [record.late_us(), record.latency_us(), record.dds_in_us(), record.dds_out_us()].map(short);
+        let Of { section, scheduling, case, program, repetition } = of;
+        let (case, written_at) = (case.replace(',', ""), record.written_at);
         let _ = writeln!(
             self.samples,
-            "{scheduling},{case},{program},{repetition},{number},{late},{latency},{dds_in},{dds_out}"
+            "{section},{scheduling},{case},{program},{repetition},{written_at},{late},{latency},{dds_in},{dds_out}"
         );
     }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::beds::{Beds, Kind, Plan, Run};
+use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
 use super::report::{Quantiles, Scale};
@@ -101,6 +102,5 @@ fn take_turns(
 
 /// From the write to the subscriber's decoder.
 pub fn latencies_us(run: &Run) -> Vec<f64> {
-    let us = |from: u64, to: u64| to.saturating_sub(from) as f64 / 1_000.0;
-    run.records.iter().map(|record| us(record.written_at, record.arrived_at)).collect()
+    run.records.iter().map(Record::latency_us).collect()
 }

@@ -21,6 +21,23 @@ pub fn median(values: &[f64]) -> f64 {
     if sorted.len() % 2 == 1 { sorted[middle] } else { f64::midpoint(sorted[middle - 1], sorted[middle]) }
 }
 
+/// Where the median lies of what the values are drawn from, with a certainty of 95 %: between two of the
+/// values. The binomial distribution tells which ones, whatever theirs is. `None` of fewer than six, which
+/// can't tell.
+pub fn median_interval(values: &[f64]) -> Option<(f64, f64)> {
+    let sorted = sorted(values);
+    // How likely it is that no more than `below` of the values are less than the median.
+    let (mut below, mut chance) = (0, 0.5_f64.powi(i32::try_from(sorted.len()).ok()?));
+    let mut total = chance;
+    while 2.0 * total <= 0.05 {
+        chance *= (sorted.len() - below) as f64 / (below + 1) as f64;
+        below += 1;
+        total += chance;
+    }
+    let first = below.checked_sub(1)?;
+    Some((sorted[first], sorted[sorted.len() - 1 - first]))
+}
+
 fn sorted(values: &[f64]) -> Vec<f64> {
     let mut sorted: Vec<f64> = values.iter().copied().filter(|value| !value.is_nan()).collect();
     sorted.sort_by(f64::total_cmp);

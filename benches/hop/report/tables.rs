@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use super::format::{count, number, range};
+use super::statistics::median;
 use super::summary::{Call, Latency, Resource, Summary};
 use super::table::Table;
 use super::targets;
@@ -434,7 +435,8 @@ pub fn isolation(summary: &Summary) -> Option<String> {
         "p99.9, µs",
         "max, µs",
         "p99.9 of rounds",
-        "p99.9 / undisturbed",
+        "their median",
+        "of a round / undisturbed (95 %)",
         "missing",
         "noncritical forwarded",
     ]);
@@ -448,7 +450,8 @@ pub fn isolation(summary: &Summary) -> Option<String> {
             number(row.latency.p999_us),
             number(row.latency.max_us),
             range(&row.rounds_p999_us),
-            number(ratio),
+            number(Some(median(&row.rounds_p999_us))),
+            ratio.map_or_else(|| number(None), |ratio| ratio.text()),
             count(row.missing),
             count(row.noncritical_forwarded),
         ]);
