@@ -1,5 +1,6 @@
 //! The RTPS edge against itself: two participants of this process, over real sockets.
 
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Wake, Waker};
@@ -274,6 +275,32 @@ impl Drop for Held {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Release);
     }
+}
+
+#[test]
+fn what_a_new_writer_writes_at_once_is_sent() {
+    let mut here = participant("here", 67);
+    let mut there = participant("there", 67);
+    let latched = reader_qos(Reliability::Reliable, Durability::TransientLocal);
+    let reader = there.create_reader("rt/latched", TYPE, &latched).unwrap();
+    let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::CRITICAL };
+    let mut expected = BTreeSet::new();
+    // So many because the event loop has to be busy, with the discovery of the ones before, at the moment at
+    // which one is made.
+    let writers: Vec<_> = (0..200_u32)
+        .map(|number| {
+            let writer = here.create_writer("rt/latched", TYPE, &qos, 64).unwrap();
+            let payload = Bytes::copy_from_slice(&number.to_le_bytes());
+            writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+            expected.insert(number);
+            writer
+        })
+        .collect();
+    while !expected.is_empty() {
+        let (payload, _, _) = take_one(&reader).unwrap_or_else(|| panic!("never sent: {expected:?}"));
+        expected.remove(&u32::from_le_bytes(payload.try_into().unwrap()));
+    }
+    drop(writers);
 }
 
 #[test]

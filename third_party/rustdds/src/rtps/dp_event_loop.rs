@@ -467,6 +467,12 @@ impl DPEventLoop {
       }
     }
 
+    // Read before the additions are: who rings was sent here to be added before. The
+    // other way round, one that is added and rings in between is not known yet, and
+    // what it wrote is not sent until it writes again.
+    let ready_readers = self.reader_ready.drain_unique();
+    let ready_writers = self.writer_ready.drain_unique();
+
     self.handle_reader_action(readers_to_remove);
     self.handle_writer_action(writers_to_remove);
     self.handle_writer_acknack_action();
@@ -512,14 +518,13 @@ impl DPEventLoop {
 
     // Adds have been applied. Ready ids for those endpoints can be handled now,
     // still before the deferred removals.
-    for eid in self.reader_ready.drain_unique() {
+    for eid in ready_readers {
       self.message_receiver.reader_mut(eid).map_or_else(
         || debug!("Command event for unknown reader {eid:?}"),
         Reader::process_command,
       );
     }
-    let writer_ids = self.writer_ready.drain_unique();
-    for eid in writer_ids {
+    for eid in ready_writers {
       let (blocked, local_readers) = match self.writers.get_mut(&eid) {
         None => {
           debug!("Command event for unknown writer {eid:?}");
