@@ -66,6 +66,8 @@ fn made_up() -> Summary {
         condition: condition.to_owned(),
         against: against.to_owned(),
         rate_hz: 1_000,
+        missing: 2,
+        reasons: BTreeMap::from([("critical queue_overflow".to_owned(), 2)]),
         // One round decides over this, and over nothing else.
         latency: quantiles(200.0, 48_000.0),
         rounds_p999_us: rounds_p999_us.to_vec(),
@@ -237,7 +239,10 @@ fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
     let lost = Summary { soak: Some(Soak { missing: 3, ..Soak::default() }), ..Summary::default() };
     assert_eq!(soak_failures(&lost), ["3 samples are missing"]);
     let readme = readme(&made_up());
-    assert!(readme.contains("0 missing; critical queue_overflow: 7."), "what became of them: {readme}");
+    assert!(
+        readme.contains("samples, missing: 0 (critical queue_overflow 7)."),
+        "what became of them: {readme}"
+    );
 }
 
 #[test]
@@ -283,7 +288,10 @@ fn tables_have_the_figures_of_the_run() {
         "{readme}"
     );
     assert!(line(&readme, "Each further lane costs").contains("0.00 µs of p50"), "{readme}");
-    assert_eq!(cells(&readme, "| killed, 1,000 Hz")[6..9], ["500 to 48,000", "520", "1.04 (1.00 to 96.0)"]);
+    assert_eq!(
+        cells(&readme, "| killed, 1,000 Hz")[6..10],
+        ["500 to 48,000", "520", "1.04 (1.00 to 96.0)", "2 (critical queue_overflow 2)"]
+    );
     assert!(cells(&readme, "5,000 Hz of 2,948 B, bridge").contains(&"critical queue_overflow 2".to_owned()));
 }
 

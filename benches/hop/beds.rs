@@ -113,6 +113,40 @@ pub struct Run {
     pub bridge: Option<BridgeRun>,
 }
 
+impl Run {
+    /// Sent and not received.
+    pub fn missing(&self) -> u64 {
+        (self.accepted + self.refused).saturating_sub(self.records.len() as u64)
+    }
+
+    /// What relay and bridge did not forward, by name.
+    pub fn drops(&self) -> BTreeMap<String, u64> {
+        let mut drops = BTreeMap::from([("relay window_full".to_owned(), self.relay_refused)]);
+        if let Some(bridge) = &self.bridge {
+            drops.extend(bridge.drops.iter().cloned());
+            drops.insert("ingress lost_upstream".to_owned(), bridge.lost_upstream);
+        }
+        drops.retain(|_, count| *count > 0);
+        drops
+    }
+
+    /// What became of those that are missing, as far as anybody said so.
+    pub fn reasons(&self) -> BTreeMap<String, u64> {
+        let mut reasons = self.drops();
+        if self.refused > 0 {
+            reasons.insert("refused by the publisher's own writer".to_owned(), self.refused);
+        }
+        reasons
+    }
+}
+
+/// Adds counts to those of the same names.
+pub fn add_up(sum: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
+    for (name, count) in more {
+        *sum.entry(name).or_default() += count;
+    }
+}
+
 /// What the bridge counted meanwhile.
 pub struct BridgeRun {
     pub lost_upstream: u64,

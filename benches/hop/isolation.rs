@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
-use super::beds::{Bed, Beds, Plan, Process, Program};
+use super::beds::{Bed, Beds, Plan, Process, Program, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
@@ -97,6 +97,7 @@ struct Seen {
     latency_us: Vec<f64>,
     rounds_p999_us: Vec<f64>,
     missing: u64,
+    reasons: BTreeMap<String, u64>,
     noncritical_forwarded: u64,
     kills: u64,
 }
@@ -138,13 +139,14 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
                 for record in &one.records {
                     output.sample(of, record);
                 }
-                output.raw(of, "missing", one.missing as f64);
+                output.raw_missing(of, one.missing, &one.reasons);
                 output.raw(of, "noncritical forwarded", one.noncritical_forwarded as f64);
                 output.raw(of, "kills", one.kills as f64);
                 let sum = seen.entry(*condition).or_default();
                 sum.rounds_p999_us.extend(Quantiles::of(&one.latency_us).p999_us);
                 sum.latency_us.extend(one.latency_us);
                 sum.missing += one.missing;
+                add_up(&mut sum.reasons, one.reasons);
                 sum.noncritical_forwarded += one.noncritical_forwarded;
                 sum.kills += one.kills;
             }
@@ -163,6 +165,7 @@ fn row(scheduling: Scheduling, condition: Condition, seen: Seen) -> Isolation {
         against: condition.against().label().to_owned(),
         rate_hz: condition.rate_hz(),
         missing: seen.missing,
+        reasons: seen.reasons,
         latency: Quantiles::of(&seen.latency_us),
         rounds_p999_us: seen.rounds_p999_us,
         noncritical_forwarded: seen.noncritical_forwarded,
@@ -181,7 +184,8 @@ fn measure_one(condition: Condition, case: &Case, bed: &mut Bed) -> Result<Seen,
     Ok(Seen {
         latency_us: latencies_us(&run),
         rounds_p999_us: Vec::new(),
-        missing: (run.accepted + run.refused).saturating_sub(run.records.len() as u64),
+        missing: run.missing(),
+        reasons: run.reasons(),
         records: run.records,
         noncritical_forwarded: run.bridge.as_ref().map_or(0, |bridge| bridge.noncritical_forwarded),
         kills,

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::beds::{Beds, Kind, Run};
+use super::beds::{Beds, Kind, Run, add_up};
 use super::histogram::Buckets;
 use super::options::{Case, Options, SCAN, SWEEP_ROUTES};
 use super::out::{Of, Output};
@@ -27,6 +27,7 @@ struct Program {
     /// Of each repetition.
     each: Vec<Quantiles>,
     missing: u64,
+    reasons: BTreeMap<String, u64>,
     cpu_ns: u64,
     accepted: u64,
     dds_in: Vec<f64>,
@@ -159,11 +160,10 @@ fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
         output.sample(of, record);
     }
     let cpu_ns: u64 = run.cpu_ns.values().sum();
-    let missing = (run.accepted + run.refused).saturating_sub(run.records.len() as u64);
     let quantiles = Quantiles::of(&latency);
     output.raw_quantiles(of, "latency", &quantiles);
     output.raw_quantiles(of, "from due", &Quantiles::of(&from_due));
-    output.raw(of, "missing", missing as f64);
+    output.raw_missing(of, run.missing(), &run.reasons());
     if run.kind != Kind::Direct {
         output.raw(of, "cpu us/sample", cpu_ns as f64 / 1_000.0 / run.accepted.max(1) as f64);
     }
@@ -179,7 +179,8 @@ fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
     program.each.push(quantiles);
     program.latency.extend(latency);
     program.from_due.extend(from_due);
-    program.missing += missing;
+    program.missing += run.missing();
+    add_up(&mut program.reasons, run.reasons());
     program.cpu_ns += cpu_ns;
     program.accepted += run.accepted;
 }
@@ -203,6 +204,7 @@ fn row(case: &Case, scheduling: Scheduling, name: &str, program: &Program, direc
         bytes: case.bytes,
         program: name.to_owned(),
         missing: program.missing,
+        reasons: program.reasons.clone(),
         latency: Quantiles::of(&program.latency),
         from_due: Quantiles::of(&program.from_due),
         repetitions_p50_us: program.each.iter().filter_map(|each| each.p50_us).collect(),
@@ -225,16 +227,6 @@ pub fn loss(case: &Case, scheduling: Scheduling, run: &Run) -> Loss {
     numbers.sort_unstable();
     numbers.dedup();
     let received = numbers.len() as u64;
-    let mut drops: BTreeMap<String, u64> = BTreeMap::new();
-    if run.relay_refused > 0 {
-        drops.insert("relay window_full".to_owned(), run.relay_refused);
-    }
-    if let Some(bridge) = &run.bridge {
-        drops.extend(bridge.drops.iter().cloned());
-        if bridge.lost_upstream > 0 {
-            drops.insert("ingress lost_upstream".to_owned(), bridge.lost_upstream);
-        }
-    }
     Loss {
         scheduling: scheduling.label().to_owned(),
         rate_hz: case.rate_hz,
@@ -246,7 +238,7 @@ pub fn loss(case: &Case, scheduling: Scheduling, run: &Run) -> Loss {
         lost: run.accepted.saturating_sub(received),
         disordered,
         damaged: run.damaged,
-        drops,
+        drops: run.drops(),
         whole: run.bridge.as_ref().map(|bridge| bridge.whole),
     }
 }

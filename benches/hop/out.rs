@@ -1,5 +1,6 @@
 //! Where the results go: the summary, the raw data beside it, the folder of the run.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -64,6 +65,14 @@ impl Output {
             if let Some(value) = value {
                 self.raw(of, &format!("{name} {quantile} us"), value);
             }
+        }
+    }
+
+    /// How many samples did not arrive, and what became of them.
+    pub fn raw_missing(&mut self, of: Of, missing: u64, reasons: &BTreeMap<String, u64>) {
+        self.raw(of, "missing", missing as f64);
+        for (reason, count) in reasons {
+            self.raw(of, &format!("missing: {reason}"), *count as f64);
         }
     }
 

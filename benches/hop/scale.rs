@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::beds::{Beds, Kind, Plan, Run};
+use super::beds::{Beds, Kind, Plan, Run, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
@@ -74,8 +74,8 @@ fn take_turns(
     for ((bed, count), runs) in beds.0.iter().zip(counts).zip(&runs) {
         let all: Vec<f64> = runs.iter().flat_map(latencies_us).collect();
         let accepted: u64 = runs.iter().map(|run| run.accepted).sum();
-        let sent: u64 = runs.iter().map(|run| run.accepted + run.refused).sum();
-        let received: u64 = runs.iter().map(|run| run.records.len() as u64).sum();
+        let mut reasons = BTreeMap::new();
+        runs.iter().for_each(|run| add_up(&mut reasons, run.reasons()));
         let mut cpu_us_per_sample: BTreeMap<String, f64> = BTreeMap::new();
         for (process, ns) in runs.iter().flat_map(|run| &run.cpu_ns) {
             *cpu_us_per_sample.entry(process.clone()).or_default() +=
@@ -87,7 +87,8 @@ fn take_turns(
             program: bed.name().to_owned(),
             rate_hz: case.rate_hz,
             bytes: case.bytes,
-            missing: sent.saturating_sub(received),
+            missing: runs.iter().map(Run::missing).sum(),
+            reasons,
             latency: Quantiles::of(&all),
             repetitions_p50_us: runs
                 .iter()

@@ -4,7 +4,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::time::{Duration, Instant};
 
-use super::beds::{Beds, Plan};
+use super::beds::{Beds, Plan, add_up};
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
 use super::report::{Soak, SoakSeries};
@@ -31,12 +31,8 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
         for case in [&scans, &clouds] {
             let run = bed.measure(case)?;
             soak.accepted += run.accepted;
-            soak.missing += (run.accepted + run.refused).saturating_sub(run.records.len() as u64);
-            let dropped = run.bridge.map(|bridge| bridge.drops).unwrap_or_default();
-            let refused = ("refused by the publisher's own writer".to_owned(), run.refused);
-            for (reason, count) in dropped.into_iter().chain([refused]).filter(|(_, count)| *count > 0) {
-                *soak.reasons.entry(reason).or_default() += count;
-            }
+            soak.missing += run.missing();
+            add_up(&mut soak.reasons, run.reasons());
         }
         let at_s = began.elapsed().as_secs_f64();
         let of = Of { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };

@@ -77,6 +77,8 @@ pub struct Latency {
     pub program: String,
     /// Sent and not received.
     pub missing: u64,
+    /// What became of those, as far as anybody said so: refused, or dropped by name.
+    pub reasons: BTreeMap<String, u64>,
     /// From the write to the subscriber's decoder.
     pub latency: Quantiles,
     /// The same, from when the sample was due.
@@ -190,6 +192,7 @@ pub struct Scale {
     pub rate_hz: u64,
     pub bytes: usize,
     pub missing: u64,
+    pub reasons: BTreeMap<String, u64>,
     pub latency: Quantiles,
     pub repetitions_p50_us: Vec<f64>,
     /// Of each process.
@@ -207,6 +210,7 @@ pub struct Isolation {
     pub against: String,
     pub rate_hz: u64,
     pub missing: u64,
+    pub reasons: BTreeMap<String, u64>,
     pub latency: Quantiles,
     /// Of each round.
     pub rounds_p999_us: Vec<f64>,
@@ -223,7 +227,6 @@ pub struct Soak {
     pub load: String,
     pub accepted: u64,
     pub missing: u64,
-    /// What became of those that are missing, as far as anybody said so: refused, or dropped by name.
     pub reasons: BTreeMap<String, u64>,
     pub series: Vec<SoakSeries>,
 }

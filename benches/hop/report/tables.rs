@@ -1,5 +1,6 @@
 //! The tables of each section, in Markdown; `None` where the run did not measure it.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use super::format::{count, number, range};
@@ -18,6 +19,18 @@ pub fn payload(bytes: usize) -> String {
         bytes if bytes >= 1_000_000 && bytes.is_multiple_of(1_000_000) => format!("{} MB", bytes / 1_000_000),
         bytes => format!("{} B", count(bytes as u64)),
     }
+}
+
+/// `critical queue_overflow 7, relay window_full 2`.
+fn by_name(counts: &BTreeMap<String, u64>) -> String {
+    let counts: Vec<String> =
+        counts.iter().map(|(name, value)| format!("{name} {}", count(*value))).collect();
+    counts.join(", ")
+}
+
+/// How many samples did not arrive, and what became of them: `7 (critical queue_overflow 7)`.
+fn missing(samples: u64, reasons: &BTreeMap<String, u64>) -> String {
+    if reasons.is_empty() { count(samples) } else { format!("{} ({})", count(samples), by_name(reasons)) }
 }
 
 /// The payloads of these rows, smallest first, without the wake-up's, which is none.
@@ -118,7 +131,7 @@ pub fn latencies(summary: &Summary, scheduling: &str) -> Option<String> {
                 range(&row.repetitions_p50_us),
                 number(row.from_due.p99_us),
                 number(row.cpu_us_per_sample),
-                if program == "wake-up" { String::new() } else { count(row.missing) },
+                if program == "wake-up" { String::new() } else { missing(row.missing, &row.reasons) },
             ]);
         }
     }
@@ -190,7 +203,6 @@ pub fn loss(summary: &Summary) -> Option<String> {
         "drops by name",
     ]);
     for row in &summary.loss {
-        let drops: Vec<String> = row.drops.iter().map(|(name, count)| format!("{name} {count}")).collect();
         let case = format!("{} Hz of {}", count(row.rate_hz), payload(row.bytes));
         table.row([
             format!("{case}, {}, {}", row.program, row.scheduling),
@@ -201,7 +213,7 @@ pub fn loss(summary: &Summary) -> Option<String> {
             count(row.disordered),
             count(row.damaged),
             row.whole.map_or("", |whole| if whole { "whole" } else { "NOT WHOLE" }).to_owned(),
-            if drops.is_empty() { "none".to_owned() } else { drops.join(", ") },
+            if row.drops.is_empty() { "none".to_owned() } else { by_name(&row.drops) },
         ]);
     }
     (!table.is_empty()).then(|| table.text())
@@ -382,7 +394,7 @@ pub fn scale(summary: &Summary, of: &str) -> Option<String> {
             number(known.then_some(cpu)),
             by_process.join(", "),
             number(known.then_some(memory as f64 / 1_024.0)),
-            count(row.missing),
+            missing(row.missing, &row.reasons),
         ]);
     }
     if table.is_empty() {
@@ -452,7 +464,7 @@ pub fn isolation(summary: &Summary) -> Option<String> {
             range(&row.rounds_p999_us),
             number(Some(median(&row.rounds_p999_us))),
             ratio.map_or_else(|| number(None), |ratio| ratio.text()),
-            count(row.missing),
+            missing(row.missing, &row.reasons),
             count(row.noncritical_forwarded),
         ]);
     }
@@ -482,15 +494,12 @@ pub fn soak(summary: &Summary) -> Option<String> {
             },
         ]);
     }
-    let reasons: String =
-        soak.reasons.iter().map(|(reason, samples)| format!("; {reason}: {}", count(*samples))).collect();
     Some(format!(
-        "{:.1} hours of {}: {} samples, {} missing{}.\n\n{}",
+        "{:.1} hours of {}: {} samples, missing: {}.\n\n{}",
         soak.seconds / 3_600.0,
         soak.load,
         count(soak.accepted),
-        count(soak.missing),
-        reasons,
+        missing(soak.missing, &soak.reasons),
         table.text()
     ))
 }
