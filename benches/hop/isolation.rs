@@ -126,8 +126,7 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         let rounds = options.repetitions * if options.quick { 1 } else { ROUNDS_PER_REPETITION };
         for round in 0..rounds {
             // Each round begins with another one: what comes first, after 5 kHz, or after what left traces
-            // would be the same each time. In forty rounds that began with it `undisturbed` was 9 % better
-            // than `repeat`.
+            // would be the same each time.
             for condition in wanted.iter().cycle().skip(round).take(wanted.len()) {
                 eprintln!("isolation: round {}, {}, {}", round + 1, condition.label(), scheduling.label());
                 // Of fewer than 1,000 samples there is no p99.9.
