@@ -104,9 +104,11 @@ fn a_whole_sample_is_told_of_before_it_is_there() {
     let expected = Arc::new(Mutex::new(None));
     let on_arriving = {
         let (arrived, expected) = (Arc::clone(&arrived), Arc::clone(&expected));
-        move |writer: Guid| {
+        move |writer: Guid, sequence: i64| {
             let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == writer);
-            arrived.fetch_add(usize::from(is_expected), Ordering::AcqRel);
+            if is_expected {
+                arrived.fetch_max(sequence as usize, Ordering::AcqRel);
+            }
         }
     };
     let on_received = {

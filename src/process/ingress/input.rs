@@ -121,9 +121,9 @@ impl Input {
         true
     }
 
-    /// Whether samples of `writer` have come before.
-    pub fn follows(&self, writer: Guid) -> bool {
-        self.followed.writers.iter().any(|(followed, _)| *followed == writer)
+    /// Whether `writer` is one whose samples came before, and this one of it has not.
+    pub fn awaits(&self, writer: Guid, sequence: i64) -> bool {
+        self.followed.awaits(writer, sequence)
     }
 
     fn publish(
@@ -348,6 +348,10 @@ struct Followed {
 }
 
 impl Followed {
+    fn awaits(&self, writer: Guid, sequence: i64) -> bool {
+        self.writers.iter().any(|(guid, last)| *guid == writer && sequence > *last)
+    }
+
     /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began
     /// to follow is not missing.
     fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
@@ -375,6 +379,8 @@ mod tests {
         let mut followed = Followed::default();
         assert_eq!(followed.missing_before(Guid([1; 16]), 10), 0);
         assert_eq!(followed.missing_before(Guid([2; 16]), 500), 0);
+        assert!(!followed.awaits(Guid([1; 16]), 10), "a second copy, from another address");
+        assert!(followed.awaits(Guid([1; 16]), 11) && !followed.awaits(Guid([3; 16]), 11));
         assert_eq!(followed.missing_before(Guid([1; 16]), 11), 0);
         assert_eq!(followed.missing_before(Guid([1; 16]), 15), 3);
         assert_eq!(followed.missing_before(Guid([1; 16]), 12), 0);

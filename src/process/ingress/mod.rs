@@ -96,7 +96,7 @@ impl Ingress {
         let receiving = Arc::new(Receiving::new(inputs, lanes));
         let on_arriving = {
             let receiving = Arc::clone(&receiving);
-            move |writer| receiving.expect(writer)
+            move |writer, sequence| receiving.expect(writer, sequence)
         };
         let on_received = {
             let receiving = Arc::clone(&receiving);

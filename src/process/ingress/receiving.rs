@@ -37,9 +37,12 @@ pub(super) struct Receiving {
     /// The critical ones first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
-    /// One more than the route whose lanes were told of a sample that is yet to be taken; 0 for none.
+    /// One more than the route whose lanes were told of a sample that is yet to be taken; 0 for none, and
+    /// [`IN_VAIN`] once none came of the datagram.
     expected: AtomicUsize,
 }
+
+const IN_VAIN: usize = usize::MAX;
 
 impl Receiving {
     pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
@@ -54,14 +57,16 @@ impl Receiving {
     }
 
     /// A datagram has come that seems to hold a sample of `writer`; on the receiving thread. Lets the
-    /// critical lanes of its route get up while it is being looked at. Only once until a sample has come:
-    /// datagrams that only look like samples wake no lane again and again.
-    pub fn expect(&self, writer: Guid) {
+    /// critical lanes of its route get up while it is being looked at, unless that sample came before: many
+    /// publishers send each one to all our addresses. Only once until a sample has come: datagrams that only
+    /// look like samples wake no lane again and again.
+    pub fn expect(&self, writer: Guid, sequence: i64) {
         if self.expected.load(Ordering::Relaxed) != 0 {
             return;
         }
-        let follows = |served: &Served| served.input.try_lock().is_ok_and(|input| input.follows(writer));
-        if let Some(route) = self.routes.iter().position(follows) {
+        let awaits =
+            |served: &Served| served.input.try_lock().is_ok_and(|input| input.awaits(writer, sequence));
+        if let Some(route) = self.routes.iter().position(awaits) {
             self.announce(route);
             self.expected.store(route + 1, Ordering::Relaxed);
         }
@@ -79,6 +84,10 @@ impl Receiving {
                 }
                 more |= self.drain(route, &mut input);
             }
+        }
+        // The next sample is announced when it is taken, for the lane sleeps again by then.
+        if self.expected.load(Ordering::Relaxed) != 0 {
+            self.expected.store(IN_VAIN, Ordering::Relaxed);
         }
         self.turns.fetch_add(1, Ordering::Release);
         more

@@ -7,7 +7,10 @@
 use crate::{
   messages::submessages::submessage_kind::SubmessageKind,
   rtps::message::{RTPS_MESSAGE_HEADER_SIZE, SUBMESSAGE_HEADER_SIZE},
-  structure::guid::{EntityKind, GUID},
+  structure::{
+    guid::{EntityKind, GUID},
+    sequence_number::SequenceNumber,
+  },
 };
 
 // RTPS 2.5, clause 9.4.4: the header ends with the prefix of the sender's GUID.
@@ -24,9 +27,9 @@ const DATA_WRITER_AT: usize = 4 + ENTITY_ID_BYTES;
 // submessages; what is not found among the first ones is not waited for.
 const SUBMESSAGES_LOOKED_AT: usize = 4;
 
-/// The user's writer of the first DATA submessage, if there is one. What is
-/// malformed has none.
-pub(crate) fn writer_of_sample(datagram: &[u8]) -> Option<GUID> {
+/// The user's writer of the first DATA submessage, if there is one, and which of
+/// its samples that is. What is malformed has none.
+pub(crate) fn sample_in(datagram: &[u8]) -> Option<(GUID, SequenceNumber)> {
   if !datagram.starts_with(b"RTPS") {
     return None;
   }
@@ -36,15 +39,26 @@ pub(crate) fn writer_of_sample(datagram: &[u8]) -> Option<GUID> {
     // Clause 9.4.5.1: kind, flags, and the length of what follows.
     let (&[kind, flags, low, high], content) =
       rest.split_first_chunk::<SUBMESSAGE_HEADER_SIZE>()?;
+    let is_little_endian = flags & 1 == 1;
     if kind == u8::from(SubmessageKind::DATA) {
       let id = content.get(DATA_WRITER_AT..DATA_WRITER_AT + ENTITY_ID_BYTES)?;
       let mut guid = [0; PREFIX_BYTES + ENTITY_ID_BYTES];
       guid[..PREFIX_BYTES].copy_from_slice(prefix);
       guid[PREFIX_BYTES..].copy_from_slice(id);
       let is_of_a_user = id.last().is_some_and(|kind| EntityKind::from(*kind).is_user_defined());
-      return is_of_a_user.then(|| GUID::from_bytes(guid));
+      // Clause 9.3.2: its high half, then its low one.
+      let (high, rest) = content
+        .get(DATA_WRITER_AT + ENTITY_ID_BYTES..)?
+        .split_first_chunk::<4>()?;
+      let low = rest.first_chunk::<4>()?;
+      let (high, low) = if is_little_endian {
+        (i32::from_le_bytes(*high), u32::from_le_bytes(*low))
+      } else {
+        (i32::from_be_bytes(*high), u32::from_be_bytes(*low))
+      };
+      let number = SequenceNumber::from((i64::from(high) << 32) | i64::from(low));
+      return is_of_a_user.then(|| (GUID::from_bytes(guid), number));
     }
-    let is_little_endian = flags & 1 == 1;
     let length = if is_little_endian {
       u16::from_le_bytes([low, high])
     } else {
@@ -76,6 +90,12 @@ mod tests {
   fn data(flags: u8, writer_kind: u8) -> Vec<u8> {
     let mut content = vec![0; 40];
     content[DATA_WRITER_AT..][..ENTITY_ID_BYTES].copy_from_slice(&[1, 2, 3, writer_kind]);
+    let halves = if flags & 1 == 1 {
+      [1_u32.to_le_bytes(), 5_u32.to_le_bytes()]
+    } else {
+      [1_u32.to_be_bytes(), 5_u32.to_be_bytes()]
+    };
+    content[DATA_WRITER_AT + ENTITY_ID_BYTES..][..8].copy_from_slice(&halves.concat());
     submessage(SubmessageKind::DATA, flags, &content)
   }
 
@@ -88,14 +108,15 @@ mod tests {
   fn a_sample_is_found_behind_what_comes_before_it() {
     let writer = [&[9; PREFIX_BYTES][..], &[1, 2, 3, USER_WRITER]].concat();
     let writer = GUID::from_bytes(writer.try_into().unwrap());
+    let expected = Some((writer, SequenceNumber::from((1_i64 << 32) + 5)));
     for flags in [0, 1] {
       let destination = submessage(SubmessageKind::INFO_DST, flags, &[7; 12]);
       let timestamp = submessage(SubmessageKind::INFO_TS, flags, &[7; 8]);
       let sample = data(flags, USER_WRITER);
-      let found = writer_of_sample(&message(&[sample.clone()]));
-      assert_eq!(found, Some(writer));
-      let found = writer_of_sample(&message(&[destination, timestamp, sample]));
-      assert_eq!(found, Some(writer));
+      let found = sample_in(&message(&[sample.clone()]));
+      assert_eq!(found, expected);
+      let found = sample_in(&message(&[destination, timestamp, sample]));
+      assert_eq!(found, expected);
     }
   }
 
@@ -111,7 +132,7 @@ mod tests {
       [b"HTTP".to_vec(), message(&[data(1, USER_WRITER)])[4..].to_vec()].concat(),
       message(&[vec![heartbeat; SUBMESSAGES_LOOKED_AT].concat(), data(1, USER_WRITER)]),
     ] {
-      assert_eq!(writer_of_sample(&other), None, "{other:?}");
+      assert_eq!(sample_in(&other), None, "{other:?}");
     }
   }
 
@@ -121,11 +142,12 @@ mod tests {
       submessage(SubmessageKind::INFO_TS, 1, &[7; 8]),
       data(1, USER_WRITER),
     ]);
-    let first = (0..=whole.len()).find(|length| writer_of_sample(&whole[..*length]).is_some());
-    // Behind the writer's id.
-    assert_eq!(first, Some(RTPS_MESSAGE_HEADER_SIZE + 12 + 4 + DATA_WRITER_AT + ENTITY_ID_BYTES));
+    let first = (0..=whole.len()).find(|length| sample_in(&whole[..*length]).is_some());
+    // Behind the writer's id and the sample's number.
+    let content = DATA_WRITER_AT + ENTITY_ID_BYTES + 8;
+    assert_eq!(first, Some(RTPS_MESSAGE_HEADER_SIZE + 12 + 4 + content));
     let padding = submessage(SubmessageKind::PAD, 1, &[0; 9]);
-    assert_eq!(writer_of_sample(&message(&[padding])), None);
-    assert_eq!(writer_of_sample(&message(&[vec![0x09, 1, 0xff, 0xff]])), None);
+    assert_eq!(sample_in(&message(&[padding])), None);
+    assert_eq!(sample_in(&message(&[vec![0x09, 1, 0xff, 0xff]])), None);
   }
 }

@@ -35,7 +35,7 @@ use crate::{
   },
   //qos::HasQoSPolicy,
   rtps::{
-    arriving::writer_of_sample,
+    arriving::sample_in,
     constant::*,
     message_receiver::MessageReceiver,
     outbound::SocketId,
@@ -424,8 +424,8 @@ impl DPEventLoop {
         return false;
       };
       if let Some(hook) = &mut self.hooks.on_sample_arriving {
-        if let Some(writer) = writer_of_sample(&packet) {
-          hook(writer);
+        if let Some((writer, number)) = sample_in(&packet) {
+          hook(writer, number.into());
         }
       }
       self
