@@ -91,7 +91,7 @@ const KILL_EVERY: Duration = Duration::from_millis(300);
 /// More than the 15 s for which the others know of a participant that was killed.
 const LEASE: Duration = Duration::from_secs(16);
 
-/// Fewer than six rounds tell nothing, and a dozen tell 20 %.
+/// Fewer than six rounds tell nothing, a dozen a third, and forty a tenth or two.
 const ROUNDS_PER_REPETITION: usize = 4;
 
 #[derive(Default)]
