@@ -8,6 +8,7 @@ pub(crate) mod participant;
 pub use participant::DomainParticipant;
 
 pub(crate) mod ddsdata;
+pub(crate) mod lent;
 pub(crate) mod pubsub;
 pub(crate) mod readcondition;
 pub(crate) mod topic;

@@ -7,11 +7,12 @@ use std::{
   sync::{Arc, Mutex, RwLock},
 };
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 
 use crate::{
   dds::{
     ddsdata::DDSData,
+    lent::{LentMemory, Lender, SampleMemory},
     qos::{policy, QosPolicies, QosPolicyBuilder},
     statusevents::{sync_status_channel, DataReaderStatus},
     typedesc::TypeDesc,
@@ -120,6 +121,9 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
   }) else {
     return;
   };
+  if let Ok(mut topic_cache) = topic_cache_handle.lock() {
+    topic_cache.lender = Lender(Some(Arc::new(EvenLengths)));
+  }
   let reader_id =
     EntityId::new([0, 0, 1], EntityKind::READER_WITH_KEY_USER_DEFINED);
   let writer_id =
@@ -177,6 +181,25 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
       writer.handle_ack_nack(prefix, &acknack);
       writer.repair(remote_reader);
     }
+  }
+}
+
+// Lends memory for some samples, so that both kinds are put together.
+struct EvenLengths;
+
+impl SampleMemory for EvenLengths {
+  fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+    len
+      .is_multiple_of(2)
+      .then(|| Box::new(Zeros(BytesMut::zeroed(len))) as Box<dyn LentMemory>)
+  }
+}
+
+struct Zeros(BytesMut);
+
+impl LentMemory for Zeros {
+  fn bytes(&mut self) -> &mut [u8] {
+    &mut self.0
   }
 }
 

@@ -212,6 +212,7 @@ pub mod serialization;
 #[doc(inline)]
 pub use dds::{
   key::{Key, Keyed},
+  lent::{LentMemory, SampleMemory},
   participant::{DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener},
   pubsub::{Publisher, Subscriber},
   qos,

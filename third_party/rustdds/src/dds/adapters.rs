@@ -81,7 +81,7 @@
 pub mod no_key {
   use bytes::Bytes;
 
-  use crate::RepresentationIdentifier;
+  use crate::{LentMemory, RepresentationIdentifier};
 
   /// trait for connecting a Deserializer implementation and DataReader
   /// together - no_key version.
@@ -158,6 +158,22 @@ pub mod no_key {
         .map(Self::transform_decoded)
     }
 
+    /// Like [`from_encapsulated_with`](Self::from_encapsulated_with), of a
+    /// sample in memory of the application, which the decoder may take.
+    fn from_lent_with<'de, S>(
+      memory: &'de mut Option<Box<dyn LentMemory>>,
+      encoding: RepresentationIdentifier,
+      options: [u8; 2],
+      decoder: S,
+    ) -> Result<D, S::Error>
+    where
+      S: Decode<'de, Self::Decoded>,
+    {
+      decoder
+        .decode_lent(memory, encoding, options)
+        .map(Self::transform_decoded)
+    }
+
     /// Deserialize data from bytes to an object.
     /// `encoding` must be something given by `supported_encodings()`, or
     /// implementation may fail with Err or `panic!()`.
@@ -221,6 +237,22 @@ pub mod no_key {
       Self: Sized,
     {
       self.decode_bytes(input_bytes, encoding)
+    }
+
+    /// Like [`decode_encapsulated`](Self::decode_encapsulated), of a sample in
+    /// memory that [`crate::SampleMemory`] lent. A decoder that wants to keep
+    /// it takes it out.
+    fn decode_lent(
+      self,
+      memory: &'de mut Option<Box<dyn LentMemory>>,
+      encoding: RepresentationIdentifier,
+      options: [u8; 2],
+    ) -> Result<Decoded, Self::Error>
+    where
+      Self: Sized,
+    {
+      let bytes = memory.as_mut().map_or(&mut [][..], |memory| memory.bytes());
+      self.decode_encapsulated(bytes, encoding, options)
     }
   }
 

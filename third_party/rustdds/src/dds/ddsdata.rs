@@ -3,7 +3,8 @@ use std::cmp::min;
 use bytes::Bytes;
 
 use crate::{
-  dds::key::KeyHash, messages::submessages::elements::serialized_payload::SerializedPayload,
+  dds::{key::KeyHash, lent::Lent},
+  messages::submessages::elements::serialized_payload::SerializedPayload,
   structure::cache_change::ChangeKind,
 };
 
@@ -16,6 +17,9 @@ use crate::{
 pub enum DDSData {
   Data {
     serialized_payload: SerializedPayload,
+    // Of a sample that was put together in memory of the application: then the
+    // payload above has the encapsulation only.
+    lent: Option<Lent>,
   },
   DisposeByKey {
     change_kind: ChangeKind,
@@ -32,7 +36,16 @@ pub enum DDSData {
 
 impl DDSData {
   pub fn new(serialized_payload: SerializedPayload) -> Self {
-    Self::Data { serialized_payload }
+    Self::Data {
+      serialized_payload,
+      lent: None,
+    }
+  }
+  pub(crate) fn new_lent(encapsulation: SerializedPayload, lent: Lent) -> Self {
+    Self::Data {
+      serialized_payload: encapsulation,
+      lent: Some(lent),
+    }
   }
   pub fn new_disposed_by_key(change_kind: ChangeKind, key: SerializedPayload) -> Self {
     Self::DisposeByKey {
@@ -71,7 +84,10 @@ impl DDSData {
   // What is the serialized size of this?
   pub fn payload_size(&self) -> usize {
     match self {
-      DDSData::Data { serialized_payload } => serialized_payload.len_serialized(),
+      DDSData::Data {
+        serialized_payload,
+        lent,
+      } => serialized_payload.len_serialized() + lent.as_ref().map_or(0, Lent::len),
       DDSData::DisposeByKey { key, .. } => key.len_serialized(),
       DDSData::DisposeByKeyHash { .. } => 16,
       // This is a fundamental constant of the RTPS
@@ -81,7 +97,9 @@ impl DDSData {
 
   pub(crate) fn reallocate(&mut self) {
     match self {
-      DDSData::Data { serialized_payload } => serialized_payload.reallocate(),
+      DDSData::Data {
+        serialized_payload, ..
+      } => serialized_payload.reallocate(),
       DDSData::DisposeByKey { key, .. } => key.reallocate(),
       DDSData::DisposeByKeyHash { .. } => {}
     }
@@ -95,7 +113,9 @@ impl DDSData {
   #[cfg(test)]
   fn payload_bytes(&self) -> Bytes {
     match &self {
-      DDSData::Data { serialized_payload } => serialized_payload.value.clone(),
+      DDSData::Data {
+        serialized_payload, ..
+      } => serialized_payload.value.clone(),
       DDSData::DisposeByKey { key, .. } => key.value.clone(),
       DDSData::DisposeByKeyHash { key_hash, .. } => Bytes::from(key_hash.to_vec()),
     }
@@ -103,7 +123,9 @@ impl DDSData {
 
   pub fn bytes_slice(&self, from: usize, to: usize) -> Bytes {
     match &self {
-      DDSData::Data { serialized_payload } => serialized_payload.bytes_slice(from, to),
+      DDSData::Data {
+        serialized_payload, ..
+      } => serialized_payload.bytes_slice(from, to),
       DDSData::DisposeByKey { key, .. } => key.bytes_slice(from, to),
       DDSData::DisposeByKeyHash { key_hash, .. } => {
         // This may be a bit of overengineering, since this

@@ -1,16 +1,20 @@
 use std::{
+  cmp::min,
   collections::{btree_map::Entry, BTreeMap},
   fmt, iter,
 };
 
 use bit_vec::BitVec;
 use enumflags2::BitFlags;
-use bytes::BytesMut;
+use bytes::{Bytes, BytesMut};
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
 
 use crate::{
-  dds::ddsdata::DDSData,
+  dds::{
+    ddsdata::DDSData,
+    lent::{Lent, LentMemory},
+  },
   messages::submessages::{
     elements::serialized_payload::SerializedPayload,
     submessages::{DATAFRAG_Flags, DataFrag},
@@ -22,9 +26,69 @@ use crate::{
   },
 };
 
+// Where the fragments of one sample are put together.
+enum Memory {
+  // The library's: encapsulation and payload.
+  Own(BytesMut),
+  // The application's, for the payload; the encapsulation is beside it.
+  Lent {
+    encapsulation: [u8; ENCAPSULATION_LEN],
+    payload: Box<dyn LentMemory>,
+  },
+}
+
+const ENCAPSULATION_LEN: usize = 4;
+
+impl Memory {
+  fn write(&mut self, from: usize, data: &[u8]) {
+    match self {
+      Memory::Own(buffer) => buffer[from..from + data.len()].copy_from_slice(data),
+      Memory::Lent {
+        encapsulation,
+        payload,
+      } => {
+        let (head, tail) = data.split_at(
+          ENCAPSULATION_LEN
+            .saturating_sub(from)
+            .min(data.len()),
+        );
+        encapsulation[from.min(ENCAPSULATION_LEN)..][..head.len()].copy_from_slice(head);
+        let from = (from + head.len()).saturating_sub(ENCAPSULATION_LEN);
+        payload.bytes()[from..from + tail.len()].copy_from_slice(tail);
+      }
+    }
+  }
+
+  // What was put together, as data or as a key.
+  fn into_dds_data(self, data_size: usize, is_key: bool) -> std::io::Result<DDSData> {
+    match self {
+      Memory::Own(buffer) => {
+        let serialized = SerializedPayload::from_bytes(&buffer.freeze())?;
+        Ok(if is_key {
+          DDSData::new_disposed_by_key(ChangeKind::NotAliveDisposed, serialized)
+        } else {
+          DDSData::new(serialized)
+        })
+      }
+      Memory::Lent {
+        encapsulation,
+        payload,
+      } => {
+        let encapsulation = SerializedPayload::from_bytes(&Bytes::copy_from_slice(&encapsulation))?;
+        let lent = Lent::new(data_size - ENCAPSULATION_LEN, payload);
+        Ok(DDSData::new_lent(encapsulation, lent))
+      }
+    }
+  }
+}
+
 // This is for the assembly of a single object
 struct AssemblyBuffer {
-  buffer_bytes: BytesMut,
+  memory: Memory,
+  // Bytes of the whole, of each fragment but the last, and the fragments: as the
+  // first one that came had them.
+  data_size: usize,
+  fragment_size: u16,
   fragment_count: usize,
   received_bitmap: BitVec,
 
@@ -38,7 +102,10 @@ struct AssemblyBuffer {
 }
 
 impl AssemblyBuffer {
-  pub fn new(datafrag: &DataFrag) -> Option<Self> {
+  pub fn new(
+    datafrag: &DataFrag,
+    lend: impl FnOnce(usize) -> Option<Box<dyn LentMemory>>,
+  ) -> Option<Self> {
     let data_size: usize = datafrag.data_size.try_into().ok()?;
     if data_size > MAX_ASSEMBLED_SIZE {
       debug!("DATAFRAG of a sample of {data_size} bytes, more than {MAX_ASSEMBLED_SIZE}");
@@ -52,20 +119,29 @@ impl AssemblyBuffer {
       return None;
     }
 
-    // The size is what the sender claims. Zeroed memory costs nothing until it
-    // is written to.
-    let buffer_bytes = BytesMut::zeroed(data_size);
-
     let fragment_count = usize::from(datafrag.total_number_of_fragments());
     if fragment_count == 0 {
       error!("Cannot create AssemblyBuffer: zero fragment count");
       return None;
     }
 
+    // The size is what the sender claims. Zeroed memory costs nothing until it
+    // is written to.
+    let own = || Memory::Own(BytesMut::zeroed(data_size));
+    let memory = data_size
+      .checked_sub(ENCAPSULATION_LEN)
+      .and_then(lend)
+      .map_or_else(own, |payload| Memory::Lent {
+        encapsulation: [0; ENCAPSULATION_LEN],
+        payload,
+      });
+
     let now = Timestamp::now();
 
     Some(Self {
-      buffer_bytes,
+      memory,
+      data_size,
+      fragment_size,
       fragment_count,
       received_bitmap: BitVec::from_elem(fragment_count, false),
       source_timestamp: None,
@@ -74,15 +150,22 @@ impl AssemblyBuffer {
     })
   }
 
-  /// Returns `false` if the fragment run is invalid or out of bounds.
-  pub fn insert_frags(&mut self, datafrag: &DataFrag, frag_size: u16) -> bool {
-    // TODO: Sanity checks? E.g. datafrag.fragment_size == frag_size
-    // Or is this even guaranteed? Can Writer vary fragment size?
-    // Answer: Writer must guarantee constant fragment size per SequenceNumber.
-    // So yes, it is guaranteed. RTPS spec v2.5 Section 8.4.14.1.1 "How to select
-    // the fragment size" even says that the frag size is fixed per-writer.
-
-    let frag_size = usize::from(frag_size);
+  /// Returns `false` if the fragment run is invalid, out of bounds, or not what
+  /// the first one of this sample promised. All bytes of a run that is accepted
+  /// are written: memory that is lent may hold an older sample.
+  pub fn insert_frags(&mut self, datafrag: &DataFrag) -> bool {
+    // Constant for each sample, and by RTPS spec v2.5 Section 8.4.14.1.1 "How to
+    // select the fragment size" for each writer.
+    if datafrag.fragment_size != self.fragment_size
+      || usize::try_from(datafrag.data_size) != Ok(self.data_size)
+    {
+      error!(
+        "insert_frags: fragment of {} of {} bytes, not of {} of {}",
+        datafrag.fragment_size, datafrag.data_size, self.fragment_size, self.data_size
+      );
+      return false;
+    }
+    let frag_size = usize::from(self.fragment_size);
     let frags_in_submessage = usize::from(datafrag.fragments_in_submessage);
     if frags_in_submessage == 0 {
       error!("insert_frags: fragments_in_submessage is zero");
@@ -108,47 +191,13 @@ impl AssemblyBuffer {
       return false;
     }
 
-    debug!(
-      "insert_frags: datafrag.writer_sn = {:?}, frag_size = {:?}, datafrag.fragment_size = {:?}, \
-       datafrag.fragment_starting_num = {:?}, datafrag.fragments_in_submessage = {:?}, \
-       datafrag.data_size = {:?}",
-      datafrag.writer_sn,
-      frag_size,
-      datafrag.fragment_size,
-      datafrag.fragment_starting_num,
-      datafrag.fragments_in_submessage,
-      datafrag.data_size
-    );
-
-    // unwrap: u32 should fit into usize
+    // The last fragment of a sample may be smaller than the others.
     let from_byte = start_frag_from_0 * frag_size;
-
-    // Last fragment might be smaller than fragment size
-    // Copy reported number of fragments, or as much data as there is, whichever
-    // ends first.
-    // And clamp to assembly buffer length to avoid buffer overrun.
-    let to_before_byte = std::cmp::min(
-      from_byte
-        + std::cmp::min(
-          frags_in_submessage * frag_size,
-          datafrag.serialized_payload.len(),
-        ),
-      self.buffer_bytes.len(),
-    );
-    if from_byte > to_before_byte {
-      error!(
-        "insert_frags: invalid byte range from_byte={from_byte} to_before_byte={to_before_byte}"
-      );
-      return false;
-    }
-    let payload_size = to_before_byte - from_byte;
-
-    // sanity check data size
-    // Last fragment may be smaller than frags_in_submessage * frag_size
-    let last_frag_in_submessage = start_frag_from_0 + frags_in_submessage;
-    if last_frag_in_submessage < self.fragment_count
-      && datafrag.serialized_payload.len() < frags_in_submessage * frag_size
-    {
+    let to_before_byte = min(from_byte + frags_in_submessage * frag_size, self.data_size);
+    let Some(data) = to_before_byte
+      .checked_sub(from_byte)
+      .and_then(|len| datafrag.serialized_payload.get(..len))
+    else {
       error!(
         "Received DATAFRAG too small. fragment_starting_num={} out of fragment_count={}, \
          frags_in_submessage={}, frag_size={} but payload length = {}. Original data_size={}",
@@ -159,17 +208,9 @@ impl AssemblyBuffer {
         datafrag.serialized_payload.len(),
         datafrag.data_size,
       );
-    }
-
-    debug!("insert_frags: from_byte = {from_byte:?}, to_before_byte = {to_before_byte:?}");
-
-    debug!(
-      "insert_frags: dataFrag.serializedPayload.len = {:?}",
-      datafrag.serialized_payload.len()
-    );
-
-    self.buffer_bytes.as_mut()[from_byte..to_before_byte]
-      .copy_from_slice(&datafrag.serialized_payload[..payload_size]);
+      return false;
+    };
+    self.memory.write(from_byte, data);
 
     for f in 0..frags_in_submessage {
       self.received_bitmap.set(start_frag_from_0 + f, true);
@@ -200,7 +241,6 @@ const MAX_ASSEMBLED_SIZE: usize = 64 * 1024 * 1024 + 4;
 // Assembles fragments from a single (remote) Writer
 // So there is only one sequence of SNs
 pub(crate) struct FragmentAssembler {
-  fragment_size: u16, // number of bytes per fragment. Each writer must select one constant value.
   assembly_buffers: BTreeMap<SequenceNumber, AssemblyBuffer>,
   // Whether the owning reader is Reliable. This decides which buffer to drop
   // when `MAX_ASSEMBLY_BUFFERS` is exceeded (see `new_datafrag`).
@@ -216,10 +256,9 @@ impl fmt::Debug for FragmentAssembler {
 }
 
 impl FragmentAssembler {
-  pub fn new(fragment_size: u16, reliable: bool) -> Self {
-    debug!("new FragmentAssembler. frag_size = {fragment_size} reliable = {reliable}");
+  pub fn new(reliable: bool) -> Self {
+    debug!("new FragmentAssembler. reliable = {reliable}");
     Self {
-      fragment_size,
       assembly_buffers: BTreeMap::new(),
       reliable,
     }
@@ -233,29 +272,36 @@ impl FragmentAssembler {
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
     source_timestamp: Option<Timestamp>,
+    lend: impl FnOnce(usize) -> Option<Box<dyn LentMemory>>,
   ) -> Option<(DDSData, Option<Timestamp>)> {
     let writer_sn = datafrag.writer_sn;
-    let frag_size = self.fragment_size;
+    let is_key = flags.contains(DATAFRAG_Flags::Key);
 
     let sn = datafrag.writer_sn;
-    match self.assembly_buffers.entry(sn) {
+    let is_first = match self.assembly_buffers.entry(sn) {
       Entry::Vacant(v) => {
-        let Some(buf) = AssemblyBuffer::new(datafrag) else {
+        let lend = |len| if is_key { None } else { lend(len) };
+        let Some(buf) = AssemblyBuffer::new(datafrag, lend) else {
           error!("new_datafrag: failed to create AssemblyBuffer for {sn:?}");
           return None;
         };
         v.insert(buf);
+        true
       }
-      Entry::Occupied(_) => {}
-    }
+      Entry::Occupied(_) => false,
+    };
 
     let Some(assembly_buffer) = self.assembly_buffers.get_mut(&sn) else {
       error!("new_datafrag: AssemblyBuffer missing for {sn:?}");
       return None;
     };
 
-    if !assembly_buffer.insert_frags(datafrag, frag_size) {
+    if !assembly_buffer.insert_frags(datafrag) {
       error!("new_datafrag: rejected invalid DATAFRAG for {sn:?}");
+      // What it claimed about its sample is not to be relied on.
+      if is_first {
+        self.assembly_buffers.remove(&sn);
+      }
       return None;
     }
 
@@ -266,20 +312,11 @@ impl FragmentAssembler {
       if let Some(assembly_buffer) = self.assembly_buffers.remove(&writer_sn) {
         // Return what we have assembled.
         let source_timestamp = assembly_buffer.source_timestamp;
-        let serialized_data_or_key =
-          SerializedPayload::from_bytes(&assembly_buffer.buffer_bytes.freeze()).map_or_else(
-            |e| {
-              error!("Deserializing SerializedPayload from DATAFRAG: {:?}", e);
-              None
-            },
-            Some,
-          )?;
-        let dds_data = if flags.contains(DATAFRAG_Flags::Key) {
-          DDSData::new_disposed_by_key(ChangeKind::NotAliveDisposed, serialized_data_or_key)
-        } else {
-          // it is data
-          DDSData::new(serialized_data_or_key)
-        };
+        let dds_data = assembly_buffer
+          .memory
+          .into_dds_data(assembly_buffer.data_size, is_key)
+          .inspect_err(|e| error!("Deserializing SerializedPayload from DATAFRAG: {e:?}"))
+          .ok()?;
         Some((dds_data, source_timestamp)) // completed data from fragments
       } else {
         error!("Assembly buffer mysteriously lost");
@@ -357,10 +394,13 @@ impl FragmentAssembler {
 #[cfg(test)]
 mod tests {
   use bytes::Bytes;
+  use enumflags2::BitFlags;
 
-  use super::AssemblyBuffer;
+  use super::{AssemblyBuffer, FragmentAssembler, Memory};
   use crate::{
-    messages::submessages::submessages::DataFrag, structure::sequence_number::FragmentNumber,
+    dds::{ddsdata::DDSData, lent::LentMemory},
+    messages::submessages::submessages::{DATAFRAG_Flags, DataFrag},
+    structure::sequence_number::FragmentNumber,
   };
 
   // Build a DATAFRAG submessage carrying the contiguous run of `k` fragments
@@ -376,6 +416,13 @@ mod tests {
     }
   }
 
+  fn own(buffer: AssemblyBuffer) -> Vec<u8> {
+    match buffer.memory {
+      Memory::Own(bytes) => bytes.to_vec(),
+      Memory::Lent { .. } => panic!("lent"),
+    }
+  }
+
   // A DATAFRAG that packs K > 1 fragments in one submessage must reassemble the
   // same bytes as one-fragment-per-submessage would. This exercises the
   // adaptive-packing writer path against the (unchanged) receiver.
@@ -387,20 +434,16 @@ mod tests {
 
     // First submessage packs fragments 1 and 2 (K = 2, 2048 payload bytes).
     let first = datafrag(1, 2, frag_size, data_size, whole[0..2048].to_vec());
-    let mut ab = AssemblyBuffer::new(&first).expect("valid first fragment");
+    let mut ab = AssemblyBuffer::new(&first, |_| None).expect("valid first fragment");
     assert!(!ab.is_complete());
-    ab.insert_frags(&first, frag_size);
+    ab.insert_frags(&first);
     assert!(!ab.is_complete(), "still missing the tail fragment");
 
     // Trailing submessage carries the shorter final fragment 3 (552 bytes).
     let tail = datafrag(3, 1, frag_size, data_size, whole[2048..2600].to_vec());
-    ab.insert_frags(&tail, frag_size);
+    ab.insert_frags(&tail);
     assert!(ab.is_complete(), "all fragments received");
-    assert_eq!(
-      &ab.buffer_bytes[..],
-      &whole[..],
-      "reassembled bytes must match the original sample"
-    );
+    assert_eq!(own(ab), whole, "reassembled bytes must match the original sample");
   }
 
   // A single DATAFRAG carrying the whole sample in one multi-fragment run.
@@ -411,10 +454,10 @@ mod tests {
     let whole: Vec<u8> = (0..data_size as usize).map(|i| (i % 97) as u8).collect();
 
     let all = datafrag(1, 3, frag_size, data_size, whole.clone());
-    let mut ab = AssemblyBuffer::new(&all).expect("valid fragment set");
-    ab.insert_frags(&all, frag_size);
+    let mut ab = AssemblyBuffer::new(&all, |_| None).expect("valid fragment set");
+    ab.insert_frags(&all);
     assert!(ab.is_complete());
-    assert_eq!(&ab.buffer_bytes[..], &whole[..]);
+    assert_eq!(own(ab), whole);
   }
 
   // Malformed span (starting at last fragment but claiming multiple fragments)
@@ -424,24 +467,103 @@ mod tests {
     let frag_size = 256u16;
     let data_size = 512u32; // 2 fragments total
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
-    let mut ab = AssemblyBuffer::new(&bad).expect("buffer for valid data_size");
-    assert!(!ab.insert_frags(&bad, frag_size));
+    let mut ab = AssemblyBuffer::new(&bad, |_| None).expect("buffer for valid data_size");
+    assert!(!ab.insert_frags(&bad));
     assert!(!ab.is_complete());
   }
 
   #[test]
   fn fragment_assembler_rejects_span_beyond_total() {
-    use enumflags2::BitFlags;
-
-    use super::FragmentAssembler;
-    use crate::messages::submessages::submessages::DATAFRAG_Flags;
-
     let frag_size = 256u16;
     let data_size = 512u32;
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
-    let mut fa = FragmentAssembler::new(frag_size, true);
+    let mut fa = FragmentAssembler::new(true);
     assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None)
+      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None, |_| None)
+      .is_none());
+  }
+
+  // Memory of an application, with what an older sample left in it.
+  struct Used(Vec<u8>);
+
+  impl LentMemory for Used {
+    fn bytes(&mut self) -> &mut [u8] {
+      &mut self.0
+    }
+  }
+
+  fn lend(len: usize) -> Option<Box<dyn LentMemory>> {
+    Some(Box::new(Used(vec![0xEE; len])))
+  }
+
+  fn lent(data: &DDSData) -> ([u8; 2], [u8; 2], Vec<u8>) {
+    let DDSData::Data {
+      serialized_payload,
+      lent: Some(lent),
+    } = data
+    else {
+      panic!("not lent");
+    };
+    let payload = lent.with(|memory| memory.take().unwrap().bytes().to_vec());
+    (
+      serialized_payload.representation_identifier.bytes,
+      serialized_payload.representation_options,
+      payload,
+    )
+  }
+
+  #[test]
+  fn a_sample_is_put_together_in_memory_that_is_lent() {
+    // Fragments that end before, within and after the encapsulation, in any order.
+    for frag_size in [1, 2, 3, 4, 5, 7, 64, 100] {
+      let whole: Vec<u8> = (0..100).collect();
+      let count = 100_u32.div_ceil(u32::from(frag_size));
+      let mut fa = FragmentAssembler::new(true);
+      let mut done = None;
+      for number in (1..=count).rev() {
+        let from = (number as usize - 1) * usize::from(frag_size);
+        let to = (from + usize::from(frag_size)).min(100);
+        let fragment = datafrag(number, 1, frag_size, 100, whole[from..to].to_vec());
+        assert!(done.is_none());
+        done = fa.new_datafrag(&fragment, BitFlags::empty(), None, lend);
+      }
+      let (data, _) = done.expect("complete");
+      assert_eq!(data.payload_size(), 100);
+      assert_eq!(lent(&data), ([0, 1], [2, 3], whole[4..].to_vec()));
+      assert!(fa.assembly_buffers.is_empty());
+    }
+  }
+
+  #[test]
+  fn nothing_of_an_older_sample_is_left_in_memory_that_is_lent() {
+    let mut fa = FragmentAssembler::new(true);
+    let mut insert = |fragment: &DataFrag| {
+      fa.new_datafrag(fragment, BitFlags::empty(), None, lend)
+        .is_some()
+    };
+    assert!(!insert(&datafrag(1, 1, 50, 100, vec![1; 50])));
+    // Too short, of another size, of another sample size: each would leave a hole.
+    assert!(!insert(&datafrag(2, 1, 50, 100, vec![1; 49])));
+    assert!(!insert(&datafrag(2, 1, 49, 100, vec![1; 49])));
+    assert!(!insert(&datafrag(1, 1, 50, 50, vec![1; 50])));
+    assert!(insert(&datafrag(2, 1, 50, 100, vec![1; 50])));
+    // And one that begins a sample with a lie is forgotten with it.
+    assert!(!insert(&datafrag(1, 2, 50, 100, vec![1; 99])));
+    assert!(fa.assembly_buffers.is_empty());
+  }
+
+  #[test]
+  fn a_key_and_a_sample_without_an_encapsulation_are_not_put_into_lent_memory() {
+    let refuse = |_| -> Option<Box<dyn LentMemory>> { panic!("asked for memory") };
+    let mut fa = FragmentAssembler::new(true);
+    let key = datafrag(1, 1, 50, 50, vec![1; 50]);
+    let (data, _) = fa
+      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), None, refuse)
+      .expect("complete");
+    assert!(matches!(data, DDSData::DisposeByKey { .. }));
+    let short = datafrag(1, 1, 3, 3, vec![1; 3]);
+    assert!(fa
+      .new_datafrag(&short, BitFlags::empty(), None, refuse)
       .is_none());
   }
 }

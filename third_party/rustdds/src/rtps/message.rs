@@ -328,6 +328,7 @@ impl MessageBuilder {
     let serialized_payload = match cache_change.data_value {
       DDSData::Data {
         ref serialized_payload,
+        ..
       } => Some(serialized_payload.clone()), // contents is Bytes
       DDSData::DisposeByKey { ref key, .. } => Some(key.clone()),
       DDSData::DisposeByKeyHash { .. } => None,

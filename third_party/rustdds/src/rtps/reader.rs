@@ -18,6 +18,7 @@ use speedy::Writable;
 use crate::{
   dds::{
     ddsdata::DDSData,
+    lent::LentMemory,
     qos::{policy, HasQoSPolicy, QosPolicies},
     statusevents::{
       CountWithChange, DataReaderStatus, DomainParticipantStatusEvent, StatusChannelSender,
@@ -182,6 +183,13 @@ fn reply_locators<'a>(
     }
     others => others,
   }
+}
+
+// Memory of the application for a sample of the topic.
+fn lend(topic_cache: &Mutex<TopicCache>, len: usize) -> Option<Box<dyn LentMemory>> {
+  // Not under the lock, which the application's readers take.
+  let lender = topic_cache.lock().ok()?.lender.clone();
+  lender.0?.lend(len)
 }
 
 // What one NACK_FRAG can name, RTPS v2.5 Section 8.3.5.7, and how many of them one
@@ -551,6 +559,7 @@ impl Reader {
   pub fn remove_writer_proxy(&mut self, writer_guid: GUID) {
     if self.matched_writers.contains_key(&writer_guid) {
       self.matched_writers.remove(&writer_guid);
+      self.fragment_assemblers.remove(&writer_guid);
       self
         .acquire_the_topic_cache_guard()
         .forget_reliable_writer(writer_guid);
@@ -725,9 +734,13 @@ impl Reader {
 
     // Feed to fragment assembler ...
     let writer_seq_num = datafrag.writer_sn; // for borrow checker
-    let completed_dds_data = self
-      .fragment_assembler_mutable(writer_guid, datafrag.fragment_size)
-      .new_datafrag(datafrag, datafrag_flags, mr_state.source_timestamp);
+    let topic_cache = Arc::clone(&self.topic_cache);
+    let completed_dds_data = self.fragment_assembler_mutable(writer_guid).new_datafrag(
+      datafrag,
+      datafrag_flags,
+      mr_state.source_timestamp,
+      |len| lend(&topic_cache, len),
+    );
 
     // ... and continue processing, if data was completed.
     if let Some((dds_data, source_timestamp)) = completed_dds_data {
@@ -746,16 +759,12 @@ impl Reader {
     }
   }
 
-  fn fragment_assembler_mutable(
-    &mut self,
-    writer_guid: GUID,
-    frag_size: u16,
-  ) -> &mut FragmentAssembler {
+  fn fragment_assembler_mutable(&mut self, writer_guid: GUID) -> &mut FragmentAssembler {
     let reliable = self.reliability != policy::Reliability::BestEffort;
     self
       .fragment_assemblers
       .entry(writer_guid)
-      .or_insert_with(|| FragmentAssembler::new(frag_size, reliable))
+      .or_insert_with(|| FragmentAssembler::new(reliable))
   }
 
   fn garbage_collect_fragments(&mut self) {

@@ -12,6 +12,7 @@ use log::{debug, error, info, trace, warn};
 use crate::{
   create_error_internal,
   dds::{
+    lent::Lender,
     qos::{
       policy::{History, ResourceLimits},
       QosPolicies,
@@ -154,6 +155,9 @@ pub(crate) struct TopicCache {
   // Therefore, data before the marker SN can be handed off to a Reliable DataReader.
   // Initially, we consider the marker for each Writer (GUID) to be SequenceNumber::new(1)
   received_reliably_before: BTreeMap<GUID, SequenceNumber>,
+
+  // Where the application wants samples of several fragments, if it does.
+  pub(crate) lender: Lender,
 }
 
 impl TopicCache {
@@ -170,6 +174,7 @@ impl TopicCache {
       last_added_instant: Timestamp::ZERO,
       sequence_numbers: BTreeMap::new(),
       received_reliably_before: BTreeMap::new(),
+      lender: Lender::default(),
     };
 
     new_self.update_keep_limits(topic_qos);

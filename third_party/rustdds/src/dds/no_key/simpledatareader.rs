@@ -1,6 +1,7 @@
 use std::{
   io,
   pin::Pin,
+  sync::Arc,
   task::{Context, Poll, Waker},
 };
 
@@ -11,6 +12,7 @@ use log::{debug, error, info, trace, warn};
 use crate::{
   dds::{
     adapters::no_key::*,
+    lent::SampleMemory,
     no_key::{datasample::DeserializedCacheChange, wrappers::DecodeWrapper},
     qos::*,
     result::ReadResult,
@@ -45,6 +47,16 @@ where
     Self {
       keyed_simpledatareader,
     }
+  }
+
+  /// From now on samples of the topic that arrive in fragments are put together
+  /// in that memory, as far as it lends any. A decoder's
+  /// [`decode_lent`](crate::no_key::Decode::decode_lent) may take what this
+  /// reader takes; for another reader of the same topic in this participant the
+  /// sample is an error then, so it is for topics with one. Ends with this
+  /// reader.
+  pub fn set_sample_memory(&self, memory: Arc<dyn SampleMemory>) {
+    self.keyed_simpledatareader.set_sample_memory(memory);
   }
 
   pub fn set_waker(&self, w: Option<Waker>) {

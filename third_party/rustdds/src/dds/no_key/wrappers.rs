@@ -3,7 +3,9 @@ use std::{marker::PhantomData, ops::Deref};
 use bytes::Bytes;
 
 use crate::{
-  dds::adapters::*, messages::submessages::submessages::RepresentationIdentifier, Keyed,
+  dds::{adapters::*, lent::LentMemory},
+  messages::submessages::submessages::RepresentationIdentifier,
+  Keyed,
 };
 
 // This wrapper is used to convert NO_KEY types to WITH_KEY
@@ -171,6 +173,15 @@ where
     self
       .no_key
       .decode_encapsulated(input_bytes, encoding, options)
+  }
+
+  fn decode_lent(
+    self,
+    memory: &'de mut Option<Box<dyn LentMemory>>,
+    encoding: RepresentationIdentifier,
+    options: [u8; 2],
+  ) -> Result<Decoded, Self::Error> {
+    self.no_key.decode_lent(memory, encoding, options)
   }
 }
 

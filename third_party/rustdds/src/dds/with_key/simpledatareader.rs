@@ -4,7 +4,10 @@ use std::{
   io,
   marker::PhantomData,
   pin::Pin,
-  sync::{Arc, Mutex, MutexGuard},
+  sync::{
+    atomic::{AtomicBool, Ordering},
+    Arc, Mutex, MutexGuard,
+  },
   task::{Context, Poll, Waker},
 };
 
@@ -18,6 +21,7 @@ use crate::{
     adapters::with_key::{Decode, DefaultDecoder, DeserializerAdapter},
     ddsdata::*,
     key::*,
+    lent::{Lender, SampleMemory},
     pubsub::Subscriber,
     qos::*,
     result::*,
@@ -112,6 +116,10 @@ pub struct SimpleDataReader<D: Keyed, DA: DeserializerAdapter<D> = CDRDeserializ
   data_reader_waker: Arc<Mutex<Option<Waker>>>,
 
   event_source: PollEventSource,
+
+  // Whether the topic's samples are put together in memory of the application
+  // because of this reader.
+  lends_memory: AtomicBool,
 }
 
 impl<D, DA> Drop for SimpleDataReader<D, DA>
@@ -120,6 +128,12 @@ where
   DA: DeserializerAdapter<D>,
 {
   fn drop(&mut self) {
+    if *self.lends_memory.get_mut() {
+      if let Ok(mut topic_cache) = self.topic_cache.lock() {
+        topic_cache.lender = Lender::default();
+      }
+    }
+
     // Tell dp_event_loop
     self.my_subscriber.remove_reader(self.my_guid);
 
@@ -193,8 +207,14 @@ where
       reader_command,
       data_reader_waker,
       event_source,
+      lends_memory: AtomicBool::new(false),
     })
   }
+  pub(crate) fn set_sample_memory(&self, memory: Arc<dyn SampleMemory>) {
+    self.lends_memory.store(true, Ordering::Relaxed);
+    self.acquire_the_topic_cache_guard().lender = Lender(Some(memory));
+  }
+
   pub(crate) fn set_waker(&self, w: Option<Waker>) {
     *self.data_reader_waker.lock().unwrap() = w;
   }
@@ -238,18 +258,36 @@ where
     match cc.data_value {
       DDSData::Data {
         ref serialized_payload,
+        ref lent,
       } => {
         // what is our data serialization format (representation identifier) ?
         if let Some(recognized_rep_id) = DA::supported_encodings()
           .iter()
           .find(|r| **r == serialized_payload.representation_identifier)
         {
-          match DA::from_encapsulated_with(
-            &serialized_payload.value,
-            *recognized_rep_id,
-            serialized_payload.representation_options,
-            decoder,
-          ) {
+          let options = serialized_payload.representation_options;
+          let decoded = match lent {
+            None => Some(DA::from_encapsulated_with(
+              &serialized_payload.value,
+              *recognized_rep_id,
+              options,
+              decoder,
+            )),
+            Some(lent) => lent.with(|memory| {
+              memory
+                .is_some()
+                .then(|| DA::from_lent_with(memory, *recognized_rep_id, options, decoder))
+            }),
+          };
+          let Some(decoded) = decoded else {
+            return Err(ReadError::Deserialization {
+              reason: format!(
+                "Another reader took the memory of a sample, Topic = {}",
+                self.my_topic.name()
+              ),
+            });
+          };
+          match decoded {
             // Data update, decoded ok
             Ok(payload) => {
               let p = Sample::Value(payload);
