@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Discovery, Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take,
-    WriteError, WriterEvent,
+    Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter, ReaderEvent,
+    ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
     Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
@@ -142,6 +142,94 @@ fn a_whole_sample_is_told_of_before_it_is_there() {
     send(1 << 20);
     assert_eq!(arrived.load(Ordering::Acquire), before, "a fragment is no sample");
     assert!(received.load(Ordering::Acquire) > 20);
+}
+
+/// Lends memory full of what an older sample left, and counts what is lent and not dropped.
+#[derive(Default)]
+struct Lender {
+    lent: Arc<AtomicUsize>,
+    refuses: AtomicBool,
+}
+
+struct Lent {
+    bytes: Vec<u8>,
+    lent: Arc<AtomicUsize>,
+}
+
+impl SampleMemory for Lender {
+    fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+        if self.refuses.load(Ordering::Acquire) {
+            return None;
+        }
+        self.lent.fetch_add(1, Ordering::AcqRel);
+        Some(Box::new(Lent { bytes: vec![0xEE; len], lent: Arc::clone(&self.lent) }))
+    }
+}
+
+impl LentMemory for Lent {
+    fn bytes(&mut self) -> &mut [u8] {
+        &mut self.bytes
+    }
+}
+
+impl Drop for Lent {
+    fn drop(&mut self) {
+        self.lent.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+#[test]
+fn a_sample_in_fragments_is_put_together_in_memory_that_is_lent() {
+    let mut here = participant("here", 68);
+    let mut there = participant("there", 68);
+    let reader = there
+        .create_reader("rt/lent", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let lender = Arc::new(Lender::default());
+    let lent = Arc::clone(&lender.lent);
+    reader.lend_memory(lender.clone());
+    let writer = here.create_writer("rt/lent", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let pass = |length: usize, refuses: bool| {
+        lender.refuses.store(refuses, Ordering::Release);
+        let payload: Vec<u8> = (0..length).map(|at| (at * 7 + length) as u8).collect();
+        let encapsulation = Encapsulation([0, 1, 0, 3]);
+        writer.write(Bytes::from(payload.clone()), encapsulation, SourceTimestamp(5)).unwrap();
+        let give_up = Instant::now() + Duration::from_secs(20);
+        let mut taken = None;
+        while taken.is_none() {
+            assert!(Instant::now() < give_up, "nothing arrived");
+            let mut receive = |received: Payload<'_>, its_encapsulation| {
+                assert_eq!(its_encapsulation, encapsulation);
+                taken = Some(match received {
+                    Payload::Bytes(bytes) => (bytes.to_vec(), false),
+                    Payload::Lent(mut memory) => (memory.bytes().to_vec(), true),
+                });
+            };
+            let take = reader.take_payload(&mut receive);
+            assert!(matches!(take, Take::Empty | Take::Sample(_)), "{take:?}");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let (bytes, is_lent) = taken.unwrap();
+        assert!(bytes == payload, "{length} bytes changed on the way");
+        assert_eq!(lent.load(Ordering::Acquire), 0, "all memory came back");
+        is_lent
+    };
+    // One datagram needs no memory; of what has fragments some is put together here, some there.
+    assert!(!pass(2_948, false));
+    for length in [100_001, 1 << 20, 4 << 20, (4 << 20) - 3] {
+        assert!(pass(length, false));
+        assert!(!pass(length, true));
+    }
+    // One who wants bytes gets them.
+    lender.refuses.store(false, Ordering::Release);
+    writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(6)).unwrap();
+    assert!(take_one(&reader).expect("nothing arrived").0 == vec![9; 200_000]);
+    // And what nobody takes goes with its reader.
+    drop(reader);
+    writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(7)).unwrap();
+    drop((writer, there, here));
+    assert_eq!(lent.load(Ordering::Acquire), 0);
 }
 
 #[test]

@@ -130,13 +130,46 @@ fn the_pool_is_as_large_as_computed_and_all_of_it_is_there() {
 }
 
 #[test]
+fn a_payload_written_into_a_lent_slot_arrives_and_copies_go_on_meanwhile() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = channel(1_000);
+    let publisher = SamplePublisher::create(&node, &channel).unwrap();
+    let lane = lane(&node, &channel);
+    assert!(publisher.lend(1_001).is_none(), "longer than the route allows");
+    let mut first = publisher.lend(1_000).unwrap();
+    let mut second = publisher.lend(10).unwrap();
+    assert!(publisher.lend(10).is_none(), "two at once");
+    for sequence in 1..=50 {
+        publish(&publisher, sequence, 1_000);
+        assert_eq!(sequences(&lane), [sequence]);
+    }
+    first.payload_mut().copy_from_slice(&payload(51, 1_000));
+    second.payload_mut().copy_from_slice(&payload(52, 10));
+    let first = std::thread::spawn(move || first).join().unwrap();
+    for (slot, sequence, length) in [(first, 51, 1_000), (second, 52, 10)] {
+        assert_eq!(slot.into_slot().publish(header(sequence)).unwrap(), 1);
+        let sample = lane.take().unwrap().unwrap();
+        assert_eq!((*sample.header(), sample.payload()), (header(sequence), &payload(sequence, length)[..]));
+    }
+    // What is dropped, or outlives its publisher, is free again.
+    for _ in 0..100 {
+        drop(publisher.lend(1_000).unwrap());
+    }
+    let orphan = publisher.lend(1_000).unwrap();
+    drop((publisher, lane, node));
+    drop(orphan);
+    SamplePublisher::create(&place.node(), &channel).unwrap();
+}
+
+#[test]
 fn the_pool_suffices_when_everybody_holds_all_it_may() {
     let place = Place::new();
     let node = place.node();
     let shares =
         [LaneQueue { queue_depth: 5, max_borrowed: 3 }, LaneQueue { queue_depth: 2, max_borrowed: 7 }];
     let channel = RouteChannel { lanes: shares.to_vec(), max_taps: 1, retained_samples: 2, ..channel(1_000) };
-    assert_eq!(channel.pool_size().slots, (5 + 3) + (2 + 7) + (4 + 2) + 2 + 2);
+    assert_eq!(channel.pool_size().slots, (5 + 3) + (2 + 7) + (4 + 2) + 2 + 3);
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
     let subscribers = [
         SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shares[0]), false).unwrap(),
@@ -158,9 +191,11 @@ fn the_pool_suffices_when_everybody_holds_all_it_may() {
         sequence += 1;
         publish(&publisher, sequence, 1_000);
     }
-    let copies: Vec<_> = (0..2).map(|_| publisher.copy_in(&[0; 1_000]).unwrap()).collect();
+    let lent: Vec<_> = (0..2).map(|_| publisher.lend(1_000).unwrap()).collect();
+    assert!(publisher.lend(1_000).is_none());
+    let copy = publisher.copy_in(&[0; 1_000]).unwrap();
     assert!(publisher.copy_in(&[0; 1_000]).is_err());
-    drop(copies);
+    drop((lent, copy));
     drop(held);
     for (subscriber, depth) in subscribers.iter().zip([5, 2, 4]) {
         assert_eq!(sequences(subscriber), (sequence - depth + 1..=sequence).collect::<Vec<_>>());

@@ -152,6 +152,8 @@ pub struct BridgeRun {
     pub lost_upstream: u64,
     pub forwarded: u64,
     pub by_reference: u64,
+    /// Published without a copy into shared memory.
+    pub in_place: u64,
     /// Drops by ingress and by the critical lane, by name.
     pub drops: Vec<(String, u64)>,
     /// `received = forwarded + every named drop`.
@@ -633,6 +635,7 @@ struct Counted {
     lost_upstream: u64,
     forwarded: u64,
     by_reference: u64,
+    in_place: u64,
     noncritical_forwarded: u64,
     drops: BTreeMap<String, u64>,
     whole: bool,
@@ -646,6 +649,7 @@ impl Counted {
             lost_upstream: 0,
             forwarded: 0,
             by_reference: 0,
+            in_place: 0,
             noncritical_forwarded: 0,
             drops: BTreeMap::new(),
             whole: true,
@@ -658,6 +662,7 @@ impl Counted {
             counted.lost_upstream += ingress.lost_upstream;
             counted.forwarded += lane.forwarded;
             counted.by_reference += lane.by_reference;
+            counted.in_place += ingress.in_place;
             counted.noncritical_forwarded += noncritical(boards, route);
             counted.whole &= lane.is_whole();
             counted.shm.add(&boards.histogram(Stage::Shm(CRITICAL), route));
@@ -682,6 +687,7 @@ impl Counted {
             lost_upstream: self.lost_upstream - before.lost_upstream,
             forwarded: self.forwarded - before.forwarded,
             by_reference: self.by_reference - before.by_reference,
+            in_place: self.in_place - before.in_place,
             drops: drops.filter(|(_, count)| *count > 0).collect(),
             whole: self.whole,
             shm: self.shm.since(&before.shm),

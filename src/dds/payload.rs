@@ -1,12 +1,14 @@
 //! How raw payloads pass through RustDDS' serialization interfaces.
 
+use std::any::Any;
 use std::cell::RefCell;
 use std::convert::Infallible;
 
 use bytes::Bytes;
 
-use super::rustdds::RepresentationIdentifier;
+use super::lent::{Lent, Payload};
 use super::rustdds::no_key::{Decode, DeserializerAdapter, SerializerAdapter};
+use super::rustdds::{LentMemory, RepresentationIdentifier};
 use crate::model::Encapsulation;
 
 /// A payload on its way out.
@@ -40,10 +42,10 @@ static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::XML,
 ];
 
-/// What a payload and its encapsulation are lent to.
-pub(super) type Borrower<'a> = dyn FnMut(&[u8], Encapsulation) + 'a;
+/// What a payload and its encapsulation are handed to.
+pub(super) type Borrower<'a> = dyn FnMut(Payload<'_>, Encapsulation) + 'a;
 
-/// Lends the payload to a closure while it is still in the receive buffer.
+/// Hands the payload to a closure while it is still in the receive buffer, or with the memory it is in.
 #[derive(Clone, Copy)]
 pub(super) struct Lend<'cell, 'closure>(pub &'cell RefCell<&'closure mut Borrower<'closure>>);
 
@@ -60,10 +62,33 @@ impl Decode<'_, ()> for Lend<'_, '_> {
         encoding: RepresentationIdentifier,
         options: [u8; 2],
     ) -> Result<(), Infallible> {
-        let [high, low] = encoding.to_bytes();
-        (self.0.borrow_mut())(bytes, Encapsulation([high, low, options[0], options[1]]));
+        (self.0.borrow_mut())(Payload::Bytes(bytes), encapsulation(encoding, options));
         Ok(())
     }
+
+    fn decode_lent(
+        self,
+        memory: &mut Option<Box<dyn LentMemory>>,
+        encoding: RepresentationIdentifier,
+        options: [u8; 2],
+    ) -> Result<(), Infallible> {
+        if let Some(memory) = memory.take() {
+            let memory: Box<dyn Any> = memory;
+            match memory.downcast::<Lent>() {
+                Ok(lent) => {
+                    (self.0.borrow_mut())(Payload::Lent(lent.0), encapsulation(encoding, options));
+                }
+                // Every reader here gives the library memory of that type.
+                Err(_) => debug_assert!(false, "memory that nobody here lent"),
+            }
+        }
+        Ok(())
+    }
+}
+
+fn encapsulation(encoding: RepresentationIdentifier, options: [u8; 2]) -> Encapsulation {
+    let [high, low] = encoding.to_bytes();
+    Encapsulation([high, low, options[0], options[1]])
 }
 
 impl DeserializerAdapter<()> for Raw {

@@ -1,8 +1,10 @@
 //! A DDS reader that lends each payload while it is still in the receive buffer.
 
 use std::cell::RefCell;
+use std::sync::Arc;
 use std::task::Waker;
 
+use super::lent::{Lender, Payload, SampleMemory};
 use super::payload::{Lend, Raw};
 use super::rustdds::no_key::SimpleDataReader;
 use super::rustdds::{DataReaderStatus, StatusEvented};
@@ -64,12 +66,25 @@ impl RawReader {
         self.inner.drain_read_notifications();
     }
 
+    /// From now on samples that arrive in fragments are put together in memory of `memory`, as far as it
+    /// lends any. For the one reader of a topic in its participant.
+    pub fn lend_memory(&self, memory: Arc<dyn SampleMemory>) {
+        self.inner.set_sample_memory(Arc::new(Lender(memory)));
+    }
+
     /// Takes the next sample, lending its payload and encapsulation to `lend` exactly once if there is one.
     ///
     /// Samples of one RELIABLE writer come in order and without repetition. The library's lock on the topic
     /// is held while `lend` runs: it must copy and return.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
-        let lend = RefCell::new(lend);
+        self.take_payload(&mut |payload, encapsulation| {
+            payload.with_bytes(|bytes| lend(bytes, encapsulation));
+        })
+    }
+
+    /// Like [`take`](Self::take), for one who has [lent memory](Self::lend_memory) and wants it back.
+    pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
+        let lend = RefCell::new(receive);
         match self.inner.try_take_one_with(Lend(&lend)) {
             Ok(Some(change)) => Take::Sample(SampleOrigin {
                 source_timestamp: change

@@ -16,6 +16,9 @@ pub struct IngressCounters {
     /// Samples published to the lanes; also the sequence of the last one, because ingress numbers without
     /// gaps.
     pub published: u64,
+    /// Of the published, those that the DDS library put together in the pool itself, so that they were not
+    /// copied there.
+    pub in_place: u64,
     /// Samples received and not published.
     pub drops: DropCounts,
     /// Samples that the publisher numbered and the DDS reader never gave us: lost before the bridge.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Wake, Waker};
 use std::thread::Thread;
 
-use crate::dds::{RawReader, Take};
+use crate::dds::{Payload, RawReader, Take};
 use crate::model::Encapsulation;
 
 /// Rung by the DDS library when a sample has arrived.
@@ -76,17 +76,26 @@ impl Inbox {
     /// As [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: an arrival after this look keeps
     /// it from sleeping.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
+        self.take_with(|reader| reader.take(lend))
+    }
+
+    /// The same for [`RawReader::take_payload`].
+    pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
+        self.take_with(|reader| reader.take_payload(receive))
+    }
+
+    fn take_with(&self, mut take_one: impl FnMut(&RawReader) -> Take) -> Take {
         if !self.bell.is_rung() {
             return Take::Empty;
         }
-        let take = self.reader.take(lend);
+        let take = take_one(&self.reader);
         if take != Take::Empty {
             return take;
         }
         // Nothing there, so ask to be rung, and look again in case something came in between.
         self.bell.silence();
         self.reader.arm(&self.waker);
-        let take = self.reader.take(lend);
+        let take = take_one(&self.reader);
         if take != Take::Empty {
             self.bell.rung.store(true, Ordering::Release);
         }

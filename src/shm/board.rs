@@ -84,7 +84,7 @@ pub enum Stage {
 }
 
 /// Counts up when the meaning of a word changes.
-const LAYOUT_VERSION: u32 = 2;
+const LAYOUT_VERSION: u32 = 3;
 /// "ABboards", so that a foreign file is not taken for boards.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 /// Words of a cache line, on which every value begins, so that two writers never share one.

@@ -12,7 +12,6 @@ use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::port::{LoanError as IceoryxLoanError, ReceiveError, update_connections::UpdateConnections};
 use iceoryx2::prelude::{AllocationStrategy, AttributeVerifier, BackpressureStrategy};
 use iceoryx2::sample::Sample;
-use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeCreateError as CreateError, PublishSubscribeOpenError as OpenError,
     PublishSubscribeOpenOrCreateError as OpenOrCreateError,
@@ -24,14 +23,15 @@ use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
 use super::node::{NodeShared, ShmNode, StartLock, failed};
 use super::root::RoleLock;
-use super::sample_error::{LoanError, PublishError, TakeError};
+use super::sample_error::{LoanError, TakeError};
 use super::service::Service;
+use super::slot::{LENT_SLOTS, LentPlace, LentSlot, Slot};
 use crate::config::{Lane, Settings};
 use crate::model::{RouteId, SampleHeader, fnv1a};
 
-/// Slots that ingress may hold at once while it copies and has not published yet: the one that it fills, and
-/// one of a caller that keeps a slot while it looks at the next sample.
-const LOANED_SLOTS: usize = 2;
+/// Slots that ingress may hold at once before they are published: the one that it copies into, and those that
+/// it has the DDS library put samples together in.
+const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
 /// The share of one tap.
 const TAP: LaneQueue = LaneQueue { queue_depth: 4, max_borrowed: 2 };
 /// Ingress, and the standby that may come beside it one day.
@@ -251,7 +251,8 @@ pub struct SamplePublisher {
     // The port goes before the membership that it lives in.
     port: Publisher<Service, [u8], WireHeader>,
     max_sample_bytes: usize,
-    _node: Arc<NodeShared>,
+    lent: Arc<AtomicUsize>,
+    node: Arc<NodeShared>,
 }
 
 impl SamplePublisher {
@@ -292,7 +293,12 @@ impl SamplePublisher {
             other => failed(shared.dir(), &format!("to create {what}"), &other),
         })?;
         shared.commit(&what)?;
-        Ok(Self { port, max_sample_bytes: channel.max_sample_bytes, _node: shared.clone() })
+        Ok(Self {
+            port,
+            max_sample_bytes: channel.max_sample_bytes,
+            lent: Arc::default(),
+            node: shared.clone(),
+        })
     }
 
     /// Copies a payload into a free slot: the one copy on the way in. No allocation, no waiting.
@@ -312,27 +318,26 @@ impl SamplePublisher {
         }
     }
 
+    /// A free slot for a payload of `len` bytes that is yet to be written, if so many may be had: on any
+    /// thread, without waiting. What is in it is what an older sample left.
+    pub fn lend(&self, len: usize) -> Option<LentSlot> {
+        if len > self.max_sample_bytes {
+            return None;
+        }
+        let place = LentPlace::take(&self.lent)?;
+        let slot = self.port.loan_slice_uninit(len).ok()?;
+        // SAFETY: any byte is a valid `u8`, and those of the pool, a mapped file whose pages are all there,
+        // are initialised: by the kernel with zeros, or by an older sample.
+        let sample = unsafe { slot.assume_init() };
+        Some(LentSlot::new(sample, place, self.node.clone()))
+    }
+
     /// Connects to subscribers that came since, gives them what is retained, and takes back the slots of
     /// those that are gone. Publishing does so too; where nothing is published for long, call it now and then
     /// (10 times a second, say). Cheap when nothing has changed.
     pub fn attend(&self) {
         // A subscriber that cannot be reached is logged by iceoryx2; the others are connected all the same.
         let _ = self.port.update_connections();
-    }
-}
-
-/// A payload in shared memory that is not published yet; dropping it frees the slot.
-#[derive(Debug)]
-pub struct Slot {
-    sample: SampleMut<Service, [u8], WireHeader>,
-}
-
-impl Slot {
-    /// Publishes the payload to all subscribers, and says how many got it. Never waits: in a full queue the
-    /// oldest sample gives way.
-    pub fn publish(mut self, header: SampleHeader) -> Result<usize, PublishError> {
-        *self.sample.user_header_mut() = WireHeader(header);
-        self.sample.send().map_err(|_| PublishError::Failed("a connection of iceoryx2 is broken"))
     }
 }
 

@@ -21,11 +21,12 @@ mod root;
 mod sample_error;
 mod segment;
 mod service;
+mod slot;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
 pub use channel::{
-    LaneQueue, PoolSize, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, Slot, SubscriberRole,
+    LaneQueue, PoolSize, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, SubscriberRole,
 };
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
@@ -33,4 +34,5 @@ pub use holders::{RoleHolder, instance_files};
 pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
 pub use sample_error::{LoanError, PublishError, TakeError};
+pub use slot::{LentSlot, Slot};
 pub use wake::{LaneSleeper, LaneWaker, Woken};

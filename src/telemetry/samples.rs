@@ -82,6 +82,7 @@ pub(super) fn wide() -> Report {
             received: 0,
             received_bytes: 0,
             published: 0,
+            in_place: 0,
             lost_upstream: 9_999_999_999_999,
             drops: drops(u64::MAX / 100),
             drops_in_window: drops(0),

@@ -19,6 +19,7 @@ const UNSAFE: &[&str] = &[
     "src/shm/header.rs",
     "src/shm/segment.rs",
     "src/shm/service.rs",
+    "src/shm/slot.rs",
     "src/shm/wake.rs",
     // System calls without a safe wrapper.
     "src/process/scheduling.rs",

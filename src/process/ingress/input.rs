@@ -7,15 +7,16 @@ use tracing::{error, info, warn};
 use super::super::inbox::{Bell, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
+use super::pool::{Filled, PoolOwner};
 use super::source::{Source, Wanted, label, still_suits};
 use crate::clock;
 use crate::config::{Route, Settings};
-use crate::dds::{Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, Take};
+use crate::dds::{Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability, RouteInfo,
     SampleHeader, TopicName,
 };
-use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Slot, Stage};
+use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
 /// Writers whose sequence is followed on one route; more than publish one topic on any robot we know. With
 /// more, the one followed longest is forgotten, and its gaps are not counted.
@@ -36,7 +37,7 @@ pub(super) struct Input {
     settled_type: Option<String>,
     /// Whether the publishers have changed since the reader was last thought over.
     source_changed: bool,
-    publisher: SamplePublisher,
+    pool: PoolOwner,
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
@@ -67,7 +68,7 @@ impl Input {
             connection: None,
             settled_type: None,
             source_changed: true,
-            publisher: SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?,
+            pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
             watch: DropWatch::new(counters.get().drops),
             counters,
             info: role.boards.route_info_writer(index),
@@ -102,18 +103,18 @@ impl Input {
             self.bell.silence();
             return false;
         };
-        let publisher = &self.publisher;
-        let mut lent: Option<(Result<Slot, LoanError>, Encapsulation, usize)> = None;
-        let mut lend = |payload: &[u8], encapsulation: Encapsulation| {
-            lent = Some((publisher.copy_in(payload), encapsulation, payload.len()));
+        let pool = &self.pool;
+        let mut received: Option<(Filled, Encapsulation)> = None;
+        let mut receive = |payload: Payload<'_>, encapsulation: Encapsulation| {
+            received = Some((pool.fill(payload), encapsulation));
         };
-        match connection.inbox.take(&mut lend) {
+        match connection.inbox.take_payload(&mut receive) {
             Take::Empty => return false,
-            Take::Sample(origin) => match lent {
-                Some((slot, encapsulation, bytes)) => {
-                    self.publish(slot, encapsulation, bytes, origin, wake);
+            Take::Sample(origin) => match received {
+                Some((filled, encapsulation)) => {
+                    self.publish(filled, encapsulation, origin, wake);
                 }
-                // The library says that there was a sample and lent none; it has no such path today.
+                // The library says that there was a sample and gave none; it has no such path today.
                 None => self.count_malformed(),
             },
             Take::Malformed => self.count_malformed(),
@@ -128,16 +129,15 @@ impl Input {
 
     fn publish(
         &mut self,
-        slot: Result<Slot, LoanError>,
+        filled: Filled,
         encapsulation: Encapsulation,
-        bytes: usize,
         origin: SampleOrigin,
         wake: impl FnOnce(),
     ) {
         let taken_at = clock::monotonic();
         let taken_at_wall = clock::wall();
         let lost_upstream = self.followed.missing_before(origin.writer, origin.sequence);
-        let dropped = match slot {
+        let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
             Err(_) => Some(DropReason::PoolExhausted),
@@ -146,16 +146,19 @@ impl Input {
         // the lanes count, and not two samples of one number.
         let sequence = self.counters.update(|counters| {
             counters.received += 1;
-            counters.received_bytes += bytes as u64;
+            counters.received_bytes += filled.bytes as u64;
             counters.lost_upstream += lost_upstream;
             counters.last_received_at = taken_at;
             match dropped {
                 Some(reason) => counters.drops.add(reason, 1),
-                None => counters.published += 1,
+                None => {
+                    counters.published += 1;
+                    counters.in_place += u64::from(filled.in_place);
+                }
             }
             counters.published
         });
-        if let Ok(slot) = slot {
+        if let Ok(slot) = filled.slot {
             let header = SampleHeader {
                 sequence,
                 source_timestamp: origin.source_timestamp,
@@ -232,7 +235,7 @@ impl Input {
                 }
             }
         }
-        self.publisher.attend();
+        self.pool.attend();
         self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[], now);
         Ok(())
     }
@@ -298,6 +301,7 @@ impl Input {
         // Before the reader: a lane must be able to make its writer before the first sample reaches it.
         self.info.update(|info| info.dds_type = FixedText::new(&dds_type));
         let reader = participant.create_reader(&self.dds_topic, &dds_type, &qos)?;
+        reader.lend_memory(self.pool.lender());
         info!(
             route = self.id,
             topic = self.dds_topic,

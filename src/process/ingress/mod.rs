@@ -4,6 +4,7 @@
 //! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house.
 
 mod input;
+mod pool;
 mod receiving;
 mod source;
 

@@ -113,6 +113,12 @@ fn routes(page: &mut Page, report: &Report) {
         route.published.into()
     });
     each(
+        "adaptive_bridge_route_in_place_samples_total",
+        Counter,
+        "Of those, the ones that were put together in shared memory, and not copied there.",
+        &|route| route.in_place.into(),
+    );
+    each(
         "adaptive_bridge_route_lost_upstream_samples_total",
         Counter,
         "Samples that the publisher numbered and that never reached the bridge.",

@@ -110,6 +110,8 @@ pub struct RouteReport {
     pub received_bytes: u64,
     /// Samples published to the lanes.
     pub published: u64,
+    /// Of those, the ones that were put together in shared memory, and not copied there.
+    pub in_place: u64,
     /// Samples that the publisher numbered and that never reached the bridge.
     pub lost_upstream: u64,
     /// Samples received and not published, by reason.
@@ -247,6 +249,7 @@ impl Snapshot {
             received: counters.received,
             received_bytes: counters.received_bytes,
             published: counters.published,
+            in_place: counters.in_place,
             lost_upstream: counters.lost_upstream,
             drops: Drops(counters.drops),
             drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
