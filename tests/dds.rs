@@ -99,15 +99,15 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
 }
 
 #[test]
-fn a_whole_sample_is_told_of_before_it_is_there() {
-    let (arrived, received) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0)));
+fn a_sample_is_told_of_before_it_is_there() {
+    let (arrived, received) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicUsize::new(0)));
     let expected = Arc::new(Mutex::new(None));
     let on_arriving = {
         let (arrived, expected) = (Arc::clone(&arrived), Arc::clone(&expected));
-        move |writer: Guid, sequence: i64| {
+        move |writer: Guid, sequence: i64, left_bytes: usize| {
             let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == writer);
             if is_expected {
-                arrived.fetch_max(sequence as usize, Ordering::AcqRel);
+                arrived.lock().unwrap().push((sequence, left_bytes));
             }
         }
     };
@@ -133,14 +133,21 @@ fn a_whole_sample_is_told_of_before_it_is_there() {
         writer.write(payload, Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
         assert_eq!(take_one(&reader).expect("nothing arrived").0.len(), length);
     };
-    for count in 1..=20 {
+    let told = |sequence: i64| {
+        let arrived = arrived.lock().unwrap();
+        let left: Vec<usize> =
+            arrived.iter().filter(|(of, _)| *of == sequence).map(|(_, left)| *left).collect();
+        left
+    };
+    for sequence in 1..=20 {
         send(2_948);
-        assert!(arrived.load(Ordering::Acquire) >= count, "sample {count} was not told of");
+        assert!(told(sequence).contains(&0), "sample {sequence} was not told of");
     }
-    let before = arrived.load(Ordering::Acquire);
-    // Seventeen fragments, and which one is the last is not to be seen from outside.
+    // In fragments, of each of which it is told what comes after it.
     send(1 << 20);
-    assert_eq!(arrived.load(Ordering::Acquire), before, "a fragment is no sample");
+    let left = told(21);
+    assert!(left.len() > 10 && left.contains(&0), "{left:?}");
+    assert!(left.is_sorted_by(|one, next| one >= next) && left[0] > 900_000, "{left:?}");
     assert!(received.load(Ordering::Acquire) > 20);
 }
 

@@ -80,8 +80,8 @@ impl Participant {
     /// Like [`open`](Self::open), and lets the thread that receives call `on_received`: after each datagram,
     /// before it is acknowledged, and when [`ring`](Self::ring) asks for it. A sample taken there has not
     /// been handed to another thread first, which saves a wake-up. It calls `on_arriving` some microseconds
-    /// before, when it has a datagram with a whole sample, with the writer and the sequence number that the
-    /// datagram claims.
+    /// before, when it has a datagram with a sample or a part of one, with the writer, the sequence number,
+    /// and how many bytes of the sample are yet to come behind it, as the datagram claims.
     ///
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
     /// not panic, and may take from readers and arm them, but not call the participant. If `on_received` has
@@ -91,10 +91,12 @@ impl Participant {
     /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
-        mut on_arriving: impl FnMut(Guid, i64) + Send + 'static,
+        mut on_arriving: impl FnMut(Guid, i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        let on_arriving = move |writer: GUID, sequence| on_arriving(Guid(writer.to_bytes()), sequence);
+        let on_arriving = move |writer: GUID, sequence, left_bytes| {
+            on_arriving(Guid(writer.to_bytes()), sequence, left_bytes);
+        };
         Self::build(options, |builder| builder.on_sample_arriving(on_arriving).on_received(on_received))
     }
 

@@ -3,6 +3,7 @@
 //! Nothing here waits for a lane: a full queue overwrites its oldest sample, and a wake-up is not waited for.
 //! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house.
 
+mod expected;
 mod input;
 mod pool;
 mod receiving;
@@ -97,7 +98,7 @@ impl Ingress {
         let receiving = Arc::new(Receiving::new(inputs, lanes));
         let on_arriving = {
             let receiving = Arc::clone(&receiving);
-            move |writer, sequence| receiving.expect(writer, sequence)
+            move |writer, sequence, left_bytes| receiving.expect(writer, sequence, left_bytes)
         };
         let on_received = {
             let receiving = Arc::clone(&receiving);

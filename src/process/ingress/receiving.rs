@@ -5,10 +5,11 @@
 //! is done by the main thread, which holds a route's lock meanwhile. The receiving thread waits for no lock:
 //! it leaves the route alone, and is rung when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::Bell;
+use super::expected::Expected;
 use super::input::Input;
 use crate::model::{Guid, TrafficClass};
 use crate::shm::LaneWaker;
@@ -37,12 +38,8 @@ pub(super) struct Receiving {
     /// The critical ones first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
-    /// One more than the route whose lanes were told of a sample that is yet to be taken; 0 for none, and
-    /// [`IN_VAIN`] once none came of the datagram.
-    expected: AtomicUsize,
+    expected: Expected,
 }
-
-const IN_VAIN: usize = usize::MAX;
 
 impl Receiving {
     pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
@@ -52,23 +49,22 @@ impl Receiving {
             routes: inputs.into_iter().map(served).collect(),
             lanes,
             turns: AtomicU64::new(0),
-            expected: AtomicUsize::new(0),
+            expected: Expected::new(),
         }
     }
 
-    /// A datagram has come that seems to hold a sample of `writer`; on the receiving thread. Lets the
-    /// critical lanes of its route get up while it is being looked at, unless that sample came before: many
-    /// publishers send each one to all our addresses. Only once until a sample has come: datagrams that only
-    /// look like samples wake no lane again and again.
-    pub fn expect(&self, writer: Guid, sequence: i64) {
-        if self.expected.load(Ordering::Relaxed) != 0 {
+    /// A datagram has come that seems to hold a sample of `writer`, or a part of one that `left_bytes` are
+    /// missing of behind it; on the receiving thread. Lets the critical lanes of its route get up while it is
+    /// being looked at, unless that sample came before: many publishers send each one to all our addresses.
+    pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize) {
+        if !self.expected.may_tell(left_bytes) {
             return;
         }
         let awaits =
             |served: &Served| served.input.try_lock().is_ok_and(|input| input.awaits(writer, sequence));
         if let Some(route) = self.routes.iter().position(awaits) {
             self.announce(route);
-            self.expected.store(route + 1, Ordering::Relaxed);
+            self.expected.told(route, left_bytes);
         }
     }
 
@@ -79,16 +75,13 @@ impl Receiving {
             if served.bell.is_rung()
                 && let Some(mut input) = served.try_enter()
             {
-                if self.expected.swap(0, Ordering::Relaxed) != route + 1 {
+                if self.expected.came(route) {
                     self.announce(route);
                 }
                 more |= self.drain(route, &mut input);
             }
         }
-        // The next sample is announced when it is taken, for the lane sleeps again by then.
-        if self.expected.load(Ordering::Relaxed) != 0 {
-            self.expected.store(IN_VAIN, Ordering::Relaxed);
-        }
+        self.expected.turn_ends();
         self.turns.fetch_add(1, Ordering::Release);
         more
     }

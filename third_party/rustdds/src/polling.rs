@@ -58,7 +58,7 @@ pub(crate) struct Hooks {
   /// See `DomainParticipantBuilder::on_received`.
   pub on_received: Option<Box<dyn FnMut() -> bool + Send>>,
   /// See `DomainParticipantBuilder::on_sample_arriving`.
-  pub on_sample_arriving: Option<Box<dyn FnMut(GUID, i64) + Send>>,
+  pub on_sample_arriving: Option<Box<dyn FnMut(GUID, i64, usize) + Send>>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

@@ -1,5 +1,5 @@
-//! Whether a datagram holds a whole sample, and whose, told without reading it
-//! properly.
+//! Whether a datagram holds a sample or a part of one, and whose, told without
+//! reading it properly.
 //!
 //! An application that is to get up for a sample can begin to while it is being
 //! received; see `DomainParticipantBuilder::on_sample_arriving`.
@@ -27,9 +27,21 @@ const DATA_WRITER_AT: usize = 4 + ENTITY_ID_BYTES;
 // submessages; what is not found among the first ones is not waited for.
 const SUBMESSAGES_LOOKED_AT: usize = 4;
 
-/// The user's writer of the first DATA submessage, if there is one, and which of
-/// its samples that is. What is malformed has none.
-pub(crate) fn sample_in(datagram: &[u8]) -> Option<(GUID, SequenceNumber)> {
+// Clause 9.4.5.5: behind the sample's number.
+const FRAGMENTS_AT: usize = DATA_WRITER_AT + ENTITY_ID_BYTES + 8;
+
+/// What a datagram seems to hold.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Arriving {
+  pub writer: GUID,
+  pub number: SequenceNumber,
+  // Bytes of the sample behind what this datagram has of it; of a whole one none.
+  pub left_bytes: u32,
+}
+
+/// The first sample of a user's writer, or fragments of one, if there are any.
+/// What is malformed has none.
+pub(crate) fn sample_in(datagram: &[u8]) -> Option<Arriving> {
   if !datagram.starts_with(b"RTPS") {
     return None;
   }
@@ -39,27 +51,29 @@ pub(crate) fn sample_in(datagram: &[u8]) -> Option<(GUID, SequenceNumber)> {
     // Clause 9.4.5.1: kind, flags, and the length of what follows.
     let (&[kind, flags, low, high], content) =
       rest.split_first_chunk::<SUBMESSAGE_HEADER_SIZE>()?;
-    let is_little_endian = flags & 1 == 1;
-    if kind == u8::from(SubmessageKind::DATA) {
+    let words = Words {
+      content,
+      is_little_endian: flags & 1 == 1,
+    };
+    let is_fragment = kind == u8::from(SubmessageKind::DATA_FRAG);
+    if is_fragment || kind == u8::from(SubmessageKind::DATA) {
       let id = content.get(DATA_WRITER_AT..DATA_WRITER_AT + ENTITY_ID_BYTES)?;
       let mut guid = [0; PREFIX_BYTES + ENTITY_ID_BYTES];
       guid[..PREFIX_BYTES].copy_from_slice(prefix);
       guid[PREFIX_BYTES..].copy_from_slice(id);
       let is_of_a_user = id.last().is_some_and(|kind| EntityKind::from(*kind).is_user_defined());
       // Clause 9.3.2: its high half, then its low one.
-      let (high, rest) = content
-        .get(DATA_WRITER_AT + ENTITY_ID_BYTES..)?
-        .split_first_chunk::<4>()?;
-      let low = rest.first_chunk::<4>()?;
-      let (high, low) = if is_little_endian {
-        (i32::from_le_bytes(*high), u32::from_le_bytes(*low))
-      } else {
-        (i32::from_be_bytes(*high), u32::from_be_bytes(*low))
-      };
+      let high = words.at(DATA_WRITER_AT + ENTITY_ID_BYTES)?.cast_signed();
+      let low = words.at(DATA_WRITER_AT + ENTITY_ID_BYTES + 4)?;
       let number = SequenceNumber::from((i64::from(high) << 32) | i64::from(low));
-      return is_of_a_user.then(|| (GUID::from_bytes(guid), number));
+      let left_bytes = if is_fragment { words.left_bytes()? } else { 0 };
+      return is_of_a_user.then(|| Arriving {
+        writer: GUID::from_bytes(guid),
+        number,
+        left_bytes,
+      });
     }
-    let length = if is_little_endian {
+    let length = if words.is_little_endian {
       u16::from_le_bytes([low, high])
     } else {
       u16::from_be_bytes([low, high])
@@ -68,6 +82,38 @@ pub(crate) fn sample_in(datagram: &[u8]) -> Option<(GUID, SequenceNumber)> {
     rest = content.get(usize::from(length)..)?;
   }
   None
+}
+
+// The words of a submessage.
+struct Words<'a> {
+  content: &'a [u8],
+  is_little_endian: bool,
+}
+
+impl Words<'_> {
+  fn at(&self, at: usize) -> Option<u32> {
+    let bytes = *self.content.get(at..)?.first_chunk::<4>()?;
+    Some(if self.is_little_endian {
+      u32::from_le_bytes(bytes)
+    } else {
+      u32::from_be_bytes(bytes)
+    })
+  }
+
+  // Of a DATA_FRAG: the first fragment's number, from 1 on, how many there are, the
+  // size of each, and that of the sample.
+  fn left_bytes(&self) -> Option<u32> {
+    let first = self.at(FRAGMENTS_AT)?.checked_sub(1)?;
+    let two = self.at(FRAGMENTS_AT + 4)?;
+    let (count, size) = if self.is_little_endian {
+      (two & 0xffff, two >> 16)
+    } else {
+      (two >> 16, two & 0xffff)
+    };
+    let here = u64::from(first).saturating_add(u64::from(count)) * u64::from(size);
+    let sample_size = self.at(FRAGMENTS_AT + 8)?;
+    Some(sample_size.saturating_sub(u32::try_from(here).unwrap_or(u32::MAX)))
+  }
 }
 
 #[cfg(test)]
@@ -99,6 +145,45 @@ mod tests {
     submessage(SubmessageKind::DATA, flags, &content)
   }
 
+  fn fragments(flags: u8, first: u32, count: u16, size: u16, sample_size: u32) -> Vec<u8> {
+    let mut content = data(flags, USER_WRITER)[SUBMESSAGE_HEADER_SIZE..].to_vec();
+    let tail = if flags & 1 == 1 {
+      [
+        &first.to_le_bytes()[..],
+        &count.to_le_bytes(),
+        &size.to_le_bytes(),
+        &sample_size.to_le_bytes(),
+      ]
+      .concat()
+    } else {
+      [
+        &first.to_be_bytes()[..],
+        &count.to_be_bytes(),
+        &size.to_be_bytes(),
+        &sample_size.to_be_bytes(),
+      ]
+      .concat()
+    };
+    content[FRAGMENTS_AT..][..tail.len()].copy_from_slice(&tail);
+    submessage(SubmessageKind::DATA_FRAG, flags, &content)
+  }
+
+  #[test]
+  fn of_fragments_it_is_told_what_is_yet_to_come() {
+    for flags in [0, 1] {
+      let left = |first, count, size, sample_size| {
+        let found = sample_in(&message(&[fragments(flags, first, count, size, sample_size)]));
+        found.map(|found| (i64::from(found.number) & 0xffff, found.left_bytes))
+      };
+      assert_eq!(left(1, 1, 1000, 2500), Some((5, 1500)));
+      assert_eq!(left(2, 1, 1000, 2500), Some((5, 500)));
+      assert_eq!(left(3, 1, 1000, 2500), Some((5, 0)));
+      assert_eq!(left(1, 3, 1000, 2500), Some((5, 0)));
+      assert_eq!(left(u32::MAX, u16::MAX, u16::MAX, u32::MAX), Some((5, 0)));
+      assert_eq!(left(0, 1, 1000, 2500), None);
+    }
+  }
+
   fn message(submessages: &[Vec<u8>]) -> Vec<u8> {
     let header = [&b"RTPS"[..], &[2, 4, 1, 0], &[9; PREFIX_BYTES]].concat();
     [header, submessages.concat()].concat()
@@ -108,7 +193,11 @@ mod tests {
   fn a_sample_is_found_behind_what_comes_before_it() {
     let writer = [&[9; PREFIX_BYTES][..], &[1, 2, 3, USER_WRITER]].concat();
     let writer = GUID::from_bytes(writer.try_into().unwrap());
-    let expected = Some((writer, SequenceNumber::from((1_i64 << 32) + 5)));
+    let expected = Some(Arriving {
+      writer,
+      number: SequenceNumber::from((1_i64 << 32) + 5),
+      left_bytes: 0,
+    });
     for flags in [0, 1] {
       let destination = submessage(SubmessageKind::INFO_DST, flags, &[7; 12]);
       let timestamp = submessage(SubmessageKind::INFO_TS, flags, &[7; 8]);
@@ -123,7 +212,7 @@ mod tests {
   #[test]
   fn nothing_else_is_one() {
     let heartbeat = submessage(SubmessageKind::HEARTBEAT, 1, &[0; 28]);
-    let fragment = submessage(SubmessageKind::DATA_FRAG, 1, &[USER_WRITER; 60]);
+    let fragment = submessage(SubmessageKind::DATA_FRAG, 1, &[BUILTIN_WRITER; 60]);
     for other in [
       message(&[]),
       message(&[heartbeat.clone()]),

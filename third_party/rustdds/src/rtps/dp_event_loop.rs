@@ -424,8 +424,12 @@ impl DPEventLoop {
         return false;
       };
       if let Some(hook) = &mut self.hooks.on_sample_arriving {
-        if let Some((writer, number)) = sample_in(&packet) {
-          hook(writer, number.into());
+        if let Some(arriving) = sample_in(&packet) {
+          hook(
+            arriving.writer,
+            arriving.number.into(),
+            arriving.left_bytes as usize,
+          );
         }
       }
       self
