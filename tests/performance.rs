@@ -272,6 +272,30 @@ fn targets_are_met_or_missed() {
 }
 
 #[test]
+fn a_hop_of_many_repetitions_is_met_or_missed_only_when_that_is_certain() {
+    let judged = |bridge_us: [f64; 9]| {
+        let row = |program: &str, each: Vec<f64>| Latency {
+            repetitions_p50_us: each,
+            ..latency(program, 100.0, Some(0.0))
+        };
+        let relay = (0..9).map(|at| 300.0 + f64::from(at)).collect();
+        let direct = (0..9).map(|at| 200.0 + f64::from(at)).collect();
+        let bridge = bridge_us.iter().zip(0..).map(|(us, at)| us + 200.0 + f64::from(at)).collect();
+        let rows = vec![row("direct", direct), row("relay", relay), row("bridge", bridge)];
+        let readme = readme(&Summary { latency: rows, ..Summary::default() });
+        let cells = cells(&readme, "hop of the bridge / hop of the relay, 1000 Hz");
+        (cells[2].clone(), cells[3].clone())
+    };
+    let expected = |value: &str, met: &str| (value.to_owned(), met.to_owned());
+    let met = judged([150.0, 20.0, 98.0, 97.0, 96.0, 95.0, 94.0, 93.0, 92.0]);
+    assert_eq!(met, expected("0.95 (0.92 to 0.98)", "met"));
+    let unknown = judged([150.0, 20.0, 101.0, 97.0, 96.0, 95.0, 94.0, 93.0, 92.0]);
+    assert_eq!(unknown, expected("0.95 (0.92 to 1.01)", "not known"));
+    let missed = judged([190.0, 20.0, 109.0, 108.0, 107.0, 106.0, 105.0, 104.0, 103.0]);
+    assert_eq!(missed, expected("1.06 (1.03 to 1.09)", "**missed**"));
+}
+
+#[test]
 fn tables_have_the_figures_of_the_run() {
     let readme = readme(&made_up());
     assert_eq!(

@@ -11,7 +11,7 @@
 //! whatever became of the one before it, and both the latency from the moment of the write and the one from
 //! the moment it was due are recorded.
 //!
-//! `cargo bench` takes half an hour, `cargo bench -- --quick` two minutes. Other arguments: [`Options`].
+//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. Other arguments: [`Options`].
 
 mod beds;
 mod histogram;

@@ -9,7 +9,7 @@ pub mod statistics;
 mod summary;
 mod table;
 mod tables;
-mod targets;
+pub mod targets;
 
 pub use figures::figures;
 pub use page::{fill, readme, runs_named};
