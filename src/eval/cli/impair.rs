@@ -196,7 +196,7 @@ impl Running<'_> {
             };
             let now = clock::monotonic();
             self.play(now)?;
-            self.backend.work(now)?;
+            self.backend.work()?;
             if signal {
                 return Ok(());
             }

@@ -27,11 +27,11 @@ pub trait Backend {
     /// When there is work although nothing is readable.
     fn next_release(&self) -> Option<MonotonicNs>;
 
-    /// Does what there is to do at `now`, and does not wait.
+    /// Does what there is to do, and does not wait.
     ///
     /// # Errors
     /// The operating system refused something; the impairment is over.
-    fn work(&mut self, now: MonotonicNs) -> Result<(), ImpairmentError>;
+    fn work(&mut self) -> Result<(), ImpairmentError>;
 
     /// Switches the link.
     ///

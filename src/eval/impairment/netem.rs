@@ -271,7 +271,7 @@ impl Backend for Netem {
         None
     }
 
-    fn work(&mut self, _now: MonotonicNs) -> Result<(), ImpairmentError> {
+    fn work(&mut self) -> Result<(), ImpairmentError> {
         Ok(())
     }
 
