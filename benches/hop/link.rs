@@ -436,11 +436,11 @@ fn orders() -> Receiver<String> {
 }
 
 /// Reads and writes with the DDS library in one process, without shared memory: what the bridge's hop is
-/// measured against. An ordinary program against the library's ordinary interface: woken by the library when
-/// a sample arrives, it drains its readers on a thread of its own. (Ingress takes samples on the library's
-/// receiving thread, which is an extension of ours.) It is not made slow for it: the same library with the
-/// same changes, a copy into an arena (the library lends what it received and keeps what it sends, so one
-/// copy there must be), no allocation for each sample.
+/// measured against. An ordinary program against the library's ordinary interface: woken by the library
+/// when a sample arrives, it drains its readers on a thread of its own. (Ingress takes samples on the
+/// library's receiving thread, and lends the library memory for large ones: extensions of ours.) It is not
+/// made slow for it: the same library with the same changes, a copy into an arena (the library lends what
+/// it received and keeps what it sends, so one copy there must be), no allocation for each sample.
 fn relay(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "relay")?;
     let mut lines = Vec::new();

@@ -20,8 +20,9 @@ use nix::sched::sched_getcpu;
 use super::segment::Segment;
 use crate::clock;
 
-/// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample: far
-/// less than this up to 1 MiB. A sample that takes longer wakes the lane as if nothing had been announced.
+/// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample, or
+/// the last 64 KiB of a large one: far less than this, as a rule. A sample that takes longer wakes the lane
+/// as if nothing had been announced.
 const ANNOUNCED_NS: u64 = 200_000;
 
 /// Why a [`LaneSleeper`] returned.
