@@ -2127,4 +2127,98 @@ mod tests {
     // we attempted to add
     assert!(reader.matched_writer(writer_guid).is_none());
   }
+
+  // Memory that tells how much of it is lent.
+  struct Counted(Arc<Mutex<usize>>);
+
+  struct CountedMemory(Vec<u8>, Arc<Mutex<usize>>);
+
+  impl crate::SampleMemory for Counted {
+    fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+      *self.0.lock().unwrap() += 1;
+      Some(Box::new(CountedMemory(vec![0; len], Arc::clone(&self.0))))
+    }
+  }
+
+  impl LentMemory for CountedMemory {
+    fn bytes(&mut self) -> &mut [u8] {
+      &mut self.0
+    }
+  }
+
+  impl Drop for CountedMemory {
+    fn drop(&mut self) {
+      *self.1.lock().unwrap() -= 1;
+    }
+  }
+
+  #[test]
+  fn what_a_writer_left_unfinished_goes_with_it_and_so_does_what_nobody_took() {
+    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
+    let qos_policy = QosPolicyBuilder::new()
+      .reliability(Reliability::Reliable {
+        max_blocking_time: Duration::ZERO,
+      })
+      .build();
+    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
+      "test_name".to_string(),
+      TypeDesc::new("test_type".to_string()),
+      &qos_policy,
+    );
+    let lent = Arc::new(Mutex::new(0));
+    topic_cache_handle.lock().unwrap().lender =
+      crate::dds::lent::Lender(Some(Arc::new(Counted(Arc::clone(&lent)))));
+    let (notification_sender, _notifications) = crate::mio_source::notification_channel(100);
+    let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+    let (status_sender, _status) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+    let (participant_status_sender, _participant_status) = sync_status_channel(16).unwrap();
+    let (_commands, data_reader_command_receiver) =
+      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
+    let mut reader = Reader::new(
+      ReaderIngredients {
+        guid: GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED),
+        notification_sender,
+        status_sender,
+        topic_name: "test_name".to_string(),
+        topic_cache_handle,
+        like_stateless: false,
+        qos_policy: qos_policy.clone(),
+        data_reader_command_receiver,
+        data_reader_waker: Arc::new(Mutex::new(None)),
+        poll_event_sender,
+        security_plugins: None,
+        discovery_notify: None,
+      },
+      Rc::new(UDPSender::new(0).unwrap()),
+      new_shared_timer(),
+      participant_status_sender,
+    );
+    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    let mr_state = MessageReceiverState {
+      source_guid_prefix: writer_guid.prefix,
+      ..Default::default()
+    };
+    reader.matched_writer_add(writer_guid, EntityId::UNKNOWN, vec![], vec![], &qos_policy);
+    let mut receive = |reader: &mut Reader, sn, number| {
+      let fragment = DataFrag {
+        writer_id: writer_guid.entity_id,
+        writer_sn: SequenceNumber::new(sn),
+        fragment_starting_num: FragmentNumber::new(number),
+        fragments_in_submessage: 1,
+        fragment_size: 8,
+        data_size: 16,
+        serialized_payload: vec![1; 8].into(),
+        ..DataFrag::default()
+      };
+      reader.handle_datafrag_msg(&fragment, BitFlags::empty(), &mr_state);
+      *lent.lock().unwrap()
+    };
+    // One whole sample, which waits for its reader, and half of another one.
+    assert_eq!(receive(&mut reader, 1, 1), 1);
+    assert_eq!(receive(&mut reader, 1, 2), 1);
+    assert_eq!(receive(&mut reader, 1, 1), 1, "no memory for one that is there");
+    assert_eq!(receive(&mut reader, 2, 1), 2);
+    reader.remove_writer_proxy(writer_guid);
+    assert_eq!(*lent.lock().unwrap(), 0);
+  }
 }
