@@ -29,7 +29,7 @@ demo: build
 package:
 	scripts/package.sh
 
-# What the bridge costs, beside the same without it: three quarters of an hour, kept in benches/runs. One that is quick, or a
+# What the bridge costs, beside the same without it: an hour, kept in benches/runs. One that is quick, or a
 # part: cargo bench -- --quick, cargo bench -- --only isolation (benches/README.md).
 bench:
 	cargo bench --locked -- --save

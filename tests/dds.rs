@@ -233,9 +233,13 @@ fn a_sample_in_fragments_is_put_together_in_memory_that_is_lent() {
     writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(6)).unwrap();
     assert!(take_one(&reader).expect("nothing arrived").0 == vec![9; 200_000]);
     // And what nobody takes goes with its reader.
-    drop(reader);
     writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(7)).unwrap();
-    drop((writer, there, here));
+    let give_up = Instant::now() + Duration::from_secs(20);
+    while lent.load(Ordering::Acquire) == 0 {
+        assert!(Instant::now() < give_up, "nothing was lent");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    drop((reader, writer, there, here));
     assert_eq!(lent.load(Ordering::Acquire), 0);
 }
 

@@ -19,10 +19,6 @@ const SMALL_BYTES: usize = 64 << 10;
 /// What is to be set for such a rate: a fifth of a second at 5 kHz, where the default of 64 is 13 ms.
 const FAST_QUEUE_DEPTH: usize = 1024;
 
-/// Repetitions of the cases that hops are judged by: so many tell with a certainty of 95 % between which two
-/// of them, the second lowest and the second highest, their median is.
-const JUDGED_REPETITIONS: usize = 9;
-
 /// Latencies of one program in one case, over the repetitions.
 #[derive(Default)]
 struct Program {
@@ -97,11 +93,7 @@ fn sweep(
     let repetitions = |case: &Case| {
         let is_judged =
             targets::HOPS.iter().any(|hop| (hop.rate_hz, hop.bytes) == (case.rate_hz, case.bytes));
-        if is_judged && !options.quick {
-            options.repetitions.max(JUDGED_REPETITIONS)
-        } else {
-            options.repetitions
-        }
+        if is_judged { options.judged_repetitions() } else { options.repetitions }
     };
     for repetition in 0..cases.iter().map(repetitions).max().unwrap_or(0) {
         for (index, case) in cases.iter().enumerate().filter(|(_, case)| repetition < repetitions(case)) {

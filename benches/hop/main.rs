@@ -66,9 +66,10 @@ fn measure(options: &Options) -> Result<(), String> {
         date: out::date(std::time::SystemTime::now()),
         machine: system::machine(),
         parameters: vec![format!(
-            "placement {}, {} repetitions, durations times {}{}{}",
+            "placement {}, {} repetitions, {} of the hops that are judged, durations times {}{}{}",
             options.placement.label(),
             options.repetitions,
+            options.judged_repetitions(),
             options.longer,
             if options.quick { ", quick" } else { "" },
             if options.awake { ", CPUs kept awake" } else { "" }

@@ -44,6 +44,10 @@ pub const SWEEP_ROUTES: [usize; 5] = [4096, 4096, 64 << 10, 2 << 20, 4 << 20];
 /// The laser scan of most sections.
 pub const SCAN: usize = 2_948;
 
+/// Repetitions of the cases that hops are judged by: so many tell with a certainty of 95 % between which two
+/// of them, the second lowest and the second highest, their median is.
+const JUDGED_REPETITIONS: usize = 9;
+
 /// No case of the sweep sends more: a subscriber on the same machine takes some 300 to 600 MB/s at most.
 const MOST_BYTES_PER_S: u64 = 250_000_000;
 
@@ -54,7 +58,7 @@ pub struct Options {
     pub quick: bool,
     /// `--save`: keep the result in `benches/runs/<date>` too.
     pub save: bool,
-    /// `--repetitions N`, 3 unless told.
+    /// `--repetitions N`, 3 unless told; the cases that hops are judged by have 9 at least.
     pub repetitions: usize,
     /// `--longer FACTOR`: of every duration.
     pub longer: f64,
@@ -141,6 +145,11 @@ impl Options {
     /// What is not a matter of normal scheduling or FIFO is measured with the first of those.
     pub fn first_scheduling(&self) -> Scheduling {
         self.schedulings()[0]
+    }
+
+    /// Repetitions of the cases that hops are judged by.
+    pub fn judged_repetitions(&self) -> usize {
+        if self.quick { self.repetitions } else { self.repetitions.max(JUDGED_REPETITIONS) }
     }
 
     /// A duration of the default run, a fifth of it in a quick one.

@@ -318,8 +318,9 @@ impl SamplePublisher {
         }
     }
 
-    /// A free slot for a payload of `len` bytes that is yet to be written, if so many may be had: on any
-    /// thread, without waiting. What is in it is what an older sample left.
+    /// A free slot for a payload of `len` bytes that is yet to be written, if so many may be had. On any
+    /// thread: waits for no process, but for a thread of this one that is in [`attend`](Self::attend), for
+    /// iceoryx2 takes a lock. What is in it is what an older sample left.
     pub fn lend(&self, len: usize) -> Option<LentSlot> {
         if len > self.max_sample_bytes {
             return None;

@@ -113,19 +113,19 @@ mod tests {
     use crate::model::{InstanceName, RouteId};
     use crate::shm::{LaneQueue, RouteChannel, ShmNode};
 
-    fn owner(node: &ShmNode) -> PoolOwner {
+    /// The pool of a route for samples of 100 bytes; it goes with the folder and the node.
+    fn owner() -> (PoolOwner, ShmNode, tempfile::TempDir) {
+        let root = tempfile::tempdir().unwrap();
+        let node = ShmNode::open(root.path(), &InstanceName::try_from("pool").unwrap(), "test").unwrap();
         let lanes = vec![LaneQueue { queue_depth: 4, max_borrowed: 2 }];
         let route = RouteId::try_from("scan").unwrap();
         let channel = RouteChannel { route, max_sample_bytes: 100, lanes, max_taps: 0, retained_samples: 0 };
-        PoolOwner::new(SamplePublisher::create(node, &channel).unwrap())
+        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap()), node, root)
     }
 
     #[test]
     fn what_is_lent_comes_back_filled_or_goes_to_the_main_thread() {
-        let root = tempfile::tempdir().unwrap();
-        let instance = InstanceName::try_from("pool").unwrap();
-        let node = ShmNode::open(root.path(), &instance, "test").unwrap();
-        let owner = owner(&node);
+        let (owner, _node, _root) = owner();
         let lender = owner.lender();
         assert!(lender.lend(101).is_none(), "longer than the route allows");
         for _ in 0..10 {
@@ -147,10 +147,7 @@ mod tests {
 
     #[test]
     fn nobody_waits_for_the_main_thread_to_connect_a_lane() {
-        let root = tempfile::tempdir().unwrap();
-        let instance = InstanceName::try_from("pool").unwrap();
-        let node = ShmNode::open(root.path(), &instance, "test").unwrap();
-        let owner = owner(&node);
+        let (owner, _node, _root) = owner();
         let attending = owner.pool.attending.lock().unwrap();
         assert!(owner.lender().lend(10).is_none());
         drop(attending);

@@ -734,13 +734,17 @@ impl Reader {
 
     // Feed to fragment assembler ...
     let writer_seq_num = datafrag.writer_sn; // for borrow checker
-    let topic_cache = Arc::clone(&self.topic_cache);
-    let completed_dds_data = self.fragment_assembler_mutable(writer_guid).new_datafrag(
-      datafrag,
-      datafrag_flags,
-      mr_state.source_timestamp,
-      |len| lend(&topic_cache, len),
-    );
+    let reliable = self.reliability != policy::Reliability::BestEffort;
+    let completed_dds_data = self
+      .fragment_assemblers
+      .entry(writer_guid)
+      .or_insert_with(|| FragmentAssembler::new(reliable))
+      .new_datafrag(
+        datafrag,
+        datafrag_flags,
+        mr_state.source_timestamp,
+        |len| lend(&self.topic_cache, len),
+      );
 
     // ... and continue processing, if data was completed.
     if let Some((dds_data, source_timestamp)) = completed_dds_data {
@@ -757,14 +761,6 @@ impl Reader {
     } else {
       self.garbage_collect_fragments();
     }
-  }
-
-  fn fragment_assembler_mutable(&mut self, writer_guid: GUID) -> &mut FragmentAssembler {
-    let reliable = self.reliability != policy::Reliability::BestEffort;
-    self
-      .fragment_assemblers
-      .entry(writer_guid)
-      .or_insert_with(|| FragmentAssembler::new(reliable))
   }
 
   fn garbage_collect_fragments(&mut self) {
