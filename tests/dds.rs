@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter, ReaderEvent,
-    ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
+    Arrival, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter,
+    ReaderEvent, ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
     Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
@@ -183,6 +183,65 @@ impl Drop for Lent {
     fn drop(&mut self) {
         self.lent.fetch_sub(1, Ordering::AcqRel);
     }
+}
+
+#[test]
+fn an_onlooker_sees_samples_come_and_takes_none() {
+    let network = DdsNetwork { domain_id: 66, interfaces: Vec::new() };
+    // The thread that receives is held up here, so that the onlooker is in time.
+    let hold = Arc::new(Mutex::new(()));
+    let on_received = {
+        let hold = Arc::clone(&hold);
+        move || {
+            drop(hold.lock());
+            false
+        }
+    };
+    let mut there =
+        Participant::open_receiving(&options("there", &network), |_, _, _| {}, on_received).unwrap();
+    let mut here = participant("here", 66);
+    let reader = there
+        .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let arrivals = there.arrivals().unwrap();
+    let closer = arrivals.closer();
+    let (tell, seen) = std::sync::mpsc::channel();
+    let onlooker = std::thread::spawn(move || {
+        loop {
+            match arrivals.wait() {
+                Arrival::Closed => return,
+                arrival => tell.send(arrival).unwrap(),
+            }
+        }
+    });
+    let mut sequence = 0;
+    let is_seen = |sequence| {
+        let expected = Arrival::Sample { writer: writer.guid(), sequence, left_bytes: 0 };
+        let give_up = Instant::now() + Duration::from_secs(1);
+        while let Ok(arrival) = seen.recv_timeout(give_up - Instant::now()) {
+            if arrival == expected {
+                return true;
+            }
+        }
+        false
+    };
+    // Of several datagrams that wait the first one is looked at: a heartbeat may be before the sample.
+    let times = (0..20).filter(|_| {
+        let held = hold.lock().unwrap();
+        there.ring();
+        std::thread::sleep(Duration::from_millis(50));
+        writer.write(Bytes::from(vec![7; 2_948]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
+        sequence += 1;
+        let seen = is_seen(sequence);
+        drop(held);
+        assert_eq!(take_one(&reader).expect("the onlooker took it").0.len(), 2_948);
+        seen
+    });
+    assert!(times.count() > 10, "seen too seldom");
+    closer.close();
+    onlooker.join().unwrap();
 }
 
 #[test]

@@ -4,6 +4,7 @@
 //! that is why any message type will do. No RustDDS type leaves this module, so that another DDS library
 //! could stand behind it.
 
+mod arrivals;
 mod discovery;
 mod error;
 mod graph;
@@ -16,6 +17,7 @@ mod qos;
 mod reader;
 mod writer;
 
+pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::arrivals::Arrivals;
 use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
@@ -149,6 +150,16 @@ impl Participant {
     /// was given.
     pub fn ring(&self) {
         self.participant.wake_event_loop();
+    }
+
+    /// Where samples come in, for a thread that looks at them before they are received: of a participant from
+    /// [`open_receiving`](Self::open_receiving), once. To be dropped before the participant, whose ports it
+    /// has, too.
+    ///
+    /// # Errors
+    /// The process may have no more descriptors.
+    pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
+        Arrivals::new(self.participant.onlooker_sockets())
     }
 
     /// Says goodbye for a participant that died and could not: the others forget its readers and writers at

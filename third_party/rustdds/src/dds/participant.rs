@@ -580,6 +580,21 @@ impl DomainParticipant {
     }
   }
 
+  /// The sockets that user traffic comes to, for a thread of the application that
+  /// the kernel wakes together with the event loop. It may look at datagrams
+  /// (`peek`, and [`sample_arriving`](crate::sample_arriving)) and must take none,
+  /// nor change anything of the sockets, which do not block. For a participant with
+  /// the hook [`DomainParticipantBuilder::on_sample_arriving`], once; later and for
+  /// others none. The ports stay bound as long as they are open.
+  #[cfg(unix)]
+  pub fn onlooker_sockets(&self) -> Vec<std::net::UdpSocket> {
+    self
+      .dpi
+      .lock()
+      .map(|mut dpi| std::mem::take(&mut dpi.dpi.onlooker_sockets))
+      .unwrap_or_default()
+  }
+
   pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
     self.dpi.lock().ok().and_then(|g| g.only_networks())
   }
@@ -1254,6 +1269,10 @@ pub(crate) struct DomainParticipantInner {
   security_plugins_handle: Option<SecurityPluginsHandle>,
 
   only_networks: Option<Arc<[IpAddr]>>,
+
+  /// See `DomainParticipant::onlooker_sockets`.
+  #[cfg(unix)]
+  onlooker_sockets: Vec<std::net::UdpSocket>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1385,6 +1404,16 @@ impl DomainParticipantInner {
     })?;
 
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
+
+    #[cfg(unix)]
+    let onlooker_sockets = if hooks.on_sample_arriving.is_some() {
+      [USER_TRAFFIC_LISTENER_TOKEN, USER_TRAFFIC_MUL_LISTENER_TOKEN]
+        .iter()
+        .filter_map(|token| listeners.get(token)?.onlooker().ok())
+        .collect()
+    } else {
+      Vec::new()
+    };
 
     // construct our own Locators
     let self_locators: HashMap<mio1::Token, Vec<Locator>> = listeners
@@ -1528,6 +1557,8 @@ impl DomainParticipantInner {
       self_locators,
       security_plugins_handle,
       only_networks,
+      #[cfg(unix)]
+      onlooker_sockets,
     })
   }
 

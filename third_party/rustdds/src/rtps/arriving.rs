@@ -39,6 +39,15 @@ pub(crate) struct Arriving {
   pub left_bytes: u32,
 }
 
+/// The writer of the first sample in a datagram, if it holds one of a user's
+/// writer or a part of one, the sample's sequence number, and how many of its
+/// bytes come after this datagram: what the datagram claims; nothing is checked.
+/// The datagram's first 256 bytes are enough, as a rule.
+pub fn sample_arriving(datagram: &[u8]) -> Option<(GUID, i64, usize)> {
+  let arriving = sample_in(datagram)?;
+  Some((arriving.writer, arriving.number.into(), arriving.left_bytes as usize))
+}
+
 /// The first sample of a user's writer, or fragments of one, if there are any.
 /// What is malformed has none.
 pub(crate) fn sample_in(datagram: &[u8]) -> Option<Arriving> {
