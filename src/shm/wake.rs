@@ -19,6 +19,7 @@ use nix::sched::sched_getcpu;
 
 use super::segment::Segment;
 use crate::clock;
+use crate::model::MonotonicNs;
 
 /// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample, or
 /// the last 64 KiB of a large one: far less than this, as a rule. A sample that takes longer wakes the lane
@@ -30,6 +31,9 @@ const ANNOUNCED_NS: u64 = 200_000;
 pub enum Woken {
     /// There was a wake since the last return, or a signal came.
     Woken,
+    /// A wake was announced, and the next sleep stays up for it. Who goes through its work meanwhile, though
+    /// there is none, has the code and the data at hand when there is.
+    Announced,
     /// The time is over and nobody woke the lane.
     TimedOut,
 }
@@ -63,11 +67,11 @@ impl LaneWaker {
         Self { words: WakeWords { segment, at } }
     }
 
-    /// Says that a wake is about to come, so that a lane that sleeps on another CPU gets up meanwhile. On
-    /// this CPU it could only get in the way. Nothing has to follow.
-    pub fn announce(&self) {
+    /// Says that a wake is about to come from `cpu`, as [`this_cpu`] has it, so that a lane that sleeps on
+    /// another one gets up meanwhile. On that CPU it could only get in the way. Nothing has to follow.
+    pub fn announce(&self, cpu: u32) {
         let sleeps_on = self.words.asleep().load(Ordering::Relaxed);
-        if sleeps_on != 0 && sleeps_on != here() {
+        if sleeps_on != 0 && sleeps_on != cpu {
             futex_wake(self.words.wakes());
         }
     }
@@ -90,6 +94,8 @@ pub struct LaneSleeper {
     /// Whether the last announcement was followed by a wake in time. After one that was not, the lane stays
     /// up for no other until a wake has come: a flood of samples that come to nothing does not keep it busy.
     trusts: bool,
+    /// Until when the lane stays up for a wake that was announced.
+    up_until: Option<MonotonicNs>,
 }
 
 impl LaneSleeper {
@@ -97,55 +103,56 @@ impl LaneSleeper {
         let words = WakeWords { segment, at };
         // What came before is unknown, so the first sleep ends at once.
         let seen = words.wakes().load(Ordering::SeqCst).wrapping_sub(1);
-        Self { words, seen, trusts: true }
+        Self { words, seen, trusts: true, up_until: None }
     }
 
     /// Sleeps until a wake, or for `timeout` at most. A wake that came since the last return ends it at once;
     /// so does the first sleep of a new lane process, and a signal.
     pub fn sleep(&mut self, timeout: Duration) -> Woken {
-        if self.look() {
-            return Woken::Woken;
-        }
         let timeout_ns = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
         let deadline = clock::monotonic().plus_ns(timeout_ns);
-        let mut left_ns = timeout_ns;
+        let woken = self.look() || self.stay_up(deadline);
+        self.up_until = None;
+        if woken {
+            self.trusts = true;
+            return Woken::Woken;
+        }
         let woken = loop {
+            let left_ns = deadline.since(clock::monotonic());
             if left_ns == 0 {
                 break Woken::TimedOut;
             }
-            self.words.asleep().store(here(), Ordering::SeqCst);
+            self.words.asleep().store(this_cpu(), Ordering::SeqCst);
             if self.look() {
                 break Woken::Woken;
             }
             // The kernel looks at the count once more, and sleeps only if it is still the one that we saw.
             let outcome = futex_wait(self.words.wakes(), self.seen, left_ns);
-            let is_announced = outcome.is_ok();
-            if self.look() || outcome == Err(Errno::EINTR) || (is_announced && self.await_announced()) {
+            if self.look() || outcome == Err(Errno::EINTR) {
                 break Woken::Woken;
             }
-            left_ns = deadline.since(clock::monotonic());
+            if outcome.is_ok() && std::mem::take(&mut self.trusts) {
+                self.up_until = Some(clock::monotonic().plus_ns(ANNOUNCED_NS));
+                break Woken::Announced;
+            }
         };
         self.words.asleep().store(0, Ordering::Relaxed);
         self.trusts |= woken == Woken::Woken;
         woken
     }
 
-    /// Stays up for a moment, as a wake was announced; whether it came.
-    fn await_announced(&mut self) -> bool {
-        if !std::mem::take(&mut self.trusts) {
+    /// Stays up for a wake that was announced, until `deadline` at most; whether it came.
+    fn stay_up(&mut self, deadline: MonotonicNs) -> bool {
+        let Some(up_until) = self.up_until else {
             return false;
-        }
-        self.words.asleep().store(0, Ordering::Relaxed);
-        let give_up_at = clock::monotonic().plus_ns(ANNOUNCED_NS);
-        loop {
+        };
+        while clock::monotonic() < up_until.min(deadline) {
             if self.look() {
                 return true;
             }
-            if clock::monotonic() >= give_up_at {
-                return false;
-            }
             std::hint::spin_loop();
         }
+        false
     }
 
     /// Whether there was a wake since the last look.
@@ -157,8 +164,8 @@ impl LaneSleeper {
     }
 }
 
-/// One more than the number of this CPU.
-fn here() -> u32 {
+/// One more than the number of the CPU that this thread runs on.
+pub fn this_cpu() -> u32 {
     let cpu = sched_getcpu().ok().and_then(|cpu| u32::try_from(cpu).ok());
     // Without an answer all CPUs count as one, and nothing is announced.
     cpu.map_or(1, |cpu| cpu.saturating_add(1))

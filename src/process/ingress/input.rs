@@ -7,6 +7,7 @@ use tracing::{error, info, warn};
 use super::super::inbox::{Bell, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
+use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
 use super::source::{Source, Wanted, label, still_suits};
 use crate::clock;
@@ -17,10 +18,6 @@ use crate::model::{
     SampleHeader, TopicName,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
-
-/// Writers whose sequence is followed on one route; more than publish one topic on any robot we know. With
-/// more, the one followed longest is forgotten, and its gaps are not counted.
-const WRITERS_FOLLOWED: usize = 32;
 
 /// How often a route without a publisher says so.
 const REMIND_MS: u64 = 30_000;
@@ -42,7 +39,7 @@ pub(super) struct Input {
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
     bell: Arc<Bell>,
-    followed: Followed,
+    followed: Arc<Followed>,
     watch: DropWatch,
     remind_at: MonotonicNs,
     conflict: Option<(String, String)>,
@@ -73,7 +70,7 @@ impl Input {
             counters,
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
-            followed: Followed::default(),
+            followed: Arc::default(),
             bell: Arc::clone(bell),
             remind_at: MonotonicNs(0),
             conflict: None,
@@ -122,9 +119,9 @@ impl Input {
         true
     }
 
-    /// Whether `writer` is one whose samples came before, and this one of it has not.
-    pub fn awaits(&self, writer: Guid, sequence: i64) -> bool {
-        self.followed.awaits(writer, sequence)
+    /// The writers whose samples came.
+    pub fn followed(&self) -> Arc<Followed> {
+        self.followed.clone()
     }
 
     fn publish(
@@ -341,63 +338,5 @@ impl Input {
             );
             self.conflict = Some(conflict);
         }
-    }
-}
-
-/// The last sequence number of each writer, to know what never reached us.
-#[derive(Default)]
-struct Followed {
-    writers: Vec<(Guid, i64)>,
-    oldest: usize,
-}
-
-impl Followed {
-    fn awaits(&self, writer: Guid, sequence: i64) -> bool {
-        self.writers.iter().any(|(guid, last)| *guid == writer && sequence > *last)
-    }
-
-    /// Samples that `writer` numbered between the last one we got and `sequence`. What came before we began
-    /// to follow is not missing.
-    fn missing_before(&mut self, writer: Guid, sequence: i64) -> u64 {
-        if let Some((_, last)) = self.writers.iter_mut().find(|(guid, _)| *guid == writer) {
-            let missing = sequence.saturating_sub(*last).saturating_sub(1).max(0);
-            *last = sequence.max(*last);
-            return missing.unsigned_abs();
-        }
-        if self.writers.len() < WRITERS_FOLLOWED {
-            self.writers.push((writer, sequence));
-        } else {
-            self.writers[self.oldest] = (writer, sequence);
-            self.oldest = (self.oldest + 1) % WRITERS_FOLLOWED;
-        }
-        0
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn gaps_are_counted_for_each_writer_by_itself() {
-        let mut followed = Followed::default();
-        assert_eq!(followed.missing_before(Guid([1; 16]), 10), 0);
-        assert_eq!(followed.missing_before(Guid([2; 16]), 500), 0);
-        assert!(!followed.awaits(Guid([1; 16]), 10), "a second copy, from another address");
-        assert!(followed.awaits(Guid([1; 16]), 11) && !followed.awaits(Guid([3; 16]), 11));
-        assert_eq!(followed.missing_before(Guid([1; 16]), 11), 0);
-        assert_eq!(followed.missing_before(Guid([1; 16]), 15), 3);
-        assert_eq!(followed.missing_before(Guid([1; 16]), 12), 0);
-        assert_eq!(followed.missing_before(Guid([1; 16]), 16), 0);
-        assert_eq!(followed.missing_before(Guid([2; 16]), i64::MAX), (i64::MAX - 501) as u64);
-    }
-
-    #[test]
-    fn many_writers_take_bounded_memory() {
-        let mut followed = Followed::default();
-        for writer in 0..=255 {
-            followed.missing_before(Guid([writer; 16]), 1);
-        }
-        assert_eq!(followed.writers.len(), WRITERS_FOLLOWED);
     }
 }

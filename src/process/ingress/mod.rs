@@ -1,10 +1,13 @@
 //! Ingress: takes every sample of every route from DDS and publishes it once into shared memory.
 //!
 //! Nothing here waits for a lane: a full queue overwrites its oldest sample, and a wake-up is not waited for.
-//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house.
+//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house, and a
+//! third one gets the critical lanes up meanwhile ([`lookout`]).
 
 mod expected;
+mod followed;
 mod input;
+mod lookout;
 mod pool;
 mod receiving;
 mod source;
@@ -25,8 +28,9 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::ProcessRole;
+use crate::shm::{ProcessRole, this_cpu};
 use input::Input;
+use lookout::Lookout;
 use receiving::{Receiving, ServedLane};
 
 /// At a shutdown, how long ingress goes on taking what DDS has received, and what still comes.
@@ -58,6 +62,8 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
 }
 
 struct Ingress {
+    /// Before the participant, whose ports it has, too.
+    _lookout: Option<Lookout>,
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
@@ -98,7 +104,9 @@ impl Ingress {
         let receiving = Arc::new(Receiving::new(inputs, lanes));
         let on_arriving = {
             let receiving = Arc::clone(&receiving);
-            move |writer, sequence, left_bytes| receiving.expect(writer, sequence, left_bytes)
+            move |writer, sequence, left_bytes| {
+                receiving.expect(writer, sequence, left_bytes, this_cpu());
+            }
         };
         let on_received = {
             let receiving = Arc::clone(&receiving);
@@ -111,8 +119,17 @@ impl Ingress {
             graph_gid_bytes: settings.graph_gid_bytes,
         };
         let participant = role.join_receiving(&options, on_arriving, on_received)?;
-        let (housekeeping_at, received) = (clock::monotonic(), Meter::default());
-        let mut ingress = Self { receiving, participant, role, turns_seen: 0, housekeeping_at, received };
+        let lookout = Lookout::start(participant.arrivals()?, &receiving, settings);
+        let housekeeping_at = clock::monotonic();
+        let mut ingress = Self {
+            _lookout: lookout,
+            receiving,
+            participant,
+            role,
+            turns_seen: 0,
+            housekeeping_at,
+            received: Meter::default(),
+        };
         ingress.keep_house(housekeeping_at)?;
         ingress.role.ready();
         Ok(ingress)

@@ -5,14 +5,15 @@
 //! is done by the main thread, which holds a route's lock meanwhile. The receiving thread waits for no lock:
 //! it leaves the route alone, and is rung when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::Bell;
 use super::expected::Expected;
+use super::followed::Followed;
 use super::input::Input;
 use crate::model::{Guid, TrafficClass};
-use crate::shm::LaneWaker;
+use crate::shm::{LaneWaker, this_cpu};
 
 /// Samples taken of one route before the next route, and the DDS library, have their turn.
 const SAMPLES_PER_TURN: usize = 32;
@@ -22,6 +23,9 @@ struct Served {
     input: Mutex<Input>,
     bell: Arc<Bell>,
     missed: AtomicBool,
+    followed: Arc<Followed>,
+    /// Whether a critical lane has it.
+    is_critical: bool,
 }
 
 /// A lane that samples are published to.
@@ -39,46 +43,66 @@ pub(super) struct Receiving {
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
     expected: Expected,
+    /// Where the receiving thread ran last.
+    cpu: AtomicU32,
 }
 
 impl Receiving {
     pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
-        let served =
-            |(input, bell)| Served { input: Mutex::new(input), bell, missed: AtomicBool::new(false) };
+        let is_critical = |route: usize| {
+            lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
+        };
+        let served = |(route, (input, bell)): (usize, (Input, _))| Served {
+            followed: input.followed(),
+            input: Mutex::new(input),
+            bell,
+            missed: AtomicBool::new(false),
+            is_critical: is_critical(route),
+        };
         Self {
-            routes: inputs.into_iter().map(served).collect(),
+            routes: inputs.into_iter().enumerate().map(served).collect(),
             lanes,
             turns: AtomicU64::new(0),
             expected: Expected::new(),
+            cpu: AtomicU32::new(0),
         }
     }
 
     /// A datagram has come that seems to hold a sample of `writer`, or a part of one that `left_bytes` are
-    /// missing of behind it; on the receiving thread. Lets the critical lanes of its route get up while it is
-    /// being looked at, unless that sample came before: many publishers send each one to all our addresses.
-    pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize) {
-        if !self.expected.may_tell(left_bytes) {
-            return;
+    /// missing of behind it. Lets the critical lanes of its route get up while it is being looked at on `cpu`,
+    /// unless that sample came before: many publishers send each one to all our addresses. Whether it did.
+    pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
+        let awaits = |served: &Served| served.is_critical && served.followed.awaits(writer, sequence);
+        let Some(route) = self.routes.iter().position(awaits) else {
+            return false;
+        };
+        let tells = self.expected.tell(route, left_bytes);
+        if tells {
+            self.announce(route, cpu);
         }
-        let awaits =
-            |served: &Served| served.input.try_lock().is_ok_and(|input| input.awaits(writer, sequence));
-        if let Some(route) = self.routes.iter().position(awaits) {
-            self.announce(route);
-            self.expected.told(route, left_bytes);
-        }
+        tells
+    }
+
+    /// Where the receiving thread ran last.
+    pub fn cpu(&self) -> u32 {
+        self.cpu.load(Ordering::Relaxed)
     }
 
     /// Takes and publishes what has arrived; on the receiving thread. Whether there may be more.
     pub fn turn(&self) -> bool {
+        let cpu = this_cpu();
+        self.cpu.store(cpu, Ordering::Relaxed);
         let mut more = false;
         for (route, served) in self.routes.iter().enumerate() {
             if served.bell.is_rung()
                 && let Some(mut input) = served.try_enter()
             {
                 if self.expected.came(route) {
-                    self.announce(route);
+                    self.announce(route, cpu);
                 }
                 more |= self.drain(route, &mut input);
+                // The lookout may have told of it after that.
+                self.expected.came(route);
             }
         }
         self.expected.turn_ends();
@@ -126,12 +150,12 @@ impl Receiving {
         true
     }
 
-    /// Lets the critical lanes that serve the route get up while its sample is taken. A noncritical one has
-    /// time.
-    fn announce(&self, route: usize) {
+    /// Lets the critical lanes that serve the route get up while its sample is taken on `cpu`. A noncritical
+    /// one has time.
+    fn announce(&self, route: usize, cpu: u32) {
         for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
             if lane.serves[route] {
-                lane.waker.announce();
+                lane.waker.announce(cpu);
             }
         }
     }
