@@ -56,7 +56,7 @@ fn the_threads_of_a_data_path_have_one_priority() {
     }
 }
 
-/// Policy, as proc_pid_stat(5) counts, and the CPUs of the thread that gets critical lanes up, if there is one.
+/// Policy, as proc_pid_stat(5) counts, and CPUs of the thread that gets critical lanes up, if there is one.
 fn lookout(ingress: &Process) -> Option<(u32, String)> {
     let tasks = fs::read_dir(format!("/proc/{}/task", ingress.pid())).unwrap();
     tasks.filter_map(Result::ok).find_map(|task| {

@@ -923,10 +923,13 @@ fn no_wake_is_missed() {
             (0..turn * 6_091 % 400).for_each(|_| std::hint::spin_loop());
         }
         waker.wake();
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "turn {turn}");
+        // A wake whose system call comes late looks like an announcement.
+        let woken = sleeper.sleep(support::PATIENCE);
+        let woken = if woken == Woken::Announced { sleeper.sleep(support::PATIENCE) } else { woken };
+        assert_eq!(woken, Woken::Woken, "turn {turn}");
     }
     pong.finish();
-    while sleeper.sleep(Duration::from_millis(20)) == Woken::Woken {}
+    while sleeper.sleep(Duration::from_millis(20)) != Woken::TimedOut {}
     boards.waker(1).wake();
     boards.waker(1).wake();
     assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "a wake before the sleep counts");
@@ -1015,7 +1018,7 @@ fn waking_a_stopped_lane_never_blocks() {
     waker.wake();
     let next = Process::start("pong", &place, "");
     next.expect("ready");
-    while sleeper.sleep(Duration::from_millis(10)) == Woken::Woken {}
+    while sleeper.sleep(Duration::from_millis(10)) != Woken::TimedOut {}
     waker.wake();
     assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken);
     next.finish();

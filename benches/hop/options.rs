@@ -45,8 +45,9 @@ pub const SWEEP_ROUTES: [usize; 5] = [4096, 4096, 64 << 10, 2 << 20, 4 << 20];
 pub const SCAN: usize = 2_948;
 
 /// Repetitions of the cases that hops are judged by: so many tell with a certainty of 95 % between which two
-/// of them, the second lowest and the second highest, their median is.
-const JUDGED_REPETITIONS: usize = 9;
+/// of them, the sixth lowest and the sixth highest, their median is. What repetitions differ by are minutes
+/// in which the machine is slower, so many short ones tell more than a few long ones.
+const JUDGED_REPETITIONS: usize = 20;
 
 /// No case of the sweep sends more: a subscriber on the same machine takes some 300 to 600 MB/s at most.
 const MOST_BYTES_PER_S: u64 = 250_000_000;
@@ -58,7 +59,7 @@ pub struct Options {
     pub quick: bool,
     /// `--save`: keep the result in `benches/runs/<date>` too.
     pub save: bool,
-    /// `--repetitions N`, 3 unless told; the cases that hops are judged by have 9 at least.
+    /// `--repetitions N`, 3 unless told; the cases that hops are judged by have 20 at least.
     pub repetitions: usize,
     /// `--longer FACTOR`: of every duration.
     pub longer: f64,
@@ -167,8 +168,8 @@ impl Options {
                 if too_much(rate_hz, bytes) || (self.quick && !is_headline) {
                     continue;
                 }
-                // Those that the targets are about have twice the time; 20 samples are the least.
-                let seconds = self.seconds(if is_headline { 3.0 } else { 1.4 }).max(20.0 / rate_hz as f64);
+                // 20 samples are the least.
+                let seconds = self.seconds(1.4).max(20.0 / rate_hz as f64);
                 let case = Case::lasting(rate_hz, bytes, seconds, route);
                 if self.wants("latency", &case.name()) {
                     cases.push(case);

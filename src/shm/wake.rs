@@ -32,7 +32,8 @@ pub enum Woken {
     /// There was a wake since the last return, or a signal came.
     Woken,
     /// A wake was announced, and the next sleep stays up for it. Who goes through its work meanwhile, though
-    /// there is none, has the code and the data at hand when there is.
+    /// there is none, has the code and the data at hand when there is. A wake that the lane has seen before
+    /// the kernel was called for it looks like this, too.
     Announced,
     /// The time is over and nobody woke the lane.
     TimedOut,

@@ -20,8 +20,8 @@ const ROUTE_SHIFT: u32 = 32;
 
 /// Which route's lanes were told of a sample that is yet to be taken.
 pub(super) struct Expected {
-    /// The route and the turns that are left; [`NONE`], or [`IN_VAIN`] when no sample came of what they were
-    /// told.
+    /// The route and the turns that are left; [`NONE`], or [`IN_VAIN`] when no sample came of what they
+    /// were told.
     told: AtomicU64,
 }
 
@@ -42,7 +42,7 @@ impl Expected {
         self.told.compare_exchange(NONE, told, Ordering::AcqRel, Ordering::Relaxed).is_ok()
     }
 
-    /// `route` has a sample to take, or one that was taken this instant; whether its lanes are yet to be told.
+    /// `route` has a sample to take, or one that was taken just now; whether its lanes are yet to be told.
     pub fn came(&self, route: usize) -> bool {
         self.told.swap(NONE, Ordering::AcqRel) >> ROUTE_SHIFT != route as u64
     }

@@ -17,8 +17,8 @@ use crate::config::Settings;
 use crate::dds::{Arrival, Arrivals, ArrivalsCloser};
 use crate::model::TrafficClass;
 
-/// How long it looks away after a datagram that it told nobody of: heartbeats, parts of large samples, what no
-/// critical lane has. So 5,000 of them a second are looked at, at most.
+/// How long it looks away after a datagram that it told nobody of: heartbeats, parts of large samples, what
+/// no critical lane has. So 5,000 of them a second are looked at, at most.
 const LOOKS_AWAY: Duration = Duration::from_micros(200);
 
 /// The thread; it ends when this is dropped.

@@ -1,8 +1,8 @@
 //! Ingress: takes every sample of every route from DDS and publishes it once into shared memory.
 //!
 //! Nothing here waits for a lane: a full queue overwrites its oldest sample, and a wake-up is not waited for.
-//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house, and a
-//! third one gets the critical lanes up meanwhile ([`lookout`]).
+//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house, and
+//! a third one gets the critical lanes up meanwhile ([`lookout`]).
 
 mod expected;
 mod followed;

@@ -69,8 +69,8 @@ impl Receiving {
     }
 
     /// A datagram has come that seems to hold a sample of `writer`, or a part of one that `left_bytes` are
-    /// missing of behind it. Lets the critical lanes of its route get up while it is being looked at on `cpu`,
-    /// unless that sample came before: many publishers send each one to all our addresses. Whether it did.
+    /// missing of behind it. Lets the critical lanes of its route get up while `cpu` receives it, unless that
+    /// sample came before: many publishers send each one to all our addresses. Whether it did.
     pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
         let awaits = |served: &Served| served.is_critical && served.followed.awaits(writer, sequence);
         let Some(route) = self.routes.iter().position(awaits) else {
