@@ -76,10 +76,11 @@ fn apart(settings: &Settings) -> Option<Vec<usize>> {
 fn run(arrivals: &Arrivals, receiving: &Receiving) {
     loop {
         let told = match arrivals.wait() {
-            Arrival::Sample { writer, sequence, left_bytes } => {
-                receiving.expect(writer, sequence, left_bytes, receiving.cpu())
+            // While more of it is to come its publisher sends, on this CPU perhaps, and is not to be held up.
+            Arrival::Sample { writer, sequence, left_bytes: 0 } => {
+                receiving.expect(writer, sequence, 0, receiving.cpu())
             }
-            Arrival::Other => false,
+            Arrival::Sample { .. } | Arrival::Other => false,
             Arrival::Closed => return,
         };
         if !told {
