@@ -13,7 +13,7 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
-use adaptive_bridge::model::{InstanceName, LaneMode, LatencyHistogram, MonotonicNs, RouteId};
+use adaptive_bridge::model::{InstanceName, LaneMode, LanePolicy, LatencyHistogram, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
     Boards, BridgeShape, HeaderError, LaneQueue, LoanError, ProcessRole, RoleLock, RouteChannel,
     SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole, TakeError, Woken,
@@ -361,7 +361,7 @@ fn nobody_else_may_read_what_is_shared() {
     let channel = RouteChannel { retained_samples: 1, ..channel(100) };
     let _role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
     let boards = node.boards(&shape()).unwrap();
-    boards.set_policy(0, MonotonicNs(1), |policy| policy).unwrap();
+    boards.policies().unwrap().set(0, MonotonicNs(1), |policy| policy);
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
     let _lane = lane(&node, &channel);
     let _tap = SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, true).unwrap();
@@ -873,13 +873,11 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
     let boards = node.boards(&shape()).unwrap();
     assert_eq!(boards.policy(0).unwrap().epoch, 0);
     let set = |mode: LaneMode, at| {
-        boards
-            .set_policy(0, MonotonicNs(1), |mut policy| {
-                (policy.mode, policy.written_at) = (mode as u8, MonotonicNs(at));
-                policy
-            })
-            .unwrap()
-            .epoch
+        let change = |mut policy: LanePolicy| {
+            (policy.mode, policy.written_at) = (mode as u8, MonotonicNs(at));
+            policy
+        };
+        boards.policies().unwrap().set(0, MonotonicNs(1), change).epoch
     };
     assert_eq!(set(LaneMode::Normal, 0), 1, "also when it says what nobody had said");
     assert_eq!(set(LaneMode::Normal, 7), 1);
@@ -894,12 +892,12 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
         other.expect("ready");
         for _ in 0..500 {
             let mut before = 0;
-            let after = boards.set_policy(0, MonotonicNs(1), |mut policy| {
+            let after = boards.policies().unwrap().set(0, MonotonicNs(1), |mut policy| {
                 before = policy.written_at.0;
                 policy.written_at.0 += 1;
                 policy
             });
-            assert_eq!(after.unwrap().written_at.0, before + 1);
+            assert_eq!(after.written_at.0, before + 1);
         }
         other.kill();
         assert_eq!(set(LaneMode::Stopped, 1), set(LaneMode::Stopped, 2));

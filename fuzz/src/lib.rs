@@ -149,12 +149,12 @@ impl Foreign {
 
         let policy = self.boards.policy(0).expect("nobody writes");
         let _ = effective_mode(&policy, TrafficClass::Critical, MonotonicNs(1), 1);
-        let set = self.boards.set_policy(0, MonotonicNs(1), |mut policy| {
+        let policies = self.boards.policies().expect("the lock of a folder of our own");
+        let set = policies.set(0, MonotonicNs(1), |mut policy| {
             policy.mode = 1;
             policy.by_hand ^= 1;
             policy
         });
-        let set = set.expect("the lock of a folder of our own");
         assert!(set.epoch != 0 && set.epoch != policy.epoch, "{policy:?} {set:?}");
         assert_eq!(self.boards.policy(0), Some(set));
 

@@ -34,11 +34,11 @@ pub fn set_mode(
         }
         _ => MonotonicNs(0),
     };
-    let policy = boards.set_policy(index, now, |former| LanePolicy {
+    let policy = boards.policies()?.set(index, now, |former| LanePolicy {
         by_hand: u8::from(mode.is_some()),
         mode_by_hand: mode.unwrap_or_default() as u8,
         expires_at,
         ..former
-    })?;
+    });
     Ok(policy.epoch)
 }

@@ -466,28 +466,11 @@ impl Boards {
         self.layout.policy(lane).read(&self.segment)
     }
 
-    /// Changes the policy of a lane; any process may, one after the other. `change` gets the present policy
-    /// and gives the new one; the epoch is counted here, up by one unless only `written_at` differs. Returns
-    /// what was written.
-    pub fn set_policy(
-        &self,
-        lane: usize,
-        now: MonotonicNs,
-        change: impl FnOnce(LanePolicy) -> LanePolicy,
-    ) -> Result<LanePolicy, ShmError> {
-        let cell = self.layout.policy(lane);
-        let _one_at_a_time = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
-        let before = cell.read(&self.segment).unwrap_or_default();
-        let mut after = change(before);
-        (after.epoch, after.changed_at) = (before.epoch, before.changed_at);
-        let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
-        if before.epoch == 0 || !only_time_differs {
-            // Only a foreign process can have written the last number. 0 still means that none has set one.
-            after.epoch = after.epoch.checked_add(1).unwrap_or(1);
-            after.changed_at = now;
-        }
-        cell.write(&self.segment, &after);
-        Ok(after)
+    /// The policies of all lanes, to change them; any process may, one after the other. Others that want to
+    /// wait until this is dropped.
+    pub fn policies(&self) -> Result<Policies<'_>, ShmError> {
+        let one_at_a_time = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
+        Ok(Policies { boards: self, _one_at_a_time: one_at_a_time })
     }
 
     /// Wakes a lane.
@@ -503,6 +486,37 @@ impl Boards {
     fn writer<T: Plain>(&self, cell: Cell<T>) -> BoardWriter<T> {
         let value = cell.read(&self.segment).unwrap_or_default();
         BoardWriter { segment: self.segment.clone(), cell, value }
+    }
+}
+
+/// The only one who changes policies.
+#[derive(Debug)]
+pub struct Policies<'a> {
+    boards: &'a Boards,
+    _one_at_a_time: FileLock,
+}
+
+impl Policies<'_> {
+    /// Changes the policy of a lane. `change` gets the present policy and gives the new one; the epoch is
+    /// counted here, up by one unless only `written_at` differs. Returns what was written.
+    pub fn set(
+        &self,
+        lane: usize,
+        now: MonotonicNs,
+        change: impl FnOnce(LanePolicy) -> LanePolicy,
+    ) -> LanePolicy {
+        let cell = self.boards.layout.policy(lane);
+        let before = cell.read(&self.boards.segment).unwrap_or_default();
+        let mut after = change(before);
+        (after.epoch, after.changed_at) = (before.epoch, before.changed_at);
+        let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
+        if before.epoch == 0 || !only_time_differs {
+            // Only a foreign process can have written the last number. 0 still means that none has set one.
+            after.epoch = after.epoch.checked_add(1).unwrap_or(1);
+            after.changed_at = now;
+        }
+        cell.write(&self.boards.segment, &after);
+        after
     }
 }
 

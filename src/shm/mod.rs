@@ -24,7 +24,7 @@ mod service;
 mod slot;
 mod wake;
 
-pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, ProcessRole, Stage};
+pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage};
 pub use channel::{
     LaneQueue, PoolSize, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, SubscriberRole,
 };

@@ -198,13 +198,11 @@ impl Child {
         let boards = self.node("control").boards(&shape()).unwrap();
         println!("@ ready");
         while !self.stopping() {
-            boards
-                .set_policy(0, MonotonicNs(1), |mut policy| {
-                    policy.mode = LaneMode::Degraded as u8;
-                    policy.written_at.0 += 1;
-                    policy
-                })
-                .unwrap();
+            boards.policies().unwrap().set(0, MonotonicNs(1), |mut policy| {
+                policy.mode = LaneMode::Degraded as u8;
+                policy.written_at.0 += 1;
+                policy
+            });
         }
     }
 

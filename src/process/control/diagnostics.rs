@@ -38,9 +38,6 @@ const WINDOW_SAMPLES: usize = 64;
 /// States are told again so often, for those who come late.
 const STATES_MS: u64 = 1_000;
 
-/// How often the reporting thread looks whether it is to end.
-const LOOK_MS: u64 = 50;
-
 /// Publishes decisions, and reports in a thread of its own.
 pub(super) struct Diagnostics {
     enabled: bool,
@@ -146,10 +143,11 @@ impl Diagnostics {
 impl Drop for Diagnostics {
     fn drop(&mut self) {
         self.shared.end.store(true, Ordering::Relaxed);
-        if let Some(reporter) = self.reporter.take()
-            && reporter.join().is_err()
-        {
-            warn!("the reporting thread panicked");
+        if let Some(reporter) = self.reporter.take() {
+            reporter.thread().unpark();
+            if reporter.join().is_err() {
+                warn!("the reporting thread panicked");
+            }
         }
     }
 }
@@ -161,7 +159,8 @@ impl Reporter {
         while !self.shared.end.load(Ordering::Relaxed) {
             let now = clock::monotonic();
             if now < report_at {
-                std::thread::sleep(Duration::from_nanos(report_at.since(now).min(LOOK_MS * 1_000_000)));
+                // Until then, or until it is to end.
+                std::thread::park_timeout(Duration::from_nanos(report_at.since(now)));
                 continue;
             }
             let settings = self.shared.settings();

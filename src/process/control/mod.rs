@@ -233,32 +233,42 @@ impl Control {
 
     /// Writes, or confirms, what each lane is to do.
     fn decide(&mut self, now: MonotonicNs) {
-        for lane in 0..self.settings.lanes.len() {
-            let class = self.settings.lanes[lane].class;
-            let decision = self.subscribers.lane_mode(&self.settings, lane);
-            let safety_floor = safety_floor(
-                class,
-                self.supervision.mode(),
-                self.supervision.critical_trouble(),
-                &self.settings.safety.rules,
-            );
-            let mode = decision.mode;
-            let text = decision_text(&decision, safety_floor, self.supervision.mode());
-            if self.decided[lane] != text {
-                info!(lane = self.settings.lanes[lane].name.as_str(), "control decides: {text}");
-                self.decided[lane] = text;
+        let decisions: Vec<_> = (0..self.settings.lanes.len()).map(|lane| self.decision(lane)).collect();
+        // All of them under one lock, ten times a second.
+        let policies = match self.role.boards.policies() {
+            Ok(policies) => policies,
+            Err(error) => {
+                error!(%error, "policies not written");
+                self.role.failed();
+                return;
             }
-            let written = self.role.boards.set_policy(lane, now, |former| LanePolicy {
+        };
+        for (lane, (mode, safety_floor)) in decisions.into_iter().enumerate() {
+            policies.set(lane, now, |former| LanePolicy {
                 mode: mode as u8,
                 safety_floor: safety_floor as u8,
                 written_at: now,
                 ..former
             });
-            if let Err(error) = written {
-                error!(lane = self.settings.lanes[lane].name.as_str(), %error, "policy not written");
-                self.role.failed();
-            }
         }
+    }
+
+    /// The mode of a lane, and the one that safety demands at least. Says so when they are others.
+    fn decision(&mut self, lane: usize) -> (LaneMode, LaneMode) {
+        let class = self.settings.lanes[lane].class;
+        let decision = self.subscribers.lane_mode(&self.settings, lane);
+        let safety_floor = safety_floor(
+            class,
+            self.supervision.mode(),
+            self.supervision.critical_trouble(),
+            &self.settings.safety.rules,
+        );
+        let text = decision_text(&decision, safety_floor, self.supervision.mode());
+        if self.decided[lane] != text {
+            info!(lane = self.settings.lanes[lane].name.as_str(), "control decides: {text}");
+            self.decided[lane] = text;
+        }
+        (decision.mode, safety_floor)
     }
 
     /// Shows what was found and decided for the bridge as a whole.
