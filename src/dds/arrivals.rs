@@ -1,5 +1,6 @@
 //! Datagrams, seen as they come, by a thread that takes none of them.
 
+use std::io;
 use std::net::UdpSocket;
 use std::sync::Arc;
 
@@ -18,7 +19,7 @@ const CLOSING: u64 = u64::MAX;
 
 /// The sockets of a participant that samples come to.
 ///
-/// The kernel wakes who waits here together with the thread that receives.
+/// The kernel wakes who waits here right after the thread that receives.
 pub struct Arrivals {
     epoll: Epoll,
     sockets: Vec<UdpSocket>,
@@ -49,21 +50,21 @@ pub enum Arrival {
 }
 
 impl Arrivals {
-    pub(super) fn new(sockets: Vec<UdpSocket>) -> Result<Self, DdsError> {
+    pub(super) fn new(sockets: io::Result<Vec<UdpSocket>>) -> Result<Self, DdsError> {
         let open = || {
+            let sockets = sockets?;
             let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
-            // Edge-triggered, for nothing is taken that would end a level.
-            let flags = EpollFlags::EPOLLIN | EpollFlags::EPOLLET;
+            // Edge-triggered, for nothing is taken that would end a level. Exclusive, for then the kernel has
+            // it behind the event loop in the queue of those it wakes; otherwise it would be before it.
+            let flags = EpollFlags::EPOLLIN | EpollFlags::EPOLLET | EpollFlags::EPOLLEXCLUSIVE;
             for (number, socket) in (0..).zip(&sockets) {
                 epoll.add(socket, EpollEvent::new(flags, number))?;
             }
             let closing = EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?;
             epoll.add(&closing, EpollEvent::new(EpollFlags::EPOLLIN, CLOSING))?;
-            Ok((epoll, Arc::new(closing)))
+            Ok(Self { epoll, sockets, closing: Arc::new(closing) })
         };
-        let (epoll, closing) = open()
-            .map_err(|error: nix::Error| DdsError::library("a watch of its sockets".to_owned(), error))?;
-        Ok(Self { epoll, sockets, closing })
+        open().map_err(|error: io::Error| DdsError::library("a watch of its sockets".to_owned(), error))
     }
 
     /// What ends the waiting.

@@ -152,12 +152,12 @@ impl Participant {
         self.participant.wake_event_loop();
     }
 
-    /// Where samples come in, for a thread that looks at them before they are received: of a participant from
-    /// [`open_receiving`](Self::open_receiving), once. To be dropped before the participant, whose ports it
-    /// has, too.
+    /// Where samples come in, for a thread that looks at them before they are received. To be dropped before
+    /// the participant, whose ports it has, too.
     ///
     /// # Errors
-    /// The process may have no more descriptors.
+    /// The process may have no more descriptors; it is not from [`open_receiving`](Self::open_receiving), or
+    /// this was called before.
     pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
         Arrivals::new(self.participant.onlooker_sockets())
     }

@@ -70,15 +70,19 @@ pub(super) fn apply(scheduling: &Scheduling) {
 
 /// For a thread that only gets others up, on the CPUs that they have. With a fair policy it never takes the
 /// CPU from a program that runs: whom it would get up then only waits, and a publisher that is held up while
-/// it sends cost 20 µs of CPU more for each sample. What the system refuses is of no great consequence.
-pub(super) fn apply_to_lookout(cpus: &[usize]) {
-    let mut outcome = set_affinity(cpus);
-    if scheduling_attributes().is_ok_and(|attributes| attributes.sched_policy == libc::SCHED_OTHER as u32) {
-        outcome = outcome.and(set_policy(libc::SCHED_BATCH, 0));
+/// it sends cost 20 µs of CPU more for each sample. Whether it is on those CPUs: where ingress receives it
+/// must not be.
+pub(super) fn apply_to_lookout(cpus: &[usize]) -> bool {
+    if let Err(error) = set_affinity(cpus) {
+        warn!(?cpus, %error, "no lookout, for it may not run there: critical lanes get up later");
+        return false;
     }
-    if let Err(error) = outcome {
-        debug!(?cpus, %error, "the lookout runs as ingress does");
+    if scheduling_attributes().is_ok_and(|attributes| attributes.sched_policy == libc::SCHED_OTHER as u32)
+        && let Err(error) = set_policy(libc::SCHED_BATCH, 0)
+    {
+        debug!(%error, "the lookout may take the CPU from a program that runs");
     }
+    true
 }
 
 /// `None` without the variable, or where it is empty.

@@ -7,7 +7,7 @@
 //! `docs/decisions/0004-shared-memory.md` has the measurements.
 //!
 //! A lane that sleeps on another CPU than ingress runs on can be told a moment ahead, and gets up while the
-//! sample is still being copied: `docs/decisions/0006-hand-overs.md`.
+//! sample is still being received: `docs/decisions/0006-hand-overs.md`, `docs/decisions/0013-lookout.md`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -21,9 +21,9 @@ use super::segment::Segment;
 use crate::clock;
 use crate::model::MonotonicNs;
 
-/// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample, or
-/// the last 64 KiB of a large one: far less than this, as a rule. A sample that takes longer wakes the lane
-/// as if nothing had been announced.
+/// How long a lane stays up for a wake that was announced. Between the two is one copy of the sample, the
+/// last 64 KiB of a large one, or what the receiving thread takes to get up: far less than this, as a rule.
+/// A sample that takes longer wakes the lane as if nothing had been announced.
 const ANNOUNCED_NS: u64 = 200_000;
 
 /// Why a [`LaneSleeper`] returned.

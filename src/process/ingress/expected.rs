@@ -21,7 +21,7 @@ const ROUTE_SHIFT: u32 = 32;
 /// Which route's lanes were told of a sample that is yet to be taken.
 pub(super) struct Expected {
     /// The route and the turns that are left; [`NONE`], or [`IN_VAIN`] when no sample came of what they
-    /// were told.
+    /// were told. Anybody may put a route where there is none; only the receiving thread changes one.
     told: AtomicU64,
 }
 
@@ -30,9 +30,14 @@ impl Expected {
         Self { told: AtomicU64::new(NONE) }
     }
 
+    /// Whether [`tell`](Self::tell) would say yes, unless somebody is faster.
+    pub fn may_tell(&self, left_bytes: usize) -> bool {
+        left_bytes <= LEFT_BYTES && self.told.load(Ordering::Relaxed) == NONE
+    }
+
     /// Whether the lanes of `route` may be told of a sample that misses `left_bytes` yet: then they were
-    /// told, and are not told again before a sample has come, of whatever route: datagrams that only look
-    /// like samples wake no lane again and again.
+    /// told, and are not told again before a sample has come, of whatever critical route: datagrams that only
+    /// look like samples wake no lane again and again.
     pub fn tell(&self, route: usize, left_bytes: usize) -> bool {
         if left_bytes > LEFT_BYTES {
             return false;
@@ -42,9 +47,16 @@ impl Expected {
         self.told.compare_exchange(NONE, told, Ordering::AcqRel, Ordering::Relaxed).is_ok()
     }
 
-    /// `route` has a sample to take, or one that was taken just now; whether its lanes are yet to be told.
+    /// `route` has a sample to take; whether its lanes are yet to be told.
     pub fn came(&self, route: usize) -> bool {
         self.told.swap(NONE, Ordering::AcqRel) >> ROUTE_SHIFT != route as u64
+    }
+
+    /// What `route` had was taken; the lookout may have told of it after [`came`](Self::came).
+    pub fn came_meanwhile(&self, route: usize) {
+        if self.told.load(Ordering::Relaxed) >> ROUTE_SHIFT == route as u64 {
+            self.told.store(NONE, Ordering::Release);
+        }
     }
 
     /// A turn has taken what there was. What has not come by now may never come, and the lanes, which sleep
@@ -56,8 +68,7 @@ impl Expected {
         }
         let turns_left = told & ((1 << ROUTE_SHIFT) - 1);
         let then = if turns_left > 0 { told - 1 } else { IN_VAIN };
-        // Told anew in this instant, it has all its turns.
-        let _ = self.told.compare_exchange(told, then, Ordering::AcqRel, Ordering::Relaxed);
+        self.told.store(then, Ordering::Release);
     }
 }
 
@@ -102,12 +113,17 @@ mod tests {
         assert!(expected.tell(7, 0));
         expected.turn_ends();
         assert!(!expected.came(7), "told of, and up");
+        assert!(expected.tell(7, 0), "of the same one, while it is taken");
+        expected.came_meanwhile(8);
+        assert!(!expected.tell(7, 0), "another route has nothing to do with it");
+        expected.came_meanwhile(7);
+        assert!(expected.may_tell(0) && expected.tell(7, 0) && !expected.may_tell(0));
     }
 
     #[test]
     fn the_rest_of_a_sample_in_fragments_has_some_turns_to_come() {
         let expected = Expected::new();
-        assert!(!expected.tell(7, LEFT_BYTES + 1));
+        assert!(!expected.may_tell(LEFT_BYTES + 1) && !expected.tell(7, LEFT_BYTES + 1));
         assert!(expected.tell(7, LEFT_BYTES));
         for _ in 0..TURNS {
             expected.turn_ends();

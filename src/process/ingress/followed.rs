@@ -47,12 +47,10 @@ impl Followed {
         let oldest = self.oldest.load(Ordering::Relaxed);
         self.oldest.store((oldest + 1) % WRITERS_FOLLOWED, Ordering::Relaxed);
         let place = &self.writers[oldest];
-        // Until the last line it awaits nothing.
-        place.last.store(i64::MAX, Ordering::Relaxed);
         for (word, half) in place.guid.iter().zip(halves(writer)) {
             word.store(half, Ordering::Relaxed);
         }
-        place.last.store(sequence, Ordering::Release);
+        place.last.store(sequence, Ordering::Relaxed);
         0
     }
 

@@ -144,7 +144,8 @@ impl Input {
         let sequence = self.counters.update(|counters| {
             counters.received += 1;
             counters.received_bytes += filled.bytes as u64;
-            counters.lost_upstream += lost_upstream;
+            // What a writer's numbers claim; a hostile one may jump as far as it likes.
+            counters.lost_upstream = counters.lost_upstream.saturating_add(lost_upstream);
             counters.last_received_at = taken_at;
             match dropped {
                 Some(reason) => counters.drops.add(reason, 1),

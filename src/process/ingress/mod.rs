@@ -119,7 +119,7 @@ impl Ingress {
             graph_gid_bytes: settings.graph_gid_bytes,
         };
         let participant = role.join_receiving(&options, on_arriving, on_received)?;
-        let lookout = Lookout::start(participant.arrivals()?, &receiving, settings);
+        let lookout = Lookout::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
             _lookout: lookout,

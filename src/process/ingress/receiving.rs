@@ -72,6 +72,10 @@ impl Receiving {
     /// missing of behind it. Lets the critical lanes of its route get up while `cpu` receives it, unless that
     /// sample came before: many publishers send each one to all our addresses. Whether it did.
     pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
+        // Before the search, which this would be in vain for all but the last of many fragments.
+        if !self.expected.may_tell(left_bytes) {
+            return false;
+        }
         let awaits = |served: &Served| served.is_critical && served.followed.awaits(writer, sequence);
         let Some(route) = self.routes.iter().position(awaits) else {
             return false;
@@ -97,12 +101,11 @@ impl Receiving {
             if served.bell.is_rung()
                 && let Some(mut input) = served.try_enter()
             {
-                if self.expected.came(route) {
+                if served.is_critical && self.expected.came(route) {
                     self.announce(route, cpu);
                 }
                 more |= self.drain(route, &mut input);
-                // The lookout may have told of it after that.
-                self.expected.came(route);
+                self.expected.came_meanwhile(route);
             }
         }
         self.expected.turn_ends();

@@ -584,15 +584,16 @@ impl DomainParticipant {
   /// the kernel wakes together with the event loop. It may look at datagrams
   /// (`peek`, and [`sample_arriving`](crate::sample_arriving)) and must take none,
   /// nor change anything of the sockets, which do not block. For a participant with
-  /// the hook [`DomainParticipantBuilder::on_sample_arriving`], once; later and for
-  /// others none. The ports stay bound as long as they are open.
+  /// the hook [`DomainParticipantBuilder::on_sample_arriving`], once; an error
+  /// otherwise, or if there were no descriptors. The ports stay bound as long as they
+  /// are open.
   #[cfg(unix)]
-  pub fn onlooker_sockets(&self) -> Vec<std::net::UdpSocket> {
-    self
-      .dpi
-      .lock()
-      .map(|mut dpi| std::mem::take(&mut dpi.dpi.onlooker_sockets))
-      .unwrap_or_default()
+  pub fn onlooker_sockets(&self) -> io::Result<Vec<std::net::UdpSocket>> {
+    let sockets = match self.dpi.lock() {
+      Ok(mut dpi) => dpi.dpi.onlooker_sockets.take(),
+      Err(_) => None,
+    };
+    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets for an onlooker")))
   }
 
   pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
@@ -1272,7 +1273,7 @@ pub(crate) struct DomainParticipantInner {
 
   /// See `DomainParticipant::onlooker_sockets`.
   #[cfg(unix)]
-  onlooker_sockets: Vec<std::net::UdpSocket>,
+  onlooker_sockets: Option<io::Result<Vec<std::net::UdpSocket>>>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1406,14 +1407,13 @@ impl DomainParticipantInner {
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
 
     #[cfg(unix)]
-    let onlooker_sockets = if hooks.on_sample_arriving.is_some() {
+    let onlooker_sockets = hooks.on_sample_arriving.is_some().then(|| {
       [USER_TRAFFIC_LISTENER_TOKEN, USER_TRAFFIC_MUL_LISTENER_TOKEN]
         .iter()
-        .filter_map(|token| listeners.get(token)?.onlooker().ok())
+        .filter_map(|token| listeners.get(token))
+        .map(UDPListener::onlooker)
         .collect()
-    } else {
-      Vec::new()
-    };
+    });
 
     // construct our own Locators
     let self_locators: HashMap<mio1::Token, Vec<Locator>> = listeners
