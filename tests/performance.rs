@@ -296,6 +296,25 @@ fn a_hop_of_many_repetitions_is_met_or_missed_only_when_that_is_certain() {
 }
 
 #[test]
+fn cpu_is_judged_by_the_repetitions_of_each_process() {
+    let mut summary = made_up();
+    for row in &mut summary.resources {
+        // In the fifth repetition somebody else had the machine.
+        let each = |usual: f64, disturbed: f64| [&[usual; 4][..], &[disturbed], &[usual; 4]].concat();
+        row.repetitions_cpu_us = match row.process.as_str() {
+            "relay" => each(100.0, 110.0),
+            "ingress" => each(70.0, 300.0),
+            "critical" => each(60.0, 200.0),
+            "control" => each(10.0, 10.0),
+            _ => each(900.0, 900.0),
+        };
+    }
+    let readme = readme(&summary);
+    let cells = cells(&readme, "CPU of all processes of the bridge");
+    assert_eq!(cells[2..4], ["1.40 (1.40 to 1.40)", "met"]);
+}
+
+#[test]
 fn tables_have_the_figures_of_the_run() {
     let readme = readme(&made_up());
     assert_eq!(

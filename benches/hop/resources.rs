@@ -9,10 +9,10 @@ use nix::unistd::Pid;
 use super::beds::{Bed, Beds, Kind, Plan};
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
-use super::report::{Call, Resource};
+use super::report::{Call, JUDGED_HZ, Resource};
 use super::system::Taken;
 
-const LOADS_HZ: [u64; 2] = [100, 1_000];
+const LOADS_HZ: [u64; 2] = [100, JUDGED_HZ];
 
 /// strace makes every call several times as long: only at this rate does what it counts stay what it is
 /// without.
@@ -32,13 +32,21 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
     eprintln!("resources: idle");
     idle(&beds, options.seconds(10.0), output);
     for rate_hz in LOADS_HZ {
-        let case = Case::lasting(rate_hz, SCAN, options.seconds(5.0), 0);
-        for repetition in 0..options.repetitions {
-            for bed in &mut beds.0 {
-                eprintln!("resources: {} {}", case.name(), bed.name());
-                load(bed, &case, repetition, output)?;
+        // As with the hops, many short repetitions of what is judged.
+        let (repetitions, seconds) = if rate_hz == JUDGED_HZ {
+            (options.judged_repetitions(), 2.0)
+        } else {
+            (options.repetitions, 5.0)
+        };
+        let case = Case::lasting(rate_hz, SCAN, options.seconds(seconds), 0);
+        for repetition in 0..repetitions {
+            eprintln!("resources {} of {repetitions}: {}", repetition + 1, case.name());
+            let count = beds.0.len();
+            for bed in (0..count).map(|turn| (turn + repetition) % count) {
+                load(&mut beds.0[bed], &case, repetition, output)?;
             }
         }
+        let case = Case::lasting(rate_hz, SCAN, options.seconds(5.0), 0);
         for bed in &mut beds.0 {
             count_calls(bed, &case, output)?;
         }
@@ -99,13 +107,15 @@ fn row(
     before: Taken,
     after: Taken,
 ) -> Resource {
+    let cpu_ms = after.cpu_ns.saturating_sub(before.cpu_ns) as f64 / 1e6;
     Resource {
         program: program.to_owned(),
         process: process.to_owned(),
         rate_hz,
         seconds,
         samples,
-        cpu_ms: after.cpu_ns.saturating_sub(before.cpu_ns) as f64 / 1e6,
+        cpu_ms,
+        repetitions_cpu_us: (samples > 0).then(|| cpu_ms * 1_000.0 / samples as f64).into_iter().collect(),
         sleeps: after.sleeps.saturating_sub(before.sleeps),
         preemptions: after.preemptions.saturating_sub(before.preemptions),
         system_calls_per_sample: None,
@@ -125,7 +135,10 @@ fn merge(rows: &mut Vec<Resource>) {
         };
         match merged.iter_mut().find(same) {
             Some(one) => {
+                let mut repetitions_cpu_us = std::mem::take(&mut one.repetitions_cpu_us);
+                repetitions_cpu_us.extend(&row.repetitions_cpu_us);
                 *one = Resource {
+                    repetitions_cpu_us,
                     seconds: one.seconds + row.seconds,
                     samples: one.samples + row.samples,
                     cpu_ms: one.cpu_ms + row.cpu_ms,

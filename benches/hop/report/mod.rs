@@ -18,3 +18,4 @@ pub use summary::{
     Throughput,
 };
 pub use tables::{payload, soak_failures};
+pub use targets::JUDGED_HZ;

@@ -151,6 +151,8 @@ pub struct Resource {
     pub seconds: f64,
     pub samples: u64,
     pub cpu_ms: f64,
+    /// For each sample, of each repetition.
+    pub repetitions_cpu_us: Vec<f64>,
     /// Times that a thread went to sleep, and so was woken.
     pub sleeps: u64,
     /// Times that a thread was taken off its CPU.
