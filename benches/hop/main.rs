@@ -66,7 +66,7 @@ fn measure(options: &Options) -> Result<(), String> {
         date: out::date(std::time::SystemTime::now()),
         machine: system::machine(),
         parameters: vec![format!(
-            "placement {}, {} repetitions, {} of the hops that are judged, durations times {}{}{}",
+            "placement {}, {} repetitions, {} of hops and CPU that are judged, durations times {}{}{}",
             options.placement.label(),
             options.repetitions,
             options.judged_repetitions(),

@@ -59,7 +59,7 @@ pub struct Options {
     pub quick: bool,
     /// `--save`: keep the result in `benches/runs/<date>` too.
     pub save: bool,
-    /// `--repetitions N`, 3 unless told; the cases that hops are judged by have 20 at least.
+    /// `--repetitions N`, 3 unless told; what hops and CPU are judged by has 20 at least.
     pub repetitions: usize,
     /// `--longer FACTOR`: of every duration.
     pub longer: f64,
@@ -148,7 +148,7 @@ impl Options {
         self.schedulings()[0]
     }
 
-    /// Repetitions of the cases that hops are judged by.
+    /// Repetitions of the cases that hops and CPU are judged by.
     pub fn judged_repetitions(&self) -> usize {
         if self.quick { self.repetitions } else { self.repetitions.max(JUDGED_REPETITIONS) }
     }
