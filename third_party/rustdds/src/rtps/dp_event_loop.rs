@@ -204,11 +204,13 @@ impl DPEventLoop {
     }
 
     // Command queues, doorbells and the timer share `waker` (installed when the
-    // loop starts). The acknack queue is drained on that same wake. Both ends
-    // of it are this thread. 1024 absorbs a burst of ACKNACKs from one poll's
-    // worth of datagrams; a still larger one is discarded.
+    // loop starts). The acknack queue does without: both ends of it are this
+    // thread, which drains it in the turn in which it was filled. Woken for it,
+    // the loop had a second turn for each ACKNACK, with nothing to do. 1024
+    // absorbs a burst of ACKNACKs from one poll's worth of datagrams; a still
+    // larger one is discarded.
     let (acknack_sender, acknack_receiver) =
-      wake_channel::<(GuidPrefix, AckSubmessage)>(1024, &waker);
+      wake_channel::<(GuidPrefix, AckSubmessage)>(1024, &LoopWaker::new());
 
     // Deadlines live in the loop. Reader/Writer timeouts are scheduled later
     // through cloned handles passed into Reader::new / Writer::new.
