@@ -1,7 +1,7 @@
 use std::{
   cmp::max,
   collections::BTreeMap,
-  sync::{Arc, Condvar, Mutex},
+  sync::{Arc, Condvar, Mutex, MutexGuard},
   time::{Duration as StdDuration, Instant},
 };
 use core::task::Waker;
@@ -74,6 +74,9 @@ struct Inner {
   // Wakers of async producers / ack-waiters parked because the window was full
   // or acknowledgements were still pending. Drained (woken) on any advance.
   wakers: Vec<Waker>,
+
+  // Threads parked on `progress`. To notify it is a system call, also for nobody.
+  parked_threads: usize,
 }
 
 struct Shared {
@@ -133,6 +136,7 @@ impl WriterSendBuffer {
           sent_frontier: SequenceNumber::new(0),
           max_retain: max_retain.max(1),
           wakers: Vec::new(),
+          parked_threads: 0,
         }),
         direct_send: DirectSend::new(),
         progress: Condvar::new(),
@@ -190,7 +194,24 @@ impl WriterSendBuffer {
     for w in inner.wakers.drain(..) {
       w.wake();
     }
-    progress.notify_all();
+    if inner.parked_threads > 0 {
+      progress.notify_all();
+    }
+  }
+
+  // Park this thread until `wake_all`, or until `max_wait` has passed.
+  fn park<'a>(
+    shared: &'a Shared,
+    mut inner: MutexGuard<'a, Inner>,
+    max_wait: Option<StdDuration>,
+  ) -> MutexGuard<'a, Inner> {
+    inner.parked_threads += 1;
+    let mut inner = match max_wait {
+      None => shared.progress.wait(inner).unwrap(),
+      Some(max_wait) => shared.progress.wait_timeout(inner, max_wait).unwrap().0,
+    };
+    inner.parked_threads -= 1;
+    inner
   }
 
   // --- producer side ---
@@ -220,17 +241,13 @@ impl WriterSendBuffer {
       }
       // Window full: wait for an acknowledgement to free up space.
       match deadline {
-        None => {
-          inner = shared.progress.wait(inner).unwrap();
-        }
+        None => inner = Self::park(shared, inner, None),
         Some(deadline) => {
           let now = Instant::now();
           if now >= deadline {
             return Admission::WouldBlock;
           }
-          let (guard, _timeout_result) =
-            shared.progress.wait_timeout(inner, deadline - now).unwrap();
-          inner = guard;
+          inner = Self::park(shared, inner, Some(deadline - now));
         }
       }
     }
@@ -465,8 +482,7 @@ impl WriterSendBuffer {
       if now >= deadline {
         return false;
       }
-      let (guard, _to) = shared.progress.wait_timeout(inner, deadline - now).unwrap();
-      inner = guard;
+      inner = Self::park(shared, inner, Some(deadline - now));
     }
   }
 
@@ -541,6 +557,39 @@ mod tests {
     // The reader's first ACKNACK acknowledges seq 1.
     buf.set_acked_frontier(Some(SequenceNumber::new(2)));
     assert!(admit_now(&buf, WriteOptions::default())); // seq 2
+  }
+
+  // Each of the two ways to wait is woken by progress, and leaves nobody parked.
+  #[test]
+  fn parked_threads_are_woken() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      /* reliable_writer */ true,
+      /* is_builtin */ false,
+      /* volatile */ true,
+      /* window_limit */ 1,
+      /* backlog_limit */ 1000,
+      /* max_retain */ 1,
+    );
+    buf.set_acked_frontier(Some(SequenceNumber::new(1)));
+    assert!(admit_now(&buf, WriteOptions::default())); // seq 1
+    let parked = |buf: &WriterSendBuffer| buf.shared.inner.lock().unwrap().parked_threads;
+    assert_eq!(parked(&buf), 0);
+    let waits = StdDuration::from_secs(60);
+    std::thread::scope(|threads| {
+      let writer = threads.spawn(|| buf.admit_blocking(WriteOptions::default(), sample(), None));
+      let waiter = threads.spawn(|| buf.wait_for_acked_through(SequenceNumber::new(1), waits));
+      while parked(&buf) < 2 {
+        std::thread::yield_now();
+      }
+      buf.set_acked_frontier(Some(SequenceNumber::new(2)));
+      assert!(matches!(writer.join().unwrap(), Admission::Admitted(_)));
+      assert!(waiter.join().unwrap());
+    });
+    assert_eq!(parked(&buf), 0);
+    assert!(!admit_now(&buf, WriteOptions::default())); // a wait that is over
+    assert_eq!(parked(&buf), 0);
   }
 
   // nonblocking-transmit: a best-effort writer that opted in via
