@@ -1178,6 +1178,7 @@ impl Writer {
         let my_topic = self.my_topic_name.clone(); // for debugging
 
         let mut start_repair = false;
+        let mut has_progressed = false;
 
         if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
           if reader_proxy.last_acknack_count == Some(an.count) {
@@ -1194,7 +1195,10 @@ impl Writer {
           // Mark requested SNs as "unsent changes"
 
           //TODO: We should drop SNs in "pending gap" from unsent changes
+          // Below the first number there is nothing to acknowledge.
+          let acked_before = reader_proxy.all_acked_before.max(SequenceNumber::from(1));
           reader_proxy.handle_ack_nack(ack_submessage, last_seq);
+          has_progressed = reader_proxy.all_acked_before > acked_before;
           if let Some(last_sent) = last_sent {
             reader_proxy.forget_unsent_after(last_sent);
           }
@@ -1235,12 +1239,11 @@ impl Writer {
 
           // if we cannot send more data, we are done.
           // This is to prevent empty "repair data" messages from being sent.
-          if reader_proxy.all_acked_before > last_seq {
-            reader_proxy.repair_mode = false;
-          } else {
-            reader_proxy.repair_mode = true;
-            start_repair = true;
-          }
+          // One that only acknowledges asks for nothing, also when more has been
+          // written meanwhile.
+          start_repair =
+            reader_proxy.all_acked_before <= last_seq && reader_proxy.first_unsent_change().is_some();
+          reader_proxy.repair_mode = start_repair;
         } // if have reader_proxy
 
         // Every Writer, built-in or user, answers after nack_response_delay
@@ -1274,6 +1277,10 @@ impl Writer {
           // preemptive ACKNACK from a reader that matched us after our HEARTBEAT.
           // Answer now instead of at the next heartbeat period.
           // One that has asked for fragments does know; it is answered with those.
+          // So does one that acknowledges more than before. It is behind only as long
+          // as the latest sample, which comes with a HEARTBEAT, is under way, and to be
+          // answered at once would be its next ACKNACK: the two would never be done
+          // while samples come faster than acknowledgements.
           // A base of 0 acknowledges nothing: Fast DDS repeats it seven times a second
           // until it has a HEARTBEAT, also of a writer that has nothing yet. Cyclone DDS
           // has a base of 1 then, and a VOLATILE reader of it takes all that the first
@@ -1281,7 +1288,9 @@ impl Writer {
           let knows_nothing = an.reader_sn_state.base() < SequenceNumber::from(1);
           let has_nothing = last_seq < SequenceNumber::from(1);
           if an.reader_sn_state.iter().next().is_none()
-            && (knows_nothing || has_nothing || reader_proxy.all_acked_before <= last_seq)
+            && (knows_nothing
+              || has_nothing
+              || (!has_progressed && reader_proxy.all_acked_before <= last_seq))
             && !reader_proxy.repair_frags_requested()
           {
             let hb_message = MessageBuilder::new()
@@ -3364,6 +3373,34 @@ mod tests {
       let before = f.writer.next_heartbeat_count();
       f.ack_nack([], 1);
       assert_eq!(f.writer.next_heartbeat_count(), before + 2);
+    }
+
+    // It was written while the ACKNACK was under way: its own HEARTBEAT tells of it.
+    #[test]
+    fn a_reader_that_acknowledges_more_than_before_is_not_answered() {
+      let mut f = Fixture::user(5, 8, None);
+      f.writer.nack_response_delay = StdDuration::ZERO;
+      let mut count = 0;
+      let mut heartbeats_after_ack_before = |base| {
+        let before = f.writer.next_heartbeat_count();
+        count += 1;
+        f.writer.handle_ack_nack(
+          f.reader_guid.prefix,
+          &AckSubmessage::AckNack(AckNack {
+            reader_id: f.reader_guid.entity_id,
+            writer_id: f.writer.my_guid.entity_id,
+            reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(base)),
+            count,
+          }),
+        );
+        f.writer.next_heartbeat_count() - before - 1
+      };
+      assert_eq!(heartbeats_after_ack_before(1), 1, "it has nothing, and does not know");
+      assert_eq!(heartbeats_after_ack_before(3), 0);
+      assert_eq!(heartbeats_after_ack_before(5), 0);
+      assert_eq!(heartbeats_after_ack_before(5), 1, "it says so again");
+      assert_eq!(heartbeats_after_ack_before(6), 0, "it has everything");
+      assert!(f.next_repair_event(StdDuration::from_millis(50)).is_none());
     }
 
     // Each datagram that a reader at `socket` has got, by now.
