@@ -1,6 +1,7 @@
 //! What this user may ask of the kernel, and what the kernel has.
 
 use std::fs;
+use std::path::Path;
 
 use nix::sys::resource::{Resource, getrlimit};
 use nix::unistd::geteuid;
@@ -10,6 +11,9 @@ use crate::config::{Scheduling, SchedulingPolicy, Settings};
 
 /// Sockets, shared memory and pipes of a process with some hundred routes.
 const OPEN_FILES: u64 = 1024;
+
+/// What leaving an idle state may take without being noticed: about what a wake-up takes anyway.
+const SLEEP_US: i64 = 10;
 
 /// CAP_SYS_NICE and CAP_IPC_LOCK, as bits of `CapEff` (capabilities(7)).
 const CAP_IPC_LOCK: u32 = 14;
@@ -39,6 +43,7 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let online = fs::read_to_string("/sys/devices/system/cpu/online").ok();
     findings.extend(online.map(|online| cpus(&configured, online.trim())));
     findings.extend(number("/proc/sys/kernel/sched_rt_runtime_us").map(throttling));
+    findings.extend(sleep(Path::new("/sys/devices/system/cpu")));
     let source = "/sys/devices/system/clocksource/clocksource0";
     let read = |name: &str| fs::read_to_string(format!("{source}/{name}")).ok();
     if let (Some(current), Some(available)) = (read("current_clocksource"), read("available_clocksource")) {
@@ -163,6 +168,40 @@ fn throttling(runtime_us: i64) -> Finding {
     }
 }
 
+/// The enabled idle state of any CPU that takes longest to leave, and how long, as `sysfs` says
+/// (the kernel's cpuidle).
+fn deepest_sleep(cpus: &Path) -> Option<(String, i64)> {
+    let entries = |directory: &Path| fs::read_dir(directory).into_iter().flatten().flatten();
+    let states = entries(cpus).flat_map(|cpu| entries(&cpu.path().join("cpuidle")));
+    let enabled = states.filter_map(|state| {
+        let read = |name: &str| fs::read_to_string(state.path().join(name)).ok();
+        let latency_us = read("latency")?.trim().parse().ok()?;
+        (read("disable")?.trim() == "0").then_some((read("name")?.trim().to_owned(), latency_us))
+    });
+    enabled.max_by_key(|(_, latency_us)| *latency_us)
+}
+
+/// `None` where the kernel has no idle states to choose from.
+fn sleep(cpus: &Path) -> Option<Finding> {
+    let (name, latency_us) = deepest_sleep(cpus)?;
+    let driver = fs::read_to_string(cpus.join("cpuidle/current_driver")).unwrap_or_default();
+    let found = match driver.trim() {
+        // A guest's driver. It says 1 us, and the hypervisor takes 40 to 70.
+        "haltpoll" => {
+            "idle CPUs of this virtual machine go to its hypervisor, which takes tens of us".to_owned()
+        }
+        _ => format!("{name}, the deepest idle state, takes {latency_us} us to leave"),
+    };
+    if latency_us <= SLEEP_US && driver.trim() != "haltpoll" {
+        return Some(Finding::ok("idle CPUs", found));
+    }
+    let meaning =
+        "A sample waits for it at up to three hand-overs, where samples are rare enough for CPUs to sleep.";
+    let command = "sudo sh -c 'exec 3>/dev/cpu_dma_latency && echo 0 >&3 && exec sleep infinity' \
+                   # none sleeps while this runs; takes power";
+    Some(Finding::new("idle CPUs", Severity::Note, found, meaning).mended_by(command))
+}
+
 fn clock_source(current: &str, available: &str) -> Finding {
     let check = "clock source";
     // Read in user space, in nanoseconds; the others take a system call or a slow device.
@@ -230,5 +269,33 @@ mod tests {
         assert_eq!(clock_source("tsc", "tsc hpet").severity, Severity::Ok);
         assert!(clock_source("hpet", "tsc hpet").command.unwrap().contains("echo tsc"));
         assert_eq!(clock_source("acpi_pm", "hpet acpi_pm").severity, Severity::Note);
+    }
+
+    #[test]
+    fn the_deepest_sleep_of_any_cpu_counts_if_it_is_enabled() {
+        let cpus = tempfile::tempdir().unwrap();
+        let write = |cpu: &str, state: u32, [name, latency_us, disable]: [&str; 3]| {
+            let state = cpus.path().join(cpu).join("cpuidle").join(format!("state{state}"));
+            fs::create_dir_all(&state).unwrap();
+            for (file, text) in [("name", name), ("latency", latency_us), ("disable", disable)] {
+                fs::write(state.join(file), format!("{text}\n")).unwrap();
+            }
+        };
+        let found = || sleep(cpus.path()).map(|finding| (finding.severity, finding.found));
+        assert_eq!(found(), None, "no cpuidle");
+        write("cpu0", 0, ["POLL", "0", "0"]);
+        write("cpu0", 1, ["C1", "2", "0"]);
+        write("cpu0", 2, ["C10", "1048", "1"]);
+        let shallow = "C1, the deepest idle state, takes 2 us to leave";
+        assert_eq!(found(), Some((Severity::Ok, shallow.to_owned())));
+        write("cpu1", 1, ["C6", "133", "0"]);
+        write("cpu1", 2, ["broken", "", "0"]);
+        let deep = "C6, the deepest idle state, takes 133 us to leave";
+        assert_eq!(found(), Some((Severity::Note, deep.to_owned())));
+        write("cpu1", 1, ["C6", "133", "1"]);
+        fs::create_dir(cpus.path().join("cpuidle")).unwrap();
+        fs::write(cpus.path().join("cpuidle/current_driver"), "haltpoll\n").unwrap();
+        let (severity, found) = found().unwrap();
+        assert!(severity == Severity::Note && found.contains("hypervisor"), "{found}");
     }
 }
