@@ -187,12 +187,11 @@ impl Program {
         Ok(Self { child, orders, answers: BufReader::new(answers) })
     }
 
-    /// A program that burns every CPU until it is dropped: as a noncritical lane (`__spinner`), or only where
-    /// a CPU would halt (`__awake`), for on a virtual machine each halt is a trip through the hypervisor,
-    /// which gives the CPU to others meanwhile.
-    pub fn burner(role: &str) -> Result<Self, String> {
+    /// A program that burns every CPU until it is dropped, with no more right to them than a noncritical
+    /// lane.
+    pub fn spinner() -> Result<Self, String> {
         let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
-        let mut program = Self::start(role, 0, anywhere, &[])?;
+        let mut program = Self::start("__spinner", 0, anywhere, &[])?;
         program.numbers("ready")?;
         Ok(program)
     }

@@ -216,7 +216,7 @@ impl Disturbance {
                 bridge.signal(LANE, Signal::SIGSTOP);
                 Self::Stopped
             }
-            Condition::Spinning => Self::Spinning(Program::burner("__spinner")?),
+            Condition::Spinning => Self::Spinning(Program::spinner()?),
             Condition::Killed => {
                 let process = bridge.take(LANE).ok_or("no noncritical lane")?;
                 let (stop, start) = (Arc::new(AtomicBool::new(false)), bridge.starter(LANE));

@@ -135,7 +135,6 @@ pub fn run(role: &str, arguments: &[String]) -> ExitCode {
         "__relay" => relay(arguments),
         "__drain" => drain(arguments),
         "__spinner" => system::slice_of_a_noncritical_lane().and_then(|()| spin()),
-        "__awake" => system::only_when_idle().and_then(|()| spin()),
         other => Err(format!("no such role: {other}")),
     };
     match outcome {

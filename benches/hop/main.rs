@@ -33,7 +33,6 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use adaptive_bridge::telemetry::CpuTime;
-use beds::Program;
 use options::Options;
 use out::Output;
 use report::Summary;
@@ -59,7 +58,7 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Result<(), String> {
     let _alone = system::alone()?;
-    let _awake = if options.awake { Some(Program::burner("__awake")?) } else { None };
+    let _awake = if options.awake { Some(system::awake()?) } else { None };
     let began = CpuTime::now();
     let mut options = options.clone();
     let mut summary = Summary {

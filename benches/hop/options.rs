@@ -65,8 +65,7 @@ pub struct Options {
     pub longer: f64,
     /// `--placement alternating|split|free`.
     pub placement: Placement,
-    /// `--awake`: a program that runs when nothing else does keeps the CPUs from halting, as `idle=poll`
-    /// does.
+    /// `--awake`: idle CPUs do not sleep.
     pub awake: bool,
     /// `--scheduling other|fifo`: only one of them.
     pub scheduling: Option<Scheduling>,

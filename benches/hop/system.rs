@@ -1,7 +1,7 @@
 //! Where and how the programs run, and what machine it is.
 
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Write as _};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::process::Command;
@@ -219,9 +219,14 @@ pub fn cpu_ns(pid: u32) -> u64 {
         .sum()
 }
 
-/// From here on this thread, and those that it starts, run only on a CPU that has nothing else to do.
-pub fn only_when_idle() -> Result<(), String> {
-    set_policy(libc::SCHED_IDLE, 0).map_err(|error| format!("no SCHED_IDLE: {error}"))
+/// Idle CPUs do not sleep until the file is dropped (the kernel's CPU latency QoS, in microseconds).
+pub fn awake() -> Result<fs::File, String> {
+    const FILE: &str = "/dev/cpu_dma_latency";
+    let asked = fs::File::options().write(true).open(FILE).and_then(|mut file| {
+        file.write_all(&0_i32.to_ne_bytes())?;
+        Ok(file)
+    });
+    asked.map_err(|error| format!("--awake: {FILE}: {error}"))
 }
 
 fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
