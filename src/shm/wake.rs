@@ -21,19 +21,20 @@ use super::segment::Segment;
 use crate::clock;
 use crate::model::MonotonicNs;
 
-/// How long a lane stays up at most for a wake that was announced. Between the two is one copy of the sample,
-/// the last 64 KiB of a large one, or what the receiving thread takes to get up: far less than this, as a
-/// rule. A sample that takes longer wakes the lane as if nothing had been announced.
-const ANNOUNCED_NS: u64 = 200_000;
+/// How long a lane stays up for a wake that was announced: the first at least, about what a sleep and getting
+/// up again take, and the second at most. What it waits for is one copy of the sample, the last 64 KiB of a
+/// large one, or the receiving thread's getting up: far less than the second, as a rule. A sample that takes
+/// longer wakes the lane as if nothing had been announced.
+const ANNOUNCED_NS: [u64; 2] = [50_000, 200_000];
 
-/// Of the time that the lane slept before, it stays up for one part in so many at most. At 1 kHz what it
-/// waits for is 37 µs away in the median, so most wakes come within 56 and the long waits are left out:
-/// waiting takes 6 % of a CPU at most, whatever the rate.
+/// Between these it stays up for one part in so many of the time that it slept before. At 1 kHz what it waits
+/// for is 37 µs away in the median, so most wakes come within 56 and the long waits are left out.
 const SLEPT_SHARE: u64 = 16;
 
 /// How long a lane that slept for so long stays up for a wake that was announced.
 fn stays_up_ns(slept_ns: u64) -> u64 {
-    ANNOUNCED_NS.min(slept_ns / SLEPT_SHARE)
+    let [at_least, at_most] = ANNOUNCED_NS;
+    (slept_ns / SLEPT_SHARE).clamp(at_least, at_most)
 }
 
 /// Why a [`LaneSleeper`] returned.
@@ -208,10 +209,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waiting_takes_a_small_part_of_a_cpu() {
-        assert_eq!(stays_up_ns(0), 0);
+    fn a_lane_waits_for_no_longer_than_pays() {
+        assert_eq!(stays_up_ns(0), 50_000);
+        assert_eq!(stays_up_ns(200_000), 50_000, "at 5 kHz");
         assert_eq!(stays_up_ns(900_000), 56_250, "at 1 kHz");
-        assert_eq!(stays_up_ns(10_000_000), ANNOUNCED_NS, "at 100 Hz");
-        assert_eq!(stays_up_ns(u64::MAX), ANNOUNCED_NS);
+        assert_eq!(stays_up_ns(10_000_000), 200_000, "at 100 Hz");
+        assert_eq!(stays_up_ns(u64::MAX), 200_000);
     }
 }
