@@ -219,14 +219,17 @@ pub fn cpu_ns(pid: u32) -> u64 {
         .sum()
 }
 
-/// Idle CPUs do not sleep until the file is dropped (the kernel's CPU latency QoS, in microseconds).
+/// Idle CPUs do not sleep until the file is dropped (the kernel's CPU latency QoS).
 pub fn awake() -> Result<fs::File, String> {
     const FILE: &str = "/dev/cpu_dma_latency";
+    const LATENCY_US: i32 = 0;
     let asked = fs::File::options().write(true).open(FILE).and_then(|mut file| {
-        file.write_all(&0_i32.to_ne_bytes())?;
+        file.write_all(&LATENCY_US.to_ne_bytes())?;
         Ok(file)
     });
-    asked.map_err(|error| format!("--awake: {FILE}: {error}"))
+    asked.map_err(|error| {
+        format!("--awake: {FILE}: {error}; run as root, outside of a container, or without --awake")
+    })
 }
 
 fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
