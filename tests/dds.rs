@@ -322,13 +322,14 @@ fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
     }
     // Nobody has asked the writer until now.
     let present = present.map(|reader| reader.guid()).unwrap();
+    let mut heard = Vec::new();
     loop {
         match writer.poll_event() {
             Some(WriterEvent::Matched { reader, joined: true, readers: 1 }) if reader == present => return,
-            Some(_) => {}
+            Some(event) => heard.push(event),
             None => std::thread::sleep(Duration::from_millis(5)),
         }
-        assert!(Instant::now() < give_up, "the present reader was not announced");
+        assert!(Instant::now() < give_up, "the present reader {present:?} was not announced: {heard:#?}");
     }
 }
 
