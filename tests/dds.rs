@@ -320,8 +320,9 @@ fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
         }
         present = Some(reader);
     }
-    // Nobody has asked the writer until now.
-    let present = present.map(|reader| reader.guid()).unwrap();
+    // Nobody has asked the writer until now. The reader stays: what is gone before it was announced never is.
+    let reader = present.unwrap();
+    let present = reader.guid();
     let mut heard = Vec::new();
     loop {
         match writer.poll_event() {
