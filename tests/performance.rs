@@ -11,7 +11,7 @@ mod report;
 
 use report::statistics::{growth, median, median_interval, quantile};
 use report::{
-    Attempt, Call, Isolation, Latency, Loss, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
+    Attempt, Call, Isolation, Latency, Loss, Lossy, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
     Throughput, figures, fill, readme, runs_named, soak_failures,
 };
 
@@ -146,9 +146,11 @@ fn made_up() -> Summary {
             seconds: 3_600.0,
             load: "1 kHz of 2,948 B".to_owned(),
             accepted: 3_600_000,
-            missing: 0,
+            missing: 7,
             reasons: BTreeMap::from([("critical queue_overflow".to_owned(), 7)]),
             series: vec![series("ingress", 0.0, 3_600.0), series("critical", 1.0, 3_600.0)],
+            lossy: vec![Lossy { at_s: 72.4, missing: 7, held_up_ms: 84.2 }],
+            held_up_ms: Some(12.3),
         }),
         ..Summary::default()
     }
@@ -240,9 +242,12 @@ fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
     assert_eq!(soak_failures(&lost), ["3 samples are missing"]);
     let readme = readme(&made_up());
     assert!(
-        readme.contains("samples, missing: 0 (critical queue_overflow 7)."),
+        readme.contains("samples, missing: 7 (critical queue_overflow 7)."),
         "what became of them: {readme}"
     );
+    let held_up = "Held up within 100 ms, the CPU that was most: 84.2 ms by 72 s, when 7 went missing; up to 12.3 ms \
+                   when none did.";
+    assert!(readme.contains(held_up), "when they did: {readme}");
 }
 
 #[test]

@@ -14,6 +14,7 @@
 //! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. Other arguments: [`Options`].
 
 mod beds;
+mod held;
 mod histogram;
 mod isolation;
 mod latency;

@@ -5,9 +5,10 @@ use std::os::unix::fs::MetadataExt;
 use std::time::{Duration, Instant};
 
 use super::beds::{Beds, Plan, add_up};
+use super::held::HeldUp;
 use super::options::{Case, Options, SCAN};
 use super::out::{Of, Output};
-use super::report::{Soak, SoakSeries};
+use super::report::{Lossy, Soak, SoakSeries};
 use super::system::{Taken, descriptors};
 
 /// Of each turn: most of the time scans, then some point clouds, which go by reference.
@@ -26,16 +27,25 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
         load: format!("{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn", scans.name(), clouds.name()),
         ..Soak::default()
     };
+    let held_up = HeldUp::watch();
     let (began, mut turn) = (Instant::now(), 0);
     while began.elapsed() < duration {
+        let of = Of { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };
         for case in [&scans, &clouds] {
+            held_up.take_ms();
             let run = bed.measure(case)?;
+            let (held_up_ms, missing) = (held_up.take_ms(), run.missing());
             soak.accepted += run.accepted;
-            soak.missing += run.missing();
+            soak.missing += missing;
             add_up(&mut soak.reasons, run.reasons());
+            output.raw(of, &format!("{} Hz: held up ms", case.rate_hz), held_up_ms);
+            if missing > 0 {
+                soak.lossy.push(Lossy { at_s: began.elapsed().as_secs_f64(), missing, held_up_ms });
+            } else {
+                soak.held_up_ms = Some(soak.held_up_ms.unwrap_or(0.0).max(held_up_ms));
+            }
         }
         let at_s = began.elapsed().as_secs_f64();
-        let of = Of { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };
         output.raw(of, "at s", at_s);
         output.raw(of, "missing so far", soak.missing as f64);
         let mut see = |name: String, unit: &str, value: f64| {

@@ -232,6 +232,16 @@ pub fn awake() -> Result<fs::File, String> {
     })
 }
 
+/// Pins this thread to a CPU and puts it before every other.
+pub fn most_urgent_on(cpu: usize) {
+    Place { cpu: Some(cpu), scheduling: Scheduling::Other }.apply();
+    if let Err(error) = set_policy(libc::SCHED_FIFO, 99) {
+        eprintln!(
+            "bench: no SCHED_FIFO: {error}; how long CPU {cpu} was held up includes what others ran on it"
+        );
+    }
+}
+
 fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
     // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
     let outcome = unsafe {

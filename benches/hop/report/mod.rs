@@ -14,8 +14,8 @@ pub mod targets;
 pub use figures::figures;
 pub use page::{fill, readme, runs_named};
 pub use summary::{
-    Attempt, Call, Isolation, Latency, Loss, Machine, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
-    Throughput,
+    Attempt, Call, Isolation, Latency, Loss, Lossy, Machine, Quantiles, Resource, Scale, Soak, SoakSeries,
+    Summary, Throughput,
 };
 pub use tables::{payload, soak_failures};
 pub use targets::JUDGED_HZ;

@@ -230,7 +230,22 @@ pub struct Soak {
     pub accepted: u64,
     pub missing: u64,
     pub reasons: BTreeMap<String, u64>,
+    /// Where samples are missing.
+    pub lossy: Vec<Lossy>,
+    /// The most that a CPU was held up for within 100 ms, where none are missing; `None` in older runs.
+    pub held_up_ms: Option<f64>,
     pub series: Vec<SoakSeries>,
+}
+
+/// Some seconds of load of which samples are missing.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Lossy {
+    /// When they ended, in seconds since the first began.
+    pub at_s: f64,
+    pub missing: u64,
+    /// The most that a CPU was held up for within 100 ms.
+    pub held_up_ms: f64,
 }
 
 /// One process, or the shared memory of all.

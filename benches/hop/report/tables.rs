@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use super::format::{count, number, range};
 use super::statistics::median;
-use super::summary::{Call, Latency, Resource, Summary};
+use super::summary::{Call, Latency, Resource, Soak, Summary};
 use super::table::Table;
 use super::targets;
 
@@ -495,13 +495,30 @@ pub fn soak(summary: &Summary) -> Option<String> {
         ]);
     }
     Some(format!(
-        "{:.1} hours of {}: {} samples, missing: {}.\n\n{}",
+        "{:.1} hours of {}: {} samples, missing: {}.{}\n\n{}",
         soak.seconds / 3_600.0,
         soak.load,
         count(soak.accepted),
         missing(soak.missing, &soak.reasons),
+        held_up(soak),
         table.text()
     ))
+}
+
+/// Whether the CPUs were held up when samples went missing, and when none did.
+fn held_up(soak: &Soak) -> String {
+    let Some(otherwise_ms) = soak.held_up_ms else { return String::new() };
+    let mut text = "\n\nHeld up within 100 ms, the CPU that was most:".to_owned();
+    for lossy in &soak.lossy {
+        text.push_str(&format!(
+            " {} ms by {} s, when {} went missing;",
+            number(Some(lossy.held_up_ms)),
+            count(lossy.at_s as u64),
+            count(lossy.missing),
+        ));
+    }
+    text.push_str(&format!(" up to {} ms when none did.", number(Some(otherwise_ms))));
+    text
 }
 
 /// Whether a soak found growth or loss.
