@@ -76,7 +76,7 @@ pub fn read_discovery(bytes: &[u8], encoding: RepresentationIdentifier) -> usize
 pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
   thread_local! {
     static UDP_SENDER: Option<Rc<UDPSender>> =
-      UDPSender::new_with_networks(0, None, 0).ok().map(Rc::new);
+      UDPSender::new_with_networks(0, &[], None, 0).ok().map(Rc::new);
   }
   let Some(udp_sender) = UDP_SENDER.with(Option::clone) else {
     return;

@@ -183,6 +183,7 @@ pub mod discovery; // to access some Discovered data in e.g. ros2-client crate
 pub mod fuzzing; // what reads bytes off the network, without sockets
 mod messages;
 mod network;
+pub use network::util::NetworkSelector;
 mod rtps;
 
 #[cfg(feature = "security")]
@@ -236,6 +237,7 @@ pub use serialization::{
 };
 /// What a datagram claims to hold, for one who looks at it.
 pub use rtps::arriving::sample_arriving;
+pub use rtps::reader_progress::MatchedReader;
 /// Part of RTPS DATA submessage: 4-byte header + serialized data
 pub use messages::submessages::elements::serialized_payload::SerializedPayload;
 pub use structure::{

@@ -37,7 +37,11 @@ use crate::{
     discovery_db::DiscoveryDB,
     sedp_messages::{DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData},
   },
-  network::{constant::*, udp_listener::UDPListener},
+  network::{
+    constant::*,
+    udp_listener::UDPListener,
+    util::{listener_locators, local_interface_table, IfAddr, NetworkSelector},
+  },
   polling::{
     ready_channel, wake_channel, wake_channel_unbounded, Hooks, LoopWaker, ReadySender,
     WakeReceiver, WakeSender, WakeUnboundedSender,
@@ -73,8 +77,8 @@ use crate::no_security::SecurityPluginsHandle;
 pub struct DomainParticipantBuilder {
   domain_id: u16,
 
-  only_networks: Option<Vec<IpAddr>>, /* optional IP address filter for discovery advertisements
-                                       * and multicast setup */
+  // Interfaces that are announced and used for multicast; `None` is all.
+  only_networks: Option<Vec<NetworkSelector>>,
 
   same_host_loopback: bool, // prefer loopback for same-host peers + localhost SPDP discovery peers
 
@@ -114,7 +118,23 @@ impl DomainParticipantBuilder {
   /// This is not a hard transport-level ACL: unicast sockets still bind to
   /// wildcard addresses for the selected ports.
   pub fn with_only_networks(mut self, addrs: impl IntoIterator<Item = impl Into<IpAddr>>) -> Self {
-    self.only_networks = Some(addrs.into_iter().map(Into::into).collect());
+    self.only_networks = Some(
+      addrs
+        .into_iter()
+        .map(|addr| NetworkSelector::Address(addr.into()))
+        .collect(),
+    );
+    self
+  }
+
+  /// As [`with_only_networks`](Self::with_only_networks), with interfaces by name,
+  /// too. They need not exist, or have an address, yet: interfaces that come later
+  /// are used from then on.
+  pub fn with_only_interfaces(
+    mut self,
+    selectors: impl IntoIterator<Item = NetworkSelector>,
+  ) -> Self {
+    self.only_networks = Some(selectors.into_iter().collect());
     self
   }
 
@@ -596,9 +616,6 @@ impl DomainParticipant {
     sockets.unwrap_or_else(|| Err(io::Error::other("no sockets for an onlooker")))
   }
 
-  pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
-    self.dpi.lock().ok().and_then(|g| g.only_networks())
-  }
 
   /// Gets all DiscoveredTopics from DDS network
   ///
@@ -684,6 +701,26 @@ impl DomainParticipant {
     self.dpi.lock()?.dispose_participant(guid)
   }
 
+  /// Readers of the topic that are made from now on begin after these samples of
+  /// these writers: for an application that has taken them before, in this process
+  /// or in an earlier one.
+  pub fn begin_after(
+    &self,
+    topic: &Topic,
+    taken: impl IntoIterator<Item = (GUID, crate::SequenceNumber)>,
+  ) -> CreateResult<()> {
+    let cache = self.dds_cache();
+    let cache = cache
+      .read()
+      .map_err(|e| CreateError::Poisoned { reason: format!("DDSCache: {e}") })?;
+    let topic_cache = cache.get_existing_topic_cache(&topic.name())?;
+    let mut topic_cache = topic_cache
+      .lock()
+      .map_err(|e| CreateError::Poisoned { reason: format!("TopicCache: {e}") })?;
+    topic_cache.taken = taken.into_iter().collect();
+    Ok(())
+  }
+
   /// Get a `DomainDomainParticipantStatusListener` that can be used
   /// to get `DomainParticipantStatusEvent`s for this DomainParticipant.
   pub fn status_listener(&self) -> DomainParticipantStatusListener {
@@ -715,6 +752,11 @@ impl DomainParticipant {
 
   pub(crate) fn self_locators(&self) -> HashMap<mio1::Token, Vec<Locator>> {
     self.dpi.lock().unwrap().self_locators()
+  }
+
+  /// Announces from now on the addresses that these interfaces have.
+  pub(crate) fn follow_interfaces(&self, interfaces: &[IfAddr]) {
+    self.dpi.lock().unwrap().dpi.follow_interfaces(interfaces);
   }
 } // end impl DomainParticipant
 
@@ -1041,7 +1083,7 @@ impl DomainParticipantDisc {
     security_plugins_handle: Option<SecurityPluginsHandle>,
     socket_receive_buffer_size: usize,
     socket_send_buffer_size: usize,
-    only_networks: Option<Vec<IpAddr>>,
+    only_networks: Option<Vec<NetworkSelector>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
     hooks: Hooks,
@@ -1149,9 +1191,6 @@ impl DomainParticipantDisc {
     self.dpi.dds_cache()
   }
 
-  pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
-    self.dpi.only_networks()
-  }
 
   #[cfg(feature = "security")] // just to avoid warning
   pub(crate) fn qos(&self) -> QosPolicies {
@@ -1266,10 +1305,12 @@ pub(crate) struct DomainParticipantInner {
 
   // RTPS locators describing how to reach this DP
   self_locators: HashMap<mio1::Token, Vec<Locator>>,
+  // Port of each listener, and whether it is one to multicast.
+  listener_kinds: HashMap<mio1::Token, (u16, bool)>,
 
   security_plugins_handle: Option<SecurityPluginsHandle>,
 
-  only_networks: Option<Arc<[IpAddr]>>,
+  only_networks: Option<Arc<[NetworkSelector]>>,
 
   /// See `DomainParticipant::onlooker_sockets`.
   #[cfg(unix)]
@@ -1314,7 +1355,7 @@ impl DomainParticipantInner {
     security_plugins_handle: Option<SecurityPluginsHandle>,
     socket_receive_buffer_size: usize,
     socket_send_buffer_size: usize,
-    only_networks: Option<Vec<IpAddr>>,
+    only_networks: Option<Vec<NetworkSelector>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
     hooks: Hooks,
@@ -1323,7 +1364,8 @@ impl DomainParticipantInner {
     #[cfg(not(feature = "security"))]
     let _dummy = _qos_policies; // to make clippy happy
 
-    let only_networks: Option<Arc<[IpAddr]>> = only_networks.map(|v| v.into());
+    let only_networks: Option<Arc<[NetworkSelector]>> = only_networks.map(|v| v.into());
+    let interfaces = local_interface_table();
 
     let mut listeners = HashMap::new();
 
@@ -1332,6 +1374,7 @@ impl DomainParticipantInner {
       spdp_well_known_multicast_port(domain_id),
       Ipv4Addr::new(239, 255, 0, 1),
       socket_receive_buffer_size,
+      &interfaces,
       only_networks.as_deref(),
     ) {
       Ok(l) => {
@@ -1351,6 +1394,7 @@ impl DomainParticipantInner {
         "0.0.0.0",
         spdp_well_known_unicast_port(domain_id, participant_id),
         socket_receive_buffer_size,
+        &interfaces,
       )
       .ok();
       if discovery_listener.is_none() {
@@ -1374,6 +1418,7 @@ impl DomainParticipantInner {
       user_traffic_multicast_port(domain_id),
       Ipv4Addr::new(239, 255, 0, 1),
       socket_receive_buffer_size,
+      &interfaces,
       only_networks.as_deref(),
     ) {
       Ok(l) => {
@@ -1386,19 +1431,24 @@ impl DomainParticipantInner {
       "0.0.0.0",
       user_traffic_unicast_port(domain_id, participant_id),
       socket_receive_buffer_size,
+      &interfaces,
     )
     .or_else(|e| {
       if matches!(e.kind(), ErrorKind::AddrInUse) {
         // If we do not get the preferred listening port,
         // try again, with "any" port number.
-        UDPListener::new_unicast_with_buf_size("0.0.0.0", 0, socket_receive_buffer_size).or_else(
-          |e| {
-            create_error_out_of_resources!(
-              "Could not open unicast user traffic listener, any port number: {:?}",
-              e
-            )
-          },
+        UDPListener::new_unicast_with_buf_size(
+          "0.0.0.0",
+          0,
+          socket_receive_buffer_size,
+          &interfaces,
         )
+        .or_else(|e| {
+          create_error_out_of_resources!(
+            "Could not open unicast user traffic listener, any port number: {:?}",
+            e
+          )
+        })
       } else {
         create_error_out_of_resources!("Could not open unicast user traffic listener: {e:?}")
       }
@@ -1416,18 +1466,18 @@ impl DomainParticipantInner {
     });
 
     // construct our own Locators
-    let self_locators: HashMap<mio1::Token, Vec<Locator>> = listeners
+    let listener_kinds = listeners
       .iter()
-      .map(
-        |(t, l)| match l.to_locator_address(only_networks.as_deref()) {
-          Ok(locs) => (*t, locs),
-          Err(e) => {
-            error!("No local network address for token {t:?}: {e:?}");
-            (*t, vec![])
-          }
-        },
-      )
+      .filter_map(|(token, listener)| match listener.kind() {
+        Ok(kind) => Some((*token, kind)),
+        Err(e) => {
+          error!("No local network address for token {token:?}: {e:?}");
+          None
+        }
+      })
       .collect();
+    let self_locators =
+      Self::locators_of(&listener_kinds, &interfaces, only_networks.as_deref());
 
     // Adding readers. Capacities match the previous mio-extras channels.
     let (sender_add_reader, receiver_add_reader) =
@@ -1501,6 +1551,7 @@ impl DomainParticipantInner {
           status_sender,
           security_plugins_clone,
           only_networks_for_ev_loop,
+          interfaces,
           socket_send_buffer_size,
           same_host_loopback,
           reader_ready_rx,
@@ -1555,6 +1606,7 @@ impl DomainParticipantInner {
       discovery_db_event_receiver,
       status_receiver,
       self_locators,
+      listener_kinds,
       security_plugins_handle,
       only_networks,
       #[cfg(unix)]
@@ -1566,8 +1618,23 @@ impl DomainParticipantInner {
     self.dds_cache.clone()
   }
 
-  pub(crate) fn only_networks(&self) -> Option<Arc<[IpAddr]>> {
-    self.only_networks.clone()
+  fn locators_of(
+    listener_kinds: &HashMap<mio1::Token, (u16, bool)>,
+    interfaces: &[IfAddr],
+    only_networks: Option<&[NetworkSelector]>,
+  ) -> HashMap<mio1::Token, Vec<Locator>> {
+    listener_kinds
+      .iter()
+      .map(|(token, (port, is_multicast))| {
+        let locators = listener_locators(interfaces, *port, *is_multicast, only_networks);
+        (*token, locators)
+      })
+      .collect()
+  }
+
+  fn follow_interfaces(&mut self, interfaces: &[IfAddr]) {
+    self.self_locators =
+      Self::locators_of(&self.listener_kinds, interfaces, self.only_networks.as_deref());
   }
 
   #[cfg(feature = "security")] // just to avoid warning

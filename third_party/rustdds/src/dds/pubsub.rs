@@ -561,6 +561,15 @@ impl InnerPublisher {
       backlog_limit,
       max_retain,
     );
+    // A KEEP_LAST writer never waits for a reader: what DDS calls KEEP_LAST is that
+    // the oldest sample gives way (DDS v1.4 Section 2.2.3.18). The resource limit
+    // bounds what is retained for repairs.
+    let send_buffer = match writer_qos.history() {
+      Some(policy::History::KeepLast { depth }) if writer_qos.is_reliable() => {
+        send_buffer.keep_last(depth.max(1) as usize)
+      }
+      _ => send_buffer,
+    };
     // Doorbell: enqueue this writer's entity id and wake the participant poll.
     let doorbell = Doorbell::new(guid.entity_id, self.writer_ready.clone());
 

@@ -57,7 +57,7 @@ impl Announced {
     D: Keyed<K = Endpoint_GUID>,
     SA: SerializerAdapter<D>,
   {
-    let goodbye = writer.dispose_numbered(&Endpoint_GUID(guid), None)?;
+    let goodbye = writer.dispose_numbered(&Endpoint_GUID(guid), None.into())?;
     if let Some(former) = self.present.borrow_mut().remove(&guid) {
       writer.retract(former);
     }

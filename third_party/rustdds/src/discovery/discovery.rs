@@ -1,4 +1,5 @@
 use std::{
+  collections::HashMap,
   sync::{Arc, RwLock},
   time::Duration as StdDuration,
 };
@@ -32,6 +33,7 @@ use crate::{
     },
     spdp_participant_data::{Participant_GUID, SpdpDiscoveredParticipantData},
   },
+  network::util::{local_interface_table, IfAddr},
   polling::{
     new_shared_timer, timeout_until, LoopWaker, ReadyReceiver, SharedTimer, WakeReceiver,
     WakeSender,
@@ -42,6 +44,7 @@ use crate::{
     duration::Duration,
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
+    locator::Locator,
     time::Timestamp,
   },
   with_key::{DataReader, DataWriter, Sample, WriteOptionsBuilder},
@@ -70,6 +73,8 @@ use crate::{
 //
 // "Participant Stateless Message" and "Participant Volatile Message" only appear
 // in Secure RTPS. Please see the RTPS Security specification for explanation.
+#[cfg(target_os = "linux")]
+use crate::network::interface_watch::InterfaceWatch;
 #[cfg(feature = "security")]
 use crate::{
   discovery::secure_discovery::SecureDiscovery,
@@ -99,6 +104,10 @@ pub enum DiscoveryCommand {
   ManualAssertLiveliness,
   DisposeParticipant {
     guid: GUID,
+  },
+  // Lets that participant discard this one and discover it anew.
+  ReintroduceTo {
+    prefix: GuidPrefix,
   },
   AssertTopicLiveliness {
     writer_guid: GUID,
@@ -199,6 +208,8 @@ enum DiscoveryTimerEvent {
   },
   // To those of `unanswered`, and to nobody else.
   AnswerParticipants,
+  // Enumerates the interfaces anew.
+  FollowInterfaces,
   ParticipantCleanup,
   TopicCleanup,
   PublishParticipantMessage,
@@ -265,6 +276,16 @@ pub(crate) struct Discovery {
   // Participants that are new, to be told of this one when the timer ends.
   unanswered: Vec<GuidPrefix>,
 
+  // The interfaces as they were last enumerated, and what notifies of changes. If it
+  // cannot be had, they are enumerated before each announcement.
+  interfaces: Vec<IfAddr>,
+  // Those of this participant. A copy, since the participant must not be locked while
+  // the database is.
+  locators: HashMap<Token, Vec<Locator>>,
+  #[cfg(target_os = "linux")]
+  interface_watch: Option<InterfaceWatch>,
+  is_follow_scheduled: bool,
+
   // A participant that died, for which goodbye is said until its lease ends.
   dead_participant: Option<(GUID, std::time::Instant)>,
 
@@ -323,6 +344,12 @@ impl Discovery {
   // For the event loop to know whom it is to send the answer to, and for one goodbye
   // to do for all who are new at about the same time.
   const ANSWER_DELAY: StdDuration = StdDuration::from_millis(10);
+  // An address comes some milliseconds after its link, and each is a notification.
+  const INTERFACES_SETTLE: StdDuration = StdDuration::from_millis(50);
+  // An announcement is repeated after a change of the interfaces: the first datagrams
+  // of a new link may be lost (carrier, association, a switch that learns).
+  const REPEAT_ON_NEW_LINK: [StdDuration; 2] =
+    [StdDuration::from_millis(300), StdDuration::from_millis(1000)];
   // How long others wait for the acknowledgements of a participant that was
   // killed: five announcements, so that two or three of them may be lost.
   const LEASE: StdDuration = StdDuration::from_secs(15);
@@ -720,6 +747,12 @@ impl Discovery {
       announced_readers: Announced::default(),
       announced_writers: Announced::default(),
       unanswered: Vec::new(),
+      // Not as the participant has them: what has changed since is followed then.
+      interfaces: Vec::new(),
+      locators: HashMap::new(),
+      #[cfg(target_os = "linux")]
+      interface_watch: None,
+      is_follow_scheduled: false,
       dead_participant: None,
     })
   }
@@ -730,6 +763,7 @@ impl Discovery {
       return;
     }
     self.initialize_participant();
+    self.watch_interfaces();
 
     // Send out info about user (=non-built-in) Writers and Readers that we have.
     // We are just initializing local participant, so likely there are none yet,
@@ -783,6 +817,7 @@ impl Discovery {
         DISCOVERY_TIMER_TOKEN,
       ];
       tokens.extend(self.discovery_samples.drain_unique());
+      self.drain_interface_watch();
       for token in tokens {
         match token {
           DISCOVERY_COMMAND_TOKEN => {
@@ -822,6 +857,7 @@ impl Discovery {
                   self.dead_participant = Some((guid, lease_end));
                   self.say_goodbye_for_the_dead();
                 }
+                DiscoveryCommand::ReintroduceTo { prefix } => self.reintroduce_to(prefix),
                 DiscoveryCommand::ManualAssertLiveliness => {
                   self
                     .liveliness_state
@@ -887,6 +923,7 @@ impl Discovery {
             for timer_event in expired {
               match timer_event {
                 DiscoveryTimerEvent::SendParticipantInfo { reschedule } => {
+                  self.follow_interfaces_without_watch();
                   if let Some(dp) = self.domain_participant.clone().upgrade() {
                     self.spdp_publish(&dp);
                     // Once more, now that they know who says so.
@@ -904,6 +941,7 @@ impl Discovery {
                     );
                   }
                 }
+                DiscoveryTimerEvent::FollowInterfaces => self.follow_interfaces(),
                 DiscoveryTimerEvent::AnswerParticipants => {
                   let Some(dp) = self.domain_participant.clone().upgrade() else {
                     error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
@@ -991,6 +1029,103 @@ impl Discovery {
       } // for
     } // loop
   } // fn
+
+  fn watch_interfaces(&mut self) {
+    #[cfg(target_os = "linux")]
+    {
+      let watch = InterfaceWatch::new().and_then(|watch| {
+        let fd = watch.raw_fd();
+        let mut source = mio1::unix::SourceFd(&fd);
+        let interest = mio1::Interest::READABLE;
+        let registry = self.poll.registry();
+        registry.register(&mut source, INTERFACE_WATCH_TOKEN, interest)?;
+        Ok(watch)
+      });
+      match watch {
+        Ok(watch) => self.interface_watch = Some(watch),
+        Err(e) => warn!("No notification of changed network interfaces, looking each 3 s: {e}"),
+      }
+    }
+    // What has changed since the participant enumerated them.
+    self.follow_interfaces();
+  }
+
+  fn drain_interface_watch(&mut self) {
+    #[cfg(target_os = "linux")]
+    if self.interface_watch.as_ref().is_some_and(InterfaceWatch::drain) && !self.is_follow_scheduled
+    {
+      self.is_follow_scheduled = true;
+      self
+        .discovery_timer
+        .borrow_mut()
+        .set_timeout(Self::INTERFACES_SETTLE, DiscoveryTimerEvent::FollowInterfaces);
+    }
+  }
+
+  fn follow_interfaces_without_watch(&mut self) {
+    #[cfg(target_os = "linux")]
+    if self.interface_watch.is_some() {
+      return;
+    }
+    self.follow_interfaces();
+  }
+
+  // Announces the addresses that this host has now, and lets the event loop use its
+  // interfaces.
+  fn follow_interfaces(&mut self) {
+    self.is_follow_scheduled = false;
+    let interfaces = local_interface_table();
+    if interfaces == self.interfaces {
+      return;
+    }
+    let is_first = self.interfaces.is_empty();
+    self.interfaces.clone_from(&interfaces);
+    let Some(dp) = self.domain_participant.clone().upgrade() else {
+      return; // shutting down
+    };
+    let before = dp.self_locators();
+    dp.follow_interfaces(&interfaces);
+    let after = dp.self_locators();
+    self.locators.clone_from(&after);
+    info!("Network interfaces now: {interfaces:?}");
+    self.send_discovery_notification(DiscoveryNotificationType::InterfacesChanged { interfaces });
+    if before != after {
+      // The announcements of all endpoints carry the addresses.
+      let db = discovery_db_read(&self.discovery_db);
+      for reader in db.get_all_local_topic_readers() {
+        self.sedp_publish_single_user_reader(reader);
+      }
+      for writer in db.get_all_local_topic_writers() {
+        self.sedp_publish_single_user_writer(writer);
+      }
+    }
+    // Also if only the carrier is back: others wait for an announcement.
+    if !is_first {
+      self.spdp_publish(&dp);
+      for after in Self::REPEAT_ON_NEW_LINK {
+        self.discovery_timer.borrow_mut().set_timeout(
+          after,
+          DiscoveryTimerEvent::SendParticipantInfo { reschedule: false },
+        );
+      }
+    }
+  }
+
+  // To that one only, a goodbye and an announcement.
+  fn reintroduce_to(&mut self, prefix: GuidPrefix) {
+    let reader = GUID::new(prefix, EntityId::SPDP_BUILTIN_PARTICIPANT_READER);
+    let options = WriteOptionsBuilder::new().to_single_reader(reader).build();
+    let own = Participant_GUID(self.domain_participant.guid());
+    let goodbye = self.dcps_participant.writer.dispose_numbered(&own, options);
+    if let Err(e) = goodbye {
+      error!("Goodbye to {prefix:?} failed: {e:?}");
+    }
+    let Some(dp) = self.domain_participant.clone().upgrade() else {
+      return; // shutting down
+    };
+    self.unanswered.push(prefix);
+    self.answer_participants(&dp);
+  }
 
   // Initialize our own participant data into the Discovery DB.
   // That causes ReaderProxies and WriterProxies to be constructed and
@@ -1917,10 +2052,16 @@ impl Discovery {
     };
 
     if do_nonsecure_write {
+      let mut current = reader_data.clone();
+      if let Some(unicast) = self.locators.get(&USER_TRAFFIC_LISTENER_TOKEN) {
+        let multicast = self.locators.get(&USER_TRAFFIC_MUL_LISTENER_TOKEN).cloned();
+        current.reader_proxy.unicast_locator_list = unicast.clone();
+        current.reader_proxy.multicast_locator_list = multicast.unwrap_or_default();
+      }
       match self.announced_readers.announce(
         &self.dcps_subscription.writer,
         reader_data.reader_proxy.remote_reader_guid,
-        reader_data.clone(),
+        current,
       ) {
         Ok(()) => {
           debug!(
@@ -2018,10 +2159,14 @@ impl Discovery {
     };
 
     if do_nonsecure_write {
+      let mut current = writer_data.clone();
+      if let Some(unicast) = self.locators.get(&USER_TRAFFIC_LISTENER_TOKEN) {
+        current.writer_proxy.unicast_locator_list = unicast.clone();
+      }
       match self.announced_writers.announce(
         &self.dcps_publication.writer,
         writer_data.writer_proxy.remote_writer_guid,
-        writer_data.clone(),
+        current,
       ) {
         Ok(()) => {
           debug!(

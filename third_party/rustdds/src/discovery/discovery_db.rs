@@ -292,6 +292,18 @@ impl DiscoveryDB {
     self.participant_proxies.get(&guid_prefix)
   }
 
+  /// The participants that fulfil a condition.
+  pub fn participant_prefixes(
+    &self,
+    condition: impl Fn(&SpdpDiscoveredParticipantData) -> bool,
+  ) -> Vec<GuidPrefix> {
+    let participants = self.participant_proxies.iter();
+    participants
+      .filter(|(_, data)| condition(data))
+      .map(|(prefix, _)| *prefix)
+      .collect()
+  }
+
   fn remove_topic_reader_with_prefix(&mut self, guid_prefix: GuidPrefix) {
     // TODO: Implement this using .drain_filter() in BTreeMap once it lands in
     // stable.

@@ -1,21 +1,17 @@
 use std::{
-  collections::HashMap,
+  collections::{BTreeSet, HashMap},
   io,
   net::{IpAddr, Ipv4Addr, SocketAddr},
 };
 
-use log::{debug, error, info, trace, warn};
-use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+use log::{debug, info, trace, warn};
+use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockAddr, SockRef, Socket, Type};
 use bytes::{Bytes, BytesMut};
 
 use crate::{
-  network::util::{
-    build_ifindex_to_interface_map, get_local_multicast_ip_addrs_filtered,
-    get_local_multicast_locators, get_local_unicast_locators_filtered,
-  },
+  network::util::{build_ifindex_map_inner, multicast_interface_indexes, IfAddr, NetworkSelector},
   rtps::transmit::InterfaceSelector,
   serialization::padding_needed_for_alignment_4,
-  structure::locator::Locator,
 };
 
 /// Metadata captured about where a received datagram came from and how it
@@ -51,23 +47,12 @@ pub struct UDPListener {
   socket: mio1::net::UdpSocket,
   receive_buffer: BytesMut,
   multicast_group: Option<Ipv4Addr>,
-  has_multicast_join: bool,
+  // Indexes of the interfaces on which the group is joined. By index, because an
+  // interface keeps it when its address changes.
+  joined: BTreeSet<u32>,
   // Cached OS interface-index -> local interface map, used to resolve the
-  // receiving interface reported by IP_PKTINFO. Built once at construction.
+  // receiving interface reported by IP_PKTINFO. Kept by `follow_interfaces`.
   ifindex_map: HashMap<u32, InterfaceSelector>,
-}
-
-impl Drop for UDPListener {
-  fn drop(&mut self) {
-    if let Some(mcg) = self.multicast_group {
-      self
-        .socket
-        .leave_multicast_v4(&mcg, &Ipv4Addr::UNSPECIFIED)
-        .unwrap_or_else(|e| {
-          error!("leave_multicast_group: {e:?}");
-        });
-    }
-  }
 }
 
 impl UDPListener {
@@ -178,28 +163,60 @@ impl UDPListener {
     Ok(mio_socket)
   }
 
-  pub fn to_locator_address(&self, only_networks: Option<&[IpAddr]>) -> io::Result<Vec<Locator>> {
-    let local_port = self.socket.local_addr()?.port();
+  /// Port, and whether it is a listener to multicast.
+  pub(crate) fn kind(&self) -> io::Result<(u16, bool)> {
+    let port = self.socket.local_addr()?.port();
+    Ok((port, self.multicast_group.is_some()))
+  }
 
-    match self.multicast_group {
-      Some(_ipv4_addr) if self.has_multicast_join => Ok(get_local_multicast_locators(local_port)),
-      Some(_ipv4_addr) => Ok(vec![]),
-      None => Ok(get_local_unicast_locators_filtered(
-        local_port,
-        only_networks,
-      )),
+  /// Joins the multicast group on interfaces that have come, and leaves it on those
+  /// that are gone. The membership of an interface that was removed and comes back
+  /// under the same name is not that of the new one, which has another index.
+  pub(crate) fn follow_interfaces(
+    &mut self,
+    interfaces: &[IfAddr],
+    only_networks: Option<&[NetworkSelector]>,
+  ) {
+    self.ifindex_map = build_ifindex_map_inner(interfaces);
+    let Some(group) = self.multicast_group else {
+      return;
+    };
+    let wanted = multicast_interface_indexes(interfaces, only_networks);
+    let socket = SockRef::from(&self.socket);
+    for gone in self.joined.difference(&wanted) {
+      // The kernel has done so where the interface was removed.
+      let interface = InterfaceIndexOrAddress::Index(*gone);
+      if let Err(e) = socket.leave_multicast_v4_n(&group, &interface) {
+        debug!("leave_multicast_v4_n {group} on interface {gone}: {e}");
+      }
+    }
+    self.joined.retain(|index| wanted.contains(index));
+    for new in wanted {
+      if self.joined.contains(&new) {
+        continue;
+      }
+      let interface = InterfaceIndexOrAddress::Index(new);
+      match socket.join_multicast_v4_n(&group, &interface) {
+        Ok(()) => {
+          self.joined.insert(new);
+        }
+        // Tried again with the next change.
+        Err(e) => warn!("join_multicast_v4_n {group} on interface {new} failed: {e}"),
+      }
     }
   }
 
   #[cfg(test)]
   pub fn new_unicast(host: &str, port: u16) -> io::Result<Self> {
-    Self::new_unicast_with_buf_size(host, port, 0)
+    let interfaces = crate::network::util::local_interface_table();
+    Self::new_unicast_with_buf_size(host, port, 0, &interfaces)
   }
 
-  pub fn new_unicast_with_buf_size(
+  pub(crate) fn new_unicast_with_buf_size(
     host: &str,
     port: u16,
     recv_buffer_size: usize,
+    interfaces: &[IfAddr],
   ) -> io::Result<Self> {
     let mio_socket = Self::new_listening_socket(host, port, false, recv_buffer_size)?;
 
@@ -207,74 +224,49 @@ impl UDPListener {
       socket: mio_socket,
       receive_buffer: BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK),
       multicast_group: None,
-      has_multicast_join: false,
-      ifindex_map: build_ifindex_to_interface_map(),
+      joined: BTreeSet::new(),
+      ifindex_map: build_ifindex_map_inner(interfaces),
     })
   }
 
   #[cfg(test)]
   pub fn new_multicast(host: &str, port: u16, multicast_group: Ipv4Addr) -> io::Result<Self> {
-    Self::new_multicast_with_buf_size(host, port, multicast_group, 0, None)
+    let interfaces = crate::network::util::local_interface_table();
+    Self::new_multicast_with_buf_size(host, port, multicast_group, 0, &interfaces, None)
   }
 
-  pub fn new_multicast_with_buf_size(
+  pub(crate) fn new_multicast_with_buf_size(
     host: &str,
     port: u16,
     multicast_group: Ipv4Addr,
     recv_buffer_size: usize,
-    only_networks: Option<&[IpAddr]>,
+    interfaces: &[IfAddr],
+    only_networks: Option<&[NetworkSelector]>,
   ) -> io::Result<Self> {
     if !multicast_group.is_multicast() {
       return io::Result::Err(io::Error::other("Not a multicast address"));
     }
-
-    let mio_socket = Self::new_listening_socket(host, port, true, recv_buffer_size)?;
-    let mut joined_multicast = false;
-
-    for multicast_if_ipaddr in get_local_multicast_ip_addrs_filtered(only_networks)? {
-      match multicast_if_ipaddr {
-        IpAddr::V4(a) => mio_socket
-          .join_multicast_v4(&multicast_group, &a)
-          .map(|()| {
-            joined_multicast = true;
-          })
-          .unwrap_or_else(|e| {
-            warn!(
-              "join_multicast_v4 failed: {e:?}. multicast_group [{multicast_group:?}] interface \
-               [{a:?}]"
-            );
-          }),
-
-        IpAddr::V6(addr) => {
-          mio_socket
-            .join_multicast_v6(&addr, 0)
-            .map(|()| {
-              joined_multicast = true;
-            })
-            .unwrap_or_else(|e| {
-              warn!(
-                "join_multicast_v6 failed. err: {e}. mcast group: [{multicast_group:?}], \
-                 addr:[{addr:?}]"
-              );
-            });
-        }
-      }
+    let socket = Self::new_listening_socket(host, port, true, recv_buffer_size)?;
+    // By default Linux delivers a group that any process has joined on an interface to
+    // all sockets of its port (ip(7), IP_MULTICAST_ALL). A participant that has not yet
+    // taken over a new address would hear a peer there, and answer with addresses at
+    // which the peer cannot reach it; Fast DDS 2.9 keeps those as long as it lives.
+    #[cfg(target_os = "linux")]
+    if let Err(e) = socket2::SockRef::from(&socket).set_multicast_all_v4(false) {
+      warn!("Multicast of groups that others have joined is received, too: {e}");
     }
-
-    if !joined_multicast {
-      warn!(
-        "No multicast joins succeeded for group {multicast_group:?}; multicast locator will not \
-         be advertised."
-      );
-    }
-
-    Ok(Self {
-      socket: mio_socket,
+    let mut listener = Self {
+      socket,
       receive_buffer: BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK),
       multicast_group: Some(multicast_group),
-      has_multicast_join: joined_multicast,
-      ifindex_map: build_ifindex_to_interface_map(),
-    })
+      joined: BTreeSet::new(),
+      ifindex_map: HashMap::new(),
+    };
+    listener.follow_interfaces(interfaces, only_networks);
+    if listener.joined.is_empty() {
+      info!("No interface to join multicast group {multicast_group} on, yet.");
+    }
+    Ok(listener)
   }
 
   /// The socket once more, for one who looks at what comes and takes nothing.

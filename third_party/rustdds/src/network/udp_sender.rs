@@ -2,11 +2,10 @@ use std::{
   cell::RefCell,
   collections::HashMap,
   io,
-  net::{IpAddr, SocketAddr, UdpSocket},
+  net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket},
+  rc::Rc,
   sync::Arc,
 };
-#[cfg(test)]
-use std::net::Ipv4Addr;
 #[cfg(unix)]
 use std::os::unix::io::{AsRawFd, RawFd};
 
@@ -15,7 +14,7 @@ use log::{debug, error, info, trace, warn};
 use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
 use crate::{
-  network::util::get_local_multicast_ip_addrs_filtered,
+  network::util::{get_local_multicast_ip_addrs_inner, IfAddr, NetworkSelector},
   rtps::{
     message::RTPS_MESSAGE_HEADER_SIZE,
     outbound::{ControlQueue, Datagram, SendOutcome, SocketId, CONTROL_QUEUE_WARN_LEN},
@@ -40,7 +39,11 @@ pub struct UDPSender {
   // One multicast sender socket per local interface, keyed by the interface it
   // was bound to (its `InterfaceSelector`). This lets us target a single
   // interface instead of sending on all of them.
-  multicast_sockets: Vec<(InterfaceSelector, UdpSocket)>,
+  //
+  // A `SocketId::Multicast` is a place in this list. The place of a socket that is
+  // closed, since its address is gone, stays empty until a new socket takes it.
+  multicast_sockets: RefCell<Vec<Option<(InterfaceSelector, Rc<UdpSocket>)>>>,
+  send_buffer_size: usize,
 
   // nonblocking-transmit: per-socket never-dropped control queue. A control
   // datagram is enqueued only when its socket is currently congested
@@ -56,7 +59,8 @@ pub struct UDPSender {
 impl UDPSender {
   #[cfg(test)]
   pub fn new(sender_port: u16) -> io::Result<Self> {
-    Self::new_with_networks(sender_port, None, 0)
+    let interfaces = crate::network::util::local_interface_table();
+    Self::new_with_networks(sender_port, &interfaces, None, 0)
   }
 
   // Request (and verify) SO_SNDBUF on a sender socket. `size == 0` leaves the
@@ -92,9 +96,10 @@ impl UDPSender {
     }
   }
 
-  pub fn new_with_networks(
+  pub(crate) fn new_with_networks(
     sender_port: u16,
-    only_networks: Option<&[IpAddr]>,
+    interfaces: &[IfAddr],
+    only_networks: Option<&[NetworkSelector]>,
     send_buffer_size: usize,
   ) -> io::Result<Self> {
     let unicast_socket = {
@@ -116,75 +121,77 @@ impl UDPSender {
         error!("Cannot set multicast loop on: {e:?}");
       });
 
-    let mut multicast_sockets = Vec::with_capacity(1);
-    for multicast_if_ipaddr in get_local_multicast_ip_addrs_filtered(only_networks)? {
-      // beef: specify output interface
-      trace!("UDPSender: Multicast sender on interface {multicast_if_ipaddr:?}");
-
-      let mc_socket = match multicast_if_ipaddr {
-        // ipv4 requires a little more work
-        IpAddr::V4(a) => {
-          let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
-          raw_socket.set_multicast_if_v4(&a)?;
-          Self::set_and_verify_send_buffer(&raw_socket, send_buffer_size);
-
-          // Handle windows.
-          //
-          // TODO: Check if necessary.
-          if cfg!(windows) {
-            raw_socket.set_reuse_address(true)?;
-          }
-
-          // bind to the multicast interface
-          raw_socket.bind(&SockAddr::from(SocketAddr::new(multicast_if_ipaddr, 0)))?;
-
-          // make multicast sock
-          let mc_socket = UdpSocket::from(raw_socket);
-          mc_socket.set_multicast_loop_v4(true).unwrap_or_else(|e| {
-            error!("Cannot set IPv4 multicast loop. err: {e}");
-          });
-          // nonblocking-transmit: mio requires the socket be non-blocking, and
-          // we must never let a full kernel buffer stall the event loop.
-          mc_socket.set_nonblocking(true).unwrap_or_else(|e| {
-            error!("Cannot set IPv4 multicast socket non-blocking. err: {e}");
-          });
-          mc_socket
-        }
-
-        // ipv6
-        IpAddr::V6(addr) => {
-          let raw_socket = Socket::new(Domain::IPV6, Type::DGRAM, Some(Protocol::UDP))?;
-          Self::set_and_verify_send_buffer(&raw_socket, send_buffer_size);
-
-          // note: you don't need to use set_multicast_if for ipv6 multicast.
-          // it comes for free!
-          raw_socket.bind(&SocketAddr::new(addr.into(), 0).into())?;
-
-          // make multicast sock
-          let mc_socket = UdpSocket::from(raw_socket);
-          mc_socket.set_multicast_loop_v6(true).unwrap_or_else(|e| {
-            error!("Cannot set IPv6 multicast loop. err: {e}");
-          });
-          // nonblocking-transmit: see IPv4 branch above.
-          mc_socket.set_nonblocking(true).unwrap_or_else(|e| {
-            error!("Cannot set IPv6 multicast socket non-blocking. err: {e}");
-          });
-
-          mc_socket
-        }
-      };
-
-      multicast_sockets.push((InterfaceSelector::Ip(multicast_if_ipaddr), mc_socket));
-    } // end for
-
     let sender = Self {
       unicast_socket: Arc::new(unicast_socket),
-      multicast_sockets,
+      multicast_sockets: RefCell::new(Vec::new()),
+      send_buffer_size,
       control_queues: RefCell::new(HashMap::new()),
       together: RefCell::new(None),
     };
+    sender.follow_interfaces(interfaces, only_networks);
     info!("UDPSender::new() --> {sender:?}");
     Ok(sender)
+  }
+
+  /// Opens a socket for multicast for each address that has come, and closes those
+  /// of addresses that are gone. Yields the closed ones.
+  pub(crate) fn follow_interfaces(
+    &self,
+    interfaces: &[IfAddr],
+    only_networks: Option<&[NetworkSelector]>,
+  ) -> Vec<SocketId> {
+    let wanted: Vec<InterfaceSelector> =
+      get_local_multicast_ip_addrs_inner(interfaces, only_networks)
+        .into_iter()
+        .map(InterfaceSelector::Ip)
+        .collect();
+    let mut closed = Vec::new();
+    let mut sockets = self.multicast_sockets.borrow_mut();
+    for (place, socket) in sockets.iter_mut().enumerate() {
+      if socket
+        .as_ref()
+        .is_some_and(|(interface, _)| !wanted.contains(interface))
+      {
+        *socket = None;
+        let id = SocketId::Multicast(place);
+        // What waited for a network that is gone.
+        self.control_queues.borrow_mut().remove(&id);
+        closed.push(id);
+      }
+    }
+    for interface in wanted {
+      if sockets.iter().flatten().any(|(known, _)| *known == interface) {
+        continue;
+      }
+      let InterfaceSelector::Ip(IpAddr::V4(address)) = interface else {
+        continue; // `get_local_multicast_ip_addrs_inner` yields none
+      };
+      match Self::open_multicast_socket(address, self.send_buffer_size) {
+        Ok(socket) => {
+          let opened = Some((interface, Rc::new(socket)));
+          match sockets.iter_mut().find(|place| place.is_none()) {
+            Some(place) => *place = opened,
+            None => sockets.push(opened),
+          }
+        }
+        // The address may be gone again. Tried again with the next change.
+        Err(e) => warn!("Cannot open a socket for multicast from {address}: {e}"),
+      }
+    }
+    closed
+  }
+
+  fn open_multicast_socket(address: Ipv4Addr, send_buffer_size: usize) -> io::Result<UdpSocket> {
+    let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    raw_socket.set_multicast_if_v4(&address)?;
+    Self::set_and_verify_send_buffer(&raw_socket, send_buffer_size);
+    raw_socket.bind(&SockAddr::from(SocketAddr::from((address, 0))))?;
+    let socket = UdpSocket::from(raw_socket);
+    // Participants on this host hear it, too.
+    socket.set_multicast_loop_v4(true)?;
+    // nonblocking-transmit: a full kernel buffer must never stall the event loop.
+    socket.set_nonblocking(true)?;
+    Ok(socket)
   }
 
   #[cfg(test)]
@@ -198,24 +205,32 @@ impl UDPSender {
 
   // --- nonblocking-transmit: socket enumeration & raw non-blocking send ------
 
-  fn socket_ref(&self, id: SocketId) -> Option<&UdpSocket> {
-    match id {
-      SocketId::Unicast => Some(&self.unicast_socket),
-      SocketId::Multicast(i) => self.multicast_sockets.get(i).map(|(_, s)| s),
-    }
+  fn multicast_socket(&self, place: usize) -> Option<(InterfaceSelector, Rc<UdpSocket>)> {
+    self.multicast_sockets.borrow().get(place).cloned().flatten()
   }
 
   /// All sender sockets, so `DPEventLoop` can arm write readiness on each.
   pub(crate) fn socket_ids(&self) -> Vec<SocketId> {
     let mut v = vec![SocketId::Unicast];
-    v.extend((0..self.multicast_sockets.len()).map(SocketId::Multicast));
+    v.extend(self.multicast_ids());
     v
+  }
+
+  fn multicast_ids(&self) -> Vec<SocketId> {
+    let sockets = self.multicast_sockets.borrow();
+    let open = sockets.iter().enumerate().filter(|(_, socket)| socket.is_some());
+    open.map(|(place, _)| SocketId::Multicast(place)).collect()
   }
 
   /// Raw fd of a sender socket, for registering write readiness in the poll.
   #[cfg(unix)]
   pub(crate) fn socket_raw_fd(&self, id: SocketId) -> Option<RawFd> {
-    self.socket_ref(id).map(AsRawFd::as_raw_fd)
+    match id {
+      SocketId::Unicast => Some(self.unicast_socket.as_raw_fd()),
+      SocketId::Multicast(place) => self
+        .multicast_socket(place)
+        .map(|(_, socket)| socket.as_raw_fd()),
+    }
   }
 
   /// Whether socket `id` can address `addr` at all. The unicast socket is
@@ -228,7 +243,7 @@ impl UDPSender {
   fn socket_can_reach(&self, id: SocketId, addr: SocketAddr) -> bool {
     match id {
       SocketId::Unicast => addr.is_ipv4(),
-      SocketId::Multicast(i) => match self.multicast_sockets.get(i) {
+      SocketId::Multicast(place) => match self.multicast_socket(place) {
         Some((InterfaceSelector::Ip(iface_ip), _)) => iface_ip.is_ipv4() == addr.is_ipv4(),
         None => false,
       },
@@ -237,15 +252,18 @@ impl UDPSender {
 
   /// One non-blocking datagram send. Never blocks; classifies the result.
   fn raw_send(&self, id: SocketId, addr: SocketAddr, buffer: &[u8]) -> SendOutcome {
-    let Some(socket) = self.socket_ref(id) else {
-      error!("raw_send: no socket for {id:?}");
-      return SendOutcome::Dropped;
-    };
     if !self.socket_can_reach(id, addr) {
       trace!("raw_send: {id:?} cannot reach {addr} (address family mismatch), dropping");
       return SendOutcome::Dropped;
     }
-    match socket.send_to(buffer, addr) {
+    let sent = match id {
+      SocketId::Unicast => self.unicast_socket.send_to(buffer, addr),
+      SocketId::Multicast(place) => match self.multicast_socket(place) {
+        Some((_, socket)) => socket.send_to(buffer, addr),
+        None => return SendOutcome::Dropped, // closed meanwhile
+      },
+    };
+    match sent {
       Ok(bytes_sent) => {
         if bytes_sent != buffer.len() {
           error!(
@@ -256,6 +274,20 @@ impl UDPSender {
         SendOutcome::Sent
       }
       Err(e) if e.kind() == io::ErrorKind::WouldBlock => SendOutcome::WouldBlock,
+      // A link that is down, or an address that is gone: so for each datagram until
+      // the peer's lease ends.
+      Err(e)
+        if matches!(
+          e.kind(),
+          io::ErrorKind::NetworkUnreachable
+            | io::ErrorKind::HostUnreachable
+            | io::ErrorKind::NetworkDown
+            | io::ErrorKind::AddrNotAvailable
+        ) =>
+      {
+        debug!("raw_send: {id:?} to {addr}: {e}");
+        SendOutcome::Dropped
+      }
       Err(e) => {
         warn!("raw_send: {id:?} to {addr} : {e:?} len={}", buffer.len());
         SendOutcome::Dropped
@@ -435,8 +467,8 @@ impl UDPSender {
       return;
     };
     if socket_address.ip().is_multicast() {
-      for id in 0..self.multicast_sockets.len() {
-        self.control_send_one(SocketId::Multicast(id), socket_address, buffer);
+      for id in self.multicast_ids() {
+        self.control_send_one(id, socket_address, buffer);
       }
     } else {
       self.control_send_one(SocketId::Unicast, socket_address, buffer);
@@ -446,18 +478,15 @@ impl UDPSender {
   /// The set of local interfaces on which this sender can emit multicast.
   /// Used by route resolution to validate an observed interface is usable.
   pub fn multicast_interfaces(&self) -> Vec<InterfaceSelector> {
-    self
-      .multicast_sockets
-      .iter()
-      .map(|(iface, _)| *iface)
-      .collect()
+    let sockets = self.multicast_sockets.borrow();
+    sockets.iter().flatten().map(|(iface, _)| *iface).collect()
   }
 
   fn multicast_socket_id_for(&self, interface: &InterfaceSelector) -> Option<SocketId> {
-    self
-      .multicast_sockets
+    let sockets = self.multicast_sockets.borrow();
+    sockets
       .iter()
-      .position(|(iface, _)| iface == interface)
+      .position(|socket| matches!(socket, Some((iface, _)) if iface == interface))
       .map(SocketId::Multicast)
   }
 
@@ -491,8 +520,8 @@ impl UDPSender {
       Some(id) => self.control_send_one(id, socket_address, buffer),
       None => {
         trace!("send_to_multicast_locator_via: interface {interface:?} not found, sending on all");
-        for id in 0..self.multicast_sockets.len() {
-          self.control_send_one(SocketId::Multicast(id), socket_address, buffer);
+        for id in self.multicast_ids() {
+          self.control_send_one(id, socket_address, buffer);
         }
       }
     }
@@ -521,7 +550,7 @@ impl UDPSender {
       return blocked;
     };
     if socket_address.ip().is_multicast() {
-      for id in (0..self.multicast_sockets.len()).map(SocketId::Multicast) {
+      for id in self.multicast_ids() {
         if self.bulk_send_one(id, socket_address, buffer) == SendOutcome::WouldBlock {
           blocked.push(id);
         }
@@ -562,9 +591,7 @@ impl UDPSender {
     }
     let ids: Vec<SocketId> = match self.multicast_socket_id_for(interface) {
       Some(id) => vec![id],
-      None => (0..self.multicast_sockets.len())
-        .map(SocketId::Multicast)
-        .collect(),
+      None => self.multicast_ids(),
     };
     for id in ids {
       if self.bulk_send_one(id, socket_address, buffer) == SendOutcome::WouldBlock {
@@ -601,7 +628,7 @@ impl UDPSender {
     if address.is_multicast() {
       let address = SocketAddr::new(IpAddr::V4(address), port);
       let mut size = 0;
-      for (_iface, s) in self.multicast_sockets {
+      for (_iface, s) in self.multicast_sockets.borrow().iter().flatten() {
         size = s.send_to(buffer, address)?;
       }
       Ok(size)

@@ -1,10 +1,10 @@
 use std::{
-  collections::HashMap,
+  collections::{BTreeSet, HashMap},
   io,
   net::{IpAddr, Ipv4Addr, SocketAddr},
 };
 
-use log::{error, warn};
+use log::error;
 
 use crate::{
   rtps::{
@@ -14,6 +14,25 @@ use crate::{
   structure::locator::Locator,
 };
 
+/// A network interface that a participant uses.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum NetworkSelector {
+  /// The interface of this name, with the addresses that it has at the time.
+  Name(String),
+  /// The interface that has this address at the time.
+  Address(IpAddr),
+}
+
+/// Whether a participant with these networks uses the address. `None` is all.
+pub(crate) fn is_selected(ifa: &IfAddr, only_networks: Option<&[NetworkSelector]>) -> bool {
+  only_networks.is_none_or(|selectors| {
+    selectors.iter().any(|selector| match selector {
+      NetworkSelector::Name(name) => *name == ifa.name,
+      NetworkSelector::Address(ip) => *ip == ifa.ip,
+    })
+  })
+}
+
 /// Platform-neutral view of one network-interface address.
 ///
 /// [`netdev`] gives us a single cross-platform enumeration; we normalize its
@@ -22,11 +41,15 @@ use crate::{
 /// of any enumeration dependency and makes them trivially unit-testable.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct IfAddr {
+  /// Name of the interface, such as `wlan0`.
+  pub name: String,
   /// An IP address bound to the interface.
   pub ip: IpAddr,
   /// OS interface index. `0` when unknown / not applicable.
   pub index: u32,
   pub is_loopback: bool,
+  /// Whether the interface is up and has a carrier.
+  pub is_running: bool,
   /// Whether the interface is multicast-capable.
   pub is_multicast: bool,
   /// IPv4 subnet mask for `ip` (only populated for IPv4 addresses). Used to
@@ -60,12 +83,16 @@ fn enumerate_interfaces() -> io::Result<Vec<IfAddr>> {
     let is_loopback = iface.is_loopback();
     let is_multicast = iface.is_multicast();
     let mtu = iface.mtu;
+    let is_running = iface.is_running();
+    let name = iface.name;
 
     for net in &iface.ipv4 {
       result.push(IfAddr {
+        name: name.clone(),
         ip: IpAddr::V4(net.addr()),
         index,
         is_loopback,
+        is_running,
         is_multicast,
         netmask: Some(net.netmask()),
         mtu,
@@ -73,9 +100,11 @@ fn enumerate_interfaces() -> io::Result<Vec<IfAddr>> {
     }
     for net in &iface.ipv6 {
       result.push(IfAddr {
+        name: name.clone(),
         ip: IpAddr::V6(net.addr()),
         index,
         is_loopback,
+        is_running,
         is_multicast,
         // IPv4-only subnet matching for now; IPv6 peers fall back to default.
         netmask: None,
@@ -187,35 +216,26 @@ pub fn localhost_spdp_peer_locators(
     .collect()
 }
 
-pub fn get_local_unicast_locators_filtered(
+/// The locators at which a listener with that port can be reached.
+pub(crate) fn listener_locators(
+  ifaces: &[IfAddr],
   port: u16,
-  only_networks: Option<&[IpAddr]>,
+  is_multicast: bool,
+  only_networks: Option<&[NetworkSelector]>,
 ) -> Vec<Locator> {
-  match enumerate_interfaces() {
-    Ok(ifaces) => {
-      let result = get_local_unicast_locators_inner(&ifaces, port, only_networks);
-      if result.is_empty() {
-        if let Some(nets) = only_networks {
-          warn!(
-            "only_networks filter {:?} matched no unicast interfaces; this participant will be \
-             invisible to peers.",
-            nets,
-          );
-        }
-      }
-      result
-    }
-    Err(e) => {
-      error!("Cannot get local network interfaces: {e:?}");
-      vec![]
-    }
+  if !is_multicast {
+    get_local_unicast_locators_inner(ifaces, port, only_networks)
+  } else if get_local_multicast_ip_addrs_inner(ifaces, only_networks).is_empty() {
+    Vec::new()
+  } else {
+    get_local_multicast_locators(port)
   }
 }
 
 fn get_local_unicast_locators_inner(
   ifaces: &[IfAddr],
   port: u16,
-  only_networks: Option<&[IpAddr]>,
+  only_networks: Option<&[NetworkSelector]>,
 ) -> Vec<Locator> {
   ifaces
     .iter()
@@ -225,36 +245,34 @@ fn get_local_unicast_locators_inner(
     // loopback -- would try to send there and get EAFNOSUPPORT per datagram.
     // Link-local IPv6 is doubly useless, as a `Locator` carries no scope id.
     .filter(|ifa| ifa.ip.is_ipv4())
-    .filter(|ifa| only_networks.is_none_or(|nets| nets.contains(&ifa.ip)))
+    .filter(|ifa| is_selected(ifa, only_networks))
     .map(|ifa| Locator::from(SocketAddr::new(ifa.ip, port)))
     .collect()
 }
 
-/// Enumerates local interfaces that we may use for multicasting.
-///
-/// The result of this function is used to set up senders and listeners.
-/// When `only_networks` is `Some`, only interfaces with a matching IP are
-/// included.
-pub fn get_local_multicast_ip_addrs_filtered(
-  only_networks: Option<&[IpAddr]>,
-) -> io::Result<Vec<IpAddr>> {
-  let ifaces = enumerate_interfaces()?;
-  let result = get_local_multicast_ip_addrs_inner(&ifaces, only_networks);
-  Ok(result)
-}
-
-/// Inner implementation of [`get_local_multicast_ip_addrs_filtered`], factored
-/// out so tests can supply a mock interface list.
-fn get_local_multicast_ip_addrs_inner(
+/// The IPv4 addresses of the interfaces that a participant uses for multicast.
+pub(crate) fn get_local_multicast_ip_addrs_inner(
   ifaces: &[IfAddr],
-  only_networks: Option<&[IpAddr]>,
+  only_networks: Option<&[NetworkSelector]>,
 ) -> Vec<IpAddr> {
   ifaces
     .iter()
     .filter(|ifa| ifa.is_multicast)
-    .filter(|ifa| only_networks.is_none_or(|nets| nets.contains(&ifa.ip)))
+    .filter(|ifa| is_selected(ifa, only_networks))
     .map(|ifa| ifa.ip)
     .filter(IpAddr::is_ipv4)
+    .collect()
+}
+
+/// The indexes of the interfaces on which a participant joins multicast groups.
+pub(crate) fn multicast_interface_indexes(
+  ifaces: &[IfAddr],
+  only_networks: Option<&[NetworkSelector]>,
+) -> BTreeSet<u32> {
+  ifaces
+    .iter()
+    .filter(|ifa| ifa.is_multicast && ifa.ip.is_ipv4() && is_selected(ifa, only_networks))
+    .map(|ifa| ifa.index)
     .collect()
 }
 
@@ -263,17 +281,7 @@ fn get_local_multicast_ip_addrs_inner(
 /// Used to resolve the `ipi_ifindex` reported by `IP_PKTINFO`/`IPV6_PKTINFO`
 /// into the interface identity our sender uses (its IP). Prefers an IPv4
 /// address so the result matches the keys of the multicast sender sockets.
-pub fn build_ifindex_to_interface_map() -> HashMap<u32, InterfaceSelector> {
-  match enumerate_interfaces() {
-    Ok(ifaces) => build_ifindex_map_inner(&ifaces),
-    Err(e) => {
-      error!("Cannot build interface-index map: {e:?}");
-      HashMap::new()
-    }
-  }
-}
-
-fn build_ifindex_map_inner(ifaces: &[IfAddr]) -> HashMap<u32, InterfaceSelector> {
+pub(crate) fn build_ifindex_map_inner(ifaces: &[IfAddr]) -> HashMap<u32, InterfaceSelector> {
   let mut map: HashMap<u32, InterfaceSelector> = HashMap::new();
   for ifa in ifaces {
     if ifa.index == 0 {
@@ -301,7 +309,7 @@ mod tests {
 
   use super::{
     build_ifindex_map_inner, get_local_multicast_ip_addrs_inner, get_local_unicast_locators_inner,
-    localhost_spdp_peer_locators, path_mtu_payload_for_peer, IfAddr, InterfaceSelector,
+    listener_locators, multicast_interface_indexes, localhost_spdp_peer_locators, path_mtu_payload_for_peer, IfAddr, InterfaceSelector, NetworkSelector,
   };
   use crate::{
     network::constant::spdp_well_known_unicast_port,
@@ -314,9 +322,11 @@ mod tests {
 
   fn iface(ip: IpAddr, index: u32, is_loopback: bool, is_multicast: bool) -> IfAddr {
     IfAddr {
+      name: format!("if{index}"),
       ip,
       index,
       is_loopback,
+      is_running: true,
       is_multicast,
       netmask: None,
       mtu: None,
@@ -332,9 +342,11 @@ mod tests {
       u32::MAX << (32 - u32::from(prefix))
     };
     IfAddr {
+      name: "if1".to_string(),
       ip: v4(a, b, c, d),
       index: 1,
       is_loopback,
+      is_running: true,
       is_multicast: !is_loopback,
       netmask: Some(Ipv4Addr::from(mask)),
       mtu: Some(mtu),
@@ -399,7 +411,7 @@ mod tests {
       iface(v4(10, 0, 0, 10), 2, false, true),
     ];
 
-    let only_networks = [v4(10, 0, 0, 10)];
+    let only_networks = [NetworkSelector::Address(v4(10, 0, 0, 10))];
     let ips = get_local_multicast_ip_addrs_inner(&ifaces, Some(&only_networks));
 
     assert_eq!(ips, vec![v4(10, 0, 0, 10)]);
@@ -407,7 +419,7 @@ mod tests {
 
   #[test]
   fn unicast_filter_respects_only_networks() {
-    let only_networks = [v4(10, 0, 0, 10)];
+    let only_networks = [NetworkSelector::Address(v4(10, 0, 0, 10))];
     let ifaces = vec![
       iface(v4(192, 168, 0, 10), 1, false, true),
       iface(v4(10, 0, 0, 10), 2, false, true),
@@ -451,6 +463,21 @@ mod tests {
       filtered,
       vec![Locator::from(SocketAddr::new(v4(192, 168, 0, 10), 7412))]
     );
+  }
+
+  // The address of a name is looked up with each change, that of an address is not.
+  #[test]
+  fn a_selected_name_is_followed_to_its_new_address() {
+    let named = [NetworkSelector::Name("if2".to_string())];
+    let at = |ip| [iface(v4(192, 168, 0, 10), 1, false, true), iface(ip, 2, false, true)];
+    for ip in [v4(10, 0, 0, 10), v4(172, 16, 0, 3)] {
+      let locators = listener_locators(&at(ip), 7412, false, Some(&named));
+      assert_eq!(locators, vec![Locator::from(SocketAddr::new(ip, 7412))]);
+      assert_eq!(multicast_interface_indexes(&at(ip), Some(&named)), [2].into());
+    }
+    assert_eq!(listener_locators(&at(v4(10, 0, 0, 10))[..1], 7400, true, Some(&named)), vec![]);
+    let locators = listener_locators(&at(v4(10, 0, 0, 10)), 7400, true, Some(&named));
+    assert_eq!(locators.len(), 1);
   }
 
   #[test]

@@ -8,6 +8,7 @@ use crate::{
     discovery::Discovery,
     sedp_messages::{DiscoveredReaderData, DiscoveredWriterData},
   },
+  network::util::IfAddr,
   polling::WakeReceiver,
   rtps::outbound::SocketId,
   structure::guid::{EntityId, EntityKind, GuidPrefix, GUID},
@@ -45,6 +46,13 @@ pub const REPAIR_INTERVAL_MAX: Duration = Duration::from_millis(100);
 // one reader. A round always sends at least one sample, even a larger one.
 pub const REPAIR_BATCH_MAX_BYTES: usize = 8192;
 
+// The same for a reader that is reached over loopback, where no link can be
+// congested. With 8 KiB each 10 ms a reader that missed 0.2 s of 3 KB samples at
+// 1 kHz is repaired slower than new samples push the missing ones out of a history
+// of 256; 64 KiB is less than half of what the kernel's default receive buffer
+// of 208 KiB holds in datagrams of that size.
+pub const REPAIR_BATCH_MAX_BYTES_LOOPBACK: usize = 65536;
+
 // Most bytes of fragments one repair round sends to one reader: what 256 fragments
 // hold, which is all that one NACK_FRAG can ask for, four times. A sample of 2 MB
 // that was lost altogether is repaired in 80 ms, and a burst of this size is smaller
@@ -70,6 +78,17 @@ pub const HEARTBEAT_PERIOD_FAST: crate::structure::duration::Duration =
 // reliable readers have not yet acknowledged are retained up to this bound (so
 // they remain available for repair) rather than being evicted eagerly.
 pub const DEFAULT_WRITER_MAX_SAMPLES: usize = 8192;
+
+// Most payload bytes that a KEEP_LAST Writer retains for readers that have not
+// acknowledged them: one second of 1 MiB samples at 30 Hz. The two latest samples
+// are retained whatever their size.
+pub const KEEP_LAST_MAX_RETAINED_BYTES: usize = 32 << 20;
+
+// How many evicted samples a HEARTBEAT still offers, so that a reader which lacks
+// them requests them and the Writer can count them. A reader that is further behind
+// skips the rest, which the Writer counts when the reader acknowledges again. Bounds
+// what a joining reader may list as missing.
+pub const MAX_ADVERTISED_EVICTED_SAMPLES: usize = 8192;
 
 // Memory-safety backstop for the per-matched-reader set of sequence numbers a
 // Writer still intends to send (`RtpsReaderProxy::unsent_changes`). In normal
@@ -399,6 +418,8 @@ pub const DISCOVERY_PARTICIPANT_MESSAGE_TIMER_TOKEN: Token = Token(41 + PTB);
 // thread), replacing the former per-topic and per-task timers.
 pub const DISCOVERY_TIMER_TOKEN: Token = Token(42 + PTB);
 
+pub const INTERFACE_WATCH_TOKEN: Token = Token(44 + PTB);
+
 pub const DPEV_ACKNACK_TIMER_TOKEN: Token = Token(45 + PTB);
 pub const DPEV_CACHE_CLEAN_TIMER_TOKEN: Token = Token(46 + PTB);
 
@@ -513,6 +534,10 @@ pub(crate) enum DiscoveryNotificationType {
   AssertTopicLiveliness {
     writer_guid: GUID,
     manual_assertion: bool,
+  },
+  /// What interfaces and addresses this host has now.
+  InterfacesChanged {
+    interfaces: Vec<IfAddr>,
   },
   #[cfg(feature = "security")]
   ParticipantAuthenticationStatusChanged {

@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-  net::{IpAddr, SocketAddr},
+  net::SocketAddr,
   rc::Rc,
   sync::{Arc, RwLock},
   time::{Duration, Instant},
@@ -22,12 +22,12 @@ use crate::{
     discovery_db::{discovery_db_read, DiscoveryDB},
     sedp_messages::{DiscoveredReaderData, DiscoveredWriterData},
   },
-  messages::submessages::submessages::AckSubmessage,
+  messages::{submessages::submessages::AckSubmessage, vendor_id::VendorId},
   network::{
     constant::SPDP_LOCALHOST_PEER_COUNT,
     udp_listener::UDPListener,
     udp_sender::UDPSender,
-    util::{local_interface_table, localhost_spdp_peer_locators, IfAddr},
+    util::{localhost_spdp_peer_locators, IfAddr, NetworkSelector},
   },
   polling::{
     new_shared_timer, timeout_until, wake_channel, Hooks, LoopWaker, ReadyReceiver,
@@ -126,6 +126,10 @@ pub struct DPEventLoop {
   // with every Writer. Rebuilt on interface-set changes (same trigger points as
   // the send-route recompute).
   local_interfaces: Rc<[IfAddr]>,
+  only_networks: Option<Arc<[NetworkSelector]>>,
+  // An address is gone, and remote participants are to discover this one anew as soon
+  // as there is another address to send that from.
+  is_reintroduction_due: bool,
 
   // One timer shared by all Readers, Writers and the periodic loop tasks.
   // Endpoints hold cloned handles to schedule timeouts; the loop owns it,
@@ -169,7 +173,8 @@ impl DPEventLoop {
     spdp_liveness_sender: WakeSender<GuidPrefix>,
     participant_status_sender: StatusChannelSender<DomainParticipantStatusEvent>,
     security_plugins_opt: Option<SecurityPluginsHandle>,
-    only_networks: Option<Arc<[IpAddr]>>,
+    only_networks: Option<Arc<[NetworkSelector]>>,
+    interfaces: Vec<IfAddr>,
     socket_send_buffer_size: usize,
     same_host_loopback: bool,
     reader_ready: ReadyReceiver<EntityId>,
@@ -223,15 +228,22 @@ impl DPEventLoop {
 
     // port number 0 means OS chooses an available port number.
     let udp_sender = try_init!(
-      UDPSender::new_with_networks(0, only_networks.as_deref(), socket_send_buffer_size),
+      UDPSender::new_with_networks(
+        0,
+        &interfaces,
+        only_networks.as_deref(),
+        socket_send_buffer_size
+      ),
       "UDPSender construction fail"
     );
 
     #[cfg(not(feature = "security"))]
     let security_plugins_opt = security_plugins_opt.and(None); // make sure it is None an consume value
 
-    let interface_observations = Rc::new(RefCell::new(InterfaceObservations::new()));
-    let local_interfaces: Rc<[IfAddr]> = Rc::from(local_interface_table());
+    let mut interface_observations = InterfaceObservations::new();
+    interface_observations.follow_addresses(interfaces.iter().map(|ifa| ifa.ip).collect());
+    let interface_observations = Rc::new(RefCell::new(interface_observations));
+    let local_interfaces: Rc<[IfAddr]> = Rc::from(interfaces);
 
     Ok(Self {
       domain_info,
@@ -249,6 +261,8 @@ impl DPEventLoop {
       ),
       interface_observations,
       local_interfaces,
+      only_networks,
+      is_reintroduction_due: false,
       #[cfg(feature = "security")]
       security_plugins_opt,
       add_reader_receiver,
@@ -506,6 +520,7 @@ impl DPEventLoop {
           }
         }
         ParticipantLost { guid_prefix } => self.remote_participant_lost(guid_prefix),
+        InterfacesChanged { interfaces } => self.follow_interfaces(interfaces),
         AssertTopicLiveliness {
           writer_guid,
           manual_assertion,
@@ -911,6 +926,61 @@ impl DPEventLoop {
     }
 
     debug!("update_participant - finished for {participant_guid_prefix:?}");
+  }
+
+  // Joins and leaves multicast groups, opens and closes the sockets that send
+  // multicast, and resolves all routes anew. Sockets for unicast are bound to all
+  // addresses and stay as they are.
+  fn follow_interfaces(&mut self, interfaces: Vec<IfAddr>) {
+    let only_networks = self.only_networks.as_deref();
+    for listener in self.udp_listeners.values_mut() {
+      listener.follow_interfaces(&interfaces, only_networks);
+    }
+    for closed in self.udp_sender.follow_interfaces(&interfaces, only_networks) {
+      // epoll forgets a descriptor that is closed.
+      self.writable_armed.remove(&closed);
+      self.bulk_ready.remove(&closed);
+    }
+    self
+      .interface_observations
+      .borrow_mut()
+      .follow_addresses(interfaces.iter().map(|ifa| ifa.ip).collect());
+
+    let is_gone = |ifa: &IfAddr| !interfaces.iter().any(|present| present.ip == ifa.ip);
+    self.is_reintroduction_due |= self.local_interfaces.iter().any(is_gone);
+    let reaches_others = interfaces.iter().any(|ifa| !ifa.ip.is_loopback());
+    self.local_interfaces = Rc::from(interfaces);
+    for writer in self.writers.values_mut() {
+      writer.follow_interfaces(Rc::clone(&self.local_interfaces));
+    }
+    if self.is_reintroduction_due && reaches_others {
+      self.is_reintroduction_due = false;
+      self.reintroduce_to_remote_participants();
+    }
+  }
+
+  // Fast DDS 2 and Cyclone DDS 0.10 take over new addresses of readers and writers,
+  // but not of the built-in ones of a participant that they know: they would send
+  // their acknowledgements and announcements to the address that is gone as long as
+  // the participant is alive. So they are to discover it anew. Not those on this
+  // host, which reach it by the loopback address.
+  fn reintroduce_to_remote_participants(&self) {
+    let observations = self.interface_observations.borrow();
+    let own = self.domain_info.domain_participant_guid.prefix;
+    let remote = discovery_db_read(&self.discovery_db).participant_prefixes(|data| {
+      let prefix = data.participant_guid.prefix;
+      prefix != own
+        && data.vendor_id != VendorId::THIS_IMPLEMENTATION
+        && !observations
+          .get(prefix)
+          .is_some_and(|routes| routes.is_same_host())
+    });
+    for prefix in remote {
+      let command = DiscoveryCommand::ReintroduceTo { prefix };
+      if let Err(e) = self.discovery_command_sender.try_send(command) {
+        error!("Cannot ask Discovery to reintroduce this participant: {e}");
+      }
+    }
   }
 
   fn remote_participant_lost(&mut self, participant_guid_prefix: GuidPrefix) {
@@ -1433,6 +1503,7 @@ mod tests {
         participant_status_sender,
         None,
         None,
+        vec![],
         0,
         true,
         reader_ready,

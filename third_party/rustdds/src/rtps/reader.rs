@@ -1,7 +1,8 @@
 use std::{
+  borrow::Cow,
   collections::{BTreeMap, BTreeSet},
   fmt, iter,
-  net::SocketAddr,
+  net::{Ipv4Addr, SocketAddr},
   rc::Rc,
   sync::{Arc, Mutex, MutexGuard},
   task::Waker,
@@ -164,10 +165,14 @@ pub(crate) struct Reader {
 // interface of its host, and answering at all of them makes it handle each answer
 // several times. The address that its message came from is one of those, unless
 // there is a translation of addresses in between.
+//
+// One that sends from the loopback address is on this host, and is answered there:
+// Fast DDS announces the address that `eth0` had when it was started, also when it is
+// gone, and binds its sockets to all addresses.
 fn reply_locators<'a>(
   mr_state: &MessageReceiverState<'a>,
   writer_proxy: &'a RtpsWriterProxy,
-) -> &'a [Locator] {
+) -> Cow<'a, [Locator]> {
   match mr_state.unicast_reply_locator_list {
     [] | [Locator::Invalid] => {
       let announced = &writer_proxy.unicast_locator_list;
@@ -176,12 +181,27 @@ fn reply_locators<'a>(
           .source_address
           .is_some_and(|source| locator.is_udp() && SocketAddr::from(**locator).ip() == source.ip())
       };
-      announced
-        .iter()
-        .find(came_from)
-        .map_or(announced, std::slice::from_ref)
+      if let Some(locator) = announced.iter().find(came_from) {
+        return Cow::Borrowed(std::slice::from_ref(locator));
+      }
+      let is_here = mr_state
+        .source_address
+        .is_some_and(|source| source.ip().is_loopback());
+      if is_here && !announced.iter().any(Locator::is_loopback) {
+        let ports = announced.iter().filter_map(|locator| match locator {
+          Locator::UdpV4(address) => Some(address.port()),
+          _ => None,
+        });
+        let here: Vec<Locator> = ports
+          .map(|port| Locator::from(SocketAddr::from((Ipv4Addr::LOCALHOST, port))))
+          .collect();
+        if !here.is_empty() {
+          return Cow::Owned(here);
+        }
+      }
+      Cow::Borrowed(announced)
     }
-    others => others,
+    others => Cow::Borrowed(others),
   }
 }
 
@@ -489,6 +509,12 @@ impl Reader {
     match offered_qos.compliance_failure_wrt(&self.qos_policy) {
       None => {
         // success, update or insert
+        let mut proxy = proxy;
+        let taken = self.acquire_the_topic_cache_guard().taken.get(&writer).copied();
+        if let Some(taken) = taken {
+          // Neither requested nor waited for.
+          proxy.irrelevant_changes_up_to(taken.plus_1());
+        }
         let count_change = self.matched_writer_update(proxy);
         if count_change > 0 {
           self.writer_match_count_total += count_change;
@@ -1051,7 +1077,7 @@ impl Reader {
             && mr_state.follows_data
             && reader_id.kind().is_user_defined()
           {
-            this.delay_acknack(writer_guid, reply_locators(mr_state, writer_proxy));
+            this.delay_acknack(writer_guid, &reply_locators(mr_state, writer_proxy));
             return true;
           }
 
@@ -1153,7 +1179,7 @@ impl Reader {
               InfoDestination {
                 guid_prefix: mr_state.source_guid_prefix,
               },
-              reply_locators,
+              &reply_locators,
               writer_guid,
             );
           }
@@ -1164,7 +1190,7 @@ impl Reader {
             InfoDestination {
               guid_prefix: mr_state.source_guid_prefix,
             },
-            reply_locators,
+            &reply_locators,
             writer_guid,
           );
 
@@ -1795,6 +1821,64 @@ mod tests {
       cc_from_cache, &cc_locally_built,
       "The content of the cache change in the topic cache not as expected"
     );
+  }
+
+  // An application that was started again has taken samples 1 to 5 before.
+  #[test]
+  fn reader_begins_after_what_was_taken_before() {
+    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
+    let reliable_qos = QosPolicyBuilder::new()
+      .reliability(Reliability::Reliable {
+        max_blocking_time: Duration::from_millis(100),
+      })
+      .build();
+    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
+      "test_name".to_string(),
+      TypeDesc::new("test_type".to_string()),
+      &reliable_qos,
+    );
+    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    topic_cache_handle
+      .lock()
+      .unwrap()
+      .taken
+      .insert(writer_guid, SequenceNumber::new(5));
+
+    let (notification_sender, _notification_receiver) =
+      crate::mio_source::notification_channel(100);
+    let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+    let (participant_status_sender, _participant_status_receiver) =
+      sync_status_channel(16).unwrap();
+    let (_reader_command_sender, data_reader_command_receiver) =
+      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
+    let mut reader = Reader::new(
+      ReaderIngredients {
+        guid: GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED),
+        notification_sender,
+        status_sender,
+        topic_name: "test_name".to_string(),
+        topic_cache_handle,
+        like_stateless: false,
+        qos_policy: reliable_qos.clone(),
+        data_reader_command_receiver,
+        data_reader_waker: Arc::new(Mutex::new(None)),
+        poll_event_sender,
+        security_plugins: None,
+        discovery_notify: None,
+      },
+      Rc::new(UDPSender::new(0).unwrap()),
+      new_shared_timer(),
+      participant_status_sender,
+    );
+    reader.matched_writer_add(writer_guid, EntityId::UNKNOWN, vec![], vec![], &reliable_qos);
+
+    let writer_proxy = reader.matched_writer(writer_guid).unwrap();
+    let missing =
+      writer_proxy.missing_seqnums(SequenceNumber::new(1), SequenceNumber::new(7));
+    assert_eq!(missing, [SequenceNumber::new(6), SequenceNumber::new(7)]);
+    assert!(writer_proxy.should_ignore_change(SequenceNumber::new(5)));
+    assert!(!writer_proxy.should_ignore_change(SequenceNumber::new(6)));
   }
 
   #[test]

@@ -1,7 +1,7 @@
 use std::{
   cmp::max,
   collections::{BTreeMap, BTreeSet},
-  net::SocketAddr,
+  net::{Ipv4Addr, SocketAddr},
 };
 
 use bit_vec::BitVec;
@@ -23,7 +23,11 @@ use crate::{
     sequence_number::{FragmentNumberSet, SequenceNumber, SequenceNumberRange},
   },
 };
-use super::reader::ReaderIngredients;
+use super::{reader::ReaderIngredients, reader_progress::SharedProgress};
+
+// Requested samples that are gone, from which on a reader is taken to lack all that
+// is gone: half of what one ACKNACK can request (RTPS v2.5 Section 8.3.5.5).
+const BULK_GAP_MIN_SAMPLES: usize = 128;
 
 #[derive(Debug, PartialEq, Eq, Clone)]
 /// ReaderProxy class represents the information an RTPS StatefulWriter
@@ -61,6 +65,11 @@ pub(crate) struct RtpsReaderProxy {
   // This is directly the same as readerSNState.base in ACKNACK submessage.
   pub all_acked_before: SequenceNumber,
 
+  // What the DataWriter may know of this reader. `None` until the reader is matched.
+  progress: Option<SharedProgress>,
+  // Samples before this that the reader missed are counted in `progress`.
+  overrun_counted_before: SequenceNumber,
+
   // List of SequenceNumbers to be sent to Reader. Both unsent and requested by ACKNACK.
   unsent_changes: BTreeSet<SequenceNumber>,
 
@@ -78,6 +87,9 @@ pub(crate) struct RtpsReaderProxy {
   // Count of the last ACKNACK / NACK_FRAG accepted from this reader. A reader
   // sends one ACKNACK to each of our locators; the copies carry the same count.
   pub last_acknack_count: Option<i32>,
+  // The base of that ACKNACK. A reader that was matched anew on its side counts
+  // from the beginning again, so an equal count alone makes no copy.
+  pub last_acknack_base: SequenceNumber,
   pub last_nackfrag_count: Option<i32>,
   qos: QosPolicies,
   frags_requested: BTreeMap<SequenceNumber, BitVec>,
@@ -108,12 +120,15 @@ impl RtpsReaderProxy {
       expects_in_line_qos,
       is_active: true,
       all_acked_before: SequenceNumber::zero(),
+      progress: None,
+      overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
       repair_mode: false,
       repair_data_scheduled: false,
       repair_frags_scheduled: false,
       last_acknack_count: None,
+      last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
       qos,
       frags_requested: BTreeMap::new(),
@@ -136,7 +151,12 @@ impl RtpsReaderProxy {
                                                                      // Refuse to update
     }
 
-    if self.unicast_locator_list != update.unicast_locator_list
+    // `update` may have loopback locators inline, see below.
+    let differs = |(unicasts, loopbacks): (Vec<Locator>, Vec<Locator>)| {
+      self.unicast_locator_list != unicasts
+        || (!loopbacks.is_empty() && self.loopback_unicast_locators != loopbacks)
+    };
+    if differs(Self::split_loopback(&update.unicast_locator_list))
       || self.multicast_locator_list != update.multicast_locator_list
     {
       info!("Update changes Locators in ReaderProxy. topic={topic:?}");
@@ -190,6 +210,62 @@ impl RtpsReaderProxy {
     self.expects_in_line_qos
   }
 
+  /// The reader is matched: it is owed what it is offered, and nothing before.
+  /// A reader of a built-in topic acknowledges from the beginning.
+  pub fn start_progress(&mut self, progress: SharedProgress, is_builtin: bool) {
+    if !is_builtin {
+      self.all_acked_before = progress.first_offered();
+    }
+    self.progress = Some(progress);
+  }
+
+  /// The first sample that the reader is offered.
+  pub fn first_offered(&self) -> SequenceNumber {
+    self
+      .progress
+      .as_ref()
+      .map_or_else(SequenceNumber::zero, |progress| progress.first_offered())
+  }
+
+  // Counts `missed` samples, all of them before `before`, once.
+  fn add_overrun(&mut self, missed: u64, before: SequenceNumber) {
+    self.overrun_counted_before = max(self.overrun_counted_before, before);
+    if let Some(progress) = &self.progress {
+      progress.add_overrun(missed);
+    }
+  }
+
+  /// Takes the samples that the reader requested and that are no longer retained,
+  /// those before `first_available`, counts them as missed, and returns them for a
+  /// GAP. A reader that lacks nearly everything gets one GAP for all that is gone:
+  /// 256 samples in each round trip would not catch up with 1 kHz behind 200 ms.
+  pub fn take_evicted_requests(
+    &mut self,
+    first_available: SequenceNumber,
+  ) -> BTreeSet<SequenceNumber> {
+    let still_retained = self.unsent_changes.split_off(&first_available);
+    let mut evicted = std::mem::replace(&mut self.unsent_changes, still_retained);
+    let uncounted =
+      |sn: &&SequenceNumber| **sn >= self.overrun_counted_before && **sn >= self.first_offered();
+    let mut missed = evicted.iter().filter(uncounted).count() as u64;
+    let Some((&first, &last)) = evicted.first().zip(evicted.last()) else {
+      return evicted;
+    };
+    let mut counted_before = last.plus_1();
+    let span = i64::from(last) - i64::from(first) + 1;
+    if evicted.len() >= BULK_GAP_MIN_SAMPLES && span <= 2 * evicted.len() as i64 {
+      let unknown_from = max(counted_before, self.overrun_counted_before);
+      missed += u64::try_from(i64::from(first_available) - i64::from(unknown_from)).unwrap_or(0);
+      evicted.extend(SequenceNumberRange::new(
+        counted_before,
+        first_available - SequenceNumber::from(1),
+      ));
+      counted_before = first_available;
+    }
+    self.add_overrun(missed, counted_before);
+    evicted
+  }
+
   pub fn unsent_changes_iter(
     &self,
   ) -> impl std::iter::DoubleEndedIterator<Item = SequenceNumber> + '_ {
@@ -237,12 +313,15 @@ impl RtpsReaderProxy {
       expects_in_line_qos: false,
       is_active: true,
       all_acked_before: SequenceNumber::zero(),
+      progress: None,
+      overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
       repair_mode: false,
       repair_data_scheduled: false,
       repair_frags_scheduled: false,
       last_acknack_count: None,
+      last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
       qos: reader.qos_policy.clone(),
       frags_requested: BTreeMap::new(),
@@ -315,12 +394,15 @@ impl RtpsReaderProxy {
       expects_in_line_qos: discovered_reader_data.reader_proxy.expects_inline_qos,
       is_active: true,
       all_acked_before: SequenceNumber::zero(),
+      progress: None,
+      overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
       repair_mode: false,
       repair_data_scheduled: false,
       repair_frags_scheduled: false,
       last_acknack_count: None,
+      last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
       qos: discovered_reader_data.subscription_topic_data.qos(),
       frags_requested: BTreeMap::new(),
@@ -343,13 +425,41 @@ impl RtpsReaderProxy {
     selector: &dyn RouteSelector,
   ) {
     let observed = observations.get(self.remote_reader_guid.prefix);
+    let substitutes;
+    let mut loopback_unicast_locators = &self.loopback_unicast_locators;
+    if loopback_unicast_locators.is_empty() && observed.is_some_and(|it| it.is_same_host()) {
+      substitutes = self.loopback_substitutes(observations);
+      loopback_unicast_locators = &substitutes;
+    }
     self.send_route = selector.select(
       &self.unicast_locator_list,
       &self.multicast_locator_list,
-      &self.loopback_unicast_locators,
+      loopback_unicast_locators,
       observed,
       local_multicast_ifaces,
     );
+  }
+
+  /// Where a reader on this host is reached that announces none but addresses which
+  /// this host has no longer: Fast DDS and Cyclone DDS announce the address that
+  /// `eth0` had when they were started, whatever becomes of it, and bind their
+  /// sockets to all addresses. Empty while one of the announced addresses is there.
+  fn loopback_substitutes(&self, observations: &InterfaceObservations) -> Vec<Locator> {
+    let announced = || {
+      self
+        .unicast_locator_list
+        .iter()
+        .filter_map(|locator| match locator {
+          Locator::UdpV4(address) => Some(SocketAddr::V4(*address)),
+          _ => None,
+        })
+    };
+    if announced().any(|address| observations.is_own_address(address.ip())) {
+      return Vec::new();
+    }
+    announced()
+      .map(|address| Locator::from(SocketAddr::from((Ipv4Addr::LOCALHOST, address.port()))))
+      .collect()
   }
 
   /// The per-peer datagram-payload budget (bytes for RTPS submessages in one
@@ -417,11 +527,13 @@ impl RtpsReaderProxy {
     &mut self,
     ack_submessage: &AckSubmessage,
     last_available: SequenceNumber,
+    advertised_first: SequenceNumber,
+    serves_history: bool,
   ) {
     match ack_submessage {
       AckSubmessage::AckNack(acknack) => {
         // Eliminate case that base = 0
-        let new_all_acked_before = max(acknack.reader_sn_state.base(), SequenceNumber::from(1));
+        let mut new_all_acked_before = max(acknack.reader_sn_state.base(), SequenceNumber::from(1));
         // Sending acknack with sn_state base = 0 should not happen.
         // This is not allowed by  SequenceNumberSet
         // validity rules (RTPS Spec v2.5 "8.3.5.5 SequenceNumberSet")
@@ -440,7 +552,7 @@ impl RtpsReaderProxy {
         // block real ACKNACKs (issue #405).
         let max_plausible_acked_before = last_available.plus_1();
         if new_all_acked_before > max_plausible_acked_before {
-          warn!(
+          debug!(
             "Ignoring ACKNACK: base {:?} implies ack through unsent data (last sent seq={:?}, max \
              plausible all-acked-before {:?}) reader={:x?}",
             new_all_acked_before,
@@ -451,35 +563,57 @@ impl RtpsReaderProxy {
           return;
         }
 
-        // RTPS ack state is monotonic for a matched reader. Other implementations
-        // (e.g. FastDDS) may send preemptive or reordered ACKNACK on discovery with
-        // a lower readerSNState.base — ignore rather than regress all_acked_before.
+        // The reader acknowledges less than before. Either an older ACKNACK was
+        // overtaken by a newer one, or the reader's participant discarded ours when
+        // our lease expired there, and has matched us anew: then the reader has no
+        // state of us and waits for what it acknowledged before.
+        // An overtaken one costs a repeated repair, which the next ACKNACK ends. A
+        // reader that is ignored here waits for ever.
         if new_all_acked_before < self.all_acked_before {
           debug!(
-            "Ignoring ACKNACK that would move all_acked_before backwards: old={:?} new={:?} \
-             reader={:x?} count={}",
+            "ACKNACK moves all_acked_before backwards: old={:?} new={:?} reader={:x?} count={}",
             self.all_acked_before, new_all_acked_before, self.remote_reader_guid, acknack.count
           );
-          for nack_sn in acknack.reader_sn_state.iter() {
-            if nack_sn >= self.all_acked_before {
-              self.unsent_changes.insert(nack_sn);
+          if serves_history {
+            // What it acknowledged before is no loss when it is gone by now.
+            self.overrun_counted_before = max(self.overrun_counted_before, self.all_acked_before);
+            new_all_acked_before = max(new_all_acked_before, self.first_offered());
+          } else {
+            // What it acknowledged is not delivered a second time: the Writer answers
+            // with a GAP. What it has not acknowledged, as far as it is retained, is sent.
+            for nack_sn in acknack.reader_sn_state.iter() {
+              if nack_sn >= self.all_acked_before && nack_sn <= last_available {
+                self.unsent_changes.insert(nack_sn);
+              }
             }
+            return;
           }
-          return;
+        }
+        // What no HEARTBEAT offers any more the reader skips without a request.
+        let skipped_from = max(self.all_acked_before, self.overrun_counted_before);
+        let skipped_before = new_all_acked_before.min(advertised_first);
+        if skipped_before > skipped_from {
+          let skipped = i64::from(skipped_before) - i64::from(skipped_from);
+          self.add_overrun(skipped.unsigned_abs(), skipped_before);
         }
         self.remove_from_unsent_set_all_before(new_all_acked_before);
         self.all_acked_before = new_all_acked_before;
+        if let Some(progress) = &self.progress {
+          progress.set_acked_before(new_all_acked_before);
+        }
         self.frags_requested = self.frags_requested.split_off(&new_all_acked_before);
 
         // Insert the requested changes. These are (by construction) greater
         // then new_all_acked_before.
         for nack_sn in acknack.reader_sn_state.iter() {
-          self.unsent_changes.insert(nack_sn);
+          if nack_sn >= new_all_acked_before {
+            self.unsent_changes.insert(nack_sn);
+          }
         }
         // sanity check
         if let Some(&high) = self.unsent_changes.iter().next_back() {
           if high > last_available {
-            warn!(
+            debug!(
               "ReaderProxy {:?} asks for {:?} but I have only up to {:?}. Truncating request. \
                ACKNACK = {:?}",
               self.remote_reader_guid, self.unsent_changes, last_available, acknack
@@ -504,13 +638,23 @@ impl RtpsReaderProxy {
     self.pending_gap.insert(seq_num);
   }
 
-  pub fn set_pending_gap(&mut self, first: SequenceNumber, last: SequenceNumber) {
-    self.pending_gap.extend(SequenceNumberRange::new(first, last));
-  }
-
   /// Not requested: what comes after `last_sent` will be sent without it.
   pub fn forget_unsent_after(&mut self, last_sent: SequenceNumber) {
     self.unsent_changes.split_off(&last_sent.plus_1());
+  }
+
+  /// The reader asks for this sample.
+  pub fn request_change(&mut self, sequence_number: SequenceNumber) {
+    self.unsent_changes.insert(sequence_number);
+  }
+
+  /// Whether everything for this reader goes over loopback.
+  pub fn is_reached_over_loopback(&self) -> bool {
+    !self.send_route.fallback
+      && self
+        .send_route
+        .unicast
+        .is_some_and(|locator| locator.is_loopback())
   }
 
   pub fn get_pending_gap(&self) -> &BTreeSet<SequenceNumber> {
@@ -717,7 +861,12 @@ mod acknack_tests {
       count: 1,
     };
 
-    rp.handle_ack_nack(&AckSubmessage::AckNack(ack), SequenceNumber::from(100));
+    rp.handle_ack_nack(
+      &AckSubmessage::AckNack(ack),
+      SequenceNumber::from(100),
+      SequenceNumber::from(1),
+      true,
+    );
 
     assert_eq!(rp.all_acked_before, SequenceNumber::from(10));
   }
@@ -734,27 +883,52 @@ mod acknack_tests {
       count: 1,
     };
 
-    rp.handle_ack_nack(&AckSubmessage::AckNack(ack), SequenceNumber::from(100));
+    rp.handle_ack_nack(
+      &AckSubmessage::AckNack(ack),
+      SequenceNumber::from(100),
+      SequenceNumber::from(1),
+      true,
+    );
 
     assert_eq!(rp.all_acked_before, SequenceNumber::from(50));
   }
 
-  #[test]
-  fn acknack_with_backwards_base_does_not_regress_all_acked_before() {
+  // All of 1..=9 acknowledged, 10..=12 not; then an ACKNACK of a reader that has
+  // no state of this writer any more and requests everything.
+  fn matched_anew(serves_history: bool) -> RtpsReaderProxy {
     let guid = GUID::new(GuidPrefix::UNKNOWN, EntityId::UNKNOWN);
     let mut rp = RtpsReaderProxy::new(guid, QosPolicies::default(), false);
-    rp.all_acked_before = SequenceNumber::from(4);
-
+    rp.all_acked_before = SequenceNumber::from(10);
+    let requested = (1..=12).map(SequenceNumber::from).collect();
     let ack = AckNack {
       reader_id: EntityId::UNKNOWN,
       writer_id: EntityId::UNKNOWN,
-      reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::from(2)),
-      count: 0,
+      reader_sn_state: SequenceNumberSet::from_base_and_set(SequenceNumber::from(1), &requested),
+      count: 1,
     };
+    rp.handle_ack_nack(
+      &AckSubmessage::AckNack(ack),
+      SequenceNumber::from(12),
+      SequenceNumber::from(5),
+      serves_history,
+    );
+    rp
+  }
 
-    rp.handle_ack_nack(&AckSubmessage::AckNack(ack), SequenceNumber::from(3));
+  #[test]
+  fn a_reader_that_was_matched_anew_on_its_side_gets_the_history() {
+    let rp = matched_anew(true);
+    assert_eq!(rp.all_acked_before, SequenceNumber::from(1));
+    assert_eq!(rp.unsent_changes_count(), 12);
+    assert!(rp.get_pending_gap().is_empty());
+  }
 
-    assert_eq!(rp.all_acked_before, SequenceNumber::from(4));
+  #[test]
+  fn a_reader_that_was_matched_anew_gets_no_volatile_sample_that_it_acknowledged() {
+    let rp = matched_anew(false);
+    let not_acknowledged = (10..=12).map(SequenceNumber::from);
+    assert!(rp.unsent_changes_iter().eq(not_acknowledged));
+    assert_eq!(rp.all_acked_before, SequenceNumber::from(10));
   }
 }
 

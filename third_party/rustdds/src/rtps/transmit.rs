@@ -108,12 +108,13 @@ pub struct ObservedRoutes {
   /// on a single stray packet arriving on another interface.
   current_interface: Option<InterfaceSelector>,
   /// Sticky: set once we have seen *any* traffic from this participant arrive
-  /// from a loopback source address, which positively confirms it is on the
-  /// same host. Never cleared while the participant is known — a same-host peer
-  /// remains same-host even if it later also reaches us over a LAN address.
-  /// Used to authorize sending to the peer's loopback locators (see
+  /// from a loopback source address, or from an address that was this host's at
+  /// the time (from outside, the kernel takes neither), which positively confirms
+  /// it is on the same host. Never cleared while the participant is known — a
+  /// same-host peer remains same-host even if it later also reaches us over a
+  /// LAN address. Used to authorize sending to the peer's loopback locators (see
   /// `src/rtps/loopback_same_host_design.md`).
-  seen_from_loopback: bool,
+  seen_from_own_address: bool,
 }
 
 impl ObservedRoutes {
@@ -132,7 +133,7 @@ impl ObservedRoutes {
   ) {
     self.last_source = Some(source);
     if source.ip().is_loopback() {
-      self.seen_from_loopback = true;
+      self.seen_from_own_address = true;
     }
     if let Some(iface) = iface {
       self
@@ -176,9 +177,9 @@ impl ObservedRoutes {
   }
 
   /// Whether this participant has been positively confirmed to be on the same
-  /// host (traffic seen arriving from a loopback source address). Sticky.
+  /// host (traffic seen arriving from an address of this host). Sticky.
   pub fn is_same_host(&self) -> bool {
-    self.seen_from_loopback
+    self.seen_from_own_address
   }
 
   /// The local interface currently chosen to reach this participant.
@@ -207,6 +208,8 @@ const MAX_OBSERVED_PARTICIPANTS: usize = 1024;
 #[derive(Debug, Default)]
 pub struct InterfaceObservations {
   by_participant: BTreeMap<GuidPrefix, ObservedRoutes>,
+  /// The addresses of this host at present.
+  own_addresses: Vec<IpAddr>,
 }
 
 impl InterfaceObservations {
@@ -229,11 +232,28 @@ impl InterfaceObservations {
     {
       self.by_participant.clear();
     }
-    self
-      .by_participant
-      .entry(prefix)
-      .or_default()
-      .record(iface, source);
+    let routes = self.by_participant.entry(prefix).or_default();
+    let is_other_source = routes.last_source.map(|last| last.ip()) != Some(source.ip());
+    if is_other_source && self.own_addresses.contains(&source.ip()) {
+      routes.seen_from_own_address = true;
+    }
+    routes.record(iface, source);
+  }
+
+  /// Takes over what addresses this host has now. What was observed on an address
+  /// that is gone says nothing about where to send.
+  pub fn follow_addresses(&mut self, own_addresses: Vec<IpAddr>) {
+    for routes in self.by_participant.values_mut() {
+      let is_present = |InterfaceSelector::Ip(ip): &InterfaceSelector| own_addresses.contains(ip);
+      routes.by_iface.retain(|interface, _| is_present(interface));
+      routes.current_interface = routes.current_interface.filter(is_present);
+    }
+    self.own_addresses = own_addresses;
+  }
+
+  /// Whether this host has the address at present.
+  pub fn is_own_address(&self, ip: IpAddr) -> bool {
+    self.own_addresses.contains(&ip)
   }
 
   pub fn get(&self, prefix: GuidPrefix) -> Option<&ObservedRoutes> {
@@ -415,6 +435,24 @@ mod tests {
 
   fn iface(ip: [u8; 4]) -> InterfaceSelector {
     InterfaceSelector::Ip(IpAddr::V4(Ipv4Addr::new(ip[0], ip[1], ip[2], ip[3])))
+  }
+
+  #[test]
+  fn a_peer_that_sends_from_an_address_of_this_host_is_on_it() {
+    let mut observations = InterfaceObservations::new();
+    let eth0 = IpAddr::from([10, 0, 0, 1]);
+    observations.follow_addresses(vec![IpAddr::from([127, 0, 0, 1]), eth0]);
+    let (here, there) = (GuidPrefix::new(&[1; 12]), GuidPrefix::new(&[2; 12]));
+    observations.record(here, Some(iface([10, 0, 0, 1])), sockaddr([10, 0, 0, 1], 7410));
+    observations.record(there, Some(iface([10, 0, 0, 1])), sockaddr([10, 0, 0, 2], 7410));
+    assert!(observations.get(here).unwrap().is_same_host());
+    assert!(!observations.get(there).unwrap().is_same_host());
+
+    // The address is gone; that the peer is here is still so.
+    observations.follow_addresses(vec![IpAddr::from([127, 0, 0, 1])]);
+    assert!(!observations.is_own_address(eth0));
+    assert!(observations.get(here).unwrap().is_same_host());
+    assert_eq!(observations.get(there).unwrap().best_interface(), None);
   }
 
   #[test]

@@ -32,7 +32,8 @@ use crate::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, REPAIR_BATCH_MAX_BYTES,
-      REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
+      REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
+      REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
     },
     direct_send::Plan,
     outbound::{SocketId, TrafficClass},
@@ -740,7 +741,7 @@ impl Writer {
     if hb_reserve > 0 {
       builder = builder.heartbeat_msg(
         self.entity_id(),
-        self.send_buffer.first_change_sequence_number(),
+        self.send_buffer.advertised_first(),
         last_seq,
         self.next_heartbeat_count(),
         self.endianness,
@@ -833,7 +834,7 @@ impl Writer {
           // If the data is meant for a single reader only, set others as pending
           // GAP for this sequence number.
           if let Some(single_reader_guid) = write_options.to_single_reader() {
-            if reader.remote_reader_guid != single_reader_guid {
+            if reader.remote_reader_guid != single_reader_guid && reader.qos().is_reliable() {
               reader.insert_pending_gap(sequence_number);
             }
           }
@@ -915,7 +916,7 @@ impl Writer {
         let hb_message = MessageBuilder::new()
           .heartbeat_msg(
             self.entity_id(), // from Writer
-            self.send_buffer.first_change_sequence_number(),
+            self.send_buffer.advertised_first(),
             self.send_buffer.last_change_sequence_number(),
             self.next_heartbeat_count(),
             self.endianness,
@@ -1084,7 +1085,7 @@ impl Writer {
         .ts_msg(self.endianness, Some(Timestamp::now()))
         .heartbeat_msg(
           self.entity_id(), // from Writer
-          self.send_buffer.first_change_sequence_number(),
+          self.send_buffer.advertised_first(),
           self.last_advertised(),
           self.next_heartbeat_count(),
           self.endianness,
@@ -1150,11 +1151,14 @@ impl Writer {
       AckSubmessage::AckNack(ref an) => {
         // Update the ReaderProxy
         let last_seq = self.send_buffer.last_change_sequence_number(); // to avoid borrow problems
+        let is_builtin = self.my_guid.entity_id.kind().is_built_in();
+        let writer_is_volatile = self.qos_policies.is_volatile();
         let last_sent = self.push_mode.then_some(self.last_sent());
+        let advertised_first = self.send_buffer.advertised_first();
 
         // sanity check requested sequence numbers
         if let Some(0) = an.reader_sn_state.iter().next().map(i64::from) {
-          warn!("Request for SN zero! : {an:?}");
+          debug!("Request for SN zero! : {an:?}");
         }
 
         let reader_guid = GUID::new(reader_guid_prefix, an.reader_id);
@@ -1179,9 +1183,12 @@ impl Writer {
 
         let mut start_repair = false;
         let mut has_progressed = false;
+        let mut went_back = false;
 
         if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
-          if reader_proxy.last_acknack_count == Some(an.count) {
+          if reader_proxy.last_acknack_count == Some(an.count)
+            && reader_proxy.last_acknack_base == an.reader_sn_state.base()
+          {
             trace!(
               "Ignoring duplicate ACKNACK count={} from {:?} topic={:?}",
               an.count,
@@ -1191,13 +1198,17 @@ impl Writer {
             return;
           }
           reader_proxy.last_acknack_count = Some(an.count);
+          reader_proxy.last_acknack_base = an.reader_sn_state.base();
 
           // Mark requested SNs as "unsent changes"
 
           //TODO: We should drop SNs in "pending gap" from unsent changes
           // Below the first number there is nothing to acknowledge.
           let acked_before = reader_proxy.all_acked_before.max(SequenceNumber::from(1));
-          reader_proxy.handle_ack_nack(ack_submessage, last_seq);
+          went_back = an.reader_sn_state.base().max(SequenceNumber::from(1)) < acked_before;
+          let serves_history =
+            is_builtin || !(writer_is_volatile || reader_proxy.qos().is_volatile());
+          reader_proxy.handle_ack_nack(ack_submessage, last_seq, advertised_first, serves_history);
           has_progressed = reader_proxy.all_acked_before > acked_before;
           if let Some(last_sent) = last_sent {
             reader_proxy.forget_unsent_after(last_sent);
@@ -1209,7 +1220,7 @@ impl Writer {
           if cfg!(debug_assertions) {
             if let Some(req_high) = reader_proxy.unsent_changes_iter().next_back() {
               if req_high > last_seq {
-                warn!(
+                debug!(
                   "ReaderProxy {:?} thinks we need to send {:?} but I have only up to {:?}",
                   reader_proxy.remote_reader_guid,
                   reader_proxy.unsent_changes_debug(),
@@ -1219,7 +1230,7 @@ impl Writer {
             }
             // Sanity Check 2
             if an.reader_sn_state.base() > last_seq.plus_1() {
-              warn!(
+              debug!(
                 "ACKNACK from {:?} acks {:?}, but I have only up to {:?} count={:?} topic={:?}",
                 reader_proxy.remote_reader_guid, an.reader_sn_state, last_seq, an.count, my_topic
               );
@@ -1227,7 +1238,7 @@ impl Writer {
             // Sanity check 3
             if let Some(max_req_sn) = an.reader_sn_state.iter().next_back() {
               if max_req_sn > last_seq {
-                warn!(
+                debug!(
                   "ACKNACK from {:?} requests {:?} but I have only up to {:?}",
                   reader_proxy.remote_reader_guid,
                   an.reader_sn_state.iter().collect::<Vec<SequenceNumber>>(),
@@ -1285,11 +1296,36 @@ impl Writer {
           // until it has a HEARTBEAT, also of a writer that has nothing yet. Cyclone DDS
           // has a base of 1 then, and a VOLATILE reader of it takes all that the first
           // HEARTBEAT tells of for history: that must come before the first sample.
+          // A reader that was matched anew on its side asks so as well, also one that
+          // has acknowledged everything before.
           let knows_nothing = an.reader_sn_state.base() < SequenceNumber::from(1);
           let has_nothing = last_seq < SequenceNumber::from(1);
-          if an.reader_sn_state.iter().next().is_none()
+          let requests_nothing = an.reader_sn_state.iter().next().is_none();
+          let requests_unoffered = an
+            .reader_sn_state
+            .iter()
+            .any(|sn| sn < reader_proxy.all_acked_before);
+          if requests_unoffered {
+            // From before it was matched, or acknowledged before.
+            let gap_message = MessageBuilder::new()
+              .dst_submessage(self.endianness, reader_guid.prefix)
+              .gap_msg_before(
+                reader_proxy.all_acked_before.max(SequenceNumber::from(1)),
+                self.my_guid.entity_id,
+                self.endianness,
+                reader_guid,
+              )
+              .add_header_and_build(self.my_guid.prefix);
+            self.send_control_to_readers(
+              DeliveryMode::Unicast,
+              gap_message,
+              &mut std::iter::once(reader_proxy),
+            );
+          }
+          if requests_nothing
             && (knows_nothing
               || has_nothing
+              || went_back
               || (!has_progressed && reader_proxy.all_acked_before <= last_seq))
             && !reader_proxy.repair_frags_requested()
           {
@@ -1297,7 +1333,11 @@ impl Writer {
               .ts_msg(self.endianness, Some(Timestamp::now()))
               .heartbeat_msg(
                 self.entity_id(),
-                self.send_buffer.first_change_sequence_number(),
+                if went_back {
+                  max(advertised_first, reader_proxy.all_acked_before)
+                } else {
+                  max(advertised_first, reader_proxy.first_offered())
+                },
                 last_seq,
                 self.next_heartbeat_count(),
                 self.endianness,
@@ -1331,12 +1371,19 @@ impl Writer {
           return;
         }
         reader_proxy.last_nackfrag_count = Some(nackfrag.count);
-        // Of a sample that is gone the next HEARTBEAT says so; of one that was not
-        // sent yet everything is still to come.
-        let Some(cc) = Some(nackfrag.writer_sn)
-          .filter(|sn| *sn <= self.last_sent() || !self.push_mode)
-          .and_then(|sn| self.send_buffer.get_by_sn(sn))
-        else {
+        // Of a sample that was not sent yet everything is still to come.
+        if nackfrag.writer_sn > self.last_sent() && self.push_mode {
+          return;
+        }
+        let Some(cc) = self.send_buffer.get_by_sn(nackfrag.writer_sn) else {
+          // The sample is gone: the repair round answers with a GAP and counts it.
+          if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
+            if nackfrag.writer_sn >= reader_proxy.all_acked_before {
+              reader_proxy.request_change(nackfrag.writer_sn);
+              reader_proxy.repair_mode = true;
+              self.schedule_repair_data(reader_guid, self.nack_response_delay);
+            }
+          }
           return;
         };
         let (fragment_count, _) = self.num_frags_and_frag_size(cc.data_value.payload_size());
@@ -1384,10 +1431,10 @@ impl Writer {
       .map(RtpsReaderProxy::acked_up_to_before)
       .min();
     self.send_buffer.set_acked_frontier(frontier);
-    // A VOLATILE writer owes an acknowledged sample to nobody: let go of it now
-    // instead of at the next cache cleaning, up to 6 s later.
-    if let Some(acked_before) = frontier.filter(|_| self.qos_policies.is_volatile()) {
-      self.send_buffer.pop_changes_before(acked_before);
+    // Let go of what every reader has acknowledged now, instead of at the next cache
+    // cleaning, up to 6 s later.
+    if let Some(acked_before) = frontier {
+      self.send_buffer.release_acknowledged(acked_before);
     }
   }
 
@@ -1433,13 +1480,16 @@ impl Writer {
 
     // see similar function above
     if let Some(mut reader_proxy) = self.readers.remove(&to_reader) {
-      self.handle_repair_frags_send_worker(&mut reader_proxy);
+      let evicted_meanwhile = self.handle_repair_frags_send_worker(&mut reader_proxy);
       if let Some(rp) = self
         .readers
         .insert(reader_proxy.remote_reader_guid, reader_proxy)
       {
         // this is an internal logic error, or maybe out of memory
         error!("Reader proxy was duplicated somehow??? (frags) {rp:?}");
+      }
+      if evicted_meanwhile {
+        self.schedule_repair_data(to_reader, self.nack_response_delay);
       }
     }
   }
@@ -1472,8 +1522,13 @@ impl Writer {
     let mut ts_active = false;
     let mut pending_gap_sent = false;
     let mut round_bytes = 0;
+    let round_max_bytes = if reader_proxy.is_reached_over_loopback() {
+      REPAIR_BATCH_MAX_BYTES_LOOPBACK
+    } else {
+      REPAIR_BATCH_MAX_BYTES
+    };
 
-    while round_bytes < REPAIR_BATCH_MAX_BYTES {
+    while round_bytes < round_max_bytes {
       let Some(unsent_sn) = reader_proxy.first_unsent_change() else {
         break;
       };
@@ -1483,36 +1538,23 @@ impl Writer {
       let mut gap = MessageBuilder::new();
       let mut cache_change = None;
       if unsent_sn < first_available {
-        // Reader is requesting older than what we actually have. Notify that they are
-        // gone.
+        // The reader requests samples that are gone.
+        let evicted = reader_proxy.take_evicted_requests(first_available);
         debug!(
-          "Reader {reader_guid:?} requested too old data {unsent_sn:?}. I have only from \
+          "Reader {reader_guid:?} missed {} samples from {unsent_sn:?} on. I have only from \
            {first_available:?}. Topic {:?}",
+          evicted.len(),
           self.my_topic_name
         );
-        gap = gap.gap_msg_before(
-          first_available,
-          self.entity_id(),
-          self.endianness,
-          reader_guid,
-        );
-        reader_proxy.remove_from_unsent_set_all_before(first_available);
+        gap = gap.gap_msg(&evicted, self.entity_id(), self.endianness, reader_guid);
       } else if !pending_gaps.contains(&unsent_sn) {
         match self.send_buffer.get_by_sn(unsent_sn) {
           Some(cc) => cache_change = Some(cc),
           None => {
-            // we are running out of excuses
-            error!(
-              "handle_repair_data_send_worker {:?} seq.number {:?} missing. first_change={:?}",
-              self.my_guid, unsent_sn, first_available
-            );
-            gap = gap.gap_msg(
-              &BTreeSet::from([unsent_sn]),
-              self.entity_id(),
-              self.endianness,
-              reader_guid,
-            );
-            reader_proxy.mark_change_sent(unsent_sn);
+            // A write has evicted it since `first_available` was read, or the send
+            // buffer has a hole there.
+            let evicted = reader_proxy.take_evicted_requests(unsent_sn.plus_1());
+            gap = gap.gap_msg(&evicted, self.entity_id(), self.endianness, reader_guid);
           }
         }
       }
@@ -1629,16 +1671,18 @@ impl Writer {
   // until REPAIR_FRAGS_MAX_BYTES have gone out. Runs of fragments share a DATAFRAG,
   // and DATAFRAGs a datagram, as far as the reader's path MTU allows. The HEARTBEAT
   // after the last one makes the reader say at once what is still missing: a
-  // NACK_FRAG names 256 fragments at most, and repairs get lost, too.
+  // NACK_FRAG names 256 fragments at most, and repairs get lost, too. Returns whether
+  // a requested sample was evicted meanwhile, which needs a GAP.
   fn handle_repair_frags_send_worker(
     &mut self,
     reader_proxy: &mut RtpsReaderProxy, /* This is mutable proxy temporarily detached from the
                                          * set of reader proxies */
-  ) {
+  ) -> bool {
     let reader_guid = reader_proxy.remote_reader_guid;
     let budget = reader_proxy.max_datagram_payload();
     let mut datagram: Option<MessageBuilder> = None;
     let mut round_bytes = 0;
+    let mut evicted_meanwhile = false;
 
     while round_bytes < REPAIR_FRAGS_MAX_BYTES {
       // A fragment starts at a multiple of the fragment size, so a run that is
@@ -1648,8 +1692,13 @@ impl Writer {
         break;
       };
       let Some(cache_change) = self.send_buffer.get_by_sn(seq_num) else {
-        // Evicted meanwhile. The HEARTBEAT says from where on there is anything.
+        // Evicted meanwhile: the repair round of samples answers with a GAP.
         reader_proxy.forget_requested_frags(seq_num);
+        if seq_num >= reader_proxy.all_acked_before {
+          reader_proxy.request_change(seq_num);
+          reader_proxy.repair_mode = true;
+          evicted_meanwhile = true;
+        }
         continue;
       };
       // If the data is meant for a single reader only, make sure it is the one we're
@@ -1714,7 +1763,7 @@ impl Writer {
     if round_bytes > 0 && !reader_proxy.repair_frags_requested() {
       let heartbeat = MessageBuilder::new().heartbeat_msg(
         self.entity_id(),
-        self.send_buffer.first_change_sequence_number(),
+        self.send_buffer.advertised_first(),
         self.last_advertised(),
         self.next_heartbeat_count(),
         self.endianness,
@@ -1725,6 +1774,7 @@ impl Writer {
       self.add_to_repair_datagram(&mut datagram, heartbeat, 0, reader_proxy);
     }
     self.flush_repair_datagram(&mut datagram, reader_proxy);
+    evicted_meanwhile
   } // fn
 
   // The last sample that a HEARTBEAT may speak of. In push mode that is the last
@@ -2054,7 +2104,9 @@ impl Writer {
                 .iter()
                 .find(|l| Locator::is_udp(l)),
             ) {
-              (DeliveryMode::Multicast, _, Some(_)) => send_legacy!(reader.multicast_locator_list),
+              (DeliveryMode::Multicast, _, Some(_)) => {
+                send_legacy!(reader.multicast_locator_list)
+              }
               (DeliveryMode::Unicast, Some(_), _) => send_legacy!(reader.unicast_locator_list),
               (_, _, Some(_)) => send_legacy!(reader.multicast_locator_list),
               (_, Some(_), _) => send_legacy!(reader.unicast_locator_list),
@@ -2182,7 +2234,15 @@ impl Writer {
           // and the endpoints stay unmatched. Unicast to just the new reader.
           if self.is_reliable() && !self.like_stateless {
             let new_reader_guid = reader_proxy.remote_reader_guid;
-            let first = self.send_buffer.first_change_sequence_number();
+            let first = self.readers.get(&new_reader_guid).map_or_else(
+              || self.send_buffer.first_change_sequence_number(),
+              |rp| {
+                max(
+                  self.send_buffer.first_change_sequence_number(),
+                  rp.first_offered(),
+                )
+              },
+            );
             let last = self.send_buffer.last_change_sequence_number();
             let hb_message = MessageBuilder::new()
               .ts_msg(self.endianness, Some(Timestamp::now()))
@@ -2247,8 +2307,13 @@ impl Writer {
   // return value: true = reader was new, false = reader was previously known
   fn matched_reader_update(&mut self, updated_reader_proxy: &RtpsReaderProxy) -> bool {
     let mut is_new = false;
-    let is_volatile = self.qos().is_volatile(); // Get this in advance to work with the borrow checker
-                                                // Capture the interface set once; resolution consults current observations.
+    let is_builtin = self.my_guid.entity_id.kind().is_built_in();
+    let writer_keeps_history = !self.qos_policies.is_volatile();
+    // The threads that write send nothing by themselves until the new reader is in
+    // their plan: what they write meanwhile goes to it, too, from the event loop.
+    let send_buffer = self.send_buffer.clone();
+    let mut no_other_sender = send_buffer.direct_send().lock();
+    // Capture the interface set once; resolution consults current observations.
     let multicast_ifaces = self.udp_sender.multicast_interfaces();
     let selector = DefaultRouteSelector::new(self.prefer_loopback_same_host);
     self
@@ -2271,17 +2336,15 @@ impl Writer {
         // Ensure loopback stays in the gated bucket even for proxies that
         // arrive with it inline (e.g. the built-in get_builtin_reader_proxy path).
         new_proxy.normalize_loopback();
-        if is_volatile {
-          // With Durabilty::Volatile QoS we won't send the sequence numbers which existed
-          // before matching with this reader. Therefore we set the reader as pending GAP
-          // for all existing sequence numbers
-          // that we still have. What is older, a HEARTBEAT says that it is gone; to list
-          // it here would take memory for every sample ever written.
-          new_proxy.set_pending_gap(
-            self.send_buffer.first_change_sequence_number(),
-            self.send_buffer.last_change_sequence_number(),
-          );
-        }
+        // A VOLATILE reader begins with the present, also at a writer that keeps its
+        // history for others (DDS v1.4 Section 2.2.3.4).
+        let wants_history = is_builtin || (writer_keeps_history && !new_proxy.qos().is_volatile());
+        let progress = self.send_buffer.reader_matched(
+          new_proxy.remote_reader_guid,
+          new_proxy.qos().is_reliable(),
+          wants_history,
+        );
+        new_proxy.start_progress(progress, is_builtin);
         new_proxy.resolve_send_route(
           &self.interface_observations.borrow(),
           &multicast_ifaces,
@@ -2292,7 +2355,8 @@ impl Writer {
       });
     // A reader was added or its locators changed: refresh the writer-wide
     // minimum datagram budget used for packing.
-    self.recompute_min_datagram_payload();
+    self.min_datagram_payload = self.smallest_datagram_payload();
+    *no_other_sender = self.direct_plan();
     is_new
   }
 
@@ -2301,13 +2365,18 @@ impl Writer {
   /// datagram is one packet multicast to every reader, so it must fit the
   /// smallest path MTU. With no matched readers, fall back to the default.
   fn recompute_min_datagram_payload(&mut self) {
-    self.min_datagram_payload = self
+    self.min_datagram_payload = self.smallest_datagram_payload();
+    self.refresh_direct_plan();
+  }
+
+  fn smallest_datagram_payload(&self) -> usize {
+    let budgets = self
       .readers
       .values()
-      .map(RtpsReaderProxy::max_datagram_payload)
+      .map(RtpsReaderProxy::max_datagram_payload);
+    budgets
       .min()
-      .unwrap_or(FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE);
-    self.refresh_direct_plan();
+      .unwrap_or(FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE)
   }
 
   /// Refresh the [`SendRoute`](crate::rtps::transmit::SendRoute) of every
@@ -2328,8 +2397,25 @@ impl Writer {
     self.recompute_min_datagram_payload();
   }
 
+  /// Resolves the route to each matched reader anew, for the interfaces that this
+  /// host has now.
+  pub fn follow_interfaces(&mut self, interfaces: Rc<[IfAddr]>) {
+    self.local_interfaces = interfaces;
+    let multicast_ifaces = self.udp_sender.multicast_interfaces();
+    let selector = DefaultRouteSelector::new(self.prefer_loopback_same_host);
+    {
+      let observations = self.interface_observations.borrow();
+      for rp in self.readers.values_mut() {
+        rp.resolve_send_route(&observations, &multicast_ifaces, &selector);
+        rp.resolve_path_mtu(&self.local_interfaces);
+      }
+    }
+    self.recompute_min_datagram_payload();
+  }
+
   fn matched_reader_remove(&mut self, guid: GUID) -> Option<RtpsReaderProxy> {
     let removed = self.readers.remove(&guid);
+    self.send_buffer.reader_unmatched(guid);
     if let Some(ref removed_reader) = removed {
       info!(
         "Removed reader proxy. topic={:?} reader={:?}",
@@ -2694,7 +2780,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
               let hb_msg = MessageBuilder::new()
                 .heartbeat_msg(
                   writer.entity_id(), // from Writer
-                  writer.send_buffer.first_change_sequence_number(),
+                  writer.send_buffer.advertised_first(),
                   max(cc.sequence_number, writer.last_advertised()),
                   writer.next_heartbeat_count(),
                   writer.endianness,
@@ -2752,7 +2838,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
                                        // writing new data.
           message_builder = message_builder.heartbeat_msg(
             writer.entity_id(),
-            writer.send_buffer.first_change_sequence_number(),
+            writer.send_buffer.advertised_first(),
             max(cc.sequence_number, writer.last_advertised()),
             writer.next_heartbeat_count(),
             writer.endianness,
@@ -2961,9 +3047,8 @@ mod tests {
         payload_len: usize,
         reader_locator: Option<SocketAddr>,
       ) -> Self {
-        let guid = GUID::new(GuidPrefix::new(&[1; 12]), writer_id);
         let send_buffer = WriterSendBuffer::new(
-          guid,
+          GUID::new(GuidPrefix::new(&[1; 12]), writer_id),
           "repair_test".to_string(),
           true, // reliable
           writer_id.kind().is_built_in(),
@@ -2972,6 +3057,30 @@ mod tests {
           DEFAULT_WRITER_MAX_SAMPLES,
           DEFAULT_WRITER_MAX_SAMPLES,
         );
+        Self::with_buffer(
+          send_buffer,
+          writer_id,
+          writer_qos,
+          reader_id,
+          reader_qos,
+          sample_count,
+          payload_len,
+          reader_locator,
+        )
+      }
+
+      #[allow(clippy::too_many_arguments)]
+      fn with_buffer(
+        send_buffer: WriterSendBuffer,
+        writer_id: EntityId,
+        writer_qos: QosPolicies,
+        reader_id: EntityId,
+        reader_qos: &QosPolicies,
+        sample_count: i64,
+        payload_len: usize,
+        reader_locator: Option<SocketAddr>,
+      ) -> Self {
+        let guid = GUID::new(GuidPrefix::new(&[1; 12]), writer_id);
         for _ in 0..sample_count {
           let data = DDSData::new(SerializedPayload::new(
             RepresentationIdentifier::CDR_LE,
@@ -2979,7 +3088,7 @@ mod tests {
           ));
           assert!(matches!(
             send_buffer.admit_blocking(WriteOptions::default(), data, Some(StdDuration::ZERO)),
-            Admission::Admitted(_)
+            Admission::Admitted { .. }
           ));
         }
         let (status_sender, status) = sync_status_channel(4).unwrap();
@@ -3321,22 +3430,214 @@ mod tests {
       assert!(!f.reader_proxy().repair_frags_requested());
     }
 
-    // A VOLATILE reader that comes late costs memory for what the writer still has,
-    // not for all that it ever wrote.
-    #[test]
-    fn a_late_volatile_reader_takes_no_memory_for_what_is_gone() {
-      let mut f = Fixture::user(5, 8, None);
-      f.writer.send_buffer.remove_changes_before(SequenceNumber::new(4));
-      f.writer.qos_policies.durability = Some(Durability::Volatile);
-      let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
-      let qos = QosPolicyBuilder::new().durability(Durability::Volatile).build();
-      f.writer.update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
-      let gap: Vec<i64> = f.writer.readers[&late]
-        .get_pending_gap()
+    fn acknowledge(f: &mut Fixture, base: i64, requested: &[i64], count: i32) {
+      let requested: BTreeSet<SequenceNumber> =
+        requested.iter().copied().map(SequenceNumber::new).collect();
+      let base = SequenceNumber::new(base);
+      f.writer.handle_ack_nack(
+        f.reader_guid.prefix,
+        &AckSubmessage::AckNack(AckNack {
+          reader_id: f.reader_guid.entity_id,
+          writer_id: f.writer.my_guid.entity_id,
+          reader_sn_state: SequenceNumberSet::from_base_and_set(base, &requested),
+          count,
+        }),
+      );
+    }
+
+    fn write(f: &Fixture, samples: usize, payload_len: usize) {
+      for _ in 0..samples {
+        let data = DDSData::new(SerializedPayload::new(
+          RepresentationIdentifier::CDR_LE,
+          vec![0; payload_len],
+        ));
+        let none = Some(StdDuration::ZERO);
+        let admission = f
+          .writer
+          .send_buffer
+          .admit_blocking(WriteOptions::default(), data, none);
+        assert!(
+          matches!(admission, Admission::Admitted { .. }),
+          "a write failed"
+        );
+      }
+      f.writer
+        .set_last_sent(f.writer.send_buffer.last_change_sequence_number());
+    }
+
+    // A RELIABLE, VOLATILE, KEEP_LAST writer that retains 256 samples, with one reader.
+    fn keep_last() -> Fixture {
+      let qos = QosPolicyBuilder::new()
+        .reliability(Reliability::Reliable {
+          max_blocking_time: Duration::ZERO,
+        })
+        .history(History::KeepLast { depth: 10 })
+        .durability(Durability::Volatile)
+        .build();
+      let guid = EntityId::new([0, 0, 1], EntityKind::WRITER_WITH_KEY_USER_DEFINED);
+      let buffer = WriterSendBuffer::new(
+        GUID::new(GuidPrefix::new(&[1; 12]), guid),
+        "keep_last_test".to_string(),
+        true,
+        false,
+        true,
+        256,
+        256,
+        10,
+      )
+      .keep_last(10);
+      let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
+      Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None)
+    }
+
+    fn only_reader(f: &Fixture) -> crate::MatchedReader {
+      let readers = f.writer.send_buffer.matched_readers();
+      *readers
         .iter()
-        .map(|sn| i64::from(*sn))
-        .collect();
-      assert_eq!(gap, [4, 5]);
+        .find(|reader| reader.guid == f.reader_guid)
+        .expect("the reader is matched")
+    }
+
+    // A reader that acknowledges nothing costs others nothing: each write succeeds, and
+    // no more is retained than the limits allow.
+    #[test]
+    fn a_keep_last_writer_never_waits_for_a_reader() {
+      let f = keep_last();
+      write(&f, 10_000, 8);
+      assert_eq!(f.writer.send_buffer.retained_len(), 256);
+      let reader = only_reader(&f);
+      assert_eq!((reader.offered, reader.unacknowledged), (10_000, 10_000));
+      assert_eq!(reader.overrun, 0, "it has said nothing of what it lacks");
+
+      let f = keep_last();
+      write(&f, 40, (1 << 20) - 4);
+      // 32 MiB, and 4 bytes of each sample for its encapsulation header.
+      assert_eq!(f.writer.send_buffer.retained_len(), 32);
+      write(&f, 1, 64 << 20);
+      assert_eq!(
+        f.writer.send_buffer.retained_len(),
+        2,
+        "the two latest samples"
+      );
+    }
+
+    // The samples that are gone are counted for the reader that requests them, once.
+    #[test]
+    fn what_a_reader_missed_is_counted_for_it_once() {
+      let mut f = keep_last();
+      write(&f, 300, 8); // 1 to 44 are gone
+      acknowledge(&mut f, 10, &[10, 12, 50], 1);
+      assert_eq!(f.repair_round(), 3);
+      assert_eq!(only_reader(&f).overrun, 2);
+      acknowledge(&mut f, 10, &[10, 12], 2); // the GAP was lost
+      assert_eq!(f.repair_round(), 2);
+      assert_eq!(only_reader(&f).overrun, 2);
+      acknowledge(&mut f, 20, &[21, 22], 3);
+      f.repair_round();
+      assert_eq!(only_reader(&f).overrun, 4);
+      acknowledge(&mut f, 301, &[], 4);
+      let reader = only_reader(&f);
+      assert_eq!((reader.overrun, reader.unacknowledged), (4, 0));
+      assert_eq!(f.writer.send_buffer.retained_len(), 0);
+    }
+
+    // Late acknowledgements of samples that arrived are no loss.
+    #[test]
+    fn a_reader_that_acknowledges_late_has_missed_nothing() {
+      let mut f = keep_last();
+      write(&f, 2_000, 8);
+      for (count, base) in (100..=2_001).step_by(50).enumerate() {
+        acknowledge(&mut f, base, &[], count as i32);
+      }
+      assert_eq!(only_reader(&f).overrun, 0);
+    }
+
+    // A reader that was stopped for long is sent on with one GAP, and what no HEARTBEAT
+    // offers any more counts as missed when the reader skips it.
+    #[test]
+    fn a_reader_that_is_far_behind_skips_what_is_gone() {
+      let mut f = keep_last();
+      write(&f, 1_256, 8); // 1 to 1,000 are gone
+      let requested: Vec<i64> = (101..=356).collect();
+      acknowledge(&mut f, 101, &requested, 1);
+      f.repair_round();
+      assert_eq!(only_reader(&f).overrun, 900);
+
+      let mut f = keep_last();
+      write(&f, 20_256, 8); // 1 to 20,000 are gone
+      let first = i64::from(f.writer.send_buffer.advertised_first());
+      assert_eq!(first, 20_001 - 8_192);
+      acknowledge(&mut f, first, &[], 1);
+      assert_eq!(only_reader(&f).overrun, first as u64 - 1);
+    }
+
+    // One reader's acknowledgements do not depend on another's, and a joining reader is
+    // owed nothing that was written before.
+    #[test]
+    fn a_joining_volatile_reader_is_owed_nothing() {
+      let mut f = keep_last();
+      write(&f, 5, 8);
+      acknowledge(&mut f, 6, &[], 1);
+      let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
+      let qos = f.writer.qos_policies.clone();
+      f.writer
+        .update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+      write(&f, 2, 8);
+      acknowledge(&mut f, 8, &[], 2);
+      let readers = f.writer.send_buffer.matched_readers();
+      let of_late = readers.iter().find(|reader| reader.guid == late).unwrap();
+      assert_eq!((of_late.offered, of_late.unacknowledged), (2, 2));
+      assert_eq!(only_reader(&f).unacknowledged, 0);
+      f.writer.reader_lost(late);
+      assert_eq!(f.writer.send_buffer.retained_len(), 0);
+      assert_eq!(f.writer.send_buffer.matched_readers().len(), 1);
+    }
+
+    // Of a writer that keeps history, a TRANSIENT_LOCAL reader gets the last `depth`
+    // samples, whatever another reader has not acknowledged, and a VOLATILE one nothing.
+    #[test]
+    fn a_late_joiner_gets_the_depth_of_the_history() {
+      let mut f = Fixture::user(0, 8, None);
+      f.writer.send_buffer = WriterSendBuffer::new(
+        f.writer.my_guid,
+        "t".to_string(),
+        true,
+        false,
+        false,
+        100,
+        100,
+        3,
+      )
+      .keep_last(3);
+      write(&f, 50, 8);
+      for (prefix, durability, offered) in [
+        (4, Durability::TransientLocal, 3),
+        (5, Durability::Volatile, 0),
+      ] {
+        let late = GUID::new(GuidPrefix::new(&[prefix; 12]), f.reader_guid.entity_id);
+        let mut qos = f.writer.qos_policies.clone();
+        qos.durability = Some(durability);
+        f.writer
+          .update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+        let readers = f.writer.send_buffer.matched_readers();
+        let joined = readers.iter().find(|reader| reader.guid == late).unwrap();
+        assert_eq!(joined.offered, offered, "{durability:?}");
+      }
+    }
+
+    // An ACKNACK that lies moves neither another reader's frontier nor, beyond what was
+    // written, its own.
+    #[test]
+    fn lies_in_acknacks_harm_nobody() {
+      let mut f = keep_last();
+      write(&f, 300, 8);
+      acknowledge(&mut f, i64::MAX / 2, &[], 1);
+      acknowledge(&mut f, 301, &[301, 400, 500], 2);
+      acknowledge(&mut f, 1, &[1, 2, 3], 3);
+      acknowledge(&mut f, -5, &[], 4);
+      assert!(f.unsent() <= 3);
+      write(&f, 300, 8);
+      assert_eq!(only_reader(&f).unacknowledged, 300);
     }
 
     // Nobody acknowledges what a BestEffort writer sends.
@@ -3401,6 +3702,36 @@ mod tests {
       assert_eq!(heartbeats_after_ack_before(5), 1, "it says so again");
       assert_eq!(heartbeats_after_ack_before(6), 0, "it has everything");
       assert!(f.next_repair_event(StdDuration::from_millis(50)).is_none());
+    }
+
+    // Its participant discarded ours and has matched it anew: it begins with an
+    // ACKNACK that requests nothing, and whose count it may have had before.
+    #[test]
+    fn a_reader_that_was_matched_anew_on_its_side_is_answered_and_served() {
+      let mut f = Fixture::user(5, 8, None);
+      f.writer.nack_response_delay = StdDuration::ZERO;
+      let reader_guid = f.reader_guid;
+      let ack_nack = |f: &mut Fixture, base: i64, requested: &[i64]| {
+        let requested = requested.iter().copied().map(SequenceNumber::new).collect();
+        let base = SequenceNumber::new(base);
+        let ack_nack = AckNack {
+          reader_id: reader_guid.entity_id,
+          writer_id: f.writer.my_guid.entity_id,
+          reader_sn_state: SequenceNumberSet::from_base_and_set(base, &requested),
+          count: 1,
+        };
+        let before = f.writer.next_heartbeat_count();
+        f.writer
+          .handle_ack_nack(reader_guid.prefix, &AckSubmessage::AckNack(ack_nack));
+        f.writer.next_heartbeat_count() - before - 1
+      };
+      assert_eq!(ack_nack(&mut f, 6, &[]), 0, "it has everything");
+      assert_eq!(ack_nack(&mut f, 1, &[]), 1, "it knows nothing");
+      assert!(f.writer.handle_heartbeat_tick(false), "it is behind again");
+      f.writer.readers.get_mut(&reader_guid).unwrap().last_acknack_count = Some(0);
+      assert_eq!(ack_nack(&mut f, 1, &[1, 2, 3, 4, 5]), 0);
+      assert_eq!(f.unsent(), 5);
+      assert!(f.next_repair_event(StdDuration::from_secs(10)).is_some());
     }
 
     // Each datagram that a reader at `socket` has got, by now.

@@ -11,15 +11,23 @@ use log::{debug, error, trace, warn};
 
 use crate::{
   dds::{ddsdata::DDSData, with_key::datawriter::WriteOptions},
-  rtps::direct_send::DirectSend,
+  rtps::{
+    constant::{KEEP_LAST_MAX_RETAINED_BYTES, MAX_ADVERTISED_EVICTED_SAMPLES},
+    direct_send::DirectSend,
+    reader_progress::{MatchedReader, ReaderProgress},
+  },
   structure::{cache_change::CacheChange, guid::GUID, sequence_number::SequenceNumber},
 };
 
 /// Result of an admission attempt into the [`WriterSendBuffer`].
 pub(crate) enum Admission {
-  /// The sample was admitted and given this sequence number. It now lives in
-  /// the send buffer and is ready for the Writer (event loop) to transmit.
-  Admitted(SequenceNumber),
+  /// The sample was admitted. It now lives in the send buffer and is ready for
+  /// the Writer (event loop) to transmit.
+  Admitted {
+    sequence_number: SequenceNumber,
+    /// Readers that were matched when the sample was admitted.
+    readers: usize,
+  },
   /// The reliable send window is full and no room became available within the
   /// allotted blocking time. The sample was *not* stored.
   WouldBlock,
@@ -35,8 +43,12 @@ struct Inner {
   // strictly monotonic and unique. This is the single source of truth for the
   // Writer's outgoing samples (send, repair, fragmentation, eviction).
   changes: BTreeMap<SequenceNumber, CacheChange>,
+  retained_bytes: usize,     // payload bytes of `changes`
   first_seq: SequenceNumber, // oldest still retained (default 1)
   last_seq: SequenceNumber,  // latest allocated (default 0 == nothing yet)
+
+  // What each matched reader was offered and has acknowledged.
+  readers: BTreeMap<GUID, Arc<ReaderProgress>>,
 
   // --- flow control ---
   // Maximum number of unacknowledged samples a reliable writer may have
@@ -79,6 +91,24 @@ struct Inner {
   parked_threads: usize,
 }
 
+impl Inner {
+  fn evict_oldest(&mut self) {
+    if let Some((oldest, evicted)) = self.changes.pop_first() {
+      self.retained_bytes -= evicted.data_value.payload_size();
+      self.first_seq = oldest.plus_1();
+    }
+  }
+
+  fn advertised_first(&self) -> SequenceNumber {
+    if !self.reliable_readers_present {
+      return self.first_seq;
+    }
+    let furthest_back = self.first_seq - SequenceNumber::from(MAX_ADVERTISED_EVICTED_SAMPLES);
+    let unacknowledged = max(self.acked_before, furthest_back);
+    max(unacknowledged, SequenceNumber::new(1)).min(self.first_seq)
+  }
+}
+
 struct Shared {
   inner: Mutex<Inner>,
   direct_send: DirectSend,
@@ -88,6 +118,11 @@ struct Shared {
   writer_guid: GUID,
   reliable_writer: bool,
   is_builtin: bool,
+  // The HISTORY depth of a KEEP_LAST writer whose writes never wait for a
+  // reader: when the retained samples reach their limit, the oldest one goes,
+  // and the readers that lack it get a GAP (DDS v1.4 Section 2.2.3.18). `None`
+  // for KEEP_ALL, whose writes wait for acknowledgements.
+  keep_last: Option<usize>,
   // True for VOLATILE durability (the DDS default). When true, a reliable writer
   // with no matched reliable reader trims KeepLast on insert (there is no
   // late-joiner to serve, so retaining unacked samples is pointless). When false
@@ -127,6 +162,8 @@ impl WriterSendBuffer {
       shared: Arc::new(Shared {
         inner: Mutex::new(Inner {
           changes: BTreeMap::new(),
+          retained_bytes: 0,
+          readers: BTreeMap::new(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
           window_limit: window_limit.max(1),
@@ -143,10 +180,29 @@ impl WriterSendBuffer {
         writer_guid,
         reliable_writer,
         is_builtin,
+        keep_last: None,
         volatile,
         topic_name,
       }),
     }
+  }
+
+  /// Makes this the buffer of a KEEP_LAST writer: a write never waits for
+  /// acknowledgements, and the oldest sample goes when `window_limit` samples are
+  /// retained. To be called before the buffer is shared.
+  #[must_use]
+  pub fn keep_last(mut self, depth: usize) -> Self {
+    match Arc::get_mut(&mut self.shared) {
+      Some(shared) if !shared.is_builtin => {
+        shared.keep_last = Some(depth.max(1));
+        if let Ok(inner) = shared.inner.get_mut() {
+          inner.window_limit = max(inner.window_limit, depth);
+        }
+      }
+      Some(_) => {}
+      None => error!("WriterSendBuffer: KEEP_LAST was set after the buffer was shared"),
+    }
+    self
   }
 
   // --- predicates (must be called while holding the lock) ---
@@ -160,6 +216,11 @@ impl WriterSendBuffer {
   fn has_room(shared: &Shared, inner: &Inner, may_block: bool) -> bool {
     if shared.is_builtin {
       // Built-in (discovery) writers must never stall.
+      return true;
+    }
+
+    if shared.keep_last.is_some() && shared.reliable_writer {
+      // The oldest sample gives way, see `insert_locked`.
       return true;
     }
 
@@ -236,8 +297,12 @@ impl WriterSendBuffer {
     let deadline = timeout.map(|t| Instant::now() + t);
     loop {
       if Self::has_room(shared, &inner, may_block) {
-        let seq = Self::insert_locked(shared, &mut inner, write_options, data, may_block);
-        return Admission::Admitted(seq);
+        let sequence_number =
+          Self::insert_locked(shared, &mut inner, write_options, data, may_block);
+        return Admission::Admitted {
+          sequence_number,
+          readers: inner.readers.len(),
+        };
       }
       // Window full: wait for an acknowledgement to free up space.
       match deadline {
@@ -289,6 +354,7 @@ impl WriterSendBuffer {
   ) -> SequenceNumber {
     let seq = inner.last_seq.plus_1();
     let cc = CacheChange::new(shared.writer_guid, seq, write_options, data);
+    inner.retained_bytes += cc.data_value.payload_size();
     inner.changes.insert(seq, cc);
     inner.last_seq = seq;
 
@@ -313,13 +379,16 @@ impl WriterSendBuffer {
         || (shared.reliable_writer && shared.volatile && !inner.reliable_readers_present));
     if trim_keep_last {
       while inner.changes.len() > inner.max_retain {
-        // BTreeMap keeps keys sorted, so the first entry is the oldest SN.
-        let oldest = match inner.changes.keys().next().copied() {
-          Some(sn) => sn,
-          None => break,
-        };
-        inner.changes.remove(&oldest);
-        inner.first_seq = oldest.plus_1();
+        inner.evict_oldest();
+      }
+    } else if shared.keep_last.is_some() {
+      // Some reader has not acknowledged the oldest sample for `window_limit`
+      // samples. It alone misses that sample. Two samples stay whatever their size:
+      // the one that was just written and the one that may be half sent.
+      while inner.changes.len() > inner.window_limit
+        || (inner.retained_bytes > KEEP_LAST_MAX_RETAINED_BYTES && inner.changes.len() > 2)
+      {
+        inner.evict_oldest();
       }
     }
     seq
@@ -333,7 +402,8 @@ impl WriterSendBuffer {
       .direct_send
       .try_send(self.shared.writer_guid, sequence_number, || {
         let inner = self.shared.inner.lock().unwrap();
-        Some((inner.changes.get(&sequence_number)?.clone(), inner.first_seq))
+        let change = inner.changes.get(&sequence_number)?.clone();
+        Some((change, inner.advertised_first()))
       });
     if sent {
       self.set_sent_frontier(sequence_number);
@@ -403,6 +473,52 @@ impl WriterSendBuffer {
     self.shared.inner.lock().unwrap().changes.len()
   }
 
+  /// The first sequence number that a HEARTBEAT to all readers offers.
+  ///
+  /// It is below the first retained one while a reader has not acknowledged samples
+  /// that were evicted: the reader then requests those that it lacks, is answered
+  /// by a GAP, and the Writer knows how many it missed.
+  pub fn advertised_first(&self) -> SequenceNumber {
+    self.shared.inner.lock().unwrap().advertised_first()
+  }
+
+  /// Registers a matched reader and returns the first sample that it is offered,
+  /// with the record of its progress. `wants_history` is whether the reader is to
+  /// get samples that were written before it was matched: of a KEEP_LAST writer
+  /// the last `depth` ones.
+  pub fn reader_matched(
+    &self,
+    reader: GUID,
+    reliable: bool,
+    wants_history: bool,
+  ) -> Arc<ReaderProgress> {
+    let mut inner = self.shared.inner.lock().unwrap();
+    let next = inner.last_seq.plus_1();
+    let first_offered = if !wants_history {
+      next
+    } else {
+      match self.shared.keep_last {
+        Some(depth) => max(inner.first_seq, next - SequenceNumber::from(depth)),
+        None => inner.first_seq,
+      }
+    };
+    let progress = Arc::new(ReaderProgress::new(reader, reliable, first_offered));
+    inner.readers.insert(reader, progress.clone());
+    progress
+  }
+
+  /// Forgets a reader that is gone.
+  pub fn reader_unmatched(&self, reader: GUID) {
+    self.shared.inner.lock().unwrap().readers.remove(&reader);
+  }
+
+  /// Every matched reader, with what it was offered, acknowledged and missed.
+  pub fn matched_readers(&self) -> Vec<MatchedReader> {
+    let inner = self.shared.inner.lock().unwrap();
+    let last = inner.last_seq;
+    inner.readers.values().map(|r| r.snapshot(last)).collect()
+  }
+
   /// The lowest sequence number still retained (or the next-to-be-written if
   /// the buffer is empty).
   pub fn first_change_sequence_number(&self) -> SequenceNumber {
@@ -421,7 +537,10 @@ impl WriterSendBuffer {
     let shared = &*self.shared;
     let mut inner = shared.inner.lock().unwrap();
     let count_before = inner.changes.len();
-    inner.changes = inner.changes.split_off(&remove_before);
+    let kept = inner.changes.split_off(&remove_before);
+    for evicted in std::mem::replace(&mut inner.changes, kept).values() {
+      inner.retained_bytes -= evicted.data_value.payload_size();
+    }
     if remove_before > inner.first_seq {
       inner.first_seq = remove_before;
     }
@@ -436,15 +555,24 @@ impl WriterSendBuffer {
     }
   }
 
-  /// Like [`remove_changes_before`](Self::remove_changes_before), for the few
-  /// changes that one acknowledgement releases.
-  pub fn pop_changes_before(&self, remove_before: SequenceNumber) {
+  /// Releases the samples before `acked_before`, which every reliable reader has
+  /// acknowledged, but for those that a writer which is not VOLATILE keeps for late
+  /// joiners: the last `depth` ones, or all of a KEEP_ALL writer.
+  pub fn release_acknowledged(&self, acked_before: SequenceNumber) {
     let mut inner = self.shared.inner.lock().unwrap();
+    let remove_before = match (self.shared.volatile, self.shared.keep_last) {
+      (true, _) => acked_before,
+      (false, Some(depth)) => {
+        acked_before.min(inner.last_seq.plus_1() - SequenceNumber::from(depth))
+      }
+      (false, None) => return,
+    };
     while let Some(entry) = inner.changes.first_entry() {
       if *entry.key() >= remove_before {
         break;
       }
-      entry.remove();
+      let released = entry.remove();
+      inner.retained_bytes -= released.data_value.payload_size();
     }
     // Not past what has been written: a reader may acknowledge ahead of us.
     let written_before = inner.last_seq.plus_1();
@@ -454,7 +582,9 @@ impl WriterSendBuffer {
   /// Evicts one sample. Readers that lack it are told by a GAP.
   pub fn remove(&self, sequence_number: SequenceNumber) {
     let mut inner = self.shared.inner.lock().unwrap();
-    inner.changes.remove(&sequence_number);
+    if let Some(evicted) = inner.changes.remove(&sequence_number) {
+      inner.retained_bytes -= evicted.data_value.payload_size();
+    }
     let first = inner.changes.keys().next().copied();
     inner.first_seq = first.unwrap_or_else(|| inner.last_seq.plus_1());
   }
@@ -523,7 +653,7 @@ mod tests {
   fn admit_now(buf: &WriterSendBuffer, opts: WriteOptions) -> bool {
     matches!(
       buf.admit_blocking(opts, sample(), Some(StdDuration::ZERO)),
-      Admission::Admitted(_)
+      Admission::Admitted { .. }
     )
   }
 
@@ -584,7 +714,7 @@ mod tests {
         std::thread::yield_now();
       }
       buf.set_acked_frontier(Some(SequenceNumber::new(2)));
-      assert!(matches!(writer.join().unwrap(), Admission::Admitted(_)));
+      assert!(matches!(writer.join().unwrap(), Admission::Admitted { .. }));
       assert!(waiter.join().unwrap());
     });
     assert_eq!(parked(&buf), 0);

@@ -158,6 +158,10 @@ pub(crate) struct TopicCache {
 
   // Where the application wants samples of several fragments, if it does.
   pub(crate) lender: Lender,
+
+  // What the application has taken of each Writer before: Readers of the topic that
+  // are made from now on begin after these samples.
+  pub(crate) taken: BTreeMap<GUID, SequenceNumber>,
 }
 
 impl TopicCache {
@@ -175,6 +179,7 @@ impl TopicCache {
       sequence_numbers: BTreeMap::new(),
       received_reliably_before: BTreeMap::new(),
       lender: Lender::default(),
+      taken: BTreeMap::new(),
     };
 
     new_self.update_keep_limits(topic_qos);

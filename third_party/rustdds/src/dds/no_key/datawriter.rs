@@ -14,6 +14,7 @@ use crate::{
     with_key::datawriter as datawriter_with_key,
   },
   discovery::sedp_messages::SubscriptionBuiltinTopicData,
+  rtps::reader_progress::MatchedReader,
   serialization::CDRSerializerAdapter,
   structure::{entity::RTPSEntity, rpc::SampleIdentity, time::Timestamp},
   StatusEvented, GUID,
@@ -100,6 +101,25 @@ where
       .keyed_datawriter
       .write_with_options(NoKeyWrapper::<D> { d: data }, write_options)
       .map_err(unwrap_no_key_write_error)
+  }
+
+  /// Like [`write_with_options`](Self::write_with_options), and returns how many
+  /// readers were matched when the sample got its place in the history: those that
+  /// it is offered to.
+  pub fn write_counting_readers(
+    &self,
+    data: D,
+    write_options: datawriter_with_key::WriteOptions,
+  ) -> WriteResult<(SampleIdentity, usize), D> {
+    self
+      .keyed_datawriter
+      .write_counting_readers(NoKeyWrapper::<D> { d: data }, write_options)
+      .map_err(unwrap_no_key_write_error)
+  }
+
+  /// Every matched reader, with what it was offered, acknowledged and missed.
+  pub fn matched_readers(&self) -> Vec<MatchedReader> {
+    self.keyed_datawriter.matched_readers()
   }
 
   /// Waits for all acknowledgements to finish

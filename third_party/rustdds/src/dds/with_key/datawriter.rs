@@ -25,7 +25,10 @@ use crate::{
   discovery::{discovery::DiscoveryCommand, sedp_messages::SubscriptionBuiltinTopicData},
   messages::submessages::elements::serialized_payload::SerializedPayload,
   polling::{Doorbell, WakeSender},
-  rtps::writer_send_buffer::{Admission, WriterSendBuffer},
+  rtps::{
+    reader_progress::MatchedReader,
+    writer_send_buffer::{Admission, WriterSendBuffer},
+  },
   serialization::CDRSerializerAdapter,
   structure::{
     cache_change::ChangeKind, entity::RTPSEntity, guid::GUID, rpc::SampleIdentity,
@@ -361,6 +364,19 @@ where
     data: D,
     write_options: WriteOptions,
   ) -> WriteResult<SampleIdentity, D> {
+    self
+      .write_counting_readers(data, write_options)
+      .map(|(identity, _)| identity)
+  }
+
+  /// Like [`write_with_options`](Self::write_with_options), and returns how many
+  /// readers were matched when the sample got its place in the history: those that
+  /// it is offered to.
+  pub fn write_counting_readers(
+    &self,
+    data: D,
+    write_options: WriteOptions,
+  ) -> WriteResult<(SampleIdentity, usize), D> {
     // serialize
     let send_buffer = match SA::to_bytes(&data) {
       Ok(b) => b,
@@ -385,15 +401,19 @@ where
       .send_buffer
       .admit_blocking(write_options, ddsdata, timeout)
     {
-      Admission::Admitted(sequence_number) => {
+      Admission::Admitted {
+        sequence_number,
+        readers,
+      } => {
         if !self.send_buffer.send_now(sequence_number) {
           self.ring_doorbell();
         }
         self.refresh_manual_liveliness();
-        Ok(SampleIdentity {
+        let identity = SampleIdentity {
           writer_guid: self.my_guid,
           sequence_number,
-        })
+        };
+        Ok((identity, readers))
       }
       Admission::WouldBlock => {
         warn!(
@@ -404,6 +424,11 @@ where
         Err(WriteError::WouldBlock { data })
       }
     }
+  }
+
+  /// Every matched reader, with what it was offered, acknowledged and missed.
+  pub fn matched_readers(&self) -> Vec<MatchedReader> {
+    self.send_buffer.matched_readers()
   }
 
   /// This operation blocks the calling thread until either all data written by
@@ -820,14 +845,14 @@ where
     key: &<D as Keyed>::K,
     source_timestamp: Option<Timestamp>,
   ) -> WriteResult<(), ()> {
-    self.dispose_numbered(key, source_timestamp).map(|_| ())
+    self.dispose_numbered(key, source_timestamp.into()).map(|_| ())
   }
 
   /// Like [`dispose`](Self::dispose); yields the sample's sequence number.
   pub(crate) fn dispose_numbered(
     &self,
     key: &<D as Keyed>::K,
-    source_timestamp: Option<Timestamp>,
+    write_options: WriteOptions,
   ) -> WriteResult<SequenceNumber, ()> {
     let send_buffer = SA::key_to_bytes(key).map_err(|e| WriteError::Serialization {
       reason: format!("{e}"),
@@ -842,9 +867,11 @@ where
     let timeout = self.qos().reliable_max_blocking_time().map(|d| d.to_std());
     match self
       .send_buffer
-      .admit_blocking(WriteOptions::from(source_timestamp), ddsdata, timeout)
+      .admit_blocking(write_options, ddsdata, timeout)
     {
-      Admission::Admitted(sequence_number) => {
+      Admission::Admitted {
+        sequence_number, ..
+      } => {
         self.ring_doorbell();
         self.refresh_manual_liveliness();
         Ok(sequence_number)

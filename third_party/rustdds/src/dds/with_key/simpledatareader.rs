@@ -62,10 +62,10 @@ pub(crate) struct ReadState<K: Key> {
 }
 
 impl<K: Key> ReadState<K> {
-  fn new() -> Self {
+  fn new(taken: BTreeMap<GUID, SequenceNumber>) -> Self {
     ReadState {
       latest_instant: Timestamp::ZERO,
-      last_read_sn: BTreeMap::new(),
+      last_read_sn: taken,
       hash_to_key_map: BTreeMap::<KeyHash, K>::new(),
     }
   }
@@ -193,13 +193,15 @@ where
       });
     }
 
+    let taken = topic_cache.lock().unwrap().taken.clone();
+
     Ok(Self {
       my_subscriber: subscriber,
       qos_policy,
       my_guid,
       notification_receiver: Mutex::new(notification_receiver),
       topic_cache,
-      read_state: Mutex::new(ReadState::new()),
+      read_state: Mutex::new(ReadState::new(taken)),
       my_topic: topic,
       deserializer_type: PhantomData,
       discovery_command,
