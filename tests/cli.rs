@@ -56,6 +56,27 @@ fn sample(number: u32) -> (Vec<u8>, Encapsulation) {
 }
 
 /// A publisher of `/scan` whom the bridge has found.
+/// A subscriber of an output, so that the lane has a reader to forward to.
+struct Subscriber {
+    _reader: RawReader,
+    _participant: Participant,
+}
+
+impl Subscriber {
+    fn new(domain_id: u16, lane: &str) -> Self {
+        let mut participant = participant("subscriber", domain_id);
+        let qos = ReaderQos {
+            reliability: Reliability::BestEffort,
+            durability: Durability::Volatile,
+            depth: 16,
+            deadline_ms: None,
+        };
+        let topic = format!("rt/adaptive_bridge/{lane}/scan");
+        let reader = participant.create_reader(&topic, TYPE, &qos).unwrap();
+        Self { _reader: reader, _participant: participant }
+    }
+}
+
 struct Publisher {
     writer: RawWriter,
     _participant: Participant,
@@ -274,6 +295,12 @@ fn keys(value: &Value, path: &str, found: &mut BTreeSet<String>) {
 fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
     let bridge = bridge(102);
     let _up = up(&bridge);
+    let _subscriber = Subscriber::new(102, "critical");
+    drop(Publisher::new(102));
+    wait_status(&bridge, "a subscriber, and a problem", |status| {
+        let is_listed = !lane(status, "critical")["matched_readers"].as_array().unwrap().is_empty();
+        is_listed && !status["problems"].as_array().unwrap().is_empty()
+    });
     let mut found = BTreeSet::new();
     keys(&status(&bridge), "", &mut found);
     let page = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/status-json.md")).unwrap();
@@ -282,12 +309,11 @@ fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
         let rows = rows.take_while(|line| line.starts_with('|'));
         rows.map(|line| line.split('`').nth(1).unwrap().to_owned()).collect()
     };
-    // Nobody is probed here; a test of the report itself knows the keys of these lists.
-    let of_control = |key: &String| key.starts_with("subscribers[]") || key.starts_with("intruders[]");
-    assert_eq!(
-        table("Key | Meaning").into_iter().filter(|key| !of_control(key)).collect::<BTreeSet<_>>(),
-        found
-    );
+    // Nobody is probed and nothing is published here; a test of the report itself knows the keys of these
+    // lists.
+    let empty = ["subscribers[]", "intruders[]", "routes[].publishers[]"];
+    let is_there = |key: &String| !empty.iter().any(|list| key.starts_with(list));
+    assert_eq!(table("Key | Meaning").into_iter().filter(is_there).collect::<BTreeSet<_>>(), found);
     let refusals: BTreeSet<String> = ProbeRefusal::ALL.iter().map(|one| one.label().to_owned()).collect();
     assert_eq!(table("Refusal | Meaning"), refusals);
     let reasons: BTreeSet<String> = DropReason::ALL.iter().map(|reason| reason.label().to_owned()).collect();
@@ -341,6 +367,7 @@ fn status_says_in_words_what_is_wrong() {
 fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
     let bridge = bridge(104);
     let _up = up(&bridge);
+    let _subscriber = Subscriber::new(104, "noncritical");
     let _publisher = Publisher::new(104).run();
     let before = status(&bridge);
     assert_eq!(before["lanes"][1]["mode_reason"], "control");
@@ -485,7 +512,9 @@ fn a_tap_sees_the_payloads_bit_for_bit_and_disturbs_nobody() {
         assert_eq!(lane["whole"], true, "{lane}");
     }
     let drops = lane(&status, "critical")["drops"].as_object().unwrap();
-    assert!(drops.values().all(|count| *count == 0), "{drops:?}");
+    // No subscriber was there but the tap.
+    let others = drops.iter().filter(|(reason, _)| *reason != "no_reader");
+    assert!(others.into_iter().all(|(_, count)| *count == 0), "{drops:?}");
 }
 
 #[test]
@@ -525,18 +554,27 @@ fn a_tap_that_cannot_be_says_why() {
 }
 
 #[test]
-fn a_configuration_that_the_bridge_does_not_run_with_is_named_as_such() {
+fn commands_read_the_configuration_in_force_and_not_another_file_of_the_instance() {
     let bridge = bridge(108);
     let _up = up(&bridge);
     let other = fs::read_to_string(bridge.config()).unwrap().replace("front_laser", "rear_laser");
     let path = bridge.folder().join("other.yaml");
     fs::write(&path, other).unwrap();
-    for command in [&["status"][..], &["tap", "/scan"]] {
+    let run = |command: &[&str]| {
         let output = Command::new(program()).args(command).arg("--config").arg(&path).output().unwrap();
-        assert_eq!(output.status.code(), Some(1));
-        let said = text(&output.stderr);
-        assert!(said.contains("other lanes or routes than this configuration"), "{said}");
-    }
+        (output.status.code(), text(&output.stdout) + &text(&output.stderr))
+    };
+    let (code, said) = run(&["status", "--interval-ms", "50"]);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("front_laser") && !said.contains("rear_laser"), "{said}");
+    let (code, said) = run(&["mode", "noncritical", "degraded"]);
+    assert_eq!(code, Some(0), "{said}");
+    let (code, said) = run(&["tap", "/other"]);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("the configuration has: /scan (front_laser)"), "{said}");
+    let (code, said) = run(&["check"]);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("restart of the whole bridge: topics: [front_laser] -> [rear_laser]"), "{said}");
 }
 
 #[test]

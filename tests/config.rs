@@ -531,8 +531,8 @@ fn what_is_documented_to_change_without_a_restart_does_and_nothing_else() {
     let marked: BTreeSet<String> =
         marked_keys().into_iter().filter(|key| !told_elsewhere(key)).map(str::to_owned).collect();
     assert_eq!(changed, marked);
-    for left in &reload.needs_restart {
-        assert!(!marked.contains(&pattern(&left.change.key)), "{left}");
+    for left in &reload.waits {
+        assert!(!marked.contains(&pattern(&left.key)), "{left}");
     }
     for (index, (key, ..)) in CHOICES.iter().enumerate() {
         let (_, reload) = chosen(|_| false).reloaded(chosen(|other| other == index));
@@ -544,7 +544,7 @@ fn what_is_documented_to_change_without_a_restart_does_and_nothing_else() {
 fn each_change_is_told_in_the_words_of_the_file() {
     let (_, reload) = chosen(|_| false).reloaded(chosen(|_| true));
     let mut told: Vec<String> = reload.changed.iter().map(ToString::to_string).collect();
-    told.extend(reload.needs_restart.iter().map(ToString::to_string));
+    told.extend(reload.waits.iter().map(ToString::to_string));
     for expected in [
         "policy_hold_s: 5 -> 4.5",
         "lanes.noncritical.max_rate_hz: 10 -> 20",
@@ -555,12 +555,12 @@ fn each_change_is_told_in_the_words_of_the_file() {
         "security.hmac_secret: none -> the file /etc/secret",
         "subscribers.laptop: noncritical -> rviz",
         "overrides.laptop: none -> CRITICAL",
-        "ros.networks: [] -> [lo]; restart the whole bridge",
-        "topics[scan].lanes.rviz: true -> false; restart the whole bridge",
-        "topics[scan].qos_overrides.input.history: none -> KEEP_ALL; restart ingress",
-        "topics[scan].qos_overrides.critical.history: KEEP_LAST 10 -> KEEP_LAST 11; restart egress-critical",
-        "lanes.rviz.domain_id: 0 -> 9; restart egress-rviz",
-        "diagnostics.metrics: none -> 127.0.0.1:9464; restart control",
+        "ros.networks: [] -> [lo]",
+        "topics[scan].lanes.rviz: true -> false",
+        "topics[scan].qos_overrides.input.history: none -> KEEP_ALL",
+        "topics[scan].qos_overrides.critical.history: KEEP_LAST 10 -> KEEP_LAST 11",
+        "lanes.rviz.domain_id: 0 -> 9",
+        "diagnostics.metrics: none -> 127.0.0.1:9464",
     ] {
         assert!(told.iter().any(|line| line == expected), "{expected} is not in:\n{}", told.join("\n"));
     }
@@ -576,13 +576,13 @@ fn a_lane_that_came_or_went_needs_a_restart_and_so_does_a_subscriber_on_it() {
     assert_eq!(reloaded.lanes, old.lanes);
     let subscribers: Vec<_> = reloaded.subscribers.iter().map(|(id, lane)| format!("{id} {lane}")).collect();
     assert_eq!(subscribers, ["a old", "b noncritical"]);
-    let left: Vec<String> = reload.needs_restart.iter().map(ToString::to_string).collect();
+    let left: Vec<String> = reload.waits.iter().map(ToString::to_string).collect();
     assert_eq!(
         left,
         [
-            "lanes: [critical, noncritical, old] -> [critical, noncritical, new]; restart the whole bridge",
-            "subscribers.a: old -> new; restart the whole bridge",
-            "subscribers.c: none -> new; restart the whole bridge",
+            "lanes: [critical, noncritical, old] -> [critical, noncritical, new]",
+            "subscribers.a: old -> new",
+            "subscribers.c: none -> new",
         ]
     );
     assert_eq!(reload.changed.len(), 1, "{reload:?}");
@@ -598,12 +598,12 @@ fn more_samples_may_wait_only_where_shared_memory_has_room_for_them() {
     };
     let rates = |settings: &Settings| settings.lanes[1].rates.normal;
     let (reloaded, reload) = with(5).reloaded(with(6));
-    assert_eq!((rates(&reloaded).queue_samples, reload.needs_restart.len()), (6, 0));
+    assert_eq!((rates(&reloaded).queue_samples, reload.waits.len()), (6, 0));
     for (old, new) in [(5, 50), (50, 5)] {
         let (reloaded, reload) = with(old).reloaded(with(new));
         assert_eq!((rates(&reloaded).queue_samples, rates(&reloaded).max_rate_hz), (old, new as f64));
-        let left: Vec<String> = reload.needs_restart.iter().map(ToString::to_string).collect();
-        let expected = format!("lanes.noncritical.queue_samples: {old} -> {new}; restart the whole bridge");
+        let left: Vec<String> = reload.waits.iter().map(ToString::to_string).collect();
+        let expected = format!("lanes.noncritical.queue_samples: {old} -> {new}");
         assert_eq!(left[0], expected);
     }
 }
@@ -692,8 +692,8 @@ proptest! {
         let old = chosen(|index| choices[index].0);
         let new = chosen(|index| choices[index].1);
         let (reloaded, reload) = old.reloaded(new.clone());
-        prop_assert_eq!(reload.changed.is_empty() && reload.needs_restart.is_empty(), old == new);
-        prop_assert_eq!(reload.needs_restart.is_empty(), reloaded == new);
+        prop_assert_eq!(reload.changed.is_empty() && reload.waits.is_empty(), old == new);
+        prop_assert_eq!(reload.waits.is_empty(), reloaded == new);
         prop_assert_eq!(reload.changed.is_empty(), reloaded == old);
         prop_assert_eq!(reloaded.fingerprint() == new.fingerprint(), reloaded == new);
 
@@ -701,11 +701,61 @@ proptest! {
         let (again, second) = reloaded.reloaded(new);
         prop_assert_eq!(&again, &reloaded);
         prop_assert_eq!(second.changed, Vec::new());
-        prop_assert_eq!(second.needs_restart, reload.needs_restart);
+        prop_assert_eq!(second.waits, reload.waits);
 
         // The way back leads to where it began: what was left as it is was not touched.
         let (back, third) = reloaded.reloaded(old.clone());
         prop_assert_eq!(back, old);
-        prop_assert_eq!(third.needs_restart, Vec::new());
+        prop_assert_eq!(third.waits, Vec::new());
+    }
+
+    #[test]
+    fn the_configuration_in_force_is_read_back_exactly(
+        choices in prop::collection::vec(any::<(bool, bool, bool)>(), CHOICES.len()),
+        secret in "[ -~é\\n]{0,40}",
+    ) {
+        let start: config::Configuration = chosen(|index| choices[index].0).into();
+        let (once, _) = start.reloaded(chosen(|index| choices[index].1).into());
+        let (twice, _) = once.reloaded(chosen(|index| choices[index].2).into());
+        for in_force in [start, once, twice] {
+            let bytes = in_force.encode().unwrap();
+            let read = config::Configuration::decode(&bytes).unwrap();
+            prop_assert_eq!(read.settings.fingerprint(), in_force.settings.fingerprint());
+            prop_assert_eq!(read, in_force);
+        }
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let quoted = serde_json::to_string(&secret).unwrap();
+        let text = format!("topics: [{{id: scan, input_topic: /scan}}]\nsecurity: {{hmac_secret: {quoted}}}\n");
+        std::fs::write(file.path(), text).unwrap();
+        let loaded = config::load_configuration(Some(file.path()), &no_env).unwrap();
+        let shown = format!("{loaded:?}");
+        prop_assert!(secret.len() < 8 || !shown.contains(&secret));
+        let read = config::Configuration::decode(&loaded.encode().unwrap()).unwrap();
+        prop_assert_eq!(&read, &loaded);
+        let held = read.inline_secret.map(|held| held.reveal().to_owned()).unwrap_or_default();
+        prop_assert_eq!(held, secret);
+    }
+
+    #[test]
+    fn any_rate_and_threshold_is_read_back_exactly(rate in 0.1f64..1000.0, loss in 0.0f64..0.01) {
+        let text = format!(
+            "topics: [{{id: scan, input_topic: /scan}}]\n\
+             lanes: {{noncritical: {{max_rate_hz: {rate}}}}}\nclassifier: {{promote_loss_threshold: {loss}}}\n"
+        );
+        let in_force: config::Configuration = settings(&text).into();
+        prop_assert_eq!(config::Configuration::decode(&in_force.encode().unwrap()).unwrap(), in_force);
+    }
+
+    #[test]
+    fn a_damaged_stored_configuration_is_an_error(cut in any::<prop::sample::Index>(), byte in any::<u8>()) {
+        let mut bytes = config::Configuration::from(chosen(|_| true)).encode().unwrap();
+        let at = cut.index(bytes.len());
+        let whole = config::Configuration::decode(&bytes).unwrap();
+        prop_assert!(config::Configuration::decode(&bytes[..at]).is_err());
+        bytes[at] = byte;
+        // A damaged secret cannot be told; the settings have their fingerprint.
+        if let Ok(read) = config::Configuration::decode(&bytes) {
+            prop_assert_eq!(read.settings, whole.settings);
+        }
     }
 }

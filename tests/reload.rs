@@ -1,5 +1,5 @@
 //! Reload on a bridge that really runs: the shipped binary, real shared memory, real signals, under a flow of
-//! 200 samples per second. Domains 110 to 114.
+//! 200 samples per second. Domains 110 to 118.
 
 mod support;
 
@@ -162,8 +162,6 @@ fn a_bad_file_changes_nothing_and_is_reported() {
     let after = healths(&good).unwrap();
     assert_same_processes(&before, &after);
     assert!(after.iter().all(|health| health.settings_fingerprint == good.fingerprint()), "{after:?}");
-    // `status` needs a good file, too; nobody is told of this one.
-    bridge.write_config(&file(111, ""));
     wait_rate(&bridge, 10.0);
 
     bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: 5}}"));
@@ -186,22 +184,21 @@ fn what_needs_a_restart_is_named_and_left_as_it_is() {
          subscribers: {laptop: rviz, tablet: noncritical}",
     ));
     let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(code, Some(5), "{said}");
     assert_says(
         &said,
         &[
             "changed: lanes.noncritical.max_rate_hz: 10 -> 20\n",
             "changed: subscribers.tablet: none -> noncritical\n",
-            "left as it is until egress-noncritical is restarted: lanes.noncritical.domain_id: 112 -> 113\n",
-            "left as it is until the whole bridge is restarted: lanes: [critical, noncritical] -> \
+            "waits for a restart of the whole bridge: lanes.noncritical.domain_id: 112 -> 113\n",
+            "waits for a restart of the whole bridge: lanes: [critical, noncritical] -> \
              [critical, noncritical, rviz]\n",
-            "left as it is until the whole bridge is restarted: subscribers.laptop: none -> rviz\n",
+            "waits for a restart of the whole bridge: subscribers.laptop: none -> rviz\n",
         ],
     );
     let (in_force, _) = old.reloaded(settings(&bridge));
     assert_same_processes(&before, &wait_in_force(&old, in_force.fingerprint()));
-    // The command line reads the old shape of the bridge only with the old file.
-    bridge.write_config(&file(112, "lanes: {noncritical: {max_rate_hz: 20}}"));
+    // The commands read what is in force, not the file, which has another lane.
     wait_rate(&bridge, 20.0);
     flow.end_whole(&bridge);
 }
@@ -277,4 +274,144 @@ fn a_process_that_does_not_answer_is_named_and_nobody_else_is_signalled() {
 
     ingress.cont();
     wait_until("ingress to go on", || reload(&bridge).0 == Some(0));
+}
+
+/// The one process of the bridge that has this name in `status`, running with another number than `not`.
+fn pid_of(bridge: &Bridge, name: &str, not: Option<u64>) -> u64 {
+    let mut found = None;
+    bridge.wait_status(&format!("{name} to run"), |status| {
+        let processes = status["processes"].as_array().unwrap();
+        let running = processes.iter().filter(|process| process["state"] == "running");
+        found = running.filter(|process| process["name"] == name).find_map(|process| process["pid"].as_u64());
+        found.is_some() && found != not
+    });
+    found.unwrap()
+}
+
+fn kill(pid: u64) {
+    process::signal(i32::try_from(pid).unwrap(), Signal::SIGKILL);
+}
+
+/// Kills each process of a running bridge and waits until it is back and forwards again.
+fn kill_each(bridge: &Bridge, names: &[&str]) {
+    for name in names {
+        let before = pid_of(bridge, name, None);
+        kill(before);
+        pid_of(bridge, name, Some(before));
+    }
+    let received = |status: &Value| lane(status, "critical")["forwarded"].as_u64().unwrap();
+    let before = received(&bridge.status());
+    bridge.wait_status("the critical lane to forward", |status| received(status) > before + 20);
+}
+
+#[test]
+fn processes_that_crash_come_back_whatever_the_file_says_by_then() {
+    let bridge = Bridge::new(&file(115, ""));
+    let in_force = settings(&bridge);
+    let (up, _) = up(&bridge);
+    let _flow = flow(&bridge, 115);
+    wait_rate(&bridge, 10.0);
+    let all = ["egress-critical", "egress-noncritical", "ingress", "control"];
+
+    // A lane more.
+    bridge.write_config(&file(115, "lanes: {rviz: {}, noncritical: {max_rate_hz: 20}}"));
+    let (code, said) = reload(&bridge);
+    assert_eq!(code, Some(5), "{said}");
+    kill_each(&bridge, &all);
+    for part in [
+        "using the configuration in force of the running bridge, not the configuration file",
+        "waits for a restart of the whole bridge: lanes: [critical, noncritical] -> [critical, noncritical, rviz]",
+    ] {
+        up.wait_for_log(part);
+    }
+    // What was reloaded stays in force in the processes that were started since.
+    wait_rate(&bridge, 20.0);
+    let check = bridge.run("check");
+    let said = String::from_utf8_lossy(&check.stdout).into_owned();
+    assert_eq!(check.status.code(), Some(0), "{said}");
+    assert_says(&said, &["waits for a restart of the whole bridge: lanes: [critical, noncritical] -> "]);
+
+    // A broken file, no file, and another instance.
+    for yaml in
+        [Some("topics: [{id: scan"), None, Some("instance: another\ntopics: [{id: x, input_topic: /x}]")]
+    {
+        match yaml {
+            Some(yaml) => bridge.write_config(yaml),
+            None => std::fs::remove_file(bridge.config()).unwrap(),
+        }
+        kill_each(&bridge, &all);
+        for command in ["mode noncritical degraded", "mode noncritical auto", "tap /scan --count 3"] {
+            let output = bridge.run(command);
+            assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+        }
+        let status = bridge.status();
+        assert_eq!(status["instance"], bridge.instance());
+        let fingerprints = status["processes"].as_array().unwrap().iter();
+        let fingerprints: Vec<_> = fingerprints.map(|process| &process["settings_fingerprint"]).collect();
+        assert!(fingerprints.iter().all(|one| *one == fingerprints[0]), "{status}");
+    }
+    let folder = in_force.shared_memory.root_path.unwrap().join(bridge.instance());
+    use std::os::unix::fs::PermissionsExt;
+    let kept = std::fs::metadata(folder.join("in-force.json")).unwrap();
+    assert_eq!(kept.permissions().mode() & 0o777, 0o600);
+}
+
+#[test]
+fn a_restart_of_the_whole_bridge_applies_the_file() {
+    let bridge = Bridge::new(&file(116, ""));
+    let (mut first, _) = up(&bridge);
+    bridge.write_config(&file(116, "lanes: {rviz: {}}"));
+    first.signal(Signal::SIGTERM);
+    assert_eq!(first.wait().code(), Some(0));
+    assert!(!bridge.folder().join("root").join(bridge.instance()).exists());
+    let mut second = bridge.start("up");
+    pid_of(&bridge, "egress-rviz", None);
+    // Also after all processes were killed, which leaves every file.
+    bridge.write_config(&file(116, "lanes: {fleet: {}}"));
+    second.kill9();
+    wait_until("the children to end", || {
+        let folder = bridge.folder().join("root").join(bridge.instance());
+        !folder.exists() || bridge.try_status().is_err()
+    });
+    let third = wait_for("a start", || {
+        let mut third = bridge.start("up");
+        std::thread::sleep(Duration::from_millis(500));
+        third.is_running().then_some(third)
+    });
+    pid_of(&bridge, "egress-fleet", None);
+    drop(third);
+}
+
+#[test]
+fn a_bridge_that_runs_is_not_started_a_second_time() {
+    let bridge = Bridge::new(&file(117, ""));
+    let (up, before) = up(&bridge);
+    let again = bridge.run("up");
+    let said = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{said}");
+    assert_says(&said, &[&format!("runs already as instance {}, process {}", bridge.instance(), up.pid())]);
+    let again = bridge.run("ingress");
+    let said = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{said}");
+    assert_says(&said, &[&format!("ingress is served already, by process {}", before[0].pid)]);
+    assert_same_processes(&before, &healths(&settings(&bridge)).unwrap());
+}
+
+#[test]
+fn processes_started_one_by_one_agree_on_the_first_ones_configuration() {
+    let bridge = Bridge::new(&file(118, ""));
+    let ingress = bridge.start("ingress");
+    pid_of(&bridge, "ingress", None);
+    bridge.write_config(&file(118, "lanes: {rviz: {}}"));
+    let critical = bridge.start("egress --lane critical");
+    pid_of(&bridge, "egress-critical", None);
+    critical.wait_for_log("waits for a restart of the whole bridge: lanes:");
+    // `up` beside them names one of them.
+    let again = bridge.run("up");
+    let said = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{said}");
+    assert!(
+        [ingress.pid(), critical.pid()].iter().any(|pid| said.contains(&format!("process {pid}"))),
+        "{said}"
+    );
 }

@@ -194,6 +194,40 @@ fn a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody() {
 }
 
 #[test]
+fn a_restart_of_the_target_applies_the_edited_file_and_that_of_a_service_does_not() {
+    let test = "a_restart_of_the_target_applies_the_edited_file_and_that_of_a_service_does_not";
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    bed.start();
+    let fingerprints = || -> Vec<String> {
+        let status = bed.machine.try_status().unwrap_or_default();
+        let processes = status["processes"].as_array().cloned().unwrap_or_default();
+        let running = processes.iter().filter(|process| process["state"] == "running");
+        running.filter_map(|process| process["settings_fingerprint"].as_str().map(str::to_owned)).collect()
+    };
+    // All four processes apply the same settings.
+    let agreed = || -> Option<String> {
+        let all = fingerprints();
+        (all.len() == UNITS.len() && all.iter().all(|one| *one == all[0])).then(|| all[0].clone())
+    };
+    let mut in_force = support::wait_for("all processes to agree", agreed);
+    for nice in [5, 6, 7] {
+        let edited = format!("{SCAN}\nprocesses: {{control: {{scheduling: {{nice: {nice}}}}}}}\n");
+        bed.machine.write(CONFIG, &edited);
+        bed.machine.run(&["systemctl", "restart", EGRESS_CRITICAL]);
+        bed.machine.wait_property(EGRESS_CRITICAL, "ActiveState", "active");
+        assert_eq!(support::wait_for("all processes to agree", agreed), in_force);
+        // A reload of which all waits leaves the unit active.
+        bed.machine.run(&["systemctl", "reload", CONTROL]);
+        assert_eq!(bed.machine.property(CONTROL, "ActiveState"), "active");
+
+        bed.machine.run(&["systemctl", "restart", TARGET]);
+        in_force =
+            support::wait_for("the edited file to be in force", || agreed().filter(|new| *new != in_force));
+    }
+    bed.stop();
+}
+
+#[test]
 fn a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on() {
     let test = "a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on";
     let Some(bed) = Bed::boot(test, SCAN) else { return };

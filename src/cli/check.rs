@@ -1,7 +1,7 @@
 //! `check`: is this configuration good, and what does it take?
 
-use std::fmt;
-use std::io::{self, Write};
+use std::fmt::{self, Write as _};
+use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::Args;
@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::{ConfigArguments, EXIT_CONFIG, output_ended};
 use crate::config::{ConfigError, Place, Settings};
+use crate::process::InForce;
 use crate::shm::RouteChannel;
 
 /// What `check` is asked.
@@ -30,7 +31,14 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         }
     } else {
         match arguments.config.load() {
-            Ok(settings) => (Summary::of(&settings).to_string(), ExitCode::SUCCESS),
+            Ok(settings) => {
+                let running = InForce::find(&arguments.config.file(), Some(&settings));
+                let text = Summary::of(&settings).to_string();
+                (
+                    text + &running.map_or_else(String::new, |running| differences(&running, settings)),
+                    ExitCode::SUCCESS,
+                )
+            }
             Err(code) => return code,
         }
     };
@@ -118,6 +126,24 @@ impl fmt::Display for Summary {
             )?;
         }
         writeln!(f, "\nshared memory in all: {}", bytes(self.shared_memory_bytes))
+    }
+}
+
+/// How the file differs from what the running bridge has in force.
+fn differences(running: &Settings, file: Settings) -> String {
+    let (_, reload) = running.reloaded(file);
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    for change in &reload.changed {
+        let _ = writeln!(text, "waits for a reload: {change}");
+    }
+    for change in &reload.waits {
+        let _ = writeln!(text, "waits for a restart of the whole bridge: {change}");
+    }
+    if text.is_empty() {
+        text
+    } else {
+        format!("\nthe running bridge has another configuration in force:\n{text}")
     }
 }
 

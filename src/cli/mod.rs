@@ -1,7 +1,8 @@
 //! The command line: one file for each subcommand.
 //!
 //! Exit codes: 0 done, 1 failed while running, 2 wrong command line, 78 bad configuration (`EX_CONFIG` of
-//! sysexits.h). Logs go to stderr; what a program may want to read goes to stdout, and nothing else does.
+//! sysexits.h); 3 and 4 are `doctor`'s, 5 is `reload`'s. Logs go to stderr; what a program may want to read
+//! goes to stdout, and nothing else does.
 
 mod check;
 mod completions;
@@ -24,10 +25,13 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand};
 
 use crate::clock;
-use crate::config::{self, ConfigError, Settings};
-use crate::process::Stop;
+use crate::config::{self, ConfigError, Configuration, Settings};
+use crate::process::{InForce, Stop};
 use crate::shm::{self, ShmError};
 use crate::telemetry::{self, Snapshot};
+
+/// A reload applied what it could, and the rest of the file waits for a restart of the whole bridge.
+const EXIT_WAITS: u8 = 5;
 
 /// Bad configuration (`EX_CONFIG`, sysexits.h).
 const EXIT_CONFIG: u8 = 78;
@@ -62,6 +66,9 @@ enum Command {
     /// Set the mode of a lane by hand
     Mode(mode::Arguments),
     /// Let the running bridge take over what was changed in its configuration file, without a restart
+    ///
+    /// Exit codes: 0 all applied, 5 the rest of the file waits for a restart of the whole bridge, 1 a process
+    /// refused the file or did not answer, 78 the file is bad.
     Reload(ConfigArguments),
     /// Say what on this machine will hurt the bridge, and the command that mends it
     Doctor(doctor::Arguments),
@@ -103,15 +110,37 @@ impl ConfigArguments {
 
     /// The settings, or the exit code after the problems were printed.
     fn load(&self) -> Result<Settings, ExitCode> {
-        self.try_load().map_err(|error| {
-            eprintln!("{error}");
-            ExitCode::from(EXIT_CONFIG)
-        })
+        self.try_load().map_err(|error| bad_configuration(&error))
     }
 
     fn try_load(&self) -> Result<Settings, ConfigError> {
-        config::load(self.path(), &|name| std::env::var(name).ok())
+        self.try_load_configuration().map(|configuration| configuration.settings)
     }
+
+    fn try_load_configuration(&self) -> Result<Configuration, ConfigError> {
+        config::load_configuration(self.path(), &|name| std::env::var(name).ok())
+    }
+
+    /// The settings that the running bridge has in force; `None` when no bridge runs.
+    fn running(&self) -> Option<Settings> {
+        InForce::find(&self.file(), self.try_load().ok().as_ref())
+    }
+
+    /// The settings that the running bridge has in force, whatever the file says by now; those of the file
+    /// when no bridge runs.
+    fn in_force(&self) -> Result<Settings, ExitCode> {
+        let loaded = self.try_load();
+        match InForce::find(&self.file(), loaded.as_ref().ok()) {
+            Some(settings) => Ok(settings),
+            None => loaded.map_err(|error| bad_configuration(&error)),
+        }
+    }
+}
+
+/// Prints every problem of a configuration file, and gives the exit code.
+fn bad_configuration(error: &ConfigError) -> ExitCode {
+    eprintln!("{error}");
+    ExitCode::from(EXIT_CONFIG)
 }
 
 /// Runs the program.
@@ -146,12 +175,12 @@ fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     ExitCode::FAILURE
 }
 
-/// A reading; other settings than those of the running bridge are named as what they are.
+/// A reading of the bridge that runs with these settings.
 fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, String> {
     Snapshot::take(root, settings).map_err(|error| match error {
         ShmError::Incompatible { .. } => format!(
-            "the bridge that runs as instance {} has other lanes or routes than this configuration, or is of \
-             another version; name the configuration that it was started with (--config)",
+            "the bridge that runs as instance {} is of another version than this program; restart the whole \
+             bridge",
             settings.instance
         ),
         other => other.to_string(),

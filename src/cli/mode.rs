@@ -67,7 +67,7 @@ fn how_long(text: &str) -> Result<HowLong, String> {
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.load() {
+    let settings = match arguments.config.in_force() {
         Ok(settings) => settings,
         Err(code) => return code,
     };

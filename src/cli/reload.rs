@@ -4,32 +4,45 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, root};
+use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, output_ended, root};
 use crate::config::Reload;
-use crate::process::{ReloadAnswer, ReloadResult, reload_all};
+use crate::process::{InForce, ReloadAnswer, ReloadResult, reload_all};
 
 pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
-    // A bad file is shown here with all its problems, and nobody is asked to read it.
-    let settings = match arguments.load() {
+    // A bad file is shown here with all its problems, and no process is asked to read it.
+    let file = match arguments.load() {
         Ok(settings) => settings,
         Err(code) => return code,
     };
+    // The file may name another instance than the bridge that was started with it.
+    let settings = InForce::find(&arguments.file(), Some(&file)).unwrap_or_else(|| file.clone());
     let root = root(&settings);
-    let answers = match reload_all(&root, &settings) {
+    let answers = match reload_all(&root, &settings.instance) {
         Ok(answers) if answers.is_empty() => return no_bridge(&settings, &root),
         Ok(answers) => answers,
         Err(error) => return failed(&error),
     };
-    let text = tell(&answers, settings.fingerprint());
+    let text = tell(&answers, file.fingerprint());
     if let Err(error) = io::stdout().write_all(text.as_bytes()) {
         return output_ended(&error);
     }
-    let all_did = answers.iter().all(|answer| matches!(answer.result, Some(ReloadResult::Accepted { .. })));
-    if all_did { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    exit_code(&answers)
 }
 
-/// What changed, what needs a restart, then each process. `fingerprint` is that of the file as it was read
-/// here.
+fn exit_code(answers: &[ReloadAnswer]) -> ExitCode {
+    let mut code = ExitCode::SUCCESS;
+    for answer in answers {
+        match &answer.result {
+            Some(ReloadResult::Accepted { reload, .. }) if reload.waits.is_empty() => {}
+            Some(ReloadResult::Accepted { .. }) => code = ExitCode::from(EXIT_WAITS),
+            Some(ReloadResult::Refused { .. }) | None => return ExitCode::FAILURE,
+        }
+    }
+    code
+}
+
+/// What changed, what waits for a restart, then each process. `fingerprint` is that of the file as it was
+/// read here.
 fn tell(answers: &[ReloadAnswer], fingerprint: u64) -> String {
     let mut text = String::new();
     let mut say = |line: String| {
@@ -46,8 +59,8 @@ fn tell(answers: &[ReloadAnswer], fingerprint: u64) -> String {
         reload.changed.iter().for_each(|change| say(format!("changed: {change}")));
     }
     for reload in accepted {
-        for left in &reload.needs_restart {
-            say(format!("left as it is until {} is restarted: {}", left.restart, left.change));
+        for change in &reload.waits {
+            say(format!("waits for a restart of the whole bridge: {change}"));
         }
     }
     for ReloadAnswer { role, pid, result } in answers {
@@ -64,9 +77,7 @@ fn outcome(result: Option<&ReloadResult>, fingerprint: u64) -> String {
         }
         Some(ReloadResult::Accepted { file_fingerprint, reload }) => {
             let what = match reload {
-                Reload { changed, needs_restart } if changed.is_empty() && needs_restart.is_empty() => {
-                    "nothing differs"
-                }
+                Reload { changed, waits } if changed.is_empty() && waits.is_empty() => "nothing differs",
                 Reload { changed, .. } if changed.is_empty() => "nothing changed",
                 _ => "reloaded",
             };
@@ -82,15 +93,12 @@ fn outcome(result: Option<&ReloadResult>, fingerprint: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Change, LeftAsIs, Restart};
+    use crate::config::Change;
 
     #[test]
     fn what_all_processes_say_is_told_once_and_each_outcome_for_itself() {
         let change = |key: &str| Change { key: key.to_owned(), old: "1".to_owned(), new: "2".to_owned() };
-        let reload = Reload {
-            changed: vec![change("policy_hold_s")],
-            needs_restart: vec![LeftAsIs { change: change("ros.domain_id"), restart: Restart::Bridge }],
-        };
+        let reload = Reload { changed: vec![change("policy_hold_s")], waits: vec![change("ros.domain_id")] };
         let answer = |role: &str, result| ReloadAnswer { role: role.to_owned(), pid: 7, result };
         let accepted = |file_fingerprint| ReloadResult::Accepted { file_fingerprint, reload: reload.clone() };
         let nothing = ReloadResult::Accepted { file_fingerprint: 1, reload: Reload::default() };
@@ -105,7 +113,7 @@ mod tests {
         assert_eq!(
             tell(&answers, 1),
             "changed: policy_hold_s: 1 -> 2\n\
-             left as it is until the whole bridge is restarted: ros.domain_id: 1 -> 2\n\
+             waits for a restart of the whole bridge: ros.domain_id: 1 -> 2\n\
              egress-a (pid 7): reloaded\n\
              egress-b (pid 7): reloaded; it reads another file than this one, or has another environment\n\
              egress-c (pid 7): nothing differs\n\

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Args;
 
 use super::{ConfigArguments, EXIT_CONFIG, failed, roles};
-use crate::config::{self, DdsNetwork, NetworkSelector, SecretSource, Settings};
+use crate::config::{self, Configuration, DdsNetwork, NetworkSelector, SecretSource, Settings};
 use crate::model::{LaneName, TopicName, is_probe_id};
 use crate::process::probes::Trust;
 use crate::process::{self, ResponderOptions};
@@ -41,9 +41,9 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = config::load_or_default(arguments.config.path(), &|name| std::env::var(name).ok());
-    let settings = match settings {
-        Ok(settings) => settings,
+    let loaded = config::load_or_default(arguments.config.path(), &|name| std::env::var(name).ok());
+    let Configuration { settings, inline_secret } = match loaded {
+        Ok(configuration) => configuration,
         Err(error) => {
             eprintln!("{error}");
             return ExitCode::from(EXIT_CONFIG);
@@ -61,7 +61,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         security.enable_probe_hmac = true;
         security.secret = Some(SecretSource::File(path.clone()));
     }
-    let trust = match Trust::load(&security, arguments.config.path()) {
+    let trust = match Trust::load(&security, inline_secret.as_ref()) {
         Ok(trust) => trust,
         Err(error) => {
             failed(&error);

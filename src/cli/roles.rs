@@ -5,9 +5,9 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, pause};
-use crate::config::Settings;
-use crate::process::{self, HangUp, ReloadRequests, RoleError, Stop};
+use super::{ConfigArguments, bad_configuration, failed, pause};
+use crate::config::Configuration;
+use crate::process::{self, HangUp, InForce, InForceError, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
 
 /// A service manager restarts a process that died at once, so that samples flow again; one that cannot start,
@@ -26,17 +26,19 @@ pub(super) struct EgressArguments {
 }
 
 pub(super) fn ingress(arguments: &ConfigArguments) -> ExitCode {
-    role(arguments, process::ingress)
+    role(arguments, |configuration, reloads, stop| process::ingress(&configuration.settings, reloads, stop))
 }
 
 pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
-    role(&arguments.config, |settings, reloads, stop| {
-        process::egress(settings, &arguments.lane, reloads, stop)
+    role(&arguments.config, |configuration, reloads, stop| {
+        process::egress(&configuration.settings, &arguments.lane, reloads, stop)
     })
 }
 
 pub(super) fn control(arguments: &ConfigArguments) -> ExitCode {
-    role(arguments, |settings, reloads, stop| process::control(settings, arguments.path(), reloads, stop))
+    role(arguments, |Configuration { settings, inline_secret }, reloads, stop| {
+        process::control(settings, inline_secret.as_ref(), reloads, stop)
+    })
 }
 
 pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
@@ -44,34 +46,37 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
         Ok(hang_up) => hang_up,
         Err(error) => return failed(&error),
     };
-    let settings = match arguments.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
+    // A start of the whole bridge: here the file counts.
+    let configuration = match arguments.try_load_configuration() {
+        Ok(configuration) => configuration,
+        Err(error) => return bad_configuration(&error),
     };
-    telemetry::set_verbosity(settings.diagnostics.verbosity);
+    telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
     let passed_on: Vec<OsString> = match arguments.path() {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
     };
-    run(|stop| process::up(&settings, &passed_on, &hang_up, stop))
+    run(|stop| process::up(configuration, &arguments.file(), &passed_on, &hang_up, stop))
 }
 
 fn role(
     arguments: &ConfigArguments,
-    role: impl FnOnce(&Settings, ReloadRequests, &Stop) -> Result<(), RoleError>,
+    role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
 ) -> ExitCode {
     let again = arguments.clone();
-    let reloads = match ReloadRequests::on_signal(move || again.try_load()) {
+    let reloads = match ReloadRequests::on_signal(move || again.try_load_configuration()) {
         Ok(reloads) => reloads,
         Err(error) => return failed(&error),
     };
     process::end_with_supervisor();
-    let settings = match arguments.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
+    let in_force = match InForce::join(&arguments.file(), arguments.try_load_configuration()) {
+        Ok(in_force) => in_force,
+        Err(InForceError::Config(error)) => return bad_configuration(&error),
+        Err(InForceError::Shm(error)) => return run(|_| Err(error)),
     };
-    telemetry::set_verbosity(settings.diagnostics.verbosity);
-    run(|stop| role(&settings, reloads, stop))
+    let configuration = in_force.configuration().clone();
+    telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
+    run(|stop| role(&configuration, reloads.kept_in(in_force), stop))
 }
 
 pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {

@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal, Write};
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, value_parser};
@@ -10,6 +10,7 @@ use clap::{Args, value_parser};
 use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
 use crate::config::Settings;
 use crate::process::Stop;
+use crate::shm::ShmError;
 use crate::telemetry::{ProcessState, Report, Snapshot};
 
 /// From what tells a rate of 100 Hz to an hour.
@@ -37,7 +38,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.load() {
+    let settings = match arguments.config.in_force() {
         Ok(settings) => settings,
         Err(code) => return code,
     };
@@ -51,7 +52,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         return require(&first, process);
     }
     if arguments.watch {
-        return watch(arguments, &root, &settings, first);
+        return watch(arguments, root, settings, first);
     }
     std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
     match read_bridge(&root, &settings) {
@@ -76,8 +77,9 @@ fn require(bridge: &Snapshot, process: &str) -> ExitCode {
     }
 }
 
-/// Shows one report after the other. A bridge that ends meanwhile is waited for: it may be restarted.
-fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapshot) -> ExitCode {
+/// Shows one report after the other. A bridge that ends meanwhile is waited for: it may be restarted, with
+/// other settings perhaps.
+fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first: Snapshot) -> ExitCode {
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,
         Err(error) => return failed(&error),
@@ -85,8 +87,16 @@ fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapsho
     let in_place = !arguments.json && io::stdout().is_terminal();
     let mut last = Some(first);
     while pause(arguments.interval_ms, &stop) {
-        let next = match read_bridge(root, settings) {
+        if last.is_none()
+            && let Some(restarted) = arguments.config.running()
+        {
+            settings = restarted;
+            root = super::root(&settings);
+        }
+        // A bridge that was restarted as a whole since the last look may have other lanes or routes.
+        let next = match Snapshot::take(&root, &settings) {
             Ok(next) => next,
+            Err(ShmError::Incompatible { .. }) if arguments.config.running().is_some() => None,
             Err(error) => return failed(&error),
         };
         let shown = match (&next, &last) {
@@ -95,7 +105,7 @@ fn watch(arguments: &Arguments, root: &Path, settings: &Settings, first: Snapsho
                 if in_place { redraw(&report.to_string()) } else { show(&report, arguments.json) }
             }
             (None, Some(_)) => {
-                no_bridge(settings, root);
+                no_bridge(&settings, &root);
                 Ok(())
             }
             (None, None) => Ok(()),

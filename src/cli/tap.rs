@@ -48,7 +48,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.load() {
+    let settings = match arguments.config.in_force() {
         Ok(settings) => settings,
         Err(code) => return code,
     };

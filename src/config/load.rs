@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 
 use super::environment::Environment;
 use super::field::Field;
+use super::in_force::{Configuration, InlineSecret};
 use super::lanes::MAX_SAMPLE_BYTES;
 use super::problem::{ConfigError, Place, Problem, Problems};
 use super::qos::Profiles;
-use super::settings::{Settings, SharedMemory};
+use super::settings::{SecretSource, Settings, SharedMemory};
 use super::{control, keys, lanes, routes, yaml};
 use crate::model::{InstanceName, TrafficClass};
 
@@ -26,44 +27,36 @@ pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
 /// Every problem of the file and of the environment at once; one problem when there is no file or it cannot
 /// be read.
 pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<Settings, ConfigError> {
+    load_configuration(path, env).map(|configuration| configuration.settings)
+}
+
+/// As [`load`], with the secret that the file may hold.
+///
+/// # Errors
+/// As for [`load`].
+pub fn load_configuration(
+    path: Option<&Path>,
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Configuration, ConfigError> {
     let path = find_or_fail(path, env)?;
     let name = path.display().to_string();
     let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
-    parse(bytes, &name, env)
+    parse_configuration(&bytes, &name, env)
 }
 
-/// As [`load`], for a program that can do without a file: without one, the defaults, in this environment.
-/// They have one route, which means nothing.
+/// As [`load_configuration`], for a program that can do without a file: without one, the defaults, in this
+/// environment. They have one route, which means nothing.
 ///
 /// # Errors
 /// As for [`load`], but for that no file need exist.
 pub fn load_or_default(
     path: Option<&Path>,
     env: &dyn Fn(&str) -> Option<String>,
-) -> Result<Settings, ConfigError> {
+) -> Result<Configuration, ConfigError> {
     match find(path, env, Path::new(DEFAULT_PATH)) {
-        Some(path) => load(Some(&path), env),
-        None => parse("topics: [{id: none, input_topic: /none}]", "the defaults", env),
+        Some(path) => load_configuration(Some(&path), env),
+        None => parse_configuration(b"topics: [{id: none, input_topic: /none}]", "the defaults", env),
     }
-}
-
-/// `security.hmac_secret` of the configuration file, found as [`load`] finds it. The settings never hold it.
-///
-/// # Errors
-/// There is no file, or it cannot be read.
-pub fn inline_secret(
-    path: Option<&Path>,
-    env: &dyn Fn(&str) -> Option<String>,
-) -> Result<Option<String>, ConfigError> {
-    let path = find_or_fail(path, env)?;
-    let name = path.display().to_string();
-    let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
-    let document = yaml::parse(&bytes)
-        .map_err(|error| failure(&name, error.line.map_or(Place::File, Place::Line), error.message))?;
-    let problems = Problems::default();
-    let root = Field::root(document.as_deref(), &problems);
-    let secret = root.section("security").get("hmac_secret").text().map(str::to_owned);
-    Ok(secret)
 }
 
 /// The file that is to be read; `None` where there is none at the default path and none is named.
@@ -115,7 +108,15 @@ pub fn parse(
     file_name: &str,
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Settings, ConfigError> {
-    let document = yaml::parse(text.as_ref())
+    parse_configuration(text.as_ref(), file_name, env).map(|configuration| configuration.settings)
+}
+
+fn parse_configuration(
+    text: &[u8],
+    file_name: &str,
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Configuration, ConfigError> {
+    let document = yaml::parse(text)
         .map_err(|error| failure(file_name, error.line.map_or(Place::File, Place::Line), error.message))?;
     let problems = Problems::default();
     let document = document.as_deref();
@@ -135,7 +136,20 @@ pub fn parse(
     }
     let settings = settings(&root, &Environment::read(env, &problems));
     let problems = problems.into_inner();
-    if problems.is_empty() { Ok(settings) } else { Err(ConfigError::new(file_name, problems)) }
+    if !problems.is_empty() {
+        return Err(ConfigError::new(file_name, problems));
+    }
+    let inline_secret = match settings.security.secret {
+        Some(SecretSource::ConfigFile) => inline_secret(document),
+        _ => None,
+    };
+    Ok(Configuration { settings, inline_secret })
+}
+
+/// The secret in a file without problems.
+fn inline_secret(document: Option<&yaml::Node>) -> Option<InlineSecret> {
+    let problems = Problems::default();
+    Field::root(document, &problems).section("security").get("hmac_secret").text().map(InlineSecret::new)
 }
 
 /// The settings, of which nothing is worth anything where problems were reported.

@@ -7,6 +7,7 @@
 mod control;
 mod environment;
 mod field;
+mod in_force;
 mod keys;
 mod lanes;
 mod load;
@@ -21,10 +22,11 @@ mod shown;
 mod tests;
 mod yaml;
 
+pub use in_force::{Configuration, DecodeError, InlineSecret};
 pub use keys::KEYS;
-pub use load::{DEFAULT_PATH, PATH_VARIABLE, inline_secret, load, load_or_default, parse};
+pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, parse};
 pub use problem::{ConfigError, Place, Problem};
-pub use reload::{Change, LeftAsIs, Reload, Restart};
+pub use reload::{Change, Reload};
 pub use settings::{
     Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates,
     MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules, Scheduling,

@@ -1,4 +1,4 @@
-//! What of a changed file a running bridge takes over, and what has to wait for a restart.
+//! What of a changed file a running bridge takes over, and what waits for a restart of the whole bridge.
 //!
 //! Each structure of the settings is put together or taken apart here field by field, so that a new field
 //! does not compile until somebody has decided which of the two it is.
@@ -33,53 +33,13 @@ impl fmt::Display for Change {
     }
 }
 
-/// What must be started again for a setting to take effect.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Restart {
-    /// The whole bridge: its processes have to agree on it.
-    Bridge,
-    /// Ingress.
-    Ingress,
-    /// Control.
-    Control,
-    /// The egress of one lane.
-    Lane(String),
-}
-
-impl fmt::Display for Restart {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Bridge => f.write_str("the whole bridge"),
-            Self::Ingress => f.write_str("ingress"),
-            Self::Control => f.write_str("control"),
-            Self::Lane(lane) => write!(f, "egress-{lane}"),
-        }
-    }
-}
-
-/// A setting that was left as it is.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct LeftAsIs {
-    /// The setting; its `new` value is not in force.
-    pub change: Change,
-    /// What must be started again for it.
-    pub restart: Restart,
-}
-
-impl fmt::Display for LeftAsIs {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}; restart {}", self.change, self.restart)
-    }
-}
-
 /// What a changed file came to.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reload {
     /// What is in force from now on.
     pub changed: Vec<Change>,
-    /// What differs and was left as it is.
-    pub needs_restart: Vec<LeftAsIs>,
+    /// What differs and waits for a restart of the whole bridge.
+    pub waits: Vec<Change>,
 }
 
 impl Settings {
@@ -97,30 +57,22 @@ impl Settings {
         routes(d, self, &new);
         let lanes = lanes(d, &self.lanes, &new.lanes);
         d.take("policy_hold_s", &seconds(self.policy_hold_ms), seconds(new.policy_hold_ms));
-        let (ingress, control) = (Restart::Ingress, Restart::Control);
         let settings = Self {
-            instance: d.keep("instance", Restart::Bridge, &self.instance, &new.instance),
-            input: network(d, "ros", Restart::Bridge, &self.input, &new.input),
-            graph_gid_bytes: d.keep(
-                "ros.graph_gid_bytes",
-                Restart::Bridge,
-                &self.graph_gid_bytes,
-                &new.graph_gid_bytes,
-            ),
+            instance: d.keep("instance", &self.instance, &new.instance),
+            input: network(d, "ros", &self.input, &new.input),
+            graph_gid_bytes: d.keep("ros.graph_gid_bytes", &self.graph_gid_bytes, &new.graph_gid_bytes),
             routes: self.routes.clone(),
             shared_memory: shared_memory(d, &self.shared_memory, &new.shared_memory),
             policy_hold_ms: new.policy_hold_ms,
             ingress_scheduling: scheduling(
                 d,
                 "processes.ingress",
-                ingress,
                 &self.ingress_scheduling,
                 &new.ingress_scheduling,
             ),
             control_scheduling: scheduling(
                 d,
                 "processes.control",
-                control,
                 &self.control_scheduling,
                 &new.control_scheduling,
             ),
@@ -150,11 +102,10 @@ impl Differ {
         new
     }
 
-    /// A setting that is left as it is.
-    fn keep<T: Clone + PartialEq + Shown>(&mut self, key: &str, restart: Restart, old: &T, new: &T) -> T {
+    /// A setting that stays as it is until the whole bridge is restarted.
+    fn keep<T: Clone + PartialEq + Shown>(&mut self, key: &str, old: &T, new: &T) -> T {
         if old != new {
-            let change = Change { key: key.to_owned(), old: old.shown(), new: new.shown() };
-            self.0.needs_restart.push(LeftAsIs { change, restart });
+            self.0.waits.push(Change { key: key.to_owned(), old: old.shown(), new: new.shown() });
         }
         old.clone()
     }
@@ -164,31 +115,31 @@ fn seconds(ms: u64) -> f64 {
     ms as f64 / 1_000.0
 }
 
-fn network(d: &mut Differ, of: &str, restart: Restart, old: &DdsNetwork, new: &DdsNetwork) -> DdsNetwork {
+fn network(d: &mut Differ, of: &str, old: &DdsNetwork, new: &DdsNetwork) -> DdsNetwork {
     DdsNetwork {
-        domain_id: d.keep(&format!("{of}.domain_id"), restart.clone(), &old.domain_id, &new.domain_id),
-        interfaces: d.keep(&format!("{of}.networks"), restart, &old.interfaces, &new.interfaces),
+        domain_id: d.keep(&format!("{of}.domain_id"), &old.domain_id, &new.domain_id),
+        interfaces: d.keep(&format!("{of}.networks"), &old.interfaces, &new.interfaces),
     }
 }
 
 fn shared_memory(d: &mut Differ, old: &SharedMemory, new: &SharedMemory) -> SharedMemory {
     SharedMemory {
-        root_path: d.keep("shared_memory.root_path", Restart::Bridge, &old.root_path, &new.root_path),
-        max_taps: d.keep("shared_memory.max_taps", Restart::Bridge, &old.max_taps, &new.max_taps),
+        root_path: d.keep("shared_memory.root_path", &old.root_path, &new.root_path),
+        max_taps: d.keep("shared_memory.max_taps", &old.max_taps, &new.max_taps),
     }
 }
 
-fn scheduling(d: &mut Differ, of: &str, restart: Restart, old: &Scheduling, new: &Scheduling) -> Scheduling {
+fn scheduling(d: &mut Differ, of: &str, old: &Scheduling, new: &Scheduling) -> Scheduling {
     let key = |name: &str| format!("{of}.scheduling.{name}");
     let slice_ms = |of: &Scheduling| of.slice_us.map(|us| f64::from(us) / 1_000.0);
-    d.keep(&key("slice_ms"), restart.clone(), &slice_ms(old), &slice_ms(new));
+    d.keep(&key("slice_ms"), &slice_ms(old), &slice_ms(new));
     Scheduling {
-        policy: d.keep(&key("policy"), restart.clone(), &old.policy, &new.policy),
-        priority: d.keep(&key("priority"), restart.clone(), &old.priority, &new.priority),
-        nice: d.keep(&key("nice"), restart.clone(), &old.nice, &new.nice),
+        policy: d.keep(&key("policy"), &old.policy, &new.policy),
+        priority: d.keep(&key("priority"), &old.priority, &new.priority),
+        nice: d.keep(&key("nice"), &old.nice, &new.nice),
         slice_us: old.slice_us,
-        cpus: d.keep(&key("cpus"), restart.clone(), &old.cpus, &new.cpus),
-        lock_memory: d.keep(&key("lock_memory"), restart, &old.lock_memory, &new.lock_memory),
+        cpus: d.keep(&key("cpus"), &old.cpus, &new.cpus),
+        lock_memory: d.keep(&key("lock_memory"), &old.lock_memory, &new.lock_memory),
     }
 }
 
@@ -197,7 +148,7 @@ fn routes(d: &mut Differ, old: &Settings, new: &Settings) {
     let ids = |settings: &Settings| -> Vec<String> {
         settings.routes.iter().map(|route| route.id.to_string()).collect()
     };
-    d.keep("topics", Restart::Bridge, &ids(old), &ids(new));
+    d.keep("topics", &ids(old), &ids(new));
     for (index, route) in old.routes.iter().enumerate() {
         let same_id = |other: &&Route| other.id == route.id;
         if let Some(other) = new.routes.iter().find(same_id) {
@@ -220,40 +171,39 @@ fn output_of<'a>(settings: &Settings, lane: &'a Lane, id: &RouteId) -> Option<&'
 fn compare_route(d: &mut Differ, old: &Route, new: &Route) {
     let Route { id, input_topic, message_type, input_qos, max_sample_bytes, retained_samples } = old;
     let key = |name: &str| format!("topics[{id}].{name}");
-    d.keep(&key("input_topic"), Restart::Bridge, input_topic, &new.input_topic);
-    d.keep(&key("message_type"), Restart::Bridge, message_type, &new.message_type);
-    d.keep(&key("max_sample_bytes"), Restart::Bridge, max_sample_bytes, &new.max_sample_bytes);
-    d.keep(&key("retained_samples"), Restart::Bridge, retained_samples, &new.retained_samples);
+    d.keep(&key("input_topic"), input_topic, &new.input_topic);
+    d.keep(&key("message_type"), message_type, &new.message_type);
+    d.keep(&key("max_sample_bytes"), max_sample_bytes, &new.max_sample_bytes);
+    d.keep(&key("retained_samples"), retained_samples, &new.retained_samples);
     let InputQos { reliability, durability, history, deadline_ms } = input_qos;
     let key = |name: &str| format!("topics[{id}].qos_overrides.input.{name}");
-    d.keep(&key("reliability"), Restart::Ingress, reliability, &new.input_qos.reliability);
-    d.keep(&key("durability"), Restart::Ingress, durability, &new.input_qos.durability);
-    d.keep(&key("history"), Restart::Ingress, history, &new.input_qos.history);
-    d.keep(&key("deadline_ms"), Restart::Ingress, deadline_ms, &new.input_qos.deadline_ms);
+    d.keep(&key("reliability"), reliability, &new.input_qos.reliability);
+    d.keep(&key("durability"), durability, &new.input_qos.durability);
+    d.keep(&key("history"), history, &new.input_qos.history);
+    d.keep(&key("deadline_ms"), deadline_ms, &new.input_qos.deadline_ms);
 }
 
 fn compare_output(d: &mut Differ, id: &RouteId, lane: &LaneName, old: Option<&Output>, new: Option<&Output>) {
     let (Some(old), Some(new)) = (old, new) else {
         // Which lanes serve a route decides how its samples are shared out in memory.
         let key = format!("topics[{id}].lanes.{lane}");
-        d.keep(&key, Restart::Bridge, &old.is_some(), &new.is_some());
+        d.keep(&key, &old.is_some(), &new.is_some());
         return;
     };
     let Output { route: _, topic, qos } = old;
-    let restart = || Restart::Lane(lane.to_string());
-    d.keep(&format!("topics[{id}].outputs.{lane}"), restart(), topic, &new.topic);
+    d.keep(&format!("topics[{id}].outputs.{lane}"), topic, &new.topic);
     let QosProfile { reliability, history, durability, lifespan_ms, deadline_ms } = qos;
     let key = |name: &str| format!("topics[{id}].qos_overrides.{lane}.{name}");
-    d.keep(&key("reliability"), restart(), reliability, &new.qos.reliability);
-    d.keep(&key("history"), restart(), history, &new.qos.history);
-    d.keep(&key("durability"), restart(), durability, &new.qos.durability);
-    d.keep(&key("lifespan_ms"), restart(), lifespan_ms, &new.qos.lifespan_ms);
-    d.keep(&key("deadline_ms"), restart(), deadline_ms, &new.qos.deadline_ms);
+    d.keep(&key("reliability"), reliability, &new.qos.reliability);
+    d.keep(&key("history"), history, &new.qos.history);
+    d.keep(&key("durability"), durability, &new.qos.durability);
+    d.keep(&key("lifespan_ms"), lifespan_ms, &new.qos.lifespan_ms);
+    d.keep(&key("deadline_ms"), deadline_ms, &new.qos.deadline_ms);
 }
 
 fn lanes(d: &mut Differ, old: &[Lane], new: &[Lane]) -> Vec<Lane> {
     let names = |lanes: &[Lane]| -> Vec<LaneName> { lanes.iter().map(|lane| lane.name.clone()).collect() };
-    d.keep("lanes", Restart::Bridge, &names(old), &names(new));
+    d.keep("lanes", &names(old), &names(new));
     let reloaded = old.iter().map(|lane| match new.iter().find(|other| other.name == lane.name) {
         Some(other) => reload_lane(d, lane, other),
         None => lane.clone(),
@@ -264,25 +214,23 @@ fn lanes(d: &mut Differ, old: &[Lane], new: &[Lane]) -> Vec<Lane> {
 fn reload_lane(d: &mut Differ, old: &Lane, new: &Lane) -> Lane {
     let of = format!("lanes.{}", old.name);
     let key = |name: &str| format!("{of}.{name}");
-    let restart = || Restart::Lane(old.name.to_string());
-    let depth = d.keep(&key("queue_depth"), Restart::Bridge, &old.queue_depth, &new.queue_depth);
-    let borrowed = d.keep(&key("max_borrowed"), Restart::Bridge, &old.max_borrowed, &new.max_borrowed);
+    let depth = d.keep(&key("queue_depth"), &old.queue_depth, &new.queue_depth);
+    let borrowed = d.keep(&key("max_borrowed"), &old.max_borrowed, &new.max_borrowed);
     Lane {
         name: old.name.clone(),
         class: old.class,
-        network: network(d, &of, restart(), &old.network, &new.network),
+        network: network(d, &of, &old.network, &new.network),
         outputs: old.outputs.clone(),
         queue_depth: depth,
         max_borrowed: borrowed,
         by_reference_min_bytes: d.keep(
             &key("by_reference_min_bytes"),
-            restart(),
             &old.by_reference_min_bytes,
             &new.by_reference_min_bytes,
         ),
-        window_samples: d.keep(&key("window_samples"), restart(), &old.window_samples, &new.window_samples),
+        window_samples: d.keep(&key("window_samples"), &old.window_samples, &new.window_samples),
         rates: lane_rates(d, old, new),
-        scheduling: scheduling(d, &of, restart(), &old.scheduling, &new.scheduling),
+        scheduling: scheduling(d, &of, &old.scheduling, &new.scheduling),
     }
 }
 
@@ -330,7 +278,7 @@ fn rate_policy(
         queue_samples: if has_room {
             d.take(&common_key("queue_samples"), &old.queue_samples, new.queue_samples)
         } else {
-            d.keep(&common_key("queue_samples"), Restart::Bridge, &old.queue_samples, &new.queue_samples)
+            d.keep(&common_key("queue_samples"), &old.queue_samples, &new.queue_samples)
         },
     }
 }
@@ -366,7 +314,6 @@ fn classifier(d: &mut Differ, old: &Classifier, new: Classifier) -> Classifier {
 
 fn probes(d: &mut Differ, old: &Probes, new: Probes) -> Probes {
     let key = |name: &str| format!("probes.{name}");
-    let control = Restart::Control;
     Probes {
         enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
         rate_hz: d.take(&key("rate_hz"), &old.rate_hz, new.rate_hz),
@@ -380,8 +327,8 @@ fn probes(d: &mut Differ, old: &Probes, new: Probes) -> Probes {
         window_size: d.take(&key("window_size"), &old.window_size, new.window_size),
         hysteresis_count: d.take(&key("hysteresis_count"), &old.hysteresis_count, new.hysteresis_count),
         timeout_ms: d.take(&key("timeout_ms"), &old.timeout_ms, new.timeout_ms),
-        request_topic: d.keep(&key("request_topic"), control.clone(), &old.request_topic, &new.request_topic),
-        response_topic: d.keep(&key("response_topic"), control, &old.response_topic, &new.response_topic),
+        request_topic: d.keep(&key("request_topic"), &old.request_topic, &new.request_topic),
+        response_topic: d.keep(&key("response_topic"), &old.response_topic, &new.response_topic),
     }
 }
 
@@ -436,9 +383,9 @@ fn diagnostics(d: &mut Differ, old: &Diagnostics, new: Diagnostics) -> Diagnosti
     Diagnostics {
         enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
         publish_interval_ms: new.publish_interval_ms,
-        topic: d.keep(&key("topic"), Restart::Control, &old.topic, &new.topic),
+        topic: d.keep(&key("topic"), &old.topic, &new.topic),
         verbosity: d.take(&key("verbosity"), &old.verbosity, new.verbosity),
-        metrics: d.keep(&key("metrics"), Restart::Control, &old.metrics, &new.metrics),
+        metrics: d.keep(&key("metrics"), &old.metrics, &new.metrics),
     }
 }
 
@@ -466,7 +413,7 @@ fn subscribers(
             reloaded.insert(id, lane);
         } else {
             let before = old.get(&id).cloned();
-            let kept = d.keep(&format!("subscribers.{id}"), Restart::Bridge, &before, &Some(lane));
+            let kept = d.keep(&format!("subscribers.{id}"), &before, &Some(lane));
             reloaded.extend(kept.map(|lane| (id, lane)));
         }
     }

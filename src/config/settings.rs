@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
+use serde::{Deserialize, Serialize};
+
 pub use crate::model::{ClassifierThresholds, DropPolicy, LaneRates, RatePolicy, SafetyRules};
 use crate::model::{
     Durability, History, InstanceName, LaneName, QosProfile, Reliability, RouteId, SubscriberState,
@@ -13,7 +15,7 @@ use crate::model::{
 };
 
 /// The whole configuration.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     /// Which bridge this is; the namespace of its shared memory.
     pub instance: InstanceName,
@@ -57,7 +59,7 @@ impl Settings {
 }
 
 /// One DDS domain and the network interfaces used in it.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DdsNetwork {
     /// DDS domain, 0 to 232.
     pub domain_id: u16,
@@ -66,7 +68,7 @@ pub struct DdsNetwork {
 }
 
 /// A network interface, by name or by one of its addresses.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum NetworkSelector {
     /// Such as `wlan0`.
     Name(String),
@@ -92,7 +94,7 @@ impl NetworkSelector {
 }
 
 /// One input topic.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Route {
     /// The user's name for it.
     pub id: RouteId,
@@ -110,7 +112,7 @@ pub struct Route {
 }
 
 /// What the ingress reader asks of the publisher. A policy that is `None` follows what the publisher offers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct InputQos {
     /// RELIABILITY.
     pub reliability: Option<Reliability>,
@@ -123,7 +125,7 @@ pub struct InputQos {
 }
 
 /// One lane: a process, its DDS participant and a writer for each route.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Lane {
     /// Its name.
     pub name: LaneName,
@@ -162,7 +164,7 @@ impl Lane {
 }
 
 /// One route on one lane.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Output {
     /// Index into [`Settings::routes`].
     pub route: usize,
@@ -173,7 +175,7 @@ pub struct Output {
 }
 
 /// Shared memory of one bridge.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SharedMemory {
     /// The folder of the bridge's own files; `None` lets the program choose (see `config/README.md`).
     pub root_path: Option<PathBuf>,
@@ -182,7 +184,7 @@ pub struct SharedMemory {
 }
 
 /// How the operating system schedules a process.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Scheduling {
     /// The scheduling policy.
     pub policy: SchedulingPolicy,
@@ -201,7 +203,7 @@ pub struct Scheduling {
 }
 
 /// A scheduling policy of Linux.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SchedulingPolicy {
     /// `SCHED_OTHER`.
     #[default]
@@ -213,7 +215,7 @@ pub enum SchedulingPolicy {
 }
 
 /// The classifier.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Classifier {
     /// Whether subscribers are classified at all.
     pub enabled: bool,
@@ -226,7 +228,7 @@ pub struct Classifier {
 }
 
 /// Active probing.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Probes {
     /// Whether probes are sent.
     pub enabled: bool,
@@ -251,7 +253,7 @@ pub struct Probes {
 }
 
 /// The safety supervisor.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Safety {
     /// Evaluations per second.
     pub evaluate_rate_hz: f64,
@@ -260,7 +262,7 @@ pub struct Safety {
 }
 
 /// What is done about control messages that do not authenticate.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum TrustMode {
     /// They are refused.
     DefaultDeny,
@@ -271,7 +273,7 @@ pub enum TrustMode {
 }
 
 /// Where the shared secret is. The secret itself is never held in the settings, so that it cannot be logged.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SecretSource {
     /// The file's first line.
     File(PathBuf),
@@ -282,7 +284,7 @@ pub enum SecretSource {
 }
 
 /// Authentication of control messages.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Security {
     /// What is done about messages that do not authenticate.
     pub trust_mode: TrustMode,
@@ -299,7 +301,7 @@ pub struct Security {
 }
 
 /// Diagnostics.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Diagnostics {
     /// Whether they are published.
     pub enabled: bool,
@@ -314,7 +316,7 @@ pub struct Diagnostics {
 }
 
 /// The least severe level that is logged.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Verbosity {
     /// What failed.
     Error,
@@ -329,7 +331,7 @@ pub enum Verbosity {
 }
 
 /// Where the Prometheus page is served.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum MetricsListener {
     /// TCP; a loopback address.
     Tcp(IpAddr, u16),

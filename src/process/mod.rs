@@ -7,6 +7,7 @@
 mod arena;
 mod control;
 mod egress;
+mod in_force;
 mod inbox;
 mod ingress;
 mod manual;
@@ -22,6 +23,7 @@ mod watch;
 
 pub use control::control;
 pub use egress::egress;
+pub use in_force::{InForce, InForceError};
 pub use ingress::ingress;
 pub use manual::set_mode;
 pub use reload::{HangUp, ReloadAnswer, ReloadRequests, ReloadResult, reload_all};

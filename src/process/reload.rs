@@ -20,18 +20,22 @@ use signal_hook::consts::SIGHUP;
 use signal_hook::iterator::Signals;
 use tracing::{error, info, warn};
 
+use super::in_force::InForce;
 use super::notify;
 use crate::clock;
-use crate::config::{ConfigError, Reload, Settings};
-use crate::model::MonotonicNs;
-use crate::shm::{RoleHolder, ShmError};
+use crate::config::{ConfigError, Configuration, Reload, Settings};
+use crate::model::{InstanceName, MonotonicNs};
+use crate::shm::{InForceFile, InForceShare, RoleHolder, ShmError};
 use crate::telemetry;
 
-type Load = Box<dyn FnMut() -> Result<Settings, ConfigError> + Send>;
+type Load = Box<dyn FnMut() -> Result<Configuration, ConfigError> + Send>;
 
 /// Requests to reload. To be made before anything else that a role does: without it, SIGHUP ends a process.
 #[derive(Default)]
-pub struct ReloadRequests(Option<Request>);
+pub struct ReloadRequests {
+    request: Option<Request>,
+    in_force: Option<InForce>,
+}
 
 struct Request {
     signals: Signals,
@@ -40,17 +44,23 @@ struct Request {
 }
 
 impl ReloadRequests {
-    /// The requests that SIGHUP makes from now on. `load` reads the settings as they were read at the start:
-    /// the same file, the same environment.
+    /// The requests that SIGHUP makes from now on. `load` reads the configuration as it was read at the
+    /// start: the same file, the same environment.
     ///
     /// # Errors
     /// The operating system refused the signal handler.
     pub fn on_signal(
-        load: impl FnMut() -> Result<Settings, ConfigError> + Send + 'static,
+        load: impl FnMut() -> Result<Configuration, ConfigError> + Send + 'static,
     ) -> io::Result<Self> {
         let signals = Signals::new([SIGHUP])?;
         unblock()?;
-        Ok(Self(Some(Request { signals, load: Box::new(load), terminal: Terminal::look() })))
+        let request = Request { signals, load: Box::new(load), terminal: Terminal::look() };
+        Ok(Self { request: Some(request), in_force: None })
+    }
+
+    /// These requests, for a process that applies `in_force` and keeps there what it reloads.
+    pub fn kept_in(self, in_force: InForce) -> Self {
+        Self { in_force: Some(in_force), ..self }
     }
 
     /// No requests, whatever happens.
@@ -61,7 +71,7 @@ impl ReloadRequests {
 
 impl fmt::Debug for ReloadRequests {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("ReloadRequests").field(&self.0.is_some()).finish()
+        f.debug_tuple("ReloadRequests").field(&self.request.is_some()).finish()
     }
 }
 
@@ -131,17 +141,19 @@ impl Terminal {
     }
 }
 
-/// The settings that a role has in force.
+/// The configuration that a role has in force.
 pub(super) struct Reloads {
-    in_force: Settings,
+    in_force: Configuration,
     fingerprint: u64,
     refused: u64,
     outcomes: Option<Receiver<Outcome>>,
+    /// Keeps the configuration in force for the processes that start while this one runs.
+    _share: Option<InForceShare>,
 }
 
 /// What came of one request.
 enum Outcome {
-    Accepted(Box<Settings>),
+    Accepted(Box<Configuration>),
     Refused,
 }
 
@@ -150,8 +162,8 @@ enum Outcome {
 pub(super) enum Look {
     /// No request, or none that has been dealt with yet.
     Nothing,
-    /// The file is good. The settings in force are new ones, maybe equal ones; what they refer to, such as a
-    /// secret, is to be read again.
+    /// The file is good. The configuration in force is a new one, maybe an equal one; what it refers to, such
+    /// as the file of a secret, is to be read again.
     Reloaded,
     /// The file is bad, and nothing has changed.
     Refused,
@@ -161,22 +173,26 @@ impl Reloads {
     /// Begins to serve the requests. The thread has the scheduling of the one that calls this. `note` is
     /// where each outcome is left.
     pub fn start(requests: ReloadRequests, settings: &Settings, note: Option<PathBuf>) -> io::Result<Self> {
-        let in_force = settings.clone();
-        let outcomes = requests.0.map(|request| {
+        let (in_force, share) = match requests.in_force.map(InForce::into_parts) {
+            Some((configuration, share)) => (configuration, Some(share)),
+            None => (settings.clone().into(), None),
+        };
+        let file = share.as_ref().map(InForceShare::file);
+        let outcomes = requests.request.map(|request| {
             // Without room: it is handed over only when housekeeping takes it, and then the note says so.
             let (sender, outcomes) = sync_channel(0);
-            let present = in_force.clone();
+            let server = Server { present: in_force.clone(), file };
             std::thread::Builder::new()
                 .name("reload".to_owned())
-                .spawn(move || serve(request, present, &sender, note.as_deref()))
+                .spawn(move || serve(request, server, &sender, note.as_deref()))
                 .map(|_| outcomes)
         });
-        let fingerprint = in_force.fingerprint();
-        Ok(Self { in_force, fingerprint, refused: 0, outcomes: outcomes.transpose()? })
+        let fingerprint = in_force.settings.fingerprint();
+        Ok(Self { in_force, fingerprint, refused: 0, outcomes: outcomes.transpose()?, _share: share })
     }
 
-    /// The settings in force.
-    pub fn settings(&self) -> &Settings {
+    /// The configuration in force.
+    pub fn configuration(&self) -> &Configuration {
         &self.in_force
     }
 
@@ -203,11 +219,46 @@ impl Reloads {
                 self.refused += 1;
                 Look::Refused
             }
-            Some(Ok(Outcome::Accepted(settings))) => {
-                self.fingerprint = settings.fingerprint();
-                self.in_force = *settings;
+            Some(Ok(Outcome::Accepted(configuration))) => {
+                self.fingerprint = configuration.settings.fingerprint();
+                self.in_force = *configuration;
                 Look::Reloaded
             }
+        }
+    }
+}
+
+/// What the reloading thread knows.
+struct Server {
+    /// The configuration that this process has in force.
+    present: Configuration,
+    /// Where the configuration in force of the bridge is kept.
+    file: Option<InForceFile>,
+}
+
+impl Server {
+    /// Puts into force what can be taken over from `new`, and keeps it for the processes that start later.
+    fn reload(&mut self, new: Configuration) -> Reload {
+        // Another process may have kept a reload already that this one has not seen.
+        let kept = self.file.as_ref().and_then(|file| file.read().ok()?);
+        let kept = kept.and_then(|bytes| Configuration::decode(&bytes).ok());
+        let (bridge, Reload { waits, .. }) = kept.as_ref().unwrap_or(&self.present).reloaded(new);
+        if kept.as_ref() != Some(&bridge) {
+            self.keep(&bridge);
+        }
+        let (present, Reload { changed, .. }) = self.present.reloaded(bridge);
+        self.present = present;
+        Reload { changed, waits }
+    }
+
+    fn keep(&self, configuration: &Configuration) {
+        let Some(file) = &self.file else { return };
+        let encoded = configuration.encode().map_err(io::Error::from);
+        match encoded.and_then(|bytes| file.write(&bytes)) {
+            // The bridge is being taken down, and its folder is gone.
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => error!(%error, "the reload is not kept: a process that restarts does not apply it"),
+            Ok(()) => {}
         }
     }
 }
@@ -216,7 +267,7 @@ impl Reloads {
 /// while one is dealt with are one more.
 fn serve(
     Request { mut signals, mut load, terminal }: Request,
-    mut present: Settings,
+    mut server: Server,
     outcomes: &SyncSender<Outcome>,
     note: Option<&Path>,
 ) {
@@ -231,12 +282,12 @@ fn serve(
         let began_at = clock::monotonic();
         let (outcome, result) = match load() {
             Ok(new) => {
-                let file_fingerprint = new.fingerprint();
-                let (settings, reload) = present.reloaded(new);
-                telemetry::set_verbosity(settings.diagnostics.verbosity);
+                let file_fingerprint = new.settings.fingerprint();
+                let reload = server.reload(new);
+                telemetry::set_verbosity(server.present.settings.diagnostics.verbosity);
                 log(&reload);
-                present = settings.clone();
-                (Outcome::Accepted(Box::new(settings)), ReloadResult::Accepted { file_fingerprint, reload })
+                let outcome = Outcome::Accepted(Box::new(server.present.clone()));
+                (outcome, ReloadResult::Accepted { file_fingerprint, reload })
             }
             Err(error) => {
                 error!("the configuration file is bad, and nothing is changed:\n{error}");
@@ -259,8 +310,8 @@ fn log(reload: &Reload) {
     for change in &reload.changed {
         info!("reloaded: {change}");
     }
-    for left in &reload.needs_restart {
-        warn!("needs a restart, left as it is: {left}");
+    for change in &reload.waits {
+        warn!("waits for a restart of the whole bridge: {change}");
     }
     if *reload == Reload::default() {
         info!("reloaded: nothing differs");
@@ -281,7 +332,7 @@ pub enum ReloadResult {
     /// The file was good, and what could be taken over is in force.
     Accepted {
         /// The fingerprint of what the file says, which is that of the settings in force unless something
-        /// needs a restart.
+        /// waits for a restart of the whole bridge.
         file_fingerprint: u64,
         /// What changed, and what did not.
         reload: Reload,
@@ -332,9 +383,9 @@ pub struct ReloadAnswer {
 ///
 /// # Errors
 /// It cannot be found out who they are.
-pub fn reload_all(root: &Path, settings: &Settings) -> Result<Vec<ReloadAnswer>, ShmError> {
+pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnswer>, ShmError> {
     let asked_at = clock::monotonic();
-    let holders = RoleHolder::all(root, &settings.instance)?;
+    let holders = RoleHolder::all(root, instance)?;
     let mut answers = Vec::with_capacity(holders.len());
     for RoleHolder { role, pid, .. } in &holders {
         match i32::try_from(*pid).map(|pid| kill(Pid::from_raw(pid), Signal::SIGHUP)) {

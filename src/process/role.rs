@@ -9,7 +9,7 @@ use super::notify::Notifier;
 use super::reload::{Look, ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
-use crate::config::{Scheduling, Settings};
+use crate::config::{Configuration, Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
 use crate::model::{Guid, MonotonicNs, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
@@ -153,7 +153,8 @@ impl Role {
     }
 
     /// Like [`join`](Self::join), with what the thread that receives is to do; see
-    /// [`Participant::open_receiving`].
+    /// [`Participant::open_receiving`]. The others are told only by
+    /// [`dispose_former`](Self::dispose_former).
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
@@ -161,19 +162,34 @@ impl Role {
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
         let participant = Participant::open_receiving(options, on_arriving, on_received)?;
-        self.joined(&participant);
+        self.show(&participant);
         Ok(participant)
     }
 
     fn joined(&mut self, participant: &Participant) {
-        participant.say_goodbye_for(self.former_participant);
+        self.dispose_former(participant);
+        self.show(participant);
+    }
+
+    /// Tells the other participants, once, that the participant of a killed predecessor is gone. A writer
+    /// then lets go of the samples that only the predecessor had not acknowledged.
+    pub fn dispose_former(&mut self, participant: &Participant) {
+        participant.say_goodbye_for(std::mem::take(&mut self.former_participant));
+    }
+
+    /// Whether the participant of a killed predecessor has yet to be disposed of.
+    pub fn has_former(&self) -> bool {
+        self.former_participant != Guid::default()
+    }
+
+    fn show(&mut self, participant: &Participant) {
         let guid = participant.guid();
         self.health.update(|health| health.participant = guid);
     }
 
     /// Takes over what was reloaded since the last look, if anything was, and shows it. What is yielded then
-    /// are the settings in force from now on, for the role to apply.
-    pub fn reload(&mut self) -> Option<&Settings> {
+    /// is the configuration in force from now on, for the role to apply.
+    pub fn reload(&mut self) -> Option<&Configuration> {
         let look = self.reloads.look();
         if look == Look::Nothing {
             return None;
@@ -184,7 +200,7 @@ impl Role {
             health.refused_reloads = refused;
         });
         self.notifier.reloaded(look == Look::Refused);
-        (look == Look::Reloaded).then(|| self.reloads.settings())
+        (look == Look::Reloaded).then(|| self.reloads.configuration())
     }
 
     /// The role is up: its DDS endpoints are there, but for those whose type discovery has yet to tell.

@@ -8,6 +8,7 @@ use std::ffi::OsString;
 use std::fmt::{self, Write as _};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -16,15 +17,16 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, getppid};
 use tracing::{error, info, warn};
 
+use super::in_force::{FOLDER_VARIABLE, InForce};
 use super::notify::{Notifier, write_list};
 use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
 use super::role::root;
 use super::stop::Stop;
 use crate::clock;
-use crate::config::Settings;
+use crate::config::{Configuration, Settings};
 use crate::model::MonotonicNs;
 use crate::policy::{ChildExit, GiveUpReason, RestartBackoff, RestartDecision};
-use crate::shm::ShmError;
+use crate::shm::{RoleLock, ShmError};
 use crate::telemetry::Snapshot;
 
 /// How often the children are looked at.
@@ -51,6 +53,8 @@ pub enum SupervisorError {
     },
     /// No child is left that could be started again.
     AllGaveUp,
+    /// The bridge runs already, or the folder of the instance cannot be used.
+    Shm(ShmError),
 }
 
 impl fmt::Display for SupervisorError {
@@ -58,11 +62,18 @@ impl fmt::Display for SupervisorError {
         match self {
             Self::Start { name, error } => write!(f, "cannot start {name}: {error}"),
             Self::AllGaveUp => f.write_str("every process of the bridge has given up; see the log above"),
+            Self::Shm(error) => error.fmt(f),
         }
     }
 }
 
 impl std::error::Error for SupervisorError {}
+
+impl From<ShmError> for SupervisorError {
+    fn from(error: ShmError) -> Self {
+        Self::Shm(error)
+    }
+}
 
 /// To be called by a role before anything else: if `up` started this process, it ends with `up`.
 pub fn end_with_supervisor() {
@@ -79,24 +90,33 @@ pub fn end_with_supervisor() {
     }
 }
 
-/// Runs ingress, every lane and control as children until `stop` is requested. `arguments` are passed on to
-/// each, after its own (the configuration file, say). A hang-up is passed on, too: each child checks the file
+/// Puts `configuration`, which was read from `file`, in force, and runs ingress, every lane and control as
+/// children until `stop` is requested. `arguments` are passed on to each, after its own (the configuration
+/// file, say). A hang-up is passed on, too: each child checks the file
 /// itself before it changes anything. Lanes that the file has got since are not started.
 ///
 /// # Errors
-/// The first start of a child failed, or all children gave up.
+/// The bridge runs already, the first start of a child failed, or all children gave up.
 pub fn up(
-    settings: &Settings,
+    configuration: Configuration,
+    file: &Path,
     arguments: &[OsString],
     hang_up: &HangUp,
     stop: &Stop,
 ) -> Result<(), SupervisorError> {
-    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments)];
+    let in_force = InForce::begin(file, configuration)?;
+    let settings = &in_force.configuration().settings;
+    let root = root(settings);
+    // By this role another `up` finds the process id of this one.
+    let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
+    let folder = root.join(settings.instance.as_str());
+    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments, &folder)];
     for lane in &settings.lanes {
         let name = format!("egress-{}", lane.name);
-        children.push(Supervised::new(&name, &["egress", "--lane", lane.name.as_str()], arguments));
+        let own = ["egress", "--lane", lane.name.as_str()];
+        children.push(Supervised::new(&name, &own, arguments, &folder));
     }
-    children.push(Supervised::new("control", &["control"], arguments));
+    children.push(Supervised::new("control", &["control"], arguments, &folder));
     let mut outcome = Ok(());
     for child in &mut children {
         if let Err(error) = child.start() {
@@ -221,18 +241,21 @@ enum State {
 struct Supervised {
     name: String,
     arguments: Vec<OsString>,
+    /// The folder of the instance.
+    folder: PathBuf,
     process: Option<Child>,
     backoff: RestartBackoff,
     state: State,
 }
 
 impl Supervised {
-    fn new(name: &str, own: &[&str], passed_on: &[OsString]) -> Self {
+    fn new(name: &str, own: &[&str], passed_on: &[OsString], folder: &Path) -> Self {
         let mut arguments: Vec<OsString> = own.iter().map(OsString::from).collect();
         arguments.extend_from_slice(passed_on);
         Self {
             name: name.to_owned(),
             arguments,
+            folder: folder.to_owned(),
             process: None,
             backoff: RestartBackoff::new(clock::monotonic()),
             state: State::Running,
@@ -242,6 +265,7 @@ impl Supervised {
     fn start(&mut self) -> io::Result<()> {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
+        command.env(FOLDER_VARIABLE, &self.folder);
         // The children answer to this process, and this one to the service manager.
         for variable in ["NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"] {
             command.env_remove(variable);

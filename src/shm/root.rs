@@ -13,6 +13,7 @@ use nix::fcntl::{Flock, FlockArg};
 use nix::unistd::{AccessFlags, access, geteuid};
 
 use super::error::ShmError;
+use super::{holders, in_force};
 use crate::clock;
 use crate::model::{InstanceName, fnv1a};
 
@@ -126,6 +127,7 @@ impl InstanceDir {
     /// instance's lock is held exclusively: then no process of the instance is alive.
     pub(super) fn sweep(&self) -> usize {
         let mut removed = 0;
+        in_force::sweep(&self.path);
         for file in self.shm_files() {
             removed += usize::from(fs::remove_file(file).is_ok());
         }
@@ -133,7 +135,7 @@ impl InstanceDir {
             let path = entry.path();
             let name = entry.file_name();
             let name = name.as_encoded_bytes();
-            if name == INSTANCE_LOCK.as_bytes() {
+            if name == INSTANCE_LOCK.as_bytes() || in_force::owns(name) {
                 continue;
             } else if name.ends_with(LOCK_SUFFIX.as_bytes()) {
                 if let Ok(Some(lock)) = FileLock::take(&path, FlockArg::LockExclusiveNonblock) {
@@ -163,7 +165,7 @@ fn count_files(folder: &Path) -> usize {
 }
 
 /// Creates a folder of mode 0700, with its parents, or checks the one that is there.
-fn make_private(path: &Path) -> Result<(), ShmError> {
+pub(super) fn make_private(path: &Path) -> Result<(), ShmError> {
     match DirBuilder::new().recursive(true).mode(0o700).create(path) {
         Ok(()) => check_owner(path),
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
@@ -248,7 +250,7 @@ impl FileLock {
         }
     }
 
-    fn relock(&self, how: FlockArg) -> Result<(), Errno> {
+    pub(super) fn relock(&self, how: FlockArg) -> Result<(), Errno> {
         self.lock.relock(how)
     }
 
@@ -333,7 +335,7 @@ impl Membership {
 }
 
 /// Whether the path still names the locked file, which another one may have removed while a lock was changed.
-fn lock_is_current(lock: &FileLock) -> bool {
+pub(super) fn lock_is_current(lock: &FileLock) -> bool {
     match (lock.lock.metadata(), fs::symlink_metadata(&lock.path)) {
         (Ok(locked), Ok(named)) => locked.ino() == named.ino() && locked.dev() == named.dev(),
         _ => false,
@@ -388,6 +390,14 @@ impl RoleLock {
     /// ([`RoleHolder`](super::RoleHolder)). It is removed with the instance.
     pub fn note_path(&self) -> Option<PathBuf> {
         self.lock.as_ref().map(|lock| note_path(&lock.path))
+    }
+
+    /// The process that holds the role; `None` when none does. Takes no lock.
+    pub(super) fn holder(root: &Path, instance: &InstanceName, role: &str) -> Option<u32> {
+        let path = Self::path(&InstanceDir::find(root, instance).ok()??, role);
+        let inode = fs::metadata(&path).ok()?.ino();
+        let pid = read_pid(&path);
+        holders::is_locked_by(pid, inode).then_some(pid)
     }
 
     pub(super) fn try_acquire(dir: &InstanceDir, role: &str) -> io::Result<Option<Self>> {

@@ -1,0 +1,101 @@
+//! The configuration in force, in the form in which it is kept beside the boards of a running bridge.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::reload::Reload;
+use super::settings::Settings;
+
+/// Settings and the secret that stood in the same file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Configuration {
+    /// The settings.
+    pub settings: Settings,
+    /// `security.hmac_secret` of the file. The settings never hold it: they are logged.
+    pub inline_secret: Option<InlineSecret>,
+}
+
+/// A secret from a configuration file. `Debug` does not show it.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct InlineSecret(String);
+
+impl InlineSecret {
+    pub(super) fn new(secret: &str) -> Self {
+        Self(secret.to_owned())
+    }
+
+    /// The secret itself.
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Debug for InlineSecret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("InlineSecret")
+    }
+}
+
+impl From<Settings> for Configuration {
+    /// Settings without an inline secret.
+    fn from(settings: Settings) -> Self {
+        Self { settings, inline_secret: None }
+    }
+}
+
+/// What is written. The fingerprint detects a reader whose `Settings` differ from the writer's.
+#[derive(Serialize, Deserialize)]
+struct Encoded {
+    program_version: String,
+    fingerprint: u64,
+    settings: Settings,
+    inline_secret: Option<InlineSecret>,
+}
+
+/// Why a stored configuration cannot be read: it was written by another version of the program, or damaged.
+#[derive(Debug)]
+pub struct DecodeError(String);
+
+impl fmt::Display for DecodeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for DecodeError {}
+
+impl Configuration {
+    /// As [`Settings::reloaded`]: this configuration with all that a running bridge takes over from `new`.
+    pub fn reloaded(&self, new: Self) -> (Self, Reload) {
+        let (settings, reload) = self.settings.reloaded(new.settings);
+        (Self { settings, inline_secret: new.inline_secret }, reload)
+    }
+
+    /// The configuration as bytes that [`decode`](Self::decode) reads. They hold the secret.
+    ///
+    /// # Errors
+    /// None that is known: every value of the settings can be encoded.
+    pub fn encode(&self) -> Result<Vec<u8>, serde_json::Error> {
+        serde_json::to_vec(&Encoded {
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+            fingerprint: self.settings.fingerprint(),
+            settings: self.settings.clone(),
+            inline_secret: self.inline_secret.clone(),
+        })
+    }
+
+    /// The configuration that was encoded, exactly.
+    ///
+    /// # Errors
+    /// The bytes are not those of this version of the program.
+    pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
+        let Encoded { program_version, fingerprint, settings, inline_secret } =
+            serde_json::from_slice(bytes).map_err(|error| DecodeError(error.to_string()))?;
+        if settings.fingerprint() != fingerprint {
+            return Err(DecodeError(format!("version {program_version} of the program has other settings")));
+        }
+        Ok(Self { settings, inline_secret })
+    }
+}

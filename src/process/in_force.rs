@@ -1,0 +1,180 @@
+//! The configuration in force: written beside the boards by the first process of a bridge, used by every
+//! process that starts while the bridge runs, whatever the file says by then.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use tracing::{info, warn};
+
+use super::role::root;
+use crate::config::{ConfigError, Configuration, Settings};
+use crate::model::InstanceName;
+use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root};
+use crate::telemetry::Snapshot;
+
+/// Set by `up` for its children, to the folder of the instance that they belong to.
+pub(super) const FOLDER_VARIABLE: &str = "ADAPTIVE_BRIDGE_FOLDER";
+
+/// The configuration that this process applies, and its share in keeping that in force.
+#[derive(Debug)]
+pub struct InForce {
+    configuration: Configuration,
+    share: InForceShare,
+}
+
+/// Why a process has no configuration.
+#[derive(Debug)]
+pub enum InForceError {
+    /// The bridge does not run, and the file is bad.
+    Config(ConfigError),
+    /// The folder of the instance cannot be used.
+    Shm(ShmError),
+}
+
+impl fmt::Display for InForceError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Config(error) => error.fmt(f),
+            Self::Shm(error) => error.fmt(f),
+        }
+    }
+}
+
+impl std::error::Error for InForceError {}
+
+impl From<ConfigError> for InForceError {
+    fn from(error: ConfigError) -> Self {
+        Self::Config(error)
+    }
+}
+
+impl From<ShmError> for InForceError {
+    fn from(error: ShmError) -> Self {
+        Self::Shm(error)
+    }
+}
+
+impl InForce {
+    /// The configuration for a role that starts: that in force if its bridge runs, else the one of the file,
+    /// which is in force from then on. `loaded` is what reading `file` yielded.
+    ///
+    /// # Errors
+    /// The bridge does not run and the file is bad, or the folder of the instance cannot be used.
+    pub fn join(file: &Path, loaded: Result<Configuration, ConfigError>) -> Result<Self, InForceError> {
+        let address = supervised_folder().or_else(|| {
+            let address = BridgeAddress::find(&own_root(), file)?;
+            Some((address.root().to_owned(), address.instance().clone()))
+        });
+        if let Some((root, instance)) = address
+            && let Some((share, bytes)) = InForceShare::join_running(&root, &instance)?
+        {
+            return Self::of_running_bridge(share, &bytes, loaded);
+        }
+        let configuration = loaded?;
+        let (root, instance) = (root(&configuration.settings), configuration.settings.instance.clone());
+        let own = encode(&configuration)?;
+        let (share, bytes) = InForceShare::join(&root, &instance, &own)?;
+        if bytes != own {
+            return Self::of_running_bridge(share, &bytes, Ok(configuration));
+        }
+        write_address(file, &root, &instance);
+        Ok(Self { configuration, share })
+    }
+
+    /// Puts a configuration in force for a bridge that is started as a whole.
+    ///
+    /// # Errors
+    /// The bridge runs already, or the folder of the instance cannot be used.
+    pub fn begin(file: &Path, configuration: Configuration) -> Result<Self, ShmError> {
+        let (root, instance) = (root(&configuration.settings), configuration.settings.instance.clone());
+        let share = InForceShare::begin(&root, &instance, &encode(&configuration)?)?;
+        write_address(file, &root, &instance);
+        Ok(Self { configuration, share })
+    }
+
+    fn of_running_bridge(
+        share: InForceShare,
+        bytes: &[u8],
+        loaded: Result<Configuration, ConfigError>,
+    ) -> Result<Self, InForceError> {
+        let configuration = match Configuration::decode(bytes) {
+            Ok(configuration) => configuration,
+            Err(error) => {
+                warn!(%error, "cannot read the configuration in force; using the configuration file instead");
+                return Ok(Self { configuration: loaded?, share });
+            }
+        };
+        info!("using the configuration in force of the running bridge, not the configuration file");
+        match loaded {
+            Ok(file) => {
+                let (_, reload) = configuration.reloaded(file);
+                for change in &reload.changed {
+                    info!("the configuration file differs, waits for a reload: {change}");
+                }
+                for change in &reload.waits {
+                    info!(
+                        "the configuration file differs, waits for a restart of the whole bridge: {change}"
+                    );
+                }
+            }
+            Err(error) => {
+                warn!("the configuration file is bad; the whole bridge cannot be restarted:\n{error}")
+            }
+        }
+        Ok(Self { configuration, share })
+    }
+
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        &self.configuration
+    }
+
+    pub(super) fn into_parts(self) -> (Configuration, InForceShare) {
+        (self.configuration, self.share)
+    }
+
+    /// The settings in force of the bridge that runs and was started with `file`, or else that runs as the
+    /// instance that the file names now; `None` when neither runs. Takes no lock and writes nothing.
+    pub fn find(file: &Path, loaded: Option<&Settings>) -> Option<Settings> {
+        let by_file = BridgeAddress::find(&own_root(), file)
+            .and_then(|address| settings_of_running(address.root(), address.instance()));
+        by_file.or_else(|| {
+            let named = loaded?;
+            settings_of_running(&root(named), &named.instance)
+        })
+    }
+}
+
+fn settings_of_running(root: &Path, instance: &InstanceName) -> Option<Settings> {
+    let bytes = InForceFile::find(root, instance).ok()??.read().ok()??;
+    let settings = Configuration::decode(&bytes).ok()?.settings;
+    // A bridge that was killed leaves its file.
+    matches!(Snapshot::take(root, &settings), Ok(Some(_))).then_some(settings)
+}
+
+fn encode(configuration: &Configuration) -> Result<Vec<u8>, ShmError> {
+    configuration.encode().map_err(|error| ShmError::Failed {
+        what: "to encode the configuration".to_owned(),
+        path: root(&configuration.settings),
+        reason: error.to_string(),
+    })
+}
+
+/// The root that does not depend on the configuration.
+fn own_root() -> PathBuf {
+    default_root(None, |name| std::env::var_os(name))
+}
+
+/// Without the address a process still finds its bridge, as long as the file is good and names the instance.
+fn write_address(file: &Path, root: &Path, instance: &InstanceName) {
+    if let Err(error) = BridgeAddress::new(file, root, instance).write(&own_root()) {
+        warn!(%error, "a process that restarts finds this bridge only with a valid configuration file");
+    }
+}
+
+/// Where `up` runs, if it started this process.
+fn supervised_folder() -> Option<(PathBuf, InstanceName)> {
+    let folder = PathBuf::from(std::env::var_os(FOLDER_VARIABLE)?);
+    let instance = InstanceName::try_from(folder.file_name()?.to_str()?).ok()?;
+    Some((folder.parent()?.to_owned(), instance))
+}

@@ -1,0 +1,382 @@
+//! The file that keeps the configuration in force of an instance, and the lock that says whether it counts.
+//!
+//! Every process of a running bridge holds the lock shared; a tap does not. The process that gets it
+//! exclusively is the first one: it writes the file anew. A file whose lock no process holds is left from a
+//! bridge that was killed, and is overwritten. What the bytes mean is for the caller.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, ErrorKind, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Duration;
+
+use nix::fcntl::FlockArg;
+use serde::{Deserialize, Serialize};
+
+use super::error::ShmError;
+use super::holders::RoleHolder;
+use super::root::{FileLock, InstanceDir, RoleLock, lock_is_current, make_private, read_pid};
+use crate::clock;
+use crate::model::{InstanceName, fnv1a};
+
+const LOCK: &str = "in-force.lock";
+const FILE: &str = "in-force.json";
+
+/// The largest file that is read. A configuration file has 1 MiB at most.
+const MAX_BYTES: u64 = 8 << 20;
+
+/// How long a start waits for the first process to write the file, which takes a few milliseconds.
+const PATIENCE_MS: u64 = 5_000;
+
+/// The share of one process in the configuration in force, which lasts as long as any process of the
+/// instance has a share.
+#[derive(Debug)]
+pub struct InForceShare {
+    lock: Option<FileLock>,
+    dir: PathBuf,
+}
+
+impl InForceShare {
+    /// Joins the processes of a running bridge; yields what they have in force. `None` when none runs.
+    ///
+    /// # Errors
+    /// The folder of the instance belongs to another user, or a file in it cannot be read.
+    pub fn join_running(root: &Path, instance: &InstanceName) -> Result<Option<(Self, Vec<u8>)>, ShmError> {
+        let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(None) };
+        match Self::attempt(&dir, None) {
+            Ok(Attempt::Joined { share, bytes, .. }) => Ok(Some((share, bytes))),
+            Ok(Attempt::Alone) => Ok(None),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(failed("to join the running bridge", &dir.path, &error)),
+        }
+    }
+
+    /// Joins the processes of a running bridge, or puts `first` in force when none runs. Yields what is in
+    /// force, which is `first` in the second case.
+    ///
+    /// # Errors
+    /// As for [`join_running`](Self::join_running), or the file cannot be written.
+    pub fn join(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<(Self, Vec<u8>), ShmError> {
+        let (share, bytes, _) = Self::enter(root, instance, first)?;
+        Ok((share, bytes))
+    }
+
+    /// Puts `first` in force as the first process of the instance.
+    ///
+    /// # Errors
+    /// [`ShmError::AlreadyRuns`] when a process of the instance runs; else as for [`join`](Self::join).
+    pub fn begin(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<Self, ShmError> {
+        let (share, _, is_first) = Self::enter(root, instance, first)?;
+        if is_first {
+            return Ok(share);
+        }
+        // The first process may have no role yet; it has left its number in the lock.
+        let pid = running_pid(root, instance).unwrap_or_else(|| read_pid(&share.dir.join(LOCK)));
+        Err(ShmError::AlreadyRuns { instance: instance.clone(), pid })
+    }
+
+    /// Yields also whether this is the first process.
+    fn enter(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<(Self, Vec<u8>, bool), ShmError> {
+        // The last process that leaves removes the folder: then it is made again.
+        for _ in 0..100 {
+            let dir = InstanceDir::prepare(root, instance)?;
+            match Self::attempt(&dir, Some(first)) {
+                Ok(Attempt::Joined { share, bytes, is_first }) => return Ok((share, bytes, is_first)),
+                Ok(Attempt::Alone) => {}
+                Err(error) if error.kind() == ErrorKind::NotFound => {}
+                Err(error) => return Err(failed("to put a configuration in force", &dir.path, &error)),
+            }
+        }
+        Err(ShmError::Failed {
+            what: "to put a configuration in force".to_owned(),
+            path: root.to_owned(),
+            reason: "the folder is removed again and again".to_owned(),
+        })
+    }
+
+    /// The file, for the process to put another configuration in force.
+    pub fn file(&self) -> InForceFile {
+        InForceFile { dir: self.dir.clone() }
+    }
+
+    /// `first` is `None` where a bridge that does not run is not to be begun.
+    fn attempt(dir: &InstanceDir, first: Option<&[u8]>) -> io::Result<Attempt> {
+        let path = dir.path.join(LOCK);
+        let file = InForceFile { dir: dir.path.clone() };
+        let joined = |lock, bytes, is_first| {
+            let share = Self { lock: Some(lock), dir: dir.path.clone() };
+            Ok(Attempt::Joined { share, bytes, is_first })
+        };
+        let give_up_at = clock::monotonic().plus_ms(PATIENCE_MS);
+        loop {
+            if let Some(mut lock) = FileLock::take(&path, FlockArg::LockExclusiveNonblock)? {
+                let Some(first) = first else {
+                    file.remove();
+                    lock.remove();
+                    return Ok(Attempt::Alone);
+                };
+                file.write(first)?;
+                lock.write_pid()?;
+                // The kernel may give the lock to another process while it is changed: that one is the first
+                // then, and has removed or overwritten the file.
+                if lock.relock(FlockArg::LockSharedNonblock).is_ok()
+                    && lock_is_current(&lock)
+                    && let Some(bytes) = file.read()?
+                {
+                    return joined(lock, bytes, true);
+                }
+            } else if let Some(lock) = FileLock::take(&path, FlockArg::LockSharedNonblock)?
+                && let Some(bytes) = file.read()?
+            {
+                return joined(lock, bytes, false);
+            }
+            if clock::monotonic() > give_up_at {
+                return Err(io::Error::other(format!(
+                    "process {} holds it for longer than a start takes",
+                    read_pid(&path)
+                )));
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+enum Attempt {
+    Joined {
+        share: InForceShare,
+        bytes: Vec<u8>,
+        is_first: bool,
+    },
+    /// No process runs, and none is to begin.
+    Alone,
+}
+
+fn failed(what: &str, path: &Path, error: &io::Error) -> ShmError {
+    ShmError::Failed { what: what.to_owned(), path: path.to_owned(), reason: error.to_string() }
+}
+
+impl Drop for InForceShare {
+    /// The last process that leaves removes the file.
+    fn drop(&mut self) {
+        if let Some(lock) = self.lock.take()
+            && lock.relock(FlockArg::LockExclusiveNonblock).is_ok()
+            && lock_is_current(&lock)
+        {
+            self.file().remove();
+            lock.remove();
+            // Fails while another file is there, whose removal tries again.
+            let _ = fs::remove_dir(&self.dir);
+        }
+    }
+}
+
+/// Removes the file if no process has a share in it; for the clean-up of an instance.
+pub(super) fn sweep(dir: &Path) {
+    if let Ok(Some(lock)) = FileLock::take(&dir.join(LOCK), FlockArg::LockExclusiveNonblock) {
+        InForceFile { dir: dir.to_owned() }.remove();
+        lock.remove();
+    }
+}
+
+/// Whether a file of that name belongs to this module, which sees to its removal.
+pub(super) fn owns(name: &[u8]) -> bool {
+    name == LOCK.as_bytes() || name == FILE.as_bytes()
+}
+
+/// A process of the instance that runs, `up` before all others.
+fn running_pid(root: &Path, instance: &InstanceName) -> Option<u32> {
+    let up = RoleLock::holder(root, instance, "up");
+    up.or_else(|| RoleHolder::all(root, instance).ok()?.first().map(|holder| holder.pid))
+}
+
+/// The file that keeps the configuration in force.
+#[derive(Clone, Debug)]
+pub struct InForceFile {
+    dir: PathBuf,
+}
+
+impl InForceFile {
+    /// That of an instance, whether or not a process runs; for commands that look only. Takes no lock.
+    ///
+    /// # Errors
+    /// The folder of the instance belongs to another user.
+    pub fn find(root: &Path, instance: &InstanceName) -> Result<Option<Self>, ShmError> {
+        Ok(InstanceDir::find(root, instance)?.map(|dir| Self { dir: dir.path }))
+    }
+
+    /// Its content; `None` when there is none.
+    ///
+    /// # Errors
+    /// The operating system refused.
+    pub fn read(&self) -> io::Result<Option<Vec<u8>>> {
+        let file = match File::open(self.dir.join(FILE)) {
+            Ok(file) => file,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        let mut bytes = Vec::new();
+        file.take(MAX_BYTES).read_to_end(&mut bytes)?;
+        Ok(Some(bytes))
+    }
+
+    /// Replaces its content in one step, readable by its owner only: it may hold a secret.
+    ///
+    /// # Errors
+    /// The operating system refused. `NotFound` when the folder is gone because the bridge ends.
+    pub fn write(&self, bytes: &[u8]) -> io::Result<()> {
+        write_privately(&self.dir.join(FILE), bytes)
+    }
+
+    fn remove(&self) {
+        let _ = fs::remove_file(self.dir.join(FILE));
+    }
+}
+
+fn write_privately(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let draft = path.with_extension(format!("draft{}", std::process::id()));
+    // A draft that a dead process with this number left may have other rights.
+    let _ = fs::remove_file(&draft);
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&draft)?;
+    file.write_all(bytes)?;
+    drop(file);
+    fs::rename(&draft, path)
+}
+
+/// Where the bridge runs that was started with a certain configuration file. It is found by the path of the
+/// file, so that a process finds its bridge while the file is broken, missing, or names another instance.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BridgeAddress {
+    /// The configuration file, as an absolute path.
+    file: PathBuf,
+    root: PathBuf,
+    instance: InstanceName,
+}
+
+/// The folder of the addresses in the default root. No instance has a name that begins with a dot.
+const ADDRESSES: &str = ".addresses";
+
+impl BridgeAddress {
+    /// The address of the instance in `root`, started with `file`.
+    pub fn new(file: &Path, root: &Path, instance: &InstanceName) -> Self {
+        Self { file: file.to_owned(), root: root.to_owned(), instance: instance.clone() }
+    }
+
+    /// The folder of the bridge's shared files.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The instance.
+    pub fn instance(&self) -> &InstanceName {
+        &self.instance
+    }
+
+    /// Writes the address below `default_root`, and removes those of bridges whose folders are gone.
+    ///
+    /// # Errors
+    /// The folder cannot be made or belongs to another user, or the operating system refused.
+    pub fn write(&self, default_root: &Path) -> Result<(), ShmError> {
+        let folder = default_root.join(ADDRESSES);
+        make_private(&folder)?;
+        for entry in fs::read_dir(&folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            let is_draft = path.extension().is_some_and(|extension| extension != "json");
+            let is_stale =
+                read_address(&path).is_none_or(|old| !old.root.join(old.instance.as_str()).is_dir());
+            if is_stale && !is_draft {
+                let _ = fs::remove_file(path);
+            }
+        }
+        let failed = |error: io::Error| failed("to write the address of the bridge", &folder, &error);
+        let bytes = serde_json::to_vec(self).map_err(|error| failed(error.into()))?;
+        write_privately(&address_path(default_root, &self.file), &bytes).map_err(failed)
+    }
+
+    /// The address of the bridge that was started with `file`; `None` when there is none. The bridge may have
+    /// ended since.
+    pub fn find(default_root: &Path, file: &Path) -> Option<Self> {
+        let found = read_address(&address_path(default_root, file))?;
+        (found.file == file).then_some(found)
+    }
+}
+
+fn address_path(default_root: &Path, file: &Path) -> PathBuf {
+    let hash = fnv1a(file.as_os_str().as_encoded_bytes());
+    default_root.join(ADDRESSES).join(format!("{hash:016x}.json"))
+}
+
+fn read_address(path: &Path) -> Option<BridgeAddress> {
+    let mut bytes = Vec::new();
+    File::open(path).ok()?.take(MAX_BYTES).read_to_end(&mut bytes).ok()?;
+    serde_json::from_slice(&bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    fn instance() -> InstanceName {
+        InstanceName::try_from("kept").unwrap()
+    }
+
+    #[test]
+    fn what_the_first_process_puts_in_force_lasts_until_the_last_one_has_left() {
+        let root = tempfile::tempdir().unwrap();
+        let join = |first: &[u8]| InForceShare::join(root.path(), &instance(), first).unwrap();
+        let running = || InForceShare::join_running(root.path(), &instance()).unwrap();
+        assert!(running().is_none());
+        let (one, bytes) = join(b"one");
+        assert_eq!(bytes, b"one");
+        let (two, bytes) = join(b"two");
+        assert_eq!(bytes, b"one");
+        let mode = fs::metadata(root.path().join("kept").join(FILE)).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+        one.file().write(b"changed").unwrap();
+        drop(one);
+        assert_eq!(running().unwrap().1, b"changed");
+        drop(two);
+        assert!(running().is_none());
+        assert!(!root.path().join("kept").exists());
+        assert_eq!(join(b"three").1, b"three");
+    }
+
+    #[test]
+    fn what_a_killed_bridge_left_is_not_in_force() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("kept");
+        let (mut share, _) = InForceShare::join(root.path(), &instance(), b"old").unwrap();
+        // A process that dies leaves its files and no lock.
+        drop(share.lock.take());
+        assert!(folder.join(FILE).exists());
+        assert_eq!(InForceShare::join(root.path(), &instance(), b"new").unwrap().1, b"new");
+    }
+
+    #[test]
+    fn a_second_beginning_is_refused() {
+        let root = tempfile::tempdir().unwrap();
+        let _first = InForceShare::begin(root.path(), &instance(), b"one").unwrap();
+        match InForceShare::begin(root.path(), &instance(), b"two") {
+            Err(ShmError::AlreadyRuns { pid, .. }) => assert_eq!(pid, std::process::id()),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn an_address_is_found_by_its_file_until_the_folder_of_the_bridge_is_gone() {
+        let root = tempfile::tempdir().unwrap();
+        let other = tempfile::tempdir().unwrap();
+        let find = |file: &str| BridgeAddress::find(root.path(), Path::new(file));
+        let address = BridgeAddress::new(Path::new("/a.yaml"), other.path(), &instance());
+        fs::create_dir(other.path().join("kept")).unwrap();
+        address.write(root.path()).unwrap();
+        assert_eq!(find("/a.yaml"), Some(address));
+        assert_eq!(find("/b.yaml"), None);
+        fs::remove_dir(other.path().join("kept")).unwrap();
+        BridgeAddress::new(Path::new("/b.yaml"), other.path(), &instance()).write(root.path()).unwrap();
+        assert_eq!(find("/a.yaml"), None);
+        assert!(find("/b.yaml").is_some());
+    }
+}
