@@ -6,13 +6,6 @@ use std::io;
 /// Why a participant, reader or writer could not be made.
 #[derive(Debug)]
 pub enum DdsError {
-    /// A configured interface or address is not one of this host's.
-    NoSuchInterface {
-        /// What was configured.
-        asked: String,
-        /// What the host has, as `name address`.
-        present: Vec<String>,
-    },
     /// The host's interfaces could not be listed.
     Interfaces(io::Error),
     /// The DDS library refused.
@@ -27,11 +20,6 @@ pub enum DdsError {
 impl fmt::Display for DdsError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NoSuchInterface { asked, present } => write!(
-                f,
-                "network interface {asked} is not on this host or has no IPv4 address; it has: {}",
-                present.join(", ")
-            ),
             Self::Interfaces(error) => write!(f, "cannot list the network interfaces: {error}"),
             Self::Library { what, reason } => write!(f, "cannot create {what}: {reason}"),
         }

@@ -23,11 +23,11 @@ pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
 pub use lent::{LentMemory, Payload, SampleMemory};
-pub use network::host_addresses;
+pub use network::{AbsentInterface, absent_interfaces, host_addresses};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};
-pub use writer::{RawWriter, WriteError, WriterEvent};
+pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent};
 
 /// RustDDS, in the version that ros2-client uses, so that there is one of it.
 use ros2_client::dds::rustdds;

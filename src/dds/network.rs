@@ -1,18 +1,52 @@
 //! From the interfaces that a user names to the addresses that the DDS library wants.
 
+use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 
 use super::error::DdsError;
+use super::rustdds;
 use crate::config::NetworkSelector;
 
-/// The addresses of the interfaces asked for; empty when none was asked for, which means all.
-pub(super) fn addresses(asked: &[NetworkSelector]) -> Result<Vec<IpAddr>, DdsError> {
+/// The interfaces asked for in the DDS library's terms.
+pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustdds::NetworkSelector> {
+    asked.iter().map(|selector| match selector {
+        NetworkSelector::Name(name) => rustdds::NetworkSelector::Name(name.clone()),
+        NetworkSelector::Address(address) => rustdds::NetworkSelector::Address(IpAddr::V4(*address)),
+    })
+}
+
+/// A configured interface that has no IPv4 address on this host at present.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AbsentInterface {
+    /// Its name or address, as configured.
+    pub asked: String,
+    /// What the host has, as `name address`.
+    pub present: Vec<String>,
+}
+
+impl fmt::Display for AbsentInterface {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "network interface {} is not on this host or has no IPv4 address, and is used as soon as it has \
+             one; the host has: {}",
+            self.asked,
+            self.present.join(", ")
+        )
+    }
+}
+
+/// Those of the interfaces asked for that have no address at present.
+///
+/// # Errors
+/// The kernel does not list them.
+pub fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<AbsentInterface>, DdsError> {
     if asked.is_empty() {
         return Ok(Vec::new());
     }
-    select(asked, &host_interfaces()?)
+    Ok(absent(asked, &host_interfaces()?))
 }
 
 fn host_interfaces() -> Result<Vec<(String, Ipv4Addr)>, DdsError> {
@@ -44,34 +78,21 @@ fn interface_addresses() -> Result<impl Iterator<Item = InterfaceAddress>, DdsEr
     getifaddrs().map_err(|errno| DdsError::Interfaces(errno.into()))
 }
 
-fn select(asked: &[NetworkSelector], present: &[(String, Ipv4Addr)]) -> Result<Vec<IpAddr>, DdsError> {
-    let mut chosen = Vec::new();
-    for selector in asked {
-        let before = chosen.len();
-        for (name, address) in present {
-            let wanted = match selector {
-                NetworkSelector::Name(wanted) => wanted == name,
-                NetworkSelector::Address(wanted) => wanted == address,
-            };
-            if wanted && !chosen.contains(&IpAddr::V4(*address)) {
-                chosen.push(IpAddr::V4(*address));
-            }
-        }
-        let known = present.iter().any(|(name, address)| match selector {
+fn absent(asked: &[NetworkSelector], present: &[(String, Ipv4Addr)]) -> Vec<AbsentInterface> {
+    let is_absent = |selector: &&NetworkSelector| {
+        !present.iter().any(|(name, address)| match selector {
             NetworkSelector::Name(wanted) => wanted == name,
             NetworkSelector::Address(wanted) => wanted == address,
-        });
-        if chosen.len() == before && !known {
-            return Err(DdsError::NoSuchInterface {
-                asked: match selector {
-                    NetworkSelector::Name(name) => name.clone(),
-                    NetworkSelector::Address(address) => address.to_string(),
-                },
-                present: present.iter().map(|(name, address)| format!("{name} {address}")).collect(),
-            });
-        }
-    }
-    Ok(chosen)
+        })
+    };
+    let absent = asked.iter().filter(is_absent).map(|selector| AbsentInterface {
+        asked: match selector {
+            NetworkSelector::Name(name) => name.clone(),
+            NetworkSelector::Address(address) => address.to_string(),
+        },
+        present: present.iter().map(|(name, address)| format!("{name} {address}")).collect(),
+    });
+    absent.collect()
 }
 
 #[cfg(test)]
@@ -84,15 +105,16 @@ mod tests {
 
     #[test]
     fn an_interface_is_found_by_name_and_by_address() {
-        let by_name = select(&[NetworkSelector::Name("wlan0".into())], &host()).unwrap();
-        let by_address = select(&[NetworkSelector::Address(Ipv4Addr::new(192, 168, 0, 7))], &host()).unwrap();
-        assert_eq!(by_name, by_address);
-        assert_eq!(by_name, [IpAddr::V4(Ipv4Addr::new(192, 168, 0, 7))]);
+        let asked =
+            [NetworkSelector::Name("wlan0".into()), NetworkSelector::Address(Ipv4Addr::new(192, 168, 0, 7))];
+        assert_eq!(absent(&asked, &host()), []);
     }
 
     #[test]
-    fn an_unknown_interface_is_an_error_that_lists_the_known_ones() {
-        let error = select(&[NetworkSelector::Name("eth9".into())], &host()).unwrap_err().to_string();
-        assert!(error.contains("eth9") && error.contains("wlan0 192.168.0.7"), "{error}");
+    fn an_absent_interface_is_named_beside_the_present_ones() {
+        let absent = absent(&[NetworkSelector::Name("eth9".into())], &host());
+        assert_eq!(absent.len(), 1);
+        let text = absent[0].to_string();
+        assert!(text.contains("eth9") && text.contains("wlan0 192.168.0.7"), "{text}");
     }
 }

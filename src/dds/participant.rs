@@ -14,7 +14,7 @@ use super::qos::{self, ReaderQos};
 use super::reader::{RawReader, Take};
 use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
-    QosPolicies, RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind,
+    QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, Topic, TopicKind,
 };
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
@@ -73,7 +73,8 @@ impl Participant {
     /// Joins the domain and announces the node.
     ///
     /// # Errors
-    /// An interface is not on this host, or the DDS library cannot open its sockets.
+    /// The DDS library cannot open its sockets. That an interface is absent is no error: it is used as soon
+    /// as it is there.
     pub fn open(options: &ParticipantOptions) -> Result<Self, DdsError> {
         Self::build(options, |builder| builder)
     }
@@ -107,9 +108,12 @@ impl Participant {
     ) -> Result<Self, DdsError> {
         let what = || format!("a participant in DDS domain {}", options.network.domain_id);
         let mut builder = DomainParticipantBuilder::new(options.network.domain_id);
-        let addresses = network::addresses(&options.network.interfaces)?;
-        if !addresses.is_empty() {
-            builder = builder.with_only_networks(addresses);
+        let interfaces = &options.network.interfaces;
+        if !interfaces.is_empty() {
+            builder = builder.with_only_interfaces(network::selectors(interfaces));
+        }
+        for absent in network::absent_interfaces(interfaces)? {
+            tracing::warn!(node = options.node_name, domain_id = options.network.domain_id, "{absent}");
         }
         let participant = extend(builder).build().map_err(|error| DdsError::library(what(), error))?;
         let none = QosPolicies::qos_none();
@@ -196,6 +200,36 @@ impl Participant {
         Ok(reader)
     }
 
+    /// Like [`create_reader`](Self::create_reader), for a reader that goes on where another one has ended, in
+    /// this process or in an earlier one. Of each writer in `taken` it neither requests nor gives samples up
+    /// to and including that number. A RELIABLE reader gives all that arrives from the first instant on.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_reader_after(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        reader_qos: &ReaderQos,
+        taken: impl IntoIterator<Item = (Guid, i64)>,
+    ) -> Result<RawReader, DdsError> {
+        let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
+        // The library computes with the number after it.
+        let number = |taken: i64| SequenceNumber::from(taken.min(i64::MAX - 1));
+        let taken = taken.into_iter().map(|(writer, taken)| (GUID::from_bytes(writer.0), number(taken)));
+        self.participant
+            .begin_after(&made_topic, taken)
+            .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
+        if reader_qos.reliability == Reliability::BestEffort {
+            // A BEST_EFFORT reader takes by time, not by number.
+            return self.create_reader(topic, dds_type, reader_qos);
+        }
+        let reader = self.make_reader(topic, dds_type, reader_qos)?;
+        self.readers.push(reader.guid);
+        self.announce();
+        Ok(reader)
+    }
+
     /// Learns from now on which nodes the other participants have. As in ROS 2 itself, the reader for that is
     /// in no node's graph entry.
     ///
@@ -222,8 +256,9 @@ impl Participant {
         Ok(RawReader { inner, guid })
     }
 
-    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer has
-    /// at most `window_samples` unacknowledged samples.
+    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer
+    /// retains `window_samples` for readers that have not acknowledged them; beyond that, the oldest sample
+    /// goes, and a reader that lacks it misses it.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -234,11 +269,12 @@ impl Participant {
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        self.create_blocking_writer(topic, dds_type, writer_qos, window_samples, Duration::ZERO)
+        self.add_writer(topic, dds_type, &qos::of_writer(writer_qos, window_samples))
     }
 
-    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] waits up to `max_blocking` for
-    /// room in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge itself never waits.
+    /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
+    /// `max_blocking` for room in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge
+    /// itself never waits.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -251,7 +287,16 @@ impl Participant {
         max_blocking: Duration,
     ) -> Result<RawWriter, DdsError> {
         let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
-        let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, &policies)?;
+        self.add_writer(topic, dds_type, &policies)
+    }
+
+    fn add_writer(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        policies: &QosPolicies,
+    ) -> Result<RawWriter, DdsError> {
+        let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, policies)?;
         self.writers.push(writer.guid());
         self.announce();
         Ok(writer)

@@ -39,13 +39,20 @@ pub(super) fn of_reader(qos: &ReaderQos) -> QosPolicies {
     builder.build().with_data_representation(policy::DataRepresentation { value: vec![XCDR1, XCDR2, XML] })
 }
 
-/// A writer's policies. `window_samples` bounds what may be unacknowledged, and a full window is reported at
-/// once (`max_blocking_time` zero) instead of waited for.
+/// The policies of a writer that waits for no reader. It retains `window_samples` for repairs, also where the
+/// configuration says KEEP_ALL: HISTORY is not matched between writers and readers (DDS 1.4 clause 2.2.3.18),
+/// and a KEEP_ALL writer would refuse samples as soon as one reader does not acknowledge.
 pub(super) fn of_writer(qos: &QosProfile, window_samples: usize) -> QosPolicies {
-    of_blocking_writer(qos, window_samples, std::time::Duration::ZERO)
+    let depth = u32::try_from(window_samples).unwrap_or(u32::MAX);
+    let history = match qos.history {
+        History::KeepAll => History::KeepLast { depth },
+        keep_last @ History::KeepLast { .. } => keep_last,
+    };
+    of_blocking_writer(&QosProfile { history, ..*qos }, window_samples, std::time::Duration::ZERO)
 }
 
-/// Like [`of_writer`], but a full window is waited for (`max_blocking_time`, DDS 1.4 clause 2.2.3.14).
+/// Like [`of_writer`], but a KEEP_ALL writer waits for acknowledgements while its window is full
+/// (`max_blocking_time`, DDS 1.4 clause 2.2.3.14).
 pub(super) fn of_blocking_writer(
     qos: &QosProfile,
     window_samples: usize,

@@ -1,4 +1,4 @@
-//! A DDS writer of raw payloads that never waits, unless it was made to.
+//! A DDS writer of raw payloads whose writes wait for no reader, unless it was made to wait.
 
 use std::fmt;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use crate::model::{Encapsulation, Guid, SourceTimestamp};
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WriteError {
-    /// The window of unacknowledged samples is full: a matched RELIABLE reader lags.
+    /// A writer that was made to wait for acknowledgements has waited for its blocking time.
     WindowFull,
     /// The DDS library refused for another reason.
     Refused,
@@ -52,6 +52,21 @@ pub enum WriterEvent {
     },
 }
 
+/// A matched reader: what it was offered, has acknowledged and missed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MatchedReader {
+    /// The reader.
+    pub guid: Guid,
+    /// Whether it requested RELIABLE.
+    pub reliable: bool,
+    /// Samples written since it was matched, and the history that it was offered then.
+    pub offered: u64,
+    /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
+    pub unacknowledged: u64,
+    /// Of those, samples that left the writer's history before the reader had them.
+    pub overrun: u64,
+}
+
 /// A DDS writer of raw payloads.
 pub struct RawWriter {
     pub(super) inner: DataWriter<RawPayload, Raw>,
@@ -64,18 +79,18 @@ impl RawWriter {
         self.guid
     }
 
-    /// Hands a sample to the DDS library and returns at once, or, of a writer that was made to wait, within
-    /// its blocking time. The library keeps `payload` until every matched RELIABLE reader has acknowledged
-    /// it, and lets go of it some time after that.
+    /// Hands a sample to the DDS library and returns how many matched readers it is offered to: at once, or,
+    /// of a writer that was made to wait, within its blocking time. The library keeps `payload` until every
+    /// matched RELIABLE reader has acknowledged it, or until newer samples take its place.
     ///
     /// # Errors
-    /// The sample was not taken and `payload` is let go of.
+    /// The library did not take the sample, and `payload` is dropped.
     pub fn write(
         &self,
         payload: Bytes,
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
-    ) -> Result<(), WriteError> {
+    ) -> Result<usize, WriteError> {
         self.write_with(payload, encapsulation, timestamp, None)
     }
 
@@ -91,7 +106,18 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
     ) -> Result<(), WriteError> {
-        self.write_with(payload, encapsulation, timestamp, Some(reader))
+        self.write_with(payload, encapsulation, timestamp, Some(reader)).map(|_| ())
+    }
+
+    /// Every matched reader.
+    pub fn matched_readers(&self) -> impl Iterator<Item = MatchedReader> {
+        self.inner.matched_readers().into_iter().map(|reader| MatchedReader {
+            guid: Guid(reader.guid.to_bytes()),
+            reliable: reader.reliable,
+            offered: reader.offered,
+            unacknowledged: reader.unacknowledged,
+            overrun: reader.overrun,
+        })
     }
 
     /// Waits until every matched RELIABLE reader has acknowledged everything written, for `patience` at most;
@@ -106,7 +132,7 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
         reader: Option<Guid>,
-    ) -> Result<(), WriteError> {
+    ) -> Result<usize, WriteError> {
         let mut options = WriteOptionsBuilder::new();
         if timestamp != SourceTimestamp::NONE {
             options = options.source_timestamp(Timestamp::from_ticks(timestamp.0));
@@ -114,8 +140,8 @@ impl RawWriter {
         if let Some(reader) = reader {
             options = options.to_single_reader(GUID::from_bytes(reader.0));
         }
-        match self.inner.write_with_options(RawPayload { bytes, encapsulation }, options.build()) {
-            Ok(_) => Ok(()),
+        match self.inner.write_counting_readers(RawPayload { bytes, encapsulation }, options.build()) {
+            Ok((_, readers)) => Ok(readers),
             Err(DdsWriteError::WouldBlock { .. }) => Err(WriteError::WindowFull),
             Err(_) => Err(WriteError::Refused),
         }

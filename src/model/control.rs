@@ -3,6 +3,7 @@
 use super::health::FixedText;
 use super::modes::{SafetyMode, SubscriberState};
 use super::probe::RefusalCounts;
+use super::sample::Guid;
 use super::time::MonotonicNs;
 
 /// Subscribers that are followed at once: listed ones first, then those that answer without being listed.
@@ -147,6 +148,21 @@ pub struct IntruderRecord {
     pub remedy: FixedText,
     /// When it was first seen.
     pub since: MonotonicNs,
+}
+
+/// Readers of outputs whose nodes control names.
+pub const MAX_NAMED_READERS: usize = 128;
+
+/// The ROS 2 node that has a reader of an output.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct NamedReader {
+    /// The reader; all zero for none.
+    pub reader: Guid,
+    /// Its ROS 2 node; empty when the node has not announced itself.
+    pub node: FixedText,
+    /// The address of its host; empty when it is not known.
+    pub host: FixedText,
 }
 
 #[cfg(test)]

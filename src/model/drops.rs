@@ -44,8 +44,9 @@ drop_reasons! {
     LaneDown = "lane_down",
     /// Lane: the message type of the route is not known yet, so that there is no writer.
     NoWriter = "no_writer",
-    /// Critical lane: the writer's window of unacknowledged samples is full.
-    WindowFull = "window_full",
+    /// Lane: written while no reader was matched, or, after a restart of the lane, while a reader that had
+    /// been matched before was not matched again.
+    NoReader = "no_reader",
     /// Lane: the DDS library refused the sample for another reason.
     WriteFailed = "write_failed",
     /// Noncritical lane: older than the stale threshold.
@@ -73,7 +74,7 @@ impl DropReason {
             Self::QueueOverflow => "the lane took them too slowly; raise its queue_depth",
             Self::LaneDown => "no process served the lane when they came, or it was killed while it had them",
             Self::NoWriter => "the message type is not known yet",
-            Self::WindowFull => "a reader does not acknowledge and the window is full",
+            Self::NoReader => "no subscriber was matched, or not again yet after a restart of the lane",
             Self::WriteFailed => "the DDS library refused them",
             Self::Stale => "older than stale_threshold_ms; are the clocks in step?",
             Self::Superseded => "a fresher one was there",

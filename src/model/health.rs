@@ -5,6 +5,64 @@ use super::drops::DropCounts;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 
+/// Publishers of one route whose samples are numbered in an account of their own.
+pub const MAX_PUBLISHERS: usize = 64;
+
+/// How far ingress has taken the samples of one publisher, by the sequence numbers of its DDS writer.
+///
+/// `last_sequence - first_sequence + 1 = received + lost_upstream`, always.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct PublisherAccount {
+    /// The DDS writer; all zero where no publisher has this place.
+    pub writer: Guid,
+    /// The number of the first sample taken. What has lower numbers was written before ingress first read
+    /// the writer.
+    pub first_sequence: i64,
+    /// The highest number taken: its high-water mark. No sample with this number or a lower one is published
+    /// again.
+    pub last_sequence: i64,
+    /// Samples taken.
+    pub received: u64,
+    /// Numbers between the first and the last that were not taken.
+    pub lost_upstream: u64,
+    /// Samples that arrived with a number at or below the mark, and were discarded.
+    pub repeated: u64,
+    /// When the last sample was taken.
+    pub last_at: MonotonicNs,
+}
+
+impl PublisherAccount {
+    /// The account of a writer whose first sample has this number, before that sample is taken.
+    pub const fn new(writer: Guid, first_sequence: i64) -> Self {
+        Self {
+            writer,
+            first_sequence,
+            last_sequence: first_sequence.saturating_sub(1),
+            received: 0,
+            lost_upstream: 0,
+            repeated: 0,
+            last_at: MonotonicNs(0),
+        }
+    }
+
+    /// Whether no publisher has this place.
+    pub fn is_vacant(&self) -> bool {
+        self.writer == Guid::default()
+    }
+
+    /// Takes the sample with that number, which is above the mark; yields how many numbers were skipped.
+    pub fn take(&mut self, sequence: i64, now: MonotonicNs) -> u64 {
+        let skipped = sequence.saturating_sub(self.last_sequence).saturating_sub(1).max(0).unsigned_abs();
+        self.last_sequence = sequence;
+        self.received += 1;
+        // What the numbers of the writer claim; a hostile one may jump as far as it likes.
+        self.lost_upstream = self.lost_upstream.saturating_add(skipped);
+        self.last_at = now;
+        skipped
+    }
+}
+
 /// What ingress has done on one route. `received = published + drops`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
@@ -23,10 +81,25 @@ pub struct IngressCounters {
     pub drops: DropCounts,
     /// Samples that the publisher numbered and the DDS reader never gave us: lost before the bridge.
     pub lost_upstream: u64,
+    /// Samples that arrived with a number at or below the high-water mark of their publisher, and were
+    /// discarded; not among the received.
+    pub repeated: u64,
+    /// Of the received, those of publishers beyond [`MAX_PUBLISHERS`], which have no high-water mark.
+    pub unmarked: u64,
+    /// The place of the account that changed last.
+    pub changed_place: u64,
+    /// That account as it was left. It is written here in the same step as the counts, and then in its place:
+    /// a successor of a process that died in between finds it here.
+    pub changed_account: PublisherAccount,
     /// Writers matched at present.
     pub writers: u64,
     /// When the last sample was taken.
     pub last_received_at: MonotonicNs,
+    /// How far the clock of `clock_writer` is behind ours in nanoseconds, negative when it is ahead; 0 while
+    /// the clocks of all publishers agree with ours.
+    pub clock_offset_ns: i64,
+    /// The writer whose clock is off furthest; all zero for none.
+    pub clock_writer: Guid,
 }
 
 /// What one lane has done on one route.
@@ -63,6 +136,43 @@ pub struct LaneCounters {
     pub last_writer_sequence: i64,
     /// Readers matched at present.
     pub readers: u64,
+    /// Samples that single readers missed because they did not keep up, summed over all readers ever matched.
+    /// The lane forwarded these samples; the other readers have them.
+    pub reader_overrun: u64,
+}
+
+/// Readers of one output that are recorded by name; further ones are only counted.
+pub const MAX_OUTPUT_READERS: usize = 32;
+
+/// One reader that is matched with an output.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct ReaderRecord {
+    /// The reader; all zero for none.
+    pub reader: Guid,
+    /// Samples written since it was matched, and the history that it was offered then.
+    pub offered: u64,
+    /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
+    pub unacknowledged: u64,
+    /// Of those, samples that left the writer's history before the reader had them.
+    pub overrun: u64,
+    /// 1 for a RELIABLE reader, 0 for a BEST_EFFORT one.
+    pub reliable: u64,
+}
+
+/// The readers that are matched with one output.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct OutputReaders {
+    /// The readers, from the first place on.
+    pub records: [ReaderRecord; MAX_OUTPUT_READERS],
+}
+
+impl OutputReaders {
+    /// The recorded readers.
+    pub fn iter(&self) -> impl Iterator<Item = &ReaderRecord> {
+        self.records.iter().filter(|record| record.reader != Guid::default())
+    }
 }
 
 impl LaneCounters {

@@ -17,18 +17,20 @@ mod thresholds;
 mod time;
 
 pub use control::{
-    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_SUBSCRIBERS, SubscriberRecord, SubscriberWarning,
+    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_SUBSCRIBERS, NamedReader,
+    SubscriberRecord, SubscriberWarning,
 };
 pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
-    FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, ProcessHealth, RouteInfo,
+    FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS,
+    MAX_PUBLISHERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord, RouteInfo,
 };
 pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
-pub use sample::{Encapsulation, Guid, SampleHeader};
+pub use sample::{AgeBasis, Encapsulation, Guid, SampleHeader};
 pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};

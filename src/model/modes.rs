@@ -2,8 +2,10 @@
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 /// What a lane is for. It decides how a lane treats a sample, not how it is scheduled.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum TrafficClass {
     /// Every sample, at the publisher's rate, RELIABLE by default.
     Critical,
@@ -75,7 +77,7 @@ impl fmt::Display for LaneMode {
 }
 
 /// What the classifier makes of one subscriber.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum SubscriberState {
     /// Not enough probe data yet.

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
 /// Why a string is not a name of the kind asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NameError {
@@ -18,6 +20,24 @@ impl fmt::Display for NameError {
 }
 
 impl std::error::Error for NameError {}
+
+/// A type that is serialized as its text, and checked again when it is read.
+macro_rules! text_in_serde {
+    ($name:ident) => {
+        impl Serialize for $name {
+            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                serializer.collect_str(self)
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                let text = String::deserialize(deserializer)?;
+                Self::try_from(text.as_str()).map_err(serde::de::Error::custom)
+            }
+        }
+    };
+}
 
 macro_rules! checked_name {
     ($(#[doc = $doc:literal])+ $name:ident, $kind:literal, $allowed:literal, $check:path) => {
@@ -52,6 +72,8 @@ macro_rules! checked_name {
                 f.write_str(&self.0)
             }
         }
+
+        text_in_serde!($name);
     };
 }
 
@@ -144,6 +166,8 @@ impl fmt::Display for TypeName {
         write!(f, "{}/msg/{}", self.package, self.name)
     }
 }
+
+text_in_serde!(TypeName);
 
 fn is_short_name(text: &str) -> bool {
     text.len() <= 24

@@ -1,7 +1,9 @@
 //! The DDS Quality of Service policies that a route can be given (DDS 1.4 clause 2.2.3).
 
+use serde::{Deserialize, Serialize};
+
 /// RELIABILITY.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Reliability {
     /// A lost sample stays lost.
     BestEffort,
@@ -10,7 +12,7 @@ pub enum Reliability {
 }
 
 /// HISTORY.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum History {
     /// The last `depth` samples; at least 1.
     KeepLast {
@@ -22,7 +24,7 @@ pub enum History {
 }
 
 /// DURABILITY.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Durability {
     /// A late joiner gets what is published from then on.
     Volatile,
@@ -31,7 +33,7 @@ pub enum Durability {
 }
 
 /// The policies of one reader or writer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct QosProfile {
     /// RELIABILITY.
     pub reliability: Reliability,

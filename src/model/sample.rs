@@ -1,5 +1,7 @@
 //! What travels beside a serialized sample from ingress to the lanes.
 
+use std::fmt;
+
 use super::time::{MonotonicNs, SourceTimestamp};
 
 /// The RTPS encapsulation header of a serialized payload (RTPS 2.5 clause 10.2): two bytes of representation
@@ -37,6 +39,16 @@ impl Guid {
     }
 }
 
+impl fmt::Display for Guid {
+    /// Prefix and entity id in hexadecimal, as DDS tools print them: `0102…0c:00000103`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (prefix, entity) = self.0.split_at(12);
+        prefix.iter().try_for_each(|byte| write!(f, "{byte:02x}"))?;
+        f.write_str(":")?;
+        entity.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
 /// The fixed header of one sample in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
@@ -56,6 +68,59 @@ pub struct SampleHeader {
     pub writer_guid: Guid,
     /// How the payload is encoded.
     pub encapsulation: Encapsulation,
-    /// Always 0; keeps the size a multiple of 8 without bytes that nobody wrote.
-    pub reserved: u32,
+    /// From when its age runs.
+    pub age_basis: AgeBasis,
+}
+
+impl SampleHeader {
+    /// The source timestamp, if the age of the sample runs from it.
+    pub const fn age_source(&self) -> SourceTimestamp {
+        match self.age_basis.late_ns() {
+            Some(_) => SourceTimestamp::NONE,
+            None => self.source_timestamp,
+        }
+    }
+
+    /// The instant from which the age of the sample runs where it does not run from a source timestamp.
+    pub const fn age_from(&self) -> MonotonicNs {
+        match self.age_basis.late_ns() {
+            Some(late_ns) => MonotonicNs(self.taken_at.0.saturating_sub(late_ns)),
+            None => self.taken_at,
+        }
+    }
+}
+
+/// From when the age of a sample runs: from its source timestamp, or, where the publisher's clock disagrees
+/// with ours, from its arrival less the time by which it was later than the publisher's promptest samples.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(transparent)]
+pub struct AgeBasis(u32);
+
+impl AgeBasis {
+    /// From the source timestamp, or from the arrival of a sample that has none.
+    pub const SOURCE: Self = Self(0);
+
+    /// From `late_ns` before the arrival; at most 71 minutes.
+    pub const fn arrival(late_ns: u64) -> Self {
+        let late_us = late_ns / 1_000;
+        Self(if late_us >= u32::MAX as u64 { u32::MAX } else { late_us as u32 + 1 })
+    }
+
+    /// How late the sample was on its arrival; `None` when its age runs from the source timestamp.
+    pub const fn late_ns(self) -> Option<u64> {
+        match self.0 {
+            0 => None,
+            code => Some((code as u64 - 1) * 1_000),
+        }
+    }
+
+    /// As shared memory carries it.
+    pub const fn bits(self) -> u32 {
+        self.0
+    }
+
+    /// The basis as shared memory carries it.
+    pub const fn from_bits(bits: u32) -> Self {
+        Self(bits)
+    }
 }

@@ -1,7 +1,9 @@
 //! What the control plane's decisions go by: thresholds and counts, as the configuration has them.
 
+use serde::{Deserialize, Serialize};
+
 /// The two sets of thresholds of the classifier (paper, section III-C), with a gap between them.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClassifierThresholds {
     /// Loss, 0 to 1, above which a reading speaks for demotion.
     pub demote_loss: f64,
@@ -33,7 +35,7 @@ impl Default for ClassifierThresholds {
 
 /// What the safety supervisor goes by (paper, section III-E). The paper gives no numbers: the defaults are
 /// ours, and `policy::SafetySupervisor` says why.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SafetyRules {
     /// Whether the critical path is preserved in DEGRADED; otherwise it stops there too, unless the trouble
     /// is of noncritical lanes alone.

@@ -10,9 +10,10 @@ use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SourceTime
 pub struct Stamps {
     /// The sample's number on its route.
     pub sequence: u64,
-    /// The publisher's DDS source timestamp.
+    /// The publisher's DDS source timestamp, unless its clock disagrees with ours.
     pub source_timestamp: SourceTimestamp,
-    /// When ingress took the sample; stands in for a source timestamp that is missing.
+    /// When ingress took the sample, less its lateness; stands in for a source timestamp that is missing or
+    /// can't be trusted.
     pub taken_at: MonotonicNs,
     /// Size of the serialized payload.
     pub bytes: u64,
@@ -23,8 +24,8 @@ impl Stamps {
     pub const fn new(header: &SampleHeader, bytes: u64) -> Self {
         Self {
             sequence: header.sequence,
-            source_timestamp: header.source_timestamp,
-            taken_at: header.taken_at,
+            source_timestamp: header.age_source(),
+            taken_at: header.age_from(),
             bytes,
         }
     }

@@ -7,8 +7,7 @@
 //! What others can bring about does not:
 //!
 //! - noncritical lanes, whatever they do: DEGRADED at most;
-//! - a subscriber that doesn't acknowledge (`window_full`): nothing. One bad reader would otherwise take the
-//!   data from others, which is what the bridge is there to prevent, and to suspend them wouldn't mend it;
+//! - a subscriber that does not keep up (`reader_overrun`): nothing. The other subscribers have its samples;
 //! - a write that DDS refuses (`write_failed`): DEGRADED at most;
 //! - a publisher's clock: the lag from source to shared memory leads to DEGRADED at most, see [`SourceLag`];
 //! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that

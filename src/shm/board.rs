@@ -3,20 +3,15 @@
 //! All boards of an instance are one segment, which the first process creates and which belongs to none: it
 //! stays until the last process of the instance has left, so a process that died finds its counters again.
 //!
-//! A value is kept in several copies, which take turns. Its one writer fills the next one, then shows it by
-//! counting up the version. A writer that dies within an update therefore leaves the former value, whole. A
-//! reader takes the one that is shown, and once more if the writer has come round to it meanwhile: it waits
-//! for nobody and never sees half a value. The counts of a histogram are single words, and are counted in
-//! place.
+//! Each value is a [`Cell`]; the counts of a histogram are single words, and are counted in place.
 
-use std::marker::PhantomData;
-use std::mem::MaybeUninit;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{Ordering, fence};
+use std::sync::atomic::Ordering;
 
 use nix::fcntl::FlockArg;
 
+use super::cell::{Cell, LINE, Plain, load};
 use super::error::ShmError;
 use super::root::{FileLock, InstanceDir, SHM_DIR};
 use super::segment::Segment;
@@ -24,8 +19,8 @@ use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
     ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
-    LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId,
-    RouteInfo, SubscriberRecord, fnv1a,
+    LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs,
+    NamedReader, OutputReaders, ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord, fnv1a,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.
@@ -84,125 +79,10 @@ pub enum Stage {
 }
 
 /// Counts up when the meaning of a word changes.
-const LAYOUT_VERSION: u32 = 3;
+const LAYOUT_VERSION: u32 = 5;
 /// "ABboards", so that a foreign file is not taken for boards.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
-/// Words of a cache line, on which every value begins, so that two writers never share one.
-const LINE: usize = 8;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
-/// Copies of a value. A reader, which takes some 100 ns when the writer is on another CPU, starts again only
-/// if more than `COPIES - 2` updates came meanwhile.
-const COPIES: u64 = 4;
-/// Turns of a reader, so that a writer that has run wild cannot hold it.
-const READ_ATTEMPTS: usize = 1_000;
-
-/// A type that may be copied through shared memory word by word.
-///
-/// # Safety
-/// `repr(C)`, without padding, of a size that is a multiple of 8 bytes, and every bit pattern is a value.
-unsafe trait Plain: Copy + Default {
-    /// Its size in words.
-    const WORDS: usize = {
-        assert!(size_of::<Self>().is_multiple_of(8));
-        size_of::<Self>() / 8
-    };
-}
-
-// SAFETY: `repr(C)`; words of 8 bytes, then `mode` and 7 reserved bytes, then a word; integers only.
-unsafe impl Plain for ProcessHealth {}
-// SAFETY: `repr(C)`, 64-bit integers only.
-unsafe impl Plain for IngressCounters {}
-// SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
-unsafe impl Plain for LaneCounters {}
-// SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
-unsafe impl Plain for LanePolicy {}
-// SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
-unsafe impl Plain for ControlRecord {}
-// SAFETY: `repr(C)`; 128 bytes of text, nine words, 8 single bytes, 128 bytes of text.
-unsafe impl Plain for SubscriberRecord {}
-// SAFETY: `repr(C)`; four times 128 bytes of text, then a word.
-unsafe impl Plain for IntruderRecord {}
-// SAFETY: `repr(C)`, 128 bytes of text, which is checked when it is looked at.
-unsafe impl Plain for RouteInfo {}
-// SAFETY: `repr(C)`, 64-bit integers only.
-unsafe impl Plain for LatencyHistogram {}
-
-const _: () = {
-    assert!(size_of::<ProcessHealth>() == 12 * 8);
-    assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
-    assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
-    assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
-    assert!(size_of::<LanePolicy>() == 5 * 8);
-    assert!(size_of::<RouteInfo>() == 16 * 8);
-};
-
-/// A value in its copies: a line for the version, then the copies, each on lines of its own.
-#[derive(Debug)]
-struct Cell<T> {
-    at: usize,
-    _type: PhantomData<T>,
-}
-
-impl<T> Clone for Cell<T> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<T> Copy for Cell<T> {}
-
-impl<T: Plain> Cell<T> {
-    const WORDS: usize = LINE + COPIES as usize * Self::COPY_WORDS;
-    const COPY_WORDS: usize = T::WORDS.next_multiple_of(LINE);
-
-    fn at(at: usize) -> Self {
-        Self { at, _type: PhantomData }
-    }
-
-    fn copy_at(self, version: u64) -> usize {
-        self.at + LINE + (version % COPIES) as usize * Self::COPY_WORDS
-    }
-
-    fn read(self, segment: &Segment) -> Option<T> {
-        for _ in 0..READ_ATTEMPTS {
-            let version = segment.word(self.at).load(Ordering::Acquire);
-            let value = load(segment, self.copy_at(version));
-            // The writer begins to fill this copy again, as version `version + COPIES`, only after it has
-            // shown the one before that. If we have read a word of it, this fence makes us see that it was
-            // shown.
-            fence(Ordering::Acquire);
-            let now = segment.word(self.at).load(Ordering::Relaxed);
-            if now.wrapping_sub(version) < COPIES - 1 {
-                return Some(value);
-            }
-        }
-        None
-    }
-
-    fn write(self, segment: &Segment, value: &T) {
-        let version = segment.word(self.at).load(Ordering::Relaxed).wrapping_add(1);
-        // Whoever reads a word of what follows also sees that the version was counted up before.
-        fence(Ordering::Release);
-        let to = self.copy_at(version);
-        for word in 0..T::WORDS {
-            // SAFETY: `T` has `WORDS` words, all of them initialised, as `Plain` promises.
-            let word_value = unsafe { (&raw const *value).cast::<u64>().add(word).read_unaligned() };
-            segment.word(to + word).store(word_value, Ordering::Relaxed);
-        }
-        segment.word(self.at).store(version, Ordering::Release);
-    }
-}
-
-fn load<T: Plain>(segment: &Segment, at: usize) -> T {
-    let mut value = MaybeUninit::<T>::uninit();
-    for word in 0..T::WORDS {
-        let word_value = segment.word(at + word).load(Ordering::Relaxed);
-        // SAFETY: `T` has `WORDS` words.
-        unsafe { value.as_mut_ptr().cast::<u64>().add(word).write_unaligned(word_value) };
-    }
-    // SAFETY: all words are written, and every bit pattern is a value, as `Plain` promises.
-    unsafe { value.assume_init() }
-}
 
 /// Where everything is, in words.
 #[derive(Clone, Copy, Debug)]
@@ -215,9 +95,12 @@ struct Layout {
     control: usize,
     subscribers: usize,
     intruders: usize,
+    named_readers: usize,
     route_info: usize,
     ingress: usize,
+    publishers: usize,
     lane: usize,
+    output_readers: usize,
     histograms: usize,
     words: usize,
 }
@@ -231,10 +114,13 @@ impl Layout {
         let control = policy + lanes * Cell::<LanePolicy>::WORDS;
         let subscribers = control + Cell::<ControlRecord>::WORDS;
         let intruders = subscribers + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
-        let route_info = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
+        let named_readers = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
+        let route_info = named_readers + MAX_NAMED_READERS * Cell::<NamedReader>::WORDS;
         let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
-        let lane = ingress + routes * Cell::<IngressCounters>::WORDS;
-        let histograms = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
+        let publishers = ingress + routes * Cell::<IngressCounters>::WORDS;
+        let lane = publishers + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
+        let output_readers = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
+        let histograms = output_readers + lanes * routes * Cell::<OutputReaders>::WORDS;
         let words = histograms + routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE);
         Self {
             lanes,
@@ -245,9 +131,12 @@ impl Layout {
             control,
             subscribers,
             intruders,
+            named_readers,
             route_info,
             ingress,
+            publishers,
             lane,
+            output_readers,
             histograms,
             words,
         }
@@ -280,12 +169,28 @@ impl Layout {
         Cell::at(self.intruders + place * Cell::<IntruderRecord>::WORDS)
     }
 
+    fn named_reader(&self, place: usize) -> Cell<NamedReader> {
+        assert!(place < MAX_NAMED_READERS, "named reader {place} of {MAX_NAMED_READERS}");
+        Cell::at(self.named_readers + place * Cell::<NamedReader>::WORDS)
+    }
+
+    fn output_readers(&self, lane: usize, route: usize) -> Cell<OutputReaders> {
+        let place = self.check_lane(lane) * self.routes + self.check_route(route);
+        Cell::at(self.output_readers + place * Cell::<OutputReaders>::WORDS)
+    }
+
     fn route_info(&self, route: usize) -> Cell<RouteInfo> {
         Cell::at(self.route_info + self.check_route(route) * Cell::<RouteInfo>::WORDS)
     }
 
     fn ingress(&self, route: usize) -> Cell<IngressCounters> {
         Cell::at(self.ingress + self.check_route(route) * Cell::<IngressCounters>::WORDS)
+    }
+
+    fn publisher(&self, route: usize, place: usize) -> Cell<PublisherAccount> {
+        assert!(place < MAX_PUBLISHERS, "publisher {place} of {MAX_PUBLISHERS}");
+        let index = self.check_route(route) * MAX_PUBLISHERS + place;
+        Cell::at(self.publishers + index * Cell::<PublisherAccount>::WORDS)
     }
 
     fn lane(&self, lane: usize, route: usize) -> Cell<LaneCounters> {
@@ -396,6 +301,17 @@ impl Boards {
         self.writer(self.layout.ingress(route))
     }
 
+    /// The account of the publisher at a place below [`MAX_PUBLISHERS`] of a route.
+    pub fn publisher(&self, route: usize, place: usize) -> Option<PublisherAccount> {
+        self.layout.publisher(route, place).read(&self.segment)
+    }
+
+    /// Writes the account of the publisher at a place below [`MAX_PUBLISHERS`] of a route, beginning with
+    /// what its predecessor wrote.
+    pub fn publisher_writer(&self, route: usize, place: usize) -> BoardWriter<PublisherAccount> {
+        self.writer(self.layout.publisher(route, place))
+    }
+
     /// What a lane has counted on a route.
     pub fn lane(&self, lane: usize, route: usize) -> Option<LaneCounters> {
         self.layout.lane(lane, route).read(&self.segment)
@@ -434,6 +350,26 @@ impl Boards {
     /// Writes the intruder at a place below [`MAX_INTRUDERS`].
     pub fn intruder_writer(&self, place: usize) -> BoardWriter<IntruderRecord> {
         self.writer(self.layout.intruder(place))
+    }
+
+    /// The reader that control names at a place below [`MAX_NAMED_READERS`].
+    pub fn named_reader(&self, place: usize) -> Option<NamedReader> {
+        self.layout.named_reader(place).read(&self.segment)
+    }
+
+    /// Writes the reader that control names at a place below [`MAX_NAMED_READERS`].
+    pub fn named_reader_writer(&self, place: usize) -> BoardWriter<NamedReader> {
+        self.writer(self.layout.named_reader(place))
+    }
+
+    /// The readers that are matched with a lane's output of a route.
+    pub fn output_readers(&self, lane: usize, route: usize) -> Option<OutputReaders> {
+        self.layout.output_readers(lane, route).read(&self.segment)
+    }
+
+    /// Records the readers of a lane's output of a route, beginning with what its predecessor recorded.
+    pub fn output_readers_writer(&self, lane: usize, route: usize) -> BoardWriter<OutputReaders> {
+        self.writer(self.layout.output_readers(lane, route))
     }
 
     /// What ingress found out about a route.

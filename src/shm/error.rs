@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use crate::model::RouteId;
+use crate::model::{InstanceName, RouteId};
 
 /// Why shared memory could not be set up. `Display` says what failed, where, and what to do about it.
 #[derive(Debug)]
@@ -36,6 +36,13 @@ pub enum ShmError {
         /// The role.
         role: String,
         /// The process that serves it; 0 when it has not said yet.
+        pid: u32,
+    },
+    /// The bridge is to be started as a whole, and processes of its instance run.
+    AlreadyRuns {
+        /// The instance.
+        instance: InstanceName,
+        /// One of the processes: that of `up` if there is one; 0 when it has not said yet.
         pid: u32,
     },
     /// Shared memory has less room than the bridge needs.
@@ -110,6 +117,9 @@ impl fmt::Display for ShmError {
             ),
             Self::AlreadyServed { role, pid } => {
                 write!(f, "{role} is served already, by process {pid}; stop it first")
+            }
+            Self::AlreadyRuns { instance, pid } => {
+                write!(f, "the bridge runs already as instance {instance}, process {pid}; stop it first")
             }
             Self::NoRoom { what, needed_bytes, free_bytes, path } => write!(
                 f,

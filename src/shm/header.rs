@@ -4,7 +4,7 @@ use std::fmt;
 
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
+use crate::model::{AgeBasis, Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
 
 /// The size of a [`SampleHeader`] in shared memory.
 pub const HEADER_BYTES: usize = size_of::<SampleHeader>();
@@ -16,8 +16,6 @@ pub enum HeaderError {
     WrongLength,
     /// Sequences begin at 1.
     SequenceZero,
-    /// The reserved field is not 0.
-    ReservedNotZero,
     /// The payload is longer than the route allows.
     PayloadTooLong,
 }
@@ -27,7 +25,6 @@ impl fmt::Display for HeaderError {
         f.write_str(match self {
             Self::WrongLength => "a sample header of the wrong length",
             Self::SequenceZero => "a sample header with sequence 0",
-            Self::ReservedNotZero => "a sample header whose reserved field is not 0",
             Self::PayloadTooLong => "a sample longer than its route allows",
         })
     }
@@ -36,7 +33,7 @@ impl fmt::Display for HeaderError {
 impl std::error::Error for HeaderError {}
 
 /// Reads a header from bytes that any process may have written. Every encapsulation and every timestamp is
-/// let through: they are forwarded as they came.
+/// let through: they are forwarded as they came. So is every age basis, each of which means something.
 pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
     let bytes: &[u8; HEADER_BYTES] = bytes.try_into().map_err(|_| HeaderError::WrongLength)?;
     let word = |at: usize| {
@@ -54,20 +51,14 @@ pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
         writer_sequence: word(32).cast_signed(),
         writer_guid,
         encapsulation: Encapsulation([bytes[56], bytes[57], bytes[58], bytes[59]]),
-        reserved: u32::from_ne_bytes([bytes[60], bytes[61], bytes[62], bytes[63]]),
+        age_basis: AgeBasis::from_bits(u32::from_ne_bytes([bytes[60], bytes[61], bytes[62], bytes[63]])),
     };
     check(&header)?;
     Ok(header)
 }
 
 pub(super) fn check(header: &SampleHeader) -> Result<(), HeaderError> {
-    if header.sequence == 0 {
-        Err(HeaderError::SequenceZero)
-    } else if header.reserved != 0 {
-        Err(HeaderError::ReservedNotZero)
-    } else {
-        Ok(())
-    }
+    if header.sequence == 0 { Err(HeaderError::SequenceZero) } else { Ok(()) }
 }
 
 /// A [`SampleHeader`] as iceoryx2's user header.
@@ -97,7 +88,7 @@ impl Default for WireHeader {
             writer_sequence: 0,
             writer_guid: Guid::default(),
             encapsulation: Encapsulation([0; 4]),
-            reserved: 0,
+            age_basis: AgeBasis::SOURCE,
         })
     }
 }
@@ -121,16 +112,14 @@ mod tests {
         wire.0.writer_sequence = -1;
         wire.0.writer_guid = Guid([7; 16]);
         wire.0.encapsulation = Encapsulation([1, 2, 3, 4]);
+        wire.0.age_basis = AgeBasis::arrival(5_000);
         assert_eq!(decode_header(&bytes_of(wire)), Ok(wire.0));
     }
 
     #[test]
     fn headers_that_ingress_never_writes_are_refused() {
-        let mut wire = WireHeader::default();
+        let wire = WireHeader::default();
         assert_eq!(decode_header(&bytes_of(wire)), Err(HeaderError::SequenceZero));
-        wire.0.sequence = 1;
-        wire.0.reserved = 1;
-        assert_eq!(decode_header(&bytes_of(wire)), Err(HeaderError::ReservedNotZero));
         assert_eq!(decode_header(&[0; HEADER_BYTES - 1]), Err(HeaderError::WrongLength));
         assert_eq!(decode_header(&[]), Err(HeaderError::WrongLength));
     }

@@ -60,6 +60,11 @@ impl RoleHolder {
     }
 }
 
+/// Whether the process holds a lock on the file of that inode.
+pub(super) fn is_locked_by(pid: u32, inode: u64) -> bool {
+    fs::read_to_string(LOCKS).is_ok_and(|locks| holds(&locks, pid, inode))
+}
+
 /// The files of an instance in the shared-memory file system, whoever made them.
 pub fn instance_files(root: &Path, instance: &InstanceName) -> Vec<PathBuf> {
     match InstanceDir::find(root, instance) {

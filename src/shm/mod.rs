@@ -7,15 +7,18 @@
 //! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
 //! - [`RoleLock`]: at most one process for each role; [`RoleHolder`]: which one.
+//! - [`InForceShare`]: the configuration in force, which lasts as long as any process of the bridge runs.
 //!
 //! No type of iceoryx2 leaves this module. What may be killed, stopped or restarted at any moment is every
 //! process; `docs/decisions/0004-shared-memory.md` says how each primitive bears it.
 
 mod board;
+mod cell;
 mod channel;
 mod error;
 mod header;
 mod holders;
+mod in_force;
 mod node;
 mod root;
 mod sample_error;
@@ -31,6 +34,7 @@ pub use channel::{
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
 pub use holders::{RoleHolder, instance_files};
+pub use in_force::{BridgeAddress, InForceFile, InForceShare};
 pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
 pub use sample_error::{LoanError, PublishError, TakeError};

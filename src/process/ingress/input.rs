@@ -7,8 +7,10 @@ use tracing::{error, info, warn};
 use super::super::inbox::{Bell, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
+use super::clocks::Clocks;
 use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
+use super::publishers::{Publishers, Standing};
 use super::source::{Source, Wanted, label, still_suits};
 use crate::clock;
 use crate::config::{Route, Settings};
@@ -39,7 +41,8 @@ pub(super) struct Input {
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
     bell: Arc<Bell>,
-    followed: Arc<Followed>,
+    clocks: Clocks,
+    publishers: Publishers,
     watch: DropWatch,
     remind_at: MonotonicNs,
     conflict: Option<(String, String)>,
@@ -57,6 +60,7 @@ impl Input {
         let route = settings.routes[index].clone();
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
+        let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
         Ok(Self {
             id: route.id.to_string(),
             dds_topic: route.input_topic.to_dds(),
@@ -70,7 +74,8 @@ impl Input {
             counters,
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
-            followed: Arc::default(),
+            clocks: Clocks::new(route.id.as_str()),
+            publishers,
             bell: Arc::clone(bell),
             remind_at: MonotonicNs(0),
             conflict: None,
@@ -81,6 +86,11 @@ impl Input {
     /// Whether a publisher was found and is read.
     pub fn is_connected(&self) -> bool {
         self.connection.as_ref().is_some_and(|connection| !connection.idle)
+    }
+
+    /// Whether a sample has come of each publisher that wrote until the predecessor of this process died.
+    pub fn has_resumed(&self) -> bool {
+        self.publishers.have_resumed()
     }
 
     /// What was done so far.
@@ -119,9 +129,9 @@ impl Input {
         true
     }
 
-    /// The writers whose samples came.
+    /// The high-water marks of the publishers.
     pub fn followed(&self) -> Arc<Followed> {
-        self.followed.clone()
+        self.publishers.followed()
     }
 
     fn publish(
@@ -133,19 +143,27 @@ impl Input {
     ) {
         let taken_at = clock::monotonic();
         let taken_at_wall = clock::wall();
-        let lost_upstream = self.followed.missing_before(origin.writer, origin.sequence);
+        let place = match self.publishers.standing(origin.writer, origin.sequence, taken_at) {
+            Standing::Next(place) => Some(place),
+            Standing::Unmarked => None,
+            Standing::Repeated(place) => {
+                self.publishers.update(place, &mut self.counters, |counters, account| {
+                    counters.repeated += 1;
+                    account.repeated += 1;
+                });
+                return;
+            }
+        };
+        let source = origin.source_timestamp;
+        let age_basis = self.clocks.observe(origin.writer, source, taken_at, taken_at_wall);
         let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
             Err(_) => Some(DropReason::PoolExhausted),
         };
-        // Counted before it is published: a process that dies in between leaves a hole in the sequence, which
-        // the lanes count, and not two samples of one number.
-        let sequence = self.counters.update(|counters| {
+        let count = |counters: &mut IngressCounters| {
             counters.received += 1;
             counters.received_bytes += filled.bytes as u64;
-            // What a writer's numbers claim; a hostile one may jump as far as it likes.
-            counters.lost_upstream = counters.lost_upstream.saturating_add(lost_upstream);
             counters.last_received_at = taken_at;
             match dropped {
                 Some(reason) => counters.drops.add(reason, 1),
@@ -155,7 +173,20 @@ impl Input {
                 }
             }
             counters.published
-        });
+        };
+        // Counted before it is published: a process that dies in between leaves a hole in the sequence, which
+        // the lanes count, and neither two samples of one number nor one sample published twice.
+        let sequence = match place {
+            Some(place) => self.publishers.update(place, &mut self.counters, |counters, account| {
+                let lost = account.take(origin.sequence, taken_at);
+                counters.lost_upstream = counters.lost_upstream.saturating_add(lost);
+                count(counters)
+            }),
+            None => self.counters.update(|counters| {
+                counters.unmarked += 1;
+                count(counters)
+            }),
+        };
         if let Ok(slot) = filled.slot {
             let header = SampleHeader {
                 sequence,
@@ -165,7 +196,7 @@ impl Input {
                 writer_sequence: origin.sequence,
                 writer_guid: origin.writer,
                 encapsulation,
-                reserved: 0,
+                age_basis,
             };
             let published = slot.publish(header);
             wake();
@@ -173,8 +204,10 @@ impl Input {
                 error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
             }
         }
-        if let Some(written) = origin.source_timestamp.to_wall() {
-            self.dds_in.record(taken_at_wall.since(written));
+        match (age_basis.late_ns(), source.to_wall()) {
+            (Some(late_ns), _) => self.dds_in.record(late_ns),
+            (None, Some(written)) => self.dds_in.record(taken_at_wall.since(written)),
+            (None, None) => {}
         }
     }
 
@@ -191,6 +224,7 @@ impl Input {
             return;
         }
         self.source_changed = true;
+        self.publishers.found(writer.guid);
         if self.source.found(writer) {
             info!(
                 route = self.id,
@@ -205,11 +239,13 @@ impl Input {
     /// A participant is gone, and with it its writers.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
         self.source_changed |= self.source.participant_gone(prefix);
+        self.publishers.participant_gone(prefix);
     }
 
     /// A writer is gone; whatever its topic.
     pub fn writer_gone(&mut self, guid: Guid) {
         self.source.gone(guid);
+        self.publishers.gone(guid);
         self.source_changed = true;
     }
 
@@ -234,6 +270,11 @@ impl Input {
             }
         }
         self.pool.attend();
+        let mut counters = *self.counters.get();
+        self.clocks.keep_house(&mut counters, now);
+        if counters != *self.counters.get() {
+            self.counters.update(|present| *present = counters);
+        }
         self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[], now);
         Ok(())
     }
@@ -298,7 +339,8 @@ impl Input {
         self.disconnect(participant);
         // Before the reader: a lane must be able to make its writer before the first sample reaches it.
         self.info.update(|info| info.dds_type = FixedText::new(&dds_type));
-        let reader = participant.create_reader(&self.dds_topic, &dds_type, &qos)?;
+        let marks = self.publishers.marks();
+        let reader = participant.create_reader_after(&self.dds_topic, &dds_type, &qos, marks)?;
         reader.lend_memory(self.pool.lender());
         info!(
             route = self.id,

@@ -4,11 +4,13 @@
 //! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house, and
 //! a third one gets the critical lanes up meanwhile ([`lookout`]).
 
+mod clocks;
 mod expected;
 mod followed;
 mod input;
 mod lookout;
 mod pool;
+mod publishers;
 mod receiving;
 mod source;
 
@@ -40,6 +42,14 @@ const LAST_SAMPLES_MS: u64 = 200;
 /// before the reader exists is lost to a VOLATILE reader.
 const SEARCHING_MS: u64 = 10;
 
+/// How long at most the publishers retain what they wrote while no ingress ran: the reader of a killed
+/// predecessor, which acknowledges nothing, also holds up a publisher whose history is full.
+const RESUME_MS: u64 = 1_000;
+
+/// The same once the first of these samples has come of each publisher: as one request names 256 samples, the
+/// others may take two or three more.
+const RESUMED_MS: u64 = 200;
+
 /// Runs ingress until `stop` is requested. Of what a reload changes, nothing concerns ingress.
 ///
 /// # Errors
@@ -69,6 +79,10 @@ struct Ingress {
     role: Role,
     /// Turns of the receiving thread at the last housekeeping.
     turns_seen: u64,
+    /// Whether samples have come of each publisher that wrote until the predecessor died.
+    has_resumed: bool,
+    /// When the participant of a killed predecessor is disposed of at the latest.
+    resume_until: MonotonicNs,
     housekeeping_at: MonotonicNs,
     received: Meter,
 }
@@ -119,6 +133,7 @@ impl Ingress {
             graph_gid_bytes: settings.graph_gid_bytes,
         };
         let participant = role.join_receiving(&options, on_arriving, on_received)?;
+        let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let lookout = Lookout::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
@@ -127,6 +142,8 @@ impl Ingress {
             participant,
             role,
             turns_seen: 0,
+            has_resumed: false,
+            resume_until,
             housekeeping_at,
             received: Meter::default(),
         };
@@ -169,11 +186,21 @@ impl Ingress {
             }
         }
         let mut searching = false;
+        let mut resumed = true;
         let kept = self.visit(|input, participant| {
             let kept = input.keep_house(participant, now);
             searching |= !input.is_connected();
+            resumed &= input.has_resumed();
             kept
         });
+        // Not earlier: a publisher lets go of samples that no matched reader has yet to acknowledge, and the
+        // readers of this process have not requested them yet.
+        if resumed && !std::mem::replace(&mut self.has_resumed, true) {
+            self.resume_until = self.resume_until.min(now.plus_ms(RESUMED_MS));
+        }
+        if self.role.has_former() && now >= self.resume_until {
+            self.role.dispose_former(&self.participant);
+        }
         // What shows as alive is the thread that receives, not this one: it is shown when that thread has
         // turned since, and asked to turn again, whether or not anything arrives.
         let turns = self.receiving.turns();
