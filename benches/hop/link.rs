@@ -245,7 +245,7 @@ fn publisher(arguments: &[String]) -> Result<(), String> {
             let timestamp = SourceTimestamp::from_wall(clock::wall());
             payload[16..24].copy_from_slice(&clock::monotonic().0.to_ne_bytes());
             match writer.write(payload.freeze(), Encapsulation::CDR_LE, timestamp) {
-                Ok(()) => accepted += 1,
+                Ok(_) => accepted += 1,
                 Err(_) => refused += 1,
             }
         }

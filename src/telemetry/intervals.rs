@@ -87,7 +87,7 @@ impl Intervals {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{Encapsulation, Guid, SourceTimestamp};
+    use crate::model::{AgeBasis, Encapsulation, Guid, SourceTimestamp};
 
     fn sample(sequence: u64, at_ms: u64) -> SampleHeader {
         SampleHeader {
@@ -98,7 +98,7 @@ mod tests {
             writer_sequence: 0,
             writer_guid: Guid::default(),
             encapsulation: Encapsulation::CDR_LE,
-            reserved: 0,
+            age_basis: AgeBasis::SOURCE,
         }
     }
 

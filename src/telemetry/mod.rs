@@ -26,7 +26,7 @@ pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problems::{Level, Problem};
 pub use report::{
     Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
-    Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+    PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 pub use snapshot::{
     LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,

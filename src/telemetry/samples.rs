@@ -4,7 +4,7 @@ use super::liveness::ProcessState;
 use super::problems::{Level, Problem};
 use super::report::{
     Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
-    Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+    PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 use crate::model::{DropCounts, DropReason, ProbeRefusal, RefusalCounts};
 
@@ -30,6 +30,16 @@ pub(super) fn wide() -> Report {
         lane: "a_lane_of_24_characters_".into(),
         topic: topic.clone(),
         readers: 99_999,
+        matched_readers: vec![ReaderReport {
+            guid: "0".repeat(33),
+            node: Some("/a_node".into()),
+            host: None,
+            reliability: "BEST_EFFORT",
+            offered: u64::MAX,
+            unacknowledged: u64::MAX,
+            overrun: u64::MAX,
+        }],
+        reader_overrun: u64::MAX,
         received: u64::MAX,
         forwarded: u64::MAX,
         forwarded_bytes: u64::MAX,
@@ -84,12 +94,25 @@ pub(super) fn wide() -> Report {
             published: 0,
             in_place: 0,
             lost_upstream: 9_999_999_999_999,
+            repeated: 0,
+            unmarked: 0,
+            publishers: vec![PublisherReport {
+                writer: "0102030405060708090a0b0c:00000103".into(),
+                first_sequence: 1,
+                last_sequence: i64::MAX,
+                received: u64::MAX,
+                lost_upstream: u64::MAX,
+                repeated: u64::MAX,
+                last_received_age_ms: Some(1.0),
+            }],
             drops: drops(u64::MAX / 100),
             drops_in_window: drops(0),
             whole: true,
             rate_hz: Some(99_999.9),
             bytes_per_s: Some(1e11),
             last_received_age_ms: None,
+            clock_offset_s: Some(-5.0),
+            clock_offset_writer: Some("0".repeat(33)),
             dds_in: latency,
             lanes: vec![output],
         }],

@@ -8,9 +8,10 @@ use super::liveness::ProcessState;
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{
-    ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_SUBSCRIBERS, MonotonicNs, ProcessHealth, RouteId,
-    SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
+    ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneMode, LaneName,
+    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_PUBLISHERS, MAX_SUBSCRIBERS,
+    MonotonicNs, NamedReader, OutputReaders, ProcessHealth, PublisherAccount, RouteId, SubscriberRecord,
+    TopicName, TrafficClass, TypeName, WallNs,
 };
 use crate::policy::effective_mode;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -44,6 +45,8 @@ pub struct Snapshot {
     pub subscribers: Vec<SubscriberReading>,
     /// The remote readers that reach past the bridge, as control found them.
     pub intruders: Vec<IntruderRecord>,
+    /// The nodes of the outputs' readers, as control found them.
+    pub named_readers: Vec<NamedReader>,
 }
 
 /// One subscriber, as control sees it.
@@ -129,6 +132,8 @@ pub struct RouteReading {
     pub message_type: Option<String>,
     /// What ingress counted.
     pub counters: IngressCounters,
+    /// The accounts of its publishers; one of which no sample came has none.
+    pub publishers: Vec<PublisherAccount>,
     /// From the publisher's source timestamp to ingress.
     pub dds_in: LatencyHistogram,
     /// The lanes that serve it.
@@ -144,6 +149,8 @@ pub struct OutputReading {
     pub topic: TopicName,
     /// What the lane counted.
     pub counters: LaneCounters,
+    /// The readers that are matched with it.
+    pub readers: OutputReaders,
     /// From ingress to the lane.
     pub shm: LatencyHistogram,
     /// Within the lane, up to its DDS writer.
@@ -205,6 +212,7 @@ impl Snapshot {
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
             intruders: read_intruders(boards, &control)?,
+            named_readers: read_named_readers(boards)?,
             control,
             lanes,
         })
@@ -241,6 +249,17 @@ fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<Intrud
         }
     }
     Ok(intruders)
+}
+
+fn read_named_readers(boards: &Boards) -> Result<Vec<NamedReader>, ShmError> {
+    let mut named = Vec::new();
+    for place in 0..MAX_NAMED_READERS {
+        let record = steady(boards.named_reader(place))?;
+        if record.reader != Guid::default() {
+            named.push(record);
+        }
+    }
+    Ok(named)
 }
 
 /// The places of a table that are taken; the board may say any number.
@@ -297,20 +316,44 @@ fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<Rout
                 lane,
                 topic: output.topic.clone(),
                 counters: read_lane(boards, lane, index)?,
+                readers: steady(boards.output_readers(lane, index))?,
                 shm: boards.histogram(Stage::Shm(lane), index),
                 dds_out: boards.histogram(Stage::DdsOut(lane), index),
                 age: boards.histogram(Stage::Age(lane), index),
             });
         }
     }
+    let counters = steady(boards.ingress(index))?;
     Ok(RouteReading {
+        publishers: read_publishers(boards, index, &counters)?,
+        counters,
         id: route.id.clone(),
         input_topic: route.input_topic.clone(),
         message_type: found.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
-        counters: steady(boards.ingress(index))?,
         dds_in: boards.histogram(Stage::DdsIn, index),
         outputs,
     })
+}
+
+fn read_publishers(
+    boards: &Boards,
+    route: usize,
+    counters: &IngressCounters,
+) -> Result<Vec<PublisherAccount>, ShmError> {
+    let mut accounts = Vec::new();
+    for place in 0..MAX_PUBLISHERS {
+        let account = steady(boards.publisher(route, place))?;
+        // While a process counts a sample, and after it died there, the account is with the counts only.
+        let changed = &counters.changed_account;
+        let is_behind = counters.changed_place == place as u64
+            && !changed.is_vacant()
+            && (account.writer != changed.writer || account.last_sequence < changed.last_sequence);
+        let account = if is_behind { *changed } else { account };
+        if !account.is_vacant() {
+            accounts.push(account);
+        }
+    }
+    Ok(accounts)
 }
 
 fn read_lane(boards: &Boards, lane: usize, route: usize) -> Result<LaneCounters, ShmError> {

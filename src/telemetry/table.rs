@@ -4,8 +4,8 @@ use std::fmt::{self, Write};
 
 use super::liveness::ProcessState;
 use super::report::{
-    Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, Report,
-    RouteReport, SafetyReport, SubscriberReport,
+    Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, PublisherReport,
+    Report, RouteReport, SafetyReport, SubscriberReport,
 };
 
 /// No line is longer, but for a sentence that says what is wrong, where names may be of any length.
@@ -82,6 +82,16 @@ fn route_text(route: &RouteReport) -> String {
         &route.lost_upstream.to_string(),
     ]);
     text.push_str(&drops_text(&route.drops, &route.drops_in_window));
+    for publisher in route.publishers.iter().filter(|of| of.lost_upstream > 0 || of.repeated > 0) {
+        let PublisherReport { writer, received, lost_upstream, repeated, .. } = publisher;
+        let counts = [
+            format!("{received} received, "),
+            format!("{lost_upstream} lost before, "),
+            format!("{repeated} repeated"),
+        ];
+        let first = format!("    publisher {writer}: ");
+        text.push_str(&wrapped(&first, "      ", counts.iter().map(String::as_str), ""));
+    }
     text
 }
 

@@ -1,4 +1,5 @@
-//! Readers on other hosts that reach past the bridge, and the readers behind a critical write that failed.
+//! Readers on other hosts that reach past the bridge, and the nodes of the outputs' readers: which of them
+//! miss samples.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -9,34 +10,32 @@ use super::super::role::RoleError;
 use super::networks;
 use crate::config::Settings;
 use crate::dds::{self, Discovery, GraphWatch, Participant};
-use crate::model::{DropReason, FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MonotonicNs, TrafficClass};
+use crate::model::{
+    FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_READERS, MonotonicNs, NamedReader, TrafficClass,
+};
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
 use crate::shm::{BoardWriter, Boards};
 
-/// Interfaces come and go with Wi-Fi: this host's addresses are looked at so often.
-const ADDRESSES_MS: u64 = 5_000;
+/// The nodes and the losses of the outputs' readers are looked at so often.
+const READERS_MS: u64 = 1_000;
 
-/// Readers of critical outputs that are remembered, to be named when writes fail.
-const MAX_READERS: usize = 64;
-
-/// Failed writes of one lane and topic are warned of at most so often.
-const FAILED_WRITES_REPEAT_MS: u64 = 10_000;
+/// The log names a reader that misses samples at most so often.
+const OVERRUN_REPEAT_MS: u64 = 10_000;
 
 /// One network that is watched.
 struct Watched {
     watch: IntruderWatch,
     graph: GraphWatch,
-    /// The critical outputs there, by DDS name: lane and route.
+    /// The outputs there, by DDS name: lane and route.
     outputs: BTreeMap<String, (usize, usize)>,
     /// Their readers, by topic.
     readers: Vec<(Guid, String, Location)>,
 }
 
-/// Critical writes that failed on one topic.
-struct FailedWrites {
-    lane: usize,
-    route: usize,
-    counted: u64,
+/// Samples that one reader missed, as far as the log says.
+struct LoggedOverrun {
+    reader: Guid,
+    samples: u64,
     warn_at: MonotonicNs,
 }
 
@@ -44,9 +43,10 @@ struct FailedWrites {
 pub(super) struct Guard {
     /// One for each network, in the order of the participants.
     networks: Vec<Watched>,
-    failed_writes: Vec<FailedWrites>,
+    overruns: Vec<LoggedOverrun>,
+    named: Vec<BoardWriter<NamedReader>>,
+    readers_at: MonotonicNs,
     own: Vec<IpAddr>,
-    addresses_at: MonotonicNs,
     places: Vec<BoardWriter<IntruderRecord>>,
     shown: usize,
     boards: Boards,
@@ -71,11 +71,14 @@ impl Guard {
                 }));
             }
             for (lane, configured) in settings.lanes.iter().enumerate() {
-                if configured.class != TrafficClass::Critical || network_of_lane[lane] != network {
+                if network_of_lane[lane] != network {
                     continue;
                 }
                 for output in &configured.outputs {
                     outputs.insert(output.topic.to_dds(), (lane, output.route));
+                    if configured.class != TrafficClass::Critical {
+                        continue;
+                    }
                     guarded.push(GuardedTopic {
                         topic: output.topic.clone(),
                         guarded: Guarded::CriticalOutput,
@@ -90,24 +93,21 @@ impl Guard {
                 readers: Vec::new(),
             });
         }
-        let failed_writes = watched.iter().flat_map(|network| network.outputs.values());
-        let failed_writes = failed_writes
-            .map(|&(lane, route)| FailedWrites {
-                lane,
-                route,
-                counted: failed(boards, lane, route),
-                warn_at: MonotonicNs(0),
-            })
-            .collect();
+        let mut named: Vec<_> =
+            (0..MAX_NAMED_READERS).map(|place| boards.named_reader_writer(place)).collect();
+        for place in &mut named {
+            place.update(|record| *record = NamedReader::default());
+        }
         let mut places: Vec<_> = (0..MAX_INTRUDERS).map(|place| boards.intruder_writer(place)).collect();
         for place in &mut places {
             place.update(|record| *record = IntruderRecord::default());
         }
         Ok(Self {
             networks: watched,
-            failed_writes,
+            overruns: Vec::new(),
+            named,
+            readers_at: MonotonicNs(0),
             own: Vec::new(),
-            addresses_at: MonotonicNs(0),
             places,
             shown: 0,
             boards: boards.clone(),
@@ -127,18 +127,21 @@ impl Guard {
 
     /// Takes in what discovery says; warns of what is new.
     pub fn keep_house(&mut self, participants: &mut [Participant], settings: &Settings, now: MonotonicNs) {
-        if now >= self.addresses_at {
-            match dds::host_addresses() {
-                Ok(own) => self.own = own,
-                Err(error) => {
-                    warn!(%error, "this host's addresses are not known: who is remote cannot be told")
-                }
-            }
-            self.addresses_at = now.plus_ms(ADDRESSES_MS);
-        }
         let mut changed = false;
         for (network, participant) in self.networks.iter_mut().zip(participants) {
+            let mut are_addresses_current = false;
             while let Some(change) = participant.poll_discovery() {
+                // Anew for what discovery says: an endpoint of this host that is announced again after a
+                // change of the host's address would be taken for a remote one.
+                if !are_addresses_current {
+                    are_addresses_current = true;
+                    match dds::host_addresses() {
+                        Ok(own) => self.own = own,
+                        Err(error) => {
+                            warn!(%error, "this host's addresses are not known: who is remote cannot be told")
+                        }
+                    }
+                }
                 network.take_in(change, participant, &self.own, now);
             }
             network.graph.poll();
@@ -154,7 +157,11 @@ impl Guard {
         if changed {
             self.show();
         }
-        self.name_laggards(settings, now);
+        if now >= self.readers_at {
+            self.readers_at = now.plus_ms(READERS_MS);
+            self.name_readers();
+            self.log_overruns(settings, now);
+        }
     }
 
     fn show(&mut self) {
@@ -175,31 +182,60 @@ impl Guard {
         }
     }
 
-    /// A laggard is not always remote: whoever is matched when critical writes fail may be it.
-    fn name_laggards(&mut self, settings: &Settings, now: MonotonicNs) {
-        for writes in &mut self.failed_writes {
-            let total = failed(&self.boards, writes.lane, writes.route);
-            let failed = total.saturating_sub(writes.counted);
-            if failed == 0 || now < writes.warn_at {
-                continue;
+    /// Shows the nodes of the outputs' readers.
+    fn name_readers(&mut self) {
+        let readers = self.networks.iter().flat_map(Watched::named_readers);
+        let mut readers = readers.chain(std::iter::repeat(NamedReader::default()));
+        for (place, reader) in self.named.iter_mut().zip(&mut readers) {
+            if *place.get() != reader {
+                place.update(|shown| *shown = reader);
             }
-            writes.counted = total;
-            writes.warn_at = now.plus_ms(FAILED_WRITES_REPEAT_MS);
-            let lane = &settings.lanes[writes.lane];
-            let readers: Vec<String> = self
-                .networks
-                .iter()
-                .flat_map(|network| network.readers_of(writes.lane, writes.route))
-                .collect();
-            warn!(
-                lane = lane.name.as_str(),
-                route = settings.routes[writes.route].id.as_str(),
-                failed,
-                readers = if readers.is_empty() { "none known".to_owned() } else { readers.join("; ") },
-                "critical writes failed: one of the readers that are matched does not acknowledge; make it \
-                 BEST_EFFORT, or move it to a noncritical lane"
-            );
         }
+    }
+
+    /// Warns of each reader that missed samples since it was warned of.
+    fn log_overruns(&mut self, settings: &Settings, now: MonotonicNs) {
+        let mut matched = Vec::new();
+        for (lane, configured) in settings.lanes.iter().enumerate() {
+            for output in &configured.outputs {
+                let readers = self.boards.output_readers(lane, output.route).unwrap_or_default();
+                for record in readers.iter() {
+                    matched.push(record.reader);
+                    let logged = match self.overruns.iter().position(|logged| logged.reader == record.reader)
+                    {
+                        Some(place) => &mut self.overruns[place],
+                        None if record.overrun == 0 => continue,
+                        None => {
+                            self.overruns.push(LoggedOverrun {
+                                reader: record.reader,
+                                samples: 0,
+                                warn_at: now,
+                            });
+                            let last = self.overruns.len() - 1;
+                            &mut self.overruns[last]
+                        }
+                    };
+                    let missed = record.overrun.saturating_sub(logged.samples);
+                    if missed == 0 || now < logged.warn_at {
+                        continue;
+                    }
+                    logged.samples = record.overrun;
+                    logged.warn_at = now.plus_ms(OVERRUN_REPEAT_MS);
+                    let reader = self.networks.iter().find_map(|network| network.name_of(record.reader));
+                    warn!(
+                        lane = configured.name.as_str(),
+                        route = settings.routes[output.route].id.as_str(),
+                        topic = output.topic.as_str(),
+                        reader = reader.unwrap_or_else(|| record.reader.to_string()),
+                        missed,
+                        unacknowledged = record.unacknowledged,
+                        reason = "reader_overrun",
+                        "a subscriber does not keep up and missed samples; the other subscribers have them"
+                    );
+                }
+            }
+        }
+        self.overruns.retain(|logged| matched.contains(&logged.reader));
     }
 }
 
@@ -209,7 +245,7 @@ impl Watched {
             Discovery::Reader(reader) if !participant.owns(reader.guid) => {
                 if self.outputs.contains_key(&reader.topic) {
                     self.readers.retain(|(guid, _, _)| *guid != reader.guid);
-                    if self.readers.len() < MAX_READERS {
+                    if self.readers.len() < MAX_NAMED_READERS {
                         self.readers.push((reader.guid, reader.topic.clone(), reader.location.clone()));
                     }
                 }
@@ -228,16 +264,22 @@ impl Watched {
         }
     }
 
-    /// The readers of a lane's output, by node and host.
-    fn readers_of(&self, lane: usize, route: usize) -> impl Iterator<Item = String> {
-        let topic = self.outputs.iter().find(|(_, place)| **place == (lane, route)).map(|(topic, _)| topic);
-        let readers = self.readers.iter().filter(move |(_, read, _)| Some(read) == topic);
-        readers.map(|(guid, _, location)| {
-            let node = self.graph.node_of(*guid).unwrap_or("no known node");
-            match location.host() {
-                Some(host) => format!("{node} on {host}"),
-                None => node.to_owned(),
-            }
+    /// The outputs' readers with their nodes and hosts.
+    fn named_readers(&self) -> impl Iterator<Item = NamedReader> {
+        self.readers.iter().map(|(guid, _, location)| NamedReader {
+            reader: *guid,
+            node: FixedText::new(self.graph.node_of(*guid).unwrap_or("")),
+            host: FixedText::new(&location.host().map_or_else(String::new, |host| host.to_string())),
+        })
+    }
+
+    /// A reader of an output by its node and host; `None` for a reader that discovery has not reported.
+    fn name_of(&self, reader: Guid) -> Option<String> {
+        let (guid, _, location) = self.readers.iter().find(|(guid, _, _)| *guid == reader)?;
+        let node = self.graph.node_of(*guid).map_or_else(|| guid.to_string(), str::to_owned);
+        Some(match location.host() {
+            Some(host) => format!("{node} on {host}"),
+            None => node,
         })
     }
 }
@@ -247,10 +289,4 @@ fn instead(settings: &Settings, route: usize) -> Option<crate::model::TopicName>
     let noncritical = settings.lanes.iter().filter(|lane| lane.class == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
     outputs.find(|output| output.route == route).map(|output| output.topic.clone())
-}
-
-fn failed(boards: &Boards, lane: usize, route: usize) -> u64 {
-    boards.lane(lane, route).map_or(0, |counters| {
-        counters.drops.get(DropReason::WindowFull) + counters.drops.get(DropReason::WriteFailed)
-    })
 }

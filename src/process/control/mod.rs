@@ -11,7 +11,6 @@ mod safety;
 mod subscribers;
 
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tracing::{error, info};
@@ -23,7 +22,7 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{DdsNetwork, Settings};
+use crate::config::{Configuration, DdsNetwork, InlineSecret, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{
     ControlRecord, FixedText, LaneMode, LanePolicy, MonotonicNs, ProbeRefusal, RefusalCounts, SafetyMode,
@@ -40,18 +39,18 @@ use subscribers::Subscribers;
 /// overwrites in the DDS reader meanwhile is its own.
 const RESPONSES_PER_TURN: usize = 2048;
 
-/// Runs the control process until `stop` is requested. `config` is the configuration file as the command line
-/// names it, for a secret that stands in it.
+/// Runs the control process until `stop` is requested. `secret` is the one that stands in the configuration
+/// file, if one does.
 ///
 /// # Errors
 /// Control runs already, or shared memory or DDS cannot be had.
 pub fn control(
     settings: &Settings,
-    config: Option<&Path>,
+    secret: Option<&InlineSecret>,
     reloads: ReloadRequests,
     stop: &Stop,
 ) -> Result<(), RoleError> {
-    let mut control = Control::open(settings, config, reloads)?;
+    let mut control = Control::open(settings, secret, reloads)?;
     info!(
         subscribers = settings.subscribers.len(),
         probes = settings.probes.enabled,
@@ -70,7 +69,6 @@ pub fn control(
 
 struct Control {
     settings: Settings,
-    config: Option<PathBuf>,
     /// The number of each lane's network.
     link_of_lane: Vec<usize>,
     /// Before the participants: the DDS library wants its readers and writers gone first.
@@ -97,7 +95,11 @@ struct Control {
 }
 
 impl Control {
-    fn open(settings: &Settings, config: Option<&Path>, reloads: ReloadRequests) -> Result<Self, RoleError> {
+    fn open(
+        settings: &Settings,
+        secret: Option<&InlineSecret>,
+        reloads: ReloadRequests,
+    ) -> Result<Self, RoleError> {
         let how = &settings.control_scheduling;
         let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", how)?;
         let (networks, link_of_lane) = networks(settings);
@@ -127,9 +129,8 @@ impl Control {
             supervision: Supervision::new(&role.boards, settings, now),
             guard: Guard::open(&role.boards, settings, &mut participants)?,
             diagnostics: Diagnostics::open(&role.boards, settings, &mut participants[0])?,
-            trust: trust(settings, config),
+            trust: trust(settings, secret),
             settings: settings.clone(),
-            config: config.map(Path::to_owned),
             link_of_lane,
             links,
             participants,
@@ -293,9 +294,9 @@ impl Control {
     }
 
     fn keep_house(&mut self, now: MonotonicNs) {
-        if let Some(settings) = self.role.reload() {
+        if let Some(Configuration { settings, inline_secret }) = self.role.reload() {
             self.settings = settings.clone();
-            self.trust = trust(&self.settings, self.config.as_deref());
+            self.trust = trust(settings, inline_secret.as_ref());
             self.subscribers.adopt(&self.settings, &self.link_of_lane, now);
             // With the modes that follow from it, and not an evaluation later.
             self.subscribers.show(&self.settings);
@@ -322,8 +323,8 @@ fn describe(record: &ControlRecord, settings: &Settings, decided: &[String], lin
 }
 
 /// Control does more than to probe, and goes on without it.
-fn trust(settings: &Settings, config: Option<&Path>) -> Option<Trust> {
-    match Trust::load(&settings.security, config) {
+fn trust(settings: &Settings, secret: Option<&InlineSecret>) -> Option<Trust> {
+    match Trust::load(&settings.security, secret) {
         Ok(trust) => Some(trust),
         Err(error) => {
             error!("nobody is probed, so that every subscriber stays as it is: {error}");

@@ -22,7 +22,7 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{Lane, Settings};
+use crate::config::{Configuration, Lane, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::effective_mode;
@@ -200,7 +200,7 @@ impl Egress {
 
     /// Applies what was reloaded.
     fn reload(&mut self, now: MonotonicNs) {
-        let Some(settings) = self.role.reload() else {
+        let Some(Configuration { settings, .. }) = self.role.reload() else {
             return;
         };
         self.policy.policy_hold_ms = settings.policy_hold_ms;

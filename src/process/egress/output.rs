@@ -11,16 +11,21 @@ use super::super::watch::DropWatch;
 use super::late_joiners::{Kept, LateJoiners};
 use crate::clock;
 use crate::config::{self, DropPolicy, Settings};
-use crate::dds::{Participant, RawWriter, WriteError, WriterEvent};
+use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DropReason, Durability, LaneCounters, LaneMode, MonotonicNs, QosProfile, Reliability, SampleHeader,
-    TrafficClass,
+    DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
+    ReaderRecord, Reliability, SampleHeader, TrafficClass,
 };
 use crate::policy::{SequenceTracker, Sighting};
 use crate::shm::{
     BoardWriter, Boards, HistogramWriter, LaneQueue, ProcessRole, RouteChannel, SampleSubscriber, ShmSample,
     Stage, SubscriberRole, TakeError,
 };
+
+/// After a restart, how long the readers of the process before are waited for. A live one is matched again
+/// within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that is not back by
+/// then is taken to be gone.
+const FORMER_READERS_MS: u64 = 5_000;
 
 /// One route on one lane.
 pub(super) struct Output {
@@ -44,6 +49,10 @@ pub(super) struct Output {
     late_joiners: Option<LateJoiners>,
     tracker: SequenceTracker,
     counters: BoardWriter<LaneCounters>,
+    readers: BoardWriter<OutputReaders>,
+    /// Readers that the process before was matched with and this one is not yet. What is written meanwhile
+    /// does not reach them.
+    former_readers: Vec<Guid>,
     /// Samples published before this process came up were missed by its predecessor, not by it.
     started_at: MonotonicNs,
     caught_up: bool,
@@ -76,6 +85,9 @@ impl Output {
             counters.readers = 0;
         });
         let former = *counters.get();
+        let mut readers = boards.output_readers_writer(lane_index, output.route);
+        let former_readers = readers.get().iter().map(|record| record.reader).collect();
+        readers.update(|readers| *readers = OutputReaders::default());
         let late_joiners = (output.qos.durability == Durability::TransientLocal
             && output.qos.reliability == Reliability::BestEffort)
             .then(|| LateJoiners::new(output.qos.depth().unwrap_or(1) as usize));
@@ -104,6 +116,8 @@ impl Output {
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             watch: DropWatch::new(former.drops),
             counters,
+            readers,
+            former_readers,
             started_at: clock::monotonic(),
             caught_up: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
@@ -179,6 +193,10 @@ impl Output {
         if self.writer.is_none() {
             self.find_type(participant);
         }
+        if !self.former_readers.is_empty() {
+            // Between two housekeepings, readers may have been matched again.
+            self.follow_matching(clock::monotonic());
+        }
         let Some(writer) = &self.writer else {
             self.drop_sample(&sample, DropReason::NoWriter);
             return;
@@ -196,12 +214,14 @@ impl Output {
             timestamp: header.source_timestamp,
         });
         let outcome = writer.write(payload, header.encapsulation, header.source_timestamp);
+        let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let caught_up = u64::from(header.published_at < self.started_at);
         self.counters.update(|counters| {
             account(counters, &self.tracker);
             match outcome {
-                Ok(()) => {
+                Ok(readers) if readers == 0 || !complete => counters.drops.add(DropReason::NoReader, 1),
+                Ok(_) => {
                     counters.forwarded += 1;
                     counters.forwarded_bytes += bytes as u64;
                     counters.by_reference += u64::from(by_reference);
@@ -211,8 +231,7 @@ impl Output {
                     counters.last_writer_guid = header.writer_guid;
                     counters.last_writer_sequence = header.writer_sequence;
                 }
-                Err(WriteError::WindowFull) => counters.drops.add(DropReason::WindowFull, 1),
-                Err(WriteError::Refused) => counters.drops.add(DropReason::WriteFailed, 1),
+                Err(_) => counters.drops.add(DropReason::WriteFailed, 1),
             }
         });
         if outcome.is_ok() {
@@ -221,7 +240,9 @@ impl Output {
             }
             self.shm.record(began_at.since(header.published_at));
             self.dds_out.record(done_at.since(began_at));
-            if let Some(written) = header.source_timestamp.to_wall() {
+            if header.age_basis.late_ns().is_some() {
+                self.age.record(done_at.since(header.age_from()));
+            } else if let Some(written) = header.source_timestamp.to_wall() {
                 self.age.record(clock::wall().since(written));
             }
         }
@@ -272,6 +293,7 @@ impl Output {
             self.ingress_starts = health.starts;
         }
         self.follow_matching(now);
+        self.record_readers(now);
         self.serve_late_joiners(now);
         self.watch.look(&self.counters.get().drops, &self.id, &self.lane, self.expected_drops, now);
     }
@@ -289,6 +311,9 @@ impl Output {
             match event {
                 WriterEvent::Matched { reader, joined, readers } => {
                     self.counters.update(|counters| counters.readers = readers);
+                    if joined {
+                        self.former_readers.retain(|former| *former != reader);
+                    }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
                     if let Some(late_joiners) = &mut self.late_joiners {
                         if joined {
@@ -309,6 +334,35 @@ impl Output {
                     );
                 }
             }
+        }
+    }
+
+    /// Shows the matched readers, and what single ones of them missed.
+    fn record_readers(&mut self, now: MonotonicNs) {
+        if now >= self.started_at.plus_ms(FORMER_READERS_MS) {
+            self.former_readers.clear();
+        }
+        let Some(writer) = &self.writer else {
+            return;
+        };
+        let mut shown = OutputReaders::default();
+        let mut overrun = 0;
+        for (place, reader) in shown.records.iter_mut().zip(writer.matched_readers()) {
+            let former = self.readers.get().iter().find(|record| record.reader == reader.guid);
+            overrun += reader.overrun.saturating_sub(former.map_or(0, |record| record.overrun));
+            *place = ReaderRecord {
+                reader: reader.guid,
+                offered: reader.offered,
+                unacknowledged: reader.unacknowledged,
+                overrun: reader.overrun,
+                reliable: u64::from(reader.reliable),
+            };
+        }
+        if shown != *self.readers.get() {
+            self.readers.update(|readers| *readers = shown);
+        }
+        if overrun > 0 {
+            self.counters.update(|counters| counters.reader_overrun += overrun);
         }
     }
 
@@ -420,9 +474,13 @@ const fn overwritten(class: TrafficClass, policy: DropPolicy) -> DropReason {
 
 const fn expected_drops(class: TrafficClass) -> &'static [DropReason] {
     match class {
-        TrafficClass::Critical => &[],
-        TrafficClass::Noncritical => {
-            &[DropReason::Superseded, DropReason::QueueFull, DropReason::Suspended, DropReason::Stopped]
-        }
+        TrafficClass::Critical => &[DropReason::NoReader],
+        TrafficClass::Noncritical => &[
+            DropReason::Superseded,
+            DropReason::QueueFull,
+            DropReason::Suspended,
+            DropReason::Stopped,
+            DropReason::NoReader,
+        ],
     }
 }

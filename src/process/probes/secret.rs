@@ -10,7 +10,7 @@ use hmac::{Hmac, KeyInit, Mac};
 use sha2::Sha256;
 use tracing::warn;
 
-use crate::config::{self, ConfigError, SecretSource};
+use crate::config::{InlineSecret, SecretSource};
 
 /// The longest file of a secret. Its first line is all that is wanted.
 const MAX_FILE_BYTES: u64 = 4096;
@@ -40,8 +40,8 @@ pub enum SecretError {
         /// Its name.
         name: String,
     },
-    /// The configuration file that held it cannot be read any more, or holds it no more.
-    Config(Option<ConfigError>),
+    /// `security.hmac_secret` of the configuration file is empty.
+    EmptyInline,
     /// The operating system has no random numbers for nonces.
     NoRandomness(getrandom::Error),
 }
@@ -70,8 +70,7 @@ impl fmt::Display for SecretError {
                 "the environment variable {name}, which security.hmac_secret_env names, is not set or \
                  empty; set it to the secret"
             ),
-            Self::Config(Some(error)) => error.fmt(f),
-            Self::Config(None) => f.write_str("security.hmac_secret is gone from the configuration file"),
+            Self::EmptyInline => f.write_str("security.hmac_secret of the configuration file is empty"),
             Self::NoRandomness(error) => write!(f, "no random numbers to sign with: {error}"),
         }
     }
@@ -96,11 +95,11 @@ impl Secret {
         if secret.is_empty() { None } else { Hmac::new_from_slice(secret).ok().map(Self) }
     }
 
-    /// Fetches the secret. `config` is the configuration file as the command line names it.
+    /// Fetches the secret. `inline` is the one that stands in the configuration file.
     ///
     /// # Errors
     /// It is not where it should be, or empty.
-    pub fn load(source: &SecretSource, config: Option<&Path>) -> Result<Self, SecretError> {
+    pub fn load(source: &SecretSource, inline: Option<&InlineSecret>) -> Result<Self, SecretError> {
         let (secret, empty) = match source {
             SecretSource::File(path) => (first_line(path)?, SecretError::EmptyFile { path: path.to_owned() }),
             SecretSource::Environment(name) => {
@@ -108,9 +107,8 @@ impl Secret {
                 (value.into_encoded_bytes(), SecretError::EmptyVariable { name: name.clone() })
             }
             SecretSource::ConfigFile => {
-                let secret = config::inline_secret(config, &|name| std::env::var(name).ok());
-                let secret = secret.map_err(|error| SecretError::Config(Some(error)))?;
-                (secret.unwrap_or_default().into_bytes(), SecretError::Config(None))
+                let secret = inline.map_or("", InlineSecret::reveal);
+                (secret.as_bytes().to_vec(), SecretError::EmptyInline)
             }
         };
         if (1..STRONG_BYTES).contains(&secret.len()) {
@@ -211,12 +209,10 @@ mod tests {
         let path = folder.path().join("config.yaml");
         let topics = "topics: [{id: scan, input_topic: /scan}]\n";
         std::fs::write(&path, format!("{topics}security: {{hmac_secret: swordfish}}\n")).unwrap();
-        let secret = Secret::load(&SecretSource::ConfigFile, Some(&path)).unwrap();
+        let configuration = crate::config::load_configuration(Some(&path), &|_| None).unwrap();
+        let source = configuration.settings.security.secret.unwrap();
+        let secret = Secret::load(&source, configuration.inline_secret.as_ref()).unwrap();
         assert_eq!(secret.sign("x"), Secret::new(b"swordfish").unwrap().sign("x"));
-        std::fs::write(&path, topics).unwrap();
-        assert!(matches!(
-            Secret::load(&SecretSource::ConfigFile, Some(&path)),
-            Err(SecretError::Config(None))
-        ));
+        assert!(matches!(Secret::load(&source, None), Err(SecretError::EmptyInline)));
     }
 }

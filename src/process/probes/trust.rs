@@ -1,11 +1,10 @@
 //! Who is believed: signing what is sent, and checking what is received (docs/probe-protocol.md).
 
 use std::fmt::Write as _;
-use std::path::Path;
 
 use super::message::{ProbeRequest, ProbeResponse, Signature, to_hex};
 use super::secret::{Secret, SecretError};
-use crate::config::{Security, TrustMode};
+use crate::config::{InlineSecret, Security, TrustMode};
 use crate::model::{ProbeRefusal, WallNs};
 use crate::policy::{Admission, ReplayGuard};
 
@@ -108,14 +107,14 @@ pub struct Trust {
 impl Trust {
     /// What the configuration asks for. Without `enable_probe_hmac` nothing is signed or checked, whatever
     /// the trust mode is; with it, the trust mode says what becomes of messages that do not authenticate.
-    /// `config` is the configuration file as the command line names it.
+    /// `inline` is the secret that stands in the configuration file.
     ///
     /// # Errors
     /// A secret is needed and cannot be had.
-    pub fn load(security: &Security, config: Option<&Path>) -> Result<Self, SecretError> {
+    pub fn load(security: &Security, inline: Option<&InlineSecret>) -> Result<Self, SecretError> {
         let secret = match (&security.secret, security.enable_probe_hmac) {
             (_, false) => None,
-            (Some(source), true) => Some(Secret::load(source, config)?),
+            (Some(source), true) => Some(Secret::load(source, inline)?),
             // Nothing is checked, so that nothing need be signed.
             (None, true) if security.trust_mode == TrustMode::Off => None,
             (None, true) => return Err(SecretError::NotConfigured),

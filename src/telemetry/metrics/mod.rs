@@ -124,6 +124,18 @@ fn routes(page: &mut Page, report: &Report) {
         "Samples that the publisher numbered and that never reached the bridge.",
         &|route| route.lost_upstream.into(),
     );
+    each(
+        "adaptive_bridge_route_repeated_samples_total",
+        Counter,
+        "Samples that arrived again, or after younger ones, and were discarded; not among the received.",
+        &|route| route.repeated.into(),
+    );
+    each(
+        "adaptive_bridge_route_unmarked_samples_total",
+        Counter,
+        "Of the received, those of publishers beyond 64, whose repetitions are not recognised.",
+        &|route| route.unmarked.into(),
+    );
     page.family(
         "adaptive_bridge_route_dropped_samples_total",
         Counter,
@@ -154,6 +166,12 @@ fn outputs(page: &mut Page, report: &Report) {
         }
     };
     each("adaptive_bridge_lane_subscribers", Gauge, "Subscribers matched.", &|output| output.readers);
+    each(
+        "adaptive_bridge_lane_reader_overrun_samples_total",
+        Counter,
+        "Samples that single subscribers missed because they did not keep up.",
+        &|output| output.reader_overrun,
+    );
     each("adaptive_bridge_lane_offered_samples_total", Counter, "Samples offered to the lane.", &|output| {
         output.received
     });

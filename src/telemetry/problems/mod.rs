@@ -3,16 +3,22 @@
 mod control;
 
 use super::liveness::ProcessState;
-use super::report::drops_since;
+use super::report::{clock_offset_s, drops_since};
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
-use crate::model::{DropReason, LaneMode, TrafficClass};
+use crate::model::{DropReason, LaneCounters, LaneMode, PublisherAccount, TrafficClass};
 use crate::shm::ProcessRole;
 
 /// A lane writes the mode that it applies ten times a second; one that has not after so long does not look.
 const APPLY_MS: u64 = 1_000;
 
+/// A sentence names so many publishers at most.
+const MAX_NAMED_PUBLISHERS: usize = 3;
+
 /// Fewer samples may be on their way at the moment of the reading.
 const SILENT_LANE_SAMPLES: u64 = 5;
+
+/// Fewer samples may be on their way to a reader that acknowledges at each HEARTBEAT.
+const SILENT_READER_SAMPLES: u64 = 5;
 
 /// How grave something is: the levels of `diagnostic_msgs/DiagnosticStatus`, with their numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,10 +105,15 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     for route in &now.routes {
         dropped(now, route, before.route(route), &mut problems);
     }
+    for (route, output) in outputs(now) {
+        let former = before.route(route).and_then(|former| former.output(output));
+        overrun(now, output, former, &mut problems);
+    }
     problems.extend(control::settings(now, before));
     problems.extend(control::subscribers(now));
     problems.extend(control::intruders(now));
     problems.extend(control::refusals(now, before));
+    problems.extend(now.routes.iter().filter_map(clock_offset));
     problems.extend(now.routes.iter().filter_map(no_publisher));
     problems
 }
@@ -197,7 +208,9 @@ fn silent(
     let process = now.processes.iter().find(|process| process.role == ProcessRole::Egress(output.lane))?;
     let former = former?;
     let published = route.counters.published.checked_sub(former.counters.published)?;
-    let forwarded = output.counters.forwarded.checked_sub(former.output(output)?.counters.forwarded)?;
+    // A sample that no reader was there for shows that the lane turns.
+    let written = |counters: &LaneCounters| counters.forwarded + counters.drops.get(DropReason::NoReader);
+    let forwarded = written(&output.counters).checked_sub(written(&former.output(output)?.counters))?;
     let may_forward = lane.class == TrafficClass::Critical && lane.mode != LaneMode::Stopped;
     (may_forward
         && process.state == ProcessState::Running
@@ -257,22 +270,94 @@ fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, 
         && let Some(lost @ 1..) = route.counters.lost_upstream.checked_sub(former.counters.lost_upstream)
     {
         let text = format!(
-            "route {}: {lost} samples lost just now on their way from the publisher to the bridge",
-            route.id
+            "route {}: {lost} samples lost just now on their way from the publisher to the bridge{}",
+            route.id,
+            lost_by_publisher(route, former)
         );
         problems.push(Problem::new(about, Level::Warn, text));
     }
 }
 
+/// Readers that missed samples within the window, or acknowledge nothing, by node.
+fn overrun(
+    now: &Snapshot,
+    output: &OutputReading,
+    former: Option<&OutputReading>,
+    problems: &mut Vec<Problem>,
+) {
+    let lane = &now.lanes[output.lane];
+    for record in output.readers.iter() {
+        let before = former.and_then(|former| {
+            former.readers.iter().find(|earlier| earlier.reader == record.reader).copied()
+        });
+        let Some(before) = before else { continue };
+        let missed = record.overrun.saturating_sub(before.overrun);
+        // It was offered samples and has acknowledged not one of them, nor of those that waited before.
+        let offered = record.offered.saturating_sub(before.offered);
+        let is_silent = offered >= SILENT_READER_SAMPLES
+            && record.unacknowledged.saturating_sub(before.unacknowledged) == offered
+            && before.unacknowledged > 0;
+        let reader = now.reader_name(record);
+        let text = if missed > 0 {
+            format!(
+                "lane {}, {}: {reader} missed {missed} samples just now: it does not keep up (reader_overrun); \
+                 the other subscribers have them",
+                lane.name, output.topic
+            )
+        } else if is_silent {
+            format!(
+                "lane {}, {}: {reader} acknowledges nothing, {} samples so far: is it stopped, or its link down?",
+                lane.name, output.topic, record.unacknowledged
+            )
+        } else {
+            continue;
+        };
+        problems.push(Problem::new(about_lane(lane), Level::Warn, text));
+    }
+}
+
+/// The publishers whose samples were lost, those with most losses first.
+fn lost_by_publisher(route: &RouteReading, former: &RouteReading) -> String {
+    let lost_before = |writer| {
+        let before = former.publishers.iter().find(|account| account.writer == writer);
+        before.map_or(0, |account| account.lost_upstream)
+    };
+    let lost = |account: &PublisherAccount| account.lost_upstream.saturating_sub(lost_before(account.writer));
+    let mut losses: Vec<_> = route
+        .publishers
+        .iter()
+        .map(|account| (lost(account), account.writer))
+        .filter(|of| of.0 > 0)
+        .collect();
+    losses.sort_by_key(|&(lost, _)| std::cmp::Reverse(lost));
+    if losses.is_empty() {
+        return String::new();
+    }
+    let named = losses.iter().take(MAX_NAMED_PUBLISHERS).map(|(lost, writer)| format!("{lost} of {writer}"));
+    let and_others = if losses.len() > MAX_NAMED_PUBLISHERS { ", and others" } else { "" };
+    format!(": {}{and_others}", named.collect::<Vec<_>>().join(", "))
+}
+
 /// Who may be to blame for a write that failed: one of the matched readers, and not always a remote one.
 fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
     match (reason, output.counters.readers) {
-        (DropReason::WindowFull | DropReason::WriteFailed, 1) => "; 1 reader is matched".to_owned(),
-        (DropReason::WindowFull | DropReason::WriteFailed, readers) => {
-            format!("; {readers} readers are matched")
-        }
+        (DropReason::WriteFailed, 1) => "; 1 reader is matched".to_owned(),
+        (DropReason::WriteFailed, readers) => format!("; {readers} readers are matched"),
         _ => String::new(),
     }
+}
+
+fn clock_offset(route: &RouteReading) -> Option<Problem> {
+    let offset_s = clock_offset_s(&route.counters)?;
+    let side = if offset_s < 0.0 { "behind" } else { "ahead of" };
+    let text = format!(
+        "route {}: the clock of publisher {} is {:.1} s {side} this computer's, so that the age of its samples runs \
+         from their arrival; synchronise the clocks (chrony, PTP)",
+        route.id,
+        route.counters.clock_writer,
+        offset_s.abs()
+    );
+    Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
 }
 
 fn no_publisher(route: &RouteReading) -> Option<Problem> {
@@ -291,8 +376,8 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
         DropReason::Superseded | DropReason::QueueFull | DropReason::Suspended => {
             matches!(class, TrafficClass::Noncritical)
         }
-        // The lane's mode says it.
-        DropReason::Stopped => true,
+        // The lane's mode says it, or the number of its readers, or that it was restarted just now.
+        DropReason::Stopped | DropReason::NoReader => true,
         _ => false,
     }
 }
@@ -303,7 +388,7 @@ pub(super) mod tests {
     use super::*;
     use crate::model::{
         ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
-        MonotonicNs, ProcessHealth, RouteId, TopicName, WallNs,
+        MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
     };
 
     /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
@@ -329,6 +414,7 @@ pub(super) mod tests {
             lane,
             topic: TopicName::try_from(topic).unwrap(),
             counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
+            readers: OutputReaders::default(),
             shm: LatencyHistogram::default(),
             dds_out: LatencyHistogram::default(),
             age: LatencyHistogram::default(),
@@ -356,6 +442,7 @@ pub(super) mod tests {
                     writers: 1,
                     ..IngressCounters::default()
                 },
+                publishers: Vec::new(),
                 dds_in: LatencyHistogram::default(),
                 outputs: vec![output(0, "/c/scan"), output(1, "/n/scan")],
             }],
@@ -363,6 +450,7 @@ pub(super) mod tests {
             control: ControlRecord::default(),
             subscribers: Vec::new(),
             intruders: Vec::new(),
+            named_readers: Vec::new(),
         }
     }
 
@@ -450,7 +538,7 @@ pub(super) mod tests {
             now.routes[0].counters.drops.add(DropReason::TooLarge, 1);
             now.routes[0].counters.lost_upstream += 4;
             now.routes[0].outputs[0].counters.readers = 2;
-            drop_on(now, 0, DropReason::WindowFull, 3);
+            drop_on(now, 0, DropReason::WriteFailed, 3);
             drop_on(now, 0, DropReason::Superseded, 1);
         });
         assert_eq!(said.len(), 4, "{said:?}");
@@ -459,11 +547,11 @@ pub(super) mod tests {
             "{said:?}"
         );
         assert!(said[1].contains("lane critical, /c/scan: 3 samples"), "{said:?}");
-        assert!(said[1].ends_with("(window_full); 2 readers are matched"), "{said:?}");
+        assert!(said[1].ends_with("(write_failed); 2 readers are matched"), "{said:?}");
         assert!(said[2].ends_with("(superseded)"), "{said:?}");
         assert!(said[3].contains("4 samples lost just now on their way"), "{said:?}");
         let mut before = sound();
-        drop_on(&mut before, 0, DropReason::WindowFull, 3);
+        drop_on(&mut before, 0, DropReason::WriteFailed, 3);
         assert_eq!(of(&before, &before), []);
     }
 

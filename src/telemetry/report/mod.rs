@@ -14,7 +14,9 @@ use super::liveness::ProcessState;
 use super::problems::{self, Problem};
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
-use crate::model::{DropCounts, DropReason, LaneMode, MonotonicNs};
+use crate::model::{
+    DropCounts, DropReason, FixedText, IngressCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
+};
 
 /// The state of a bridge. Keys that end in a unit are in that unit; what cannot be told is null.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -114,6 +116,13 @@ pub struct RouteReport {
     pub in_place: u64,
     /// Samples that the publisher numbered and that never reached the bridge.
     pub lost_upstream: u64,
+    /// Samples that arrived after they or younger ones of their publisher had been taken, and were discarded;
+    /// not among the received.
+    pub repeated: u64,
+    /// Of the received, those of publishers that have no account because there are too many.
+    pub unmarked: u64,
+    /// The publishers whose samples came.
+    pub publishers: Vec<PublisherReport>,
     /// Samples received and not published, by reason.
     pub drops: Drops,
     /// Of those, the ones within the window.
@@ -126,10 +135,33 @@ pub struct RouteReport {
     pub bytes_per_s: Option<f64>,
     /// How long ago the last sample was received.
     pub last_received_age_ms: Option<f64>,
+    /// How far the clock of a publisher is ahead of this computer's; `null` while the clocks of all agree.
+    pub clock_offset_s: Option<f64>,
+    /// The GUID of that publisher's DDS writer.
+    pub clock_offset_writer: Option<String>,
     /// From the publisher's source timestamp to ingress.
     pub dds_in: Latency,
     /// The lanes that serve the route.
     pub lanes: Vec<OutputReport>,
+}
+
+/// One publisher of a route, by the sequence numbers of its DDS writer.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct PublisherReport {
+    /// Its DDS writer.
+    pub writer: String,
+    /// The number of the first sample taken.
+    pub first_sequence: i64,
+    /// The highest number taken.
+    pub last_sequence: i64,
+    /// Samples taken.
+    pub received: u64,
+    /// Numbers between the first and the last that never reached the bridge.
+    pub lost_upstream: u64,
+    /// Samples that arrived again, or after younger ones, and were discarded.
+    pub repeated: u64,
+    /// How long ago the last sample was taken.
+    pub last_received_age_ms: Option<f64>,
 }
 
 /// One route on one lane.
@@ -141,6 +173,10 @@ pub struct OutputReport {
     pub topic: String,
     /// Readers matched.
     pub readers: u64,
+    /// Those readers, 32 at most.
+    pub matched_readers: Vec<ReaderReport>,
+    /// Samples that single readers missed because they did not keep up; the others have them.
+    pub reader_overrun: u64,
     /// Samples that the lane was offered since it began to account.
     pub received: u64,
     /// Samples given to the DDS writer.
@@ -173,6 +209,25 @@ pub struct OutputReport {
     pub dds_out: Latency,
     /// From the source timestamp to the lane's DDS writer.
     pub age: Latency,
+}
+
+/// One reader of an output.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct ReaderReport {
+    /// Its GUID, in hexadecimal.
+    pub guid: String,
+    /// Its ROS 2 node; null while control does not know it.
+    pub node: Option<String>,
+    /// The address of its host; null while control does not know it.
+    pub host: Option<String>,
+    /// `RELIABLE` or `BEST_EFFORT`.
+    pub reliability: &'static str,
+    /// Samples written since it was matched, and the history that it was offered then.
+    pub offered: u64,
+    /// Of those, samples that it has not acknowledged; 0 for a BEST_EFFORT reader.
+    pub unacknowledged: u64,
+    /// Of those, samples that left the lane's history before the reader had them.
+    pub overrun: u64,
 }
 
 /// Drops, by name. In JSON every reason is there, so that a key that is missing is a mistake in its name.
@@ -251,6 +306,9 @@ impl Snapshot {
             published: counters.published,
             in_place: counters.in_place,
             lost_upstream: counters.lost_upstream,
+            repeated: counters.repeated,
+            unmarked: counters.unmarked,
+            publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
             drops: Drops(counters.drops),
             drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
             whole: now.is_whole(),
@@ -261,6 +319,8 @@ impl Snapshot {
                 window_ms,
             ),
             last_received_age_ms: age_ms(counters.last_received_at, self.at),
+            clock_offset_s: clock_offset_s(counters),
+            clock_offset_writer: clock_offset_s(counters).map(|_| counters.clock_writer.to_string()),
             dds_in: Latency::of(&now.dds_in, before.map(|before| &before.dds_in)),
             lanes: now
                 .outputs
@@ -270,6 +330,18 @@ impl Snapshot {
                     self.output_report(output, before, window_ms)
                 })
                 .collect(),
+        }
+    }
+
+    fn publisher_report(&self, account: &PublisherAccount) -> PublisherReport {
+        PublisherReport {
+            writer: account.writer.to_string(),
+            first_sequence: account.first_sequence,
+            last_sequence: account.last_sequence,
+            received: account.received,
+            lost_upstream: account.lost_upstream,
+            repeated: account.repeated,
+            last_received_age_ms: age_ms(account.last_at, self.at),
         }
     }
 
@@ -285,6 +357,8 @@ impl Snapshot {
             lane: self.lanes[now.lane].name.to_string(),
             topic: now.topic.to_string(),
             readers: counters.readers,
+            matched_readers: now.readers.iter().map(|record| self.reader_report(record)).collect(),
+            reader_overrun: counters.reader_overrun,
             received: counters.received(),
             forwarded: counters.forwarded,
             forwarded_bytes: counters.forwarded_bytes,
@@ -301,6 +375,32 @@ impl Snapshot {
             shm: Latency::of(&now.shm, before.map(|before| &before.shm)),
             dds_out: Latency::of(&now.dds_out, before.map(|before| &before.dds_out)),
             age: Latency::of(&now.age, before.map(|before| &before.age)),
+        }
+    }
+}
+
+impl Snapshot {
+    fn reader_report(&self, record: &ReaderRecord) -> ReaderReport {
+        let named = self.named_readers.iter().find(|named| named.reader == record.reader);
+        let text = |text: &FixedText| Some(printable(text.as_str())).filter(|text| !text.is_empty());
+        ReaderReport {
+            guid: record.reader.to_string(),
+            node: named.and_then(|named| text(&named.node)),
+            host: named.and_then(|named| text(&named.host)),
+            reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
+            offered: record.offered,
+            unacknowledged: record.unacknowledged,
+            overrun: record.overrun,
+        }
+    }
+
+    /// A reader by its node and host, as far as they are known, for people.
+    pub(super) fn reader_name(&self, record: &ReaderRecord) -> String {
+        let report = self.reader_report(record);
+        let node = report.node.unwrap_or_else(|| format!("the reader {}", report.guid));
+        match report.host {
+            Some(host) => format!("{node} on {host}"),
+            None => node,
         }
     }
 }
@@ -346,6 +446,11 @@ fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
 }
 
 /// `None` for an instant that never was.
+/// How far the clock of a publisher is ahead of ours; `None` while all agree.
+pub(super) fn clock_offset_s(counters: &IngressCounters) -> Option<f64> {
+    (counters.clock_offset_ns != 0).then(|| -(counters.clock_offset_ns as f64) / 1e9)
+}
+
 fn age_ms(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
     (at.0 != 0).then(|| now.since(at) as f64 / 1e6)
 }
@@ -380,17 +485,22 @@ mod tests {
         assert_eq!(drops_since(&now, None).total(), 0);
         let mut before = DropCounts::default();
         before.add(DropReason::Stale, 1);
-        before.add(DropReason::WindowFull, 9);
+        before.add(DropReason::NoReader, 9);
         let since: Vec<_> = drops_since(&now, Some(before)).iter().collect();
         assert_eq!(since, [(DropReason::Stale, 2)]);
     }
     /// The other keys are compared with what a real bridge prints (tests/cli.rs).
     #[test]
-    fn every_key_of_a_subscriber_and_of_an_intruder_is_documented() {
+    fn every_key_of_a_subscriber_an_intruder_and_a_publisher_is_documented() {
         let report = serde_json::to_value(crate::telemetry::samples::wide()).unwrap();
         let page = include_str!("../../../docs/status-json.md");
-        for list in ["subscribers", "intruders"] {
-            let item = report[list][0].as_object().unwrap();
+        let publisher = &report["routes"][0]["publishers"][0];
+        for (list, item) in [
+            ("subscribers", &report["subscribers"][0]),
+            ("intruders", &report["intruders"][0]),
+            ("routes[].publishers", publisher),
+        ] {
+            let item = item.as_object().unwrap();
             let documented = page.matches(&format!("\n| `{list}[].")).count();
             assert_eq!(documented, item.len(), "{list}");
             for (key, value) in item {
