@@ -20,6 +20,19 @@ has_python() {
     return 1
 }
 
+# CPython 3.11 on x86-64 that can make a virtual environment: the only one that PyPI has wheels of ROS 2 Jazzy for.
+python_of_ros() {
+    for python in python3.11 /usr/bin/python3.11 python3 /usr/bin/python3; do
+        if "$python" -c 'import platform, sys, venv, ensurepip
+found = platform.python_implementation(), sys.version_info[:2], platform.machine(), sys.platform
+sys.exit(found != ("CPython", (3, 11), "x86_64", "linux"))' >/dev/null 2>&1; then
+            echo "$python"
+            return 0
+        fi
+    done
+    return 1
+}
+
 has_faketime() { ls /usr/lib/*/faketime/libfaketimeMT.so.1 >/dev/null 2>&1; }
 
 # Each line: whether it is there, the packages that bring it (the first that exists is taken), what needs it.
@@ -60,6 +73,9 @@ check_all() {
     need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
     need "has cmake" cmake "tests of the package in a ROS 2 workspace"
     need "has colcon" "colcon|python3-colcon-core" "the same"
+    if [ "$(uname -m)" = x86_64 ]; then
+        need "python_of_ros >/dev/null" "python3.11-venv|python3-venv" "tests with ROS 2 nodes (rclpy)"
+    fi
     need "has_python colcon_ros" python3-colcon-ros "the same"
     need "has_python colcon_metadata" python3-colcon-metadata "the same"
     need "has_python colcon_package_information" python3-colcon-package-information "the same"
@@ -113,6 +129,26 @@ fi
 if ! has cc; then
     say "error: a C compiler is needed to link Rust programs: apt-get install build-essential"
     exit 1
+fi
+
+# rclpy for the tests with ROS 2 nodes, in exactly the versions of the list. Without it these tests do not run.
+ros=$(dirname "$0")/../target/ros/jazzy
+ros_list=$(dirname "$0")/../tests/ros/requirements.txt
+if ! cmp -s "$ros_list" "$ros/requirements.txt"; then
+    if ! python=$(python_of_ros); then
+        say "******** no CPython 3.11 for x86-64 with venv: the tests with ROS 2 nodes (rclpy) will not run"
+    else
+        say "pip install -r tests/ros/requirements.txt (250 MB in target/ros/jazzy)"
+        rm -rf "$ros"
+        # The copy of the list says that the installation is complete.
+        if "$python" -m venv "$ros" \
+            && "$ros/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: -r "$ros_list" \
+            && "$ros/bin/python" -c "import rclpy, sensor_msgs.msg, std_msgs.msg"; then
+            cp "$ros_list" "$ros/requirements.txt"
+        else
+            say "******** rclpy can't be installed: the tests with ROS 2 nodes will not run"
+        fi
+    fi
 fi
 
 if ! has cargo; then

@@ -358,7 +358,7 @@ fn a_newcomer_does_not_hear_of_readers_that_are_gone() {
 }
 
 #[test]
-fn a_full_window_is_reported_at_once_and_the_sample_is_not_kept() {
+fn a_writer_takes_every_sample_and_the_reader_that_lags_misses_the_oldest() {
     let mut here = participant("here", 71);
     let mut there = participant("there", 71);
     let reader = there
@@ -366,16 +366,43 @@ fn a_full_window_is_reported_at_once_and_the_sample_is_not_kept() {
         .unwrap();
     let writer = here.create_writer("rt/full", TYPE, &QosProfile::CRITICAL, 4).unwrap();
     wait_for_reader(&writer);
-    let payload = Bytes::from(vec![0; 1 << 20]);
-    let mut refused = 0;
-    for _ in 0..200 {
-        if let Err(error) = writer.write(payload.clone(), Encapsulation::CDR_LE, SourceTimestamp::NONE) {
-            assert_eq!(error, WriteError::WindowFull);
-            refused += 1;
-        }
+    // 200 MiB at once: more than any socket buffer holds, and far more than the writer retains.
+    for number in 0..200_u8 {
+        let payload = Bytes::from(vec![number; 1 << 20]);
+        let readers = writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+        assert_eq!(readers, 1);
     }
+    let mut last = None;
+    while last != Some(199) {
+        let (payload, ..) = take_one(&reader).expect("the last sample");
+        assert!(last.is_none_or(|last| last < payload[0]), "{} after {last:?}", payload[0]);
+        last = Some(payload[0]);
+    }
+    let give_up = Instant::now() + Duration::from_secs(20);
+    while writer.matched_readers().any(|reader| reader.unacknowledged > 0) {
+        assert!(Instant::now() < give_up, "not acknowledged: {:?}", writer.matched_readers().next());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let progress = writer.matched_readers().next().unwrap();
+    assert_eq!((progress.guid, progress.offered), (reader.guid(), 200));
+    assert!(progress.overrun > 0, "{progress:?}");
+}
+
+#[test]
+fn a_keep_all_writer_that_may_wait_reports_a_full_window() {
+    let mut here = participant("here", 71);
+    let mut there = participant("there", 71);
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    let _reader = there.create_reader("rt/full_all", TYPE, &qos).unwrap();
+    let keep_all = QosProfile { history: History::KeepAll, ..QosProfile::CRITICAL };
+    let writer =
+        here.create_blocking_writer("rt/full_all", TYPE, &keep_all, 4, std::time::Duration::ZERO).unwrap();
+    wait_for_reader(&writer);
+    let payload = Bytes::from(vec![0; 1 << 20]);
+    let outcomes =
+        (0..200).map(|_| writer.write(payload.clone(), Encapsulation::CDR_LE, SourceTimestamp::NONE));
+    let refused = outcomes.filter(|outcome| *outcome == Err(WriteError::WindowFull)).count();
     assert!(refused > 0, "200 MiB were taken with a window of four samples");
-    assert!(take_one(&reader).is_some());
 }
 
 #[test]

@@ -255,34 +255,75 @@ fn nothing_of_a_bridge_is_left_whose_processes_were_killed() {
 }
 
 #[test]
-fn a_stopped_critical_subscriber_fills_the_window_and_holds_nobody_up() {
-    let test = "a_stopped_critical_subscriber_fills_the_window_and_holds_nobody_up";
+fn a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counted_for_it() {
+    let test = "a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counted_for_it";
     let yaml = format!("{SCAN}lanes:\n  critical: {{window_samples: 64}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     let laggard = bed.subscribe("slow", Peer::cyclone().keep_all(), CRITICAL);
-    let noncritical = bed.subscribe("critical", Peer::cyclone().best_effort(), NONCRITICAL);
-    let publisher = bed.publish(Peer::fast().keep_all().rate_hz(200.0), INPUT);
+    let others = [
+        bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL),
+        bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL),
+    ];
+    let publisher = bed.publish(Peer::fast().keep_all().rate_hz(1_000.0), INPUT);
     laggard.wait_received(50);
     laggard.stop();
-    bed.bridge.wait_status("drops for a full window", |status| {
-        lane(status, "critical")["drops"]["window_full"].as_u64() > Some(100)
-    });
-    bed.up.wait_for_log("window_full");
-    let before = noncritical.received();
-    noncritical.wait_received(before + 10);
+    // 18 MB: more than the laggard's socket holds.
+    let before = others[0].received();
+    others[0].wait_received(before + 6_000);
     laggard.cont();
     let before = laggard.received();
     laggard.wait_received(before + 100);
+    bed.up.wait_for_log("a subscriber does not keep up");
     let sent: Sent = publisher.end();
     assert_eq!(sent.failed, 0, "no call of the publisher waited in vain: {sent:?}");
-    let status = bed.wait_whole();
+    bed.wait_whole();
+    let status = bed.bridge.wait_status("all acknowledged", |status| {
+        let readers = lane(status, "critical")["matched_readers"].as_array().unwrap().clone();
+        readers.len() == 3 && readers.iter().all(|reader| reader["unacknowledged"] == 0)
+    });
     let critical = lane(&status, "critical");
-    assert_eq!(
-        critical["forwarded"].as_u64().unwrap() + critical["drops"]["window_full"].as_u64().unwrap(),
-        sent.ok,
-        "{critical}"
-    );
-    laggard.end::<Received>().assert_sound();
+    assert_eq!(critical["forwarded"], sent.ok, "{critical}");
+    for other in others {
+        other.end::<Received>().assert_all_of(&sent);
+    }
+    let lagged: Received = laggard.end();
+    lagged.assert_sound();
+    let overruns: Vec<u64> = critical["matched_readers"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|reader| reader["overrun"].as_u64().unwrap())
+        .filter(|overrun| *overrun > 0)
+        .collect();
+    assert_eq!(overruns, [lagged.missing_count], "{critical}\n{lagged:?}");
+    assert_eq!(critical["reader_overrun"], lagged.missing_count, "{critical}");
+    bed.end();
+}
+
+#[test]
+fn killed_critical_subscribers_cost_the_others_nothing() {
+    let test = "killed_critical_subscribers_cost_the_others_nothing";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let other = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let doomed = [
+        bed.subscribe("slow", Peer::cyclone().keep_all(), CRITICAL),
+        bed.subscribe("slow", Peer::fast().keep_all(), CRITICAL),
+        bed.subscribe("critical", Peer::fast(), CRITICAL),
+    ];
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(500.0), INPUT);
+    for one in &doomed {
+        one.wait_received(100);
+    }
+    for mut one in doomed {
+        one.kill9();
+    }
+    // Beyond the 256 samples that the writer retains, within the leases of 10 and 20 s.
+    let before = other.received();
+    other.wait_received(before + 3_000);
+    let sent: Sent = publisher.end();
+    let status = bed.wait_whole();
+    assert_eq!(lane(&status, "critical")["forwarded"], sent.ok, "{status}");
+    other.end::<Received>().assert_all_of(&sent);
     bed.end();
 }
 

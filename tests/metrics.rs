@@ -68,10 +68,12 @@ fn report() -> Report {
             input_topic: TopicName::try_from("/scan").unwrap(),
             message_type: None,
             counters: ingress,
+            publishers: Vec::new(),
             dds_in: latency,
             outputs: vec![OutputReading {
                 lane: 0,
                 topic: TopicName::try_from("/critical/scan").unwrap(),
+                readers: Default::default(),
                 counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
                 shm: latency,
                 dds_out: LatencyHistogram::default(),
@@ -81,6 +83,7 @@ fn report() -> Report {
         needs_control: true,
         control,
         subscribers: vec![SubscriberReading { lane: Some(0), record: subscriber }],
+        named_readers: Vec::new(),
         intruders: Vec::new(),
     };
     let mut report = snapshot.since(&snapshot);

@@ -8,7 +8,8 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::model::{
-    Encapsulation, Guid, InstanceName, LaneName, MonotonicNs, RouteId, SampleHeader, SourceTimestamp,
+    AgeBasis, Encapsulation, Guid, InstanceName, LaneName, MonotonicNs, RouteId, SampleHeader,
+    SourceTimestamp,
 };
 use adaptive_bridge::shm::{BridgeShape, LaneQueue, RouteChannel, ShmNode};
 use nix::sys::signal::{Signal, kill};
@@ -127,7 +128,7 @@ pub fn header(sequence: u64) -> SampleHeader {
         writer_sequence: sequence as i64,
         writer_guid: Guid([9; 16]),
         encapsulation: Encapsulation::CDR_LE,
-        reserved: 0,
+        age_basis: AgeBasis::SOURCE,
     }
 }
 

@@ -1,5 +1,5 @@
 //! A flow of 200 numbered samples per second through a bridge of one route, `/scan`, from a publisher to a
-//! subscriber of the critical lane, both of this process.
+//! subscriber of each lane, all of this process.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,9 +17,10 @@ use super::wait_until;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
-/// A subscriber of the critical lane, and a publisher that has begun when the bridge has matched both.
+/// A subscriber of each lane, and a publisher that has begun when the bridge has matched all three.
 pub struct Flow {
     reader: RawReader,
+    _noncritical: RawReader,
     received: Vec<u32>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<u32>>,
@@ -43,7 +44,12 @@ impl Flow {
             deadline_ms: None,
         };
         let reader = subscriber.create_reader("rt/adaptive_bridge/critical/scan", TYPE, &qos).unwrap();
-        bridge.wait_status("the subscriber", |status| lane(status, "critical")["readers"] == 1);
+        let qos = ReaderQos { reliability: Reliability::BestEffort, depth: 1, ..qos };
+        let noncritical =
+            subscriber.create_reader("rt/adaptive_bridge/noncritical/scan", TYPE, &qos).unwrap();
+        bridge.wait_status("the subscribers", |status| {
+            ["critical", "noncritical"].iter().all(|name| lane(status, name)["readers"] == 1)
+        });
         let stop = Arc::new(AtomicBool::new(false));
         let asked = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
@@ -60,7 +66,14 @@ impl Flow {
             number
         });
         let participants = [publisher, subscriber];
-        Self { reader, received: Vec::new(), stop, thread: Some(thread), _participants: participants }
+        Self {
+            reader,
+            _noncritical: noncritical,
+            received: Vec::new(),
+            stop,
+            thread: Some(thread),
+            _participants: participants,
+        }
     }
 
     /// Takes what has come; how many samples it is so far.

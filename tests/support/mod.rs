@@ -16,6 +16,7 @@ pub mod netns;
 pub mod peer;
 pub mod process;
 pub mod prometheus;
+pub mod ros;
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};

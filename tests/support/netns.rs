@@ -228,6 +228,16 @@ impl Host {
         ip(&format!("-n {namespace} link set {name} up"));
     }
 
+    /// Takes the address from `eth0`, and gives it this one instead, if any, as DHCP does.
+    pub fn set_address(&self, address: Option<Ipv4Addr>) {
+        let namespace = &self.namespace;
+        ip(&format!("-n {namespace} addr flush dev eth0"));
+        if let Some(address) = address {
+            ip(&format!("-n {namespace} addr add {address}/24 dev eth0"));
+            ip(&format!("-n {namespace} route replace 239.0.0.0/8 dev eth0"));
+        }
+    }
+
     /// Connects the host to the switch, or pulls its cable at the switch's end.
     pub fn set_link(&self, up: bool) {
         let state = if up { "up" } else { "down" };

@@ -1,0 +1,234 @@
+//! Subscribers of the critical lane that crash, stop, join and leave, beside subscribers that keep up: ROS 2
+//! nodes (rclpy), Fast DDS and Cyclone DDS. Each event happens to subscribers without the bridge as well.
+
+mod support;
+
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};
+use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::process::signal;
+use support::ros;
+
+/// A topic that the bridge does not know.
+const PLAIN: &str = "rt/plain";
+const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
+const RATE_HZ: f64 = 200.0;
+
+/// A bridge on a host of its own, or `None` where the machine lacks what `test` needs.
+fn bed(test: &str) -> Option<Bed> {
+    if let Some(reason) = ros::missing() {
+        support::skip(test, &reason);
+        return None;
+    }
+    Bed::start(test, SCAN)
+}
+
+fn peer(library: Library, node: &str) -> Peer {
+    match library {
+        Library::Rclpy => Peer::rclpy(node),
+        other => Peer::on(other),
+    }
+}
+
+/// The same publisher and the same subscribers twice: one flow passes through the bridge, the other does not.
+struct Scene<'b> {
+    bed: &'b Bed,
+    flows: [Flow; 2],
+}
+
+struct Flow {
+    publisher: RunningPeer,
+    /// Subscribers that keep up: a ROS 2 node, Fast DDS and Cyclone DDS.
+    healthy: Vec<RunningPeer>,
+}
+
+impl<'b> Scene<'b> {
+    /// Starts both flows, and waits until samples have come to every subscriber. The publishers are rclpy
+    /// nodes with a depth of 1,000 samples, which are 5 s.
+    fn start(bed: &'b Bed) -> Self {
+        let healthy = |topic| -> Vec<RunningPeer> {
+            LIBRARIES.map(|library| subscribe(bed, "critical", library, "planner", topic)).into()
+        };
+        let publisher = |node| Peer::rclpy(node).publisher().keep_last(1000).rate_hz(RATE_HZ);
+        let bridged = healthy(CRITICAL);
+        let plain = healthy(PLAIN);
+        let host = bed.host("publisher");
+        // A subscriber on Cyclone DDS counts what precedes a writer's first heartbeat as history. The one of
+        // the bridge matched a writer that has no samples yet.
+        let publishers = [
+            publisher("scanner").topic(INPUT).wait_match(1).start_on(host),
+            publisher("plain_scanner").topic(PLAIN).wait_match(LIBRARIES.len()).prime().hold().start_on(host),
+        ];
+        for subscriber in &plain {
+            subscriber.wait_matched(1);
+        }
+        let [publisher, plain_publisher] = publishers;
+        plain_publisher.go();
+        let flows =
+            [Flow { publisher, healthy: bridged }, Flow { publisher: plain_publisher, healthy: plain }];
+        let scene = Self { bed, flows };
+        scene.go_on(100);
+        scene
+    }
+
+    /// Waits until so many more samples have come to every subscriber that keeps up.
+    fn go_on(&self, samples: u64) {
+        wait_more(self.flows.iter().flat_map(|flow| &flow.healthy), samples);
+    }
+
+    /// Starts one more subscriber of each library on another host: those of the bridge, then the others.
+    fn join(&self, node: &str) -> [Vec<RunningPeer>; 2] {
+        let join = |topic| LIBRARIES.map(|library| subscribe(self.bed, "slow", library, node, topic)).into();
+        [CRITICAL, PLAIN].map(join)
+    }
+
+    /// Ends both flows: every sample has come to each subscriber that keeps up, through the bridge as without
+    /// it, and the bridge accounts for it.
+    fn end(self) {
+        let [bridged, plain] = self.flows;
+        plain.end();
+        let sent = bridged.end();
+        let status = self.bed.wait_whole();
+        let critical = critical(&status);
+        assert_eq!(critical["received"], sent.ok, "{critical}");
+        assert_eq!(critical["forwarded"], sent.ok, "{critical}");
+    }
+}
+
+impl Flow {
+    /// Ends it; every sample has come to each subscriber that keeps up.
+    fn end(self) -> Sent {
+        let sent: Sent = self.publisher.end();
+        assert_eq!(sent.failed, 0, "{sent:?}");
+        for subscriber in self.healthy {
+            subscriber.wait_received(sent.ok);
+            subscriber.end::<Received>().assert_all_of(&sent);
+        }
+        sent
+    }
+}
+
+/// Waits until so many more samples have come to each subscriber.
+fn wait_more<'a>(subscribers: impl IntoIterator<Item = &'a RunningPeer>, samples: u64) {
+    let goals = subscribers.into_iter().map(|subscriber| (subscriber, subscriber.received() + samples));
+    for (subscriber, goal) in goals.collect::<Vec<_>>() {
+        subscriber.wait_received(goal);
+    }
+}
+
+/// A RELIABLE subscriber with room for 1,000 samples; through the bridge it is matched on both sides.
+fn subscribe(bed: &Bed, host: &str, library: Library, node: &str, topic: &str) -> RunningPeer {
+    let peer = peer(library, node).keep_last(1000);
+    if topic == PLAIN {
+        peer.subscriber().topic(topic).start_on(bed.host(host))
+    } else {
+        bed.subscribe(host, peer, topic)
+    }
+}
+
+fn critical(status: &Value) -> &Value {
+    outputs(status).find(|output| output["lane"] == "critical").unwrap_or_else(|| panic!("{status}"))
+}
+
+#[test]
+fn killed_critical_subscribers_cost_the_others_no_sample() {
+    let Some(bed) = bed("killed_critical_subscribers_cost_the_others_no_sample") else { return };
+    let scene = Scene::start(&bed);
+    for mut victim in scene.join("crashing").into_iter().flatten() {
+        victim.wait_received(10);
+        victim.kill9();
+    }
+    // Four times what a writer retains for a subscriber that does not acknowledge, long before a lease ends.
+    scene.go_on(1024);
+    scene.end();
+    bed.end();
+}
+
+#[test]
+fn critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_are_served_again() {
+    let test = "critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_are_served_again";
+    let Some(bed) = bed(test) else { return };
+    let scene = Scene::start(&bed);
+    let stopped = scene.join("debugged");
+    for victim in stopped.iter().flatten() {
+        victim.wait_received(10);
+        victim.stop();
+    }
+    // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
+    std::thread::sleep(Duration::from_secs(22));
+    scene.go_on(100);
+    for victim in stopped.iter().flatten() {
+        victim.cont();
+    }
+    // Without the bridge, Fast DDS 2.14 does not serve its subscriber again.
+    let [bridged, _plain] = stopped;
+    wait_more(&bridged, 100);
+    for victim in bridged {
+        victim.end::<Received>().assert_sound();
+    }
+    scene.end();
+    bed.end();
+}
+
+#[test]
+fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_begin_with_the_present() {
+    let test = "twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_begin_with_the_present";
+    let Some(bed) = bed(test) else { return };
+    let scene = Scene::start(&bed);
+    for visit in 0..20 {
+        let library = LIBRARIES[visit % LIBRARIES.len()];
+        let published = scene.flows[0].healthy[1].received();
+        let visitors = [CRITICAL, PLAIN].map(|topic| subscribe(&bed, "slow", library, "visitor", topic));
+        for (mut visitor, topic) in visitors.into_iter().zip([CRITICAL, PLAIN]) {
+            visitor.wait_received(10);
+            if visit % 2 == 0 {
+                let received: Received = visitor.end();
+                received.assert_sound();
+                if topic == CRITICAL {
+                    assert_eq!(received.missing_count, 0, "{library:?}: {received:?}");
+                    assert!(received.first >= Some(published), "{library:?} after {published}: {received:?}");
+                }
+            } else {
+                visitor.kill9();
+            }
+        }
+    }
+    scene.go_on(512);
+    scene.end();
+    bed.end();
+}
+
+#[test]
+fn what_a_critical_egress_killed_five_times_forwarded_reached_every_subscriber() {
+    let test = "what_a_critical_egress_killed_five_times_forwarded_reached_every_subscriber";
+    let Some(bed) = bed(test) else { return };
+    let subscribers = LIBRARIES.map(|library| subscribe(&bed, "critical", library, "planner", CRITICAL));
+    let publisher = Peer::rclpy("scanner").keep_last(1000).rate_hz(RATE_HZ);
+    let publisher = bed.publish(publisher, INPUT);
+    subscribers[0].wait_received(100);
+    for restarts in 1..=5 {
+        signal(bed.pid("egress-critical"), Signal::SIGKILL);
+        support::wait_until("a restart", || bed.pids("egress-critical").len() == restarts + 1);
+        wait_more(&subscribers, 100);
+    }
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "the publisher is not held up: {sent:?}");
+    let status = bed.wait_whole();
+    let critical = critical(&status);
+    let forwarded = critical["forwarded"].as_u64().unwrap();
+    let named: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
+    assert_eq!(forwarded + named, sent.ok, "every sample is forwarded or named: {critical}");
+    for subscriber in subscribers {
+        subscriber.wait_for("the last sample", |event| event["last"] == sent.last);
+        let received: Received = subscriber.end();
+        received.assert_sound();
+        // What was written before all three were matched again is `no_reader`; some of them have it.
+        let no_reader = critical["drops"]["no_reader"].as_u64().unwrap();
+        let possible = forwarded..=forwarded + no_reader;
+        assert!(possible.contains(&received.received), "{received:?} of {critical}");
+    }
+    bed.end();
+}
