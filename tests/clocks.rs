@@ -130,11 +130,13 @@ fn wait_offset(bridge: &Bridge, offset_s: Option<f64>) {
 
 #[test]
 fn a_publisher_whose_clock_disagrees_is_served_and_named_and_its_late_samples_are_stale() {
+    // Samples this late would suspend the noncritical lane as well, and then count as suspended, not as stale.
     let bridge = Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {DOMAIN_ID}}}\n\
          topics: [{{id: scan, input_topic: /scan, message_type: std_msgs/msg/UInt8MultiArray, \
          max_sample_bytes: 1024}}]\n\
-         shared_memory: {{root_path: {{folder}}/root}}\nclassifier: {{enabled: false}}\n"
+         shared_memory: {{root_path: {{folder}}/root}}\nclassifier: {{enabled: false}}\n\
+         safety: {{degraded_lag_ms: 3000000, emergency_lag_ms: 3600000}}\n"
     ));
     let _up = bridge.start("up");
     bridge.wait_status("all processes", |status| {
