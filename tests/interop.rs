@@ -6,8 +6,9 @@ mod support;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, missing_from};
-use support::peer::{Graph, Library, Peer, Received, Sent};
+use support::peer::{Graph, Library, Peer, Received, RunningPeer, Sent};
 
 const LIBRARIES: [Library; 3] = [Library::Cyclone, Library::Fast, Library::Rust];
 
@@ -106,6 +107,79 @@ fn best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably() {
         critical.end::<Received>().assert_all_of(&strong.end());
     }
     bed.end();
+}
+
+#[test]
+fn a_reliable_publisher_stays_repaired_beside_best_effort_ones_that_come_and_go() {
+    let test = "a_reliable_publisher_stays_repaired_beside_best_effort_ones_that_come_and_go";
+    // What waits for a repair comes at once when it is repaired; the lane has room for all of it.
+    let yaml = format!("{SCAN}lanes:\n  critical: {{queue_depth: 1024}}\n");
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    for (index, from) in LIBRARIES.into_iter().enumerate() {
+        let beside = LIBRARIES[(index + 1) % LIBRARIES.len()];
+        // One subscriber for each publisher: it leaves out the numbers of the other.
+        let critical =
+            bed.subscribe("critical", Peer::on(Library::Cyclone).keep_all().each_sample(), CRITICAL);
+        let repaired = Peer::on(from).keep_all().option("--max-blocking-ms", 5000).heartbeat_ms(200);
+        let weak = Peer::on(beside).best_effort().rate_hz(100.0);
+
+        // The RELIABLE one joins BEST_EFFORT ones.
+        let first_weak = bed.publish(weak.clone().first_seq(1_000_000), INPUT);
+        critical.wait_received(20);
+        let strong = bed.publish(repaired.rate_hz(200.0).count(1_500).linger_s(20.0), INPUT);
+        let strong_numbers = || sequences_below(&critical, 1_000_000);
+        support::wait_until("samples of the RELIABLE publisher", || strong_numbers().len() > 50);
+        bed.host("bridge").lose_incoming(0.05);
+        support::wait_until("repaired samples", || strong_numbers().len() > 450);
+        // And BEST_EFFORT ones come and go beside it.
+        let _: Sent = first_weak.end();
+        let before = strong_numbers().len();
+        let second_weak = bed.publish(weak.first_seq(2_000_000), INPUT);
+        support::wait_until("samples of both", || {
+            let both = sequences(&critical);
+            strong_numbers().len() > before + 200 && both.iter().any(|number| *number >= 2_000_000)
+        });
+        bed.bridge.wait_status("a problem that names the BEST_EFFORT publisher", |status| {
+            let problems = status["problems"].as_array().unwrap();
+            let is_meant =
+                |problem: &&Value| problem.as_str().unwrap().contains("BEST_EFFORT beside RELIABLE");
+            problems.iter().filter(is_meant).count() == 1
+        });
+        bed.host("bridge").lose_incoming(0.0);
+        let _: Sent = second_weak.end();
+        let status = bed.bridge.status();
+        let accounts = status["routes"][0]["publishers"].as_array().unwrap();
+        let account = accounts.iter().find(|account| account["reliability"] == "RELIABLE");
+        assert_eq!(account.unwrap()["lost_upstream"], 0, "{status}");
+        strong.wait_sent();
+        let sent: Sent = strong.end();
+        support::wait_until(format!("the last sample of the RELIABLE publisher, {sent:?}"), || {
+            strong_numbers().last() == Some(&sent.last)
+        });
+        // What it wrote before its first sample was read came before the RELIABLE reader was there.
+        let numbers = strong_numbers();
+        let first = numbers[0];
+        assert!(numbers.iter().copied().eq(first..=sent.last), "in order, each once: {numbers:?}");
+        println!("{from:?} beside {beside:?}: from sample {first} on");
+        assert_eq!(sent.failed, 0, "{sent:?}");
+        let _: Received = critical.end();
+    }
+    bed.wait_whole();
+    bed.end();
+}
+
+/// The sequence numbers that a subscriber has received, in that order.
+fn sequences(subscriber: &RunningPeer) -> Vec<u64> {
+    let events = subscriber.events();
+    events
+        .iter()
+        .filter(|event| event["event"] == "sample")
+        .filter_map(|event| event["seq"].as_u64())
+        .collect()
+}
+
+fn sequences_below(subscriber: &RunningPeer, bound: u64) -> Vec<u64> {
+    sequences(subscriber).into_iter().filter(|number| *number < bound).collect()
 }
 
 /// A route of any size up to 4 MiB whose samples are all wanted on both lanes.

@@ -83,7 +83,7 @@ fn report() -> Report {
         needs_control: true,
         control,
         subscribers: vec![SubscriberReading { lane: Some(0), record: subscriber }],
-        named_readers: Vec::new(),
+        named_endpoints: Vec::new(),
         intruders: Vec::new(),
     };
     let mut report = snapshot.since(&snapshot);

@@ -194,15 +194,13 @@ impl Participant {
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         self.readers.push(reader.guid);
         self.announce();
-        // The library keeps samples by topic, beyond the life of a reader, and a new reader begins with them:
-        // what a former reader has taken would be taken once more.
-        while reader.take(&mut |_, _| {}) != Take::Empty {}
+        discard_earlier(&reader);
         Ok(reader)
     }
 
-    /// Like [`create_reader`](Self::create_reader), for a reader that goes on where another one has ended, in
-    /// this process or in an earlier one. Of each writer in `taken` it neither requests nor gives samples up
-    /// to and including that number. A RELIABLE reader gives all that arrives from the first instant on.
+    /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that goes on where another one has
+    /// ended, in this process or in an earlier one. Of each writer in `taken` it neither requests nor gives
+    /// samples up to and including that number. It gives all that arrives from the first instant on.
     ///
     /// # Errors
     /// The DDS library refused.
@@ -220,13 +218,28 @@ impl Participant {
         self.participant
             .begin_after(&made_topic, taken)
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
-        if reader_qos.reliability == Reliability::BestEffort {
-            // A BEST_EFFORT reader takes by time, not by number.
-            return self.create_reader(topic, dds_type, reader_qos);
-        }
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         self.readers.push(reader.guid);
         self.announce();
+        Ok(reader)
+    }
+
+    /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the same
+    /// topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from the beginning.
+    ///
+    /// # Errors
+    /// The DDS library refused.
+    pub fn create_reader_beside_reliable(
+        &mut self,
+        topic: &str,
+        dds_type: &str,
+        reader_qos: &ReaderQos,
+    ) -> Result<RawReader, DdsError> {
+        let reader = self.make_reader(topic, dds_type, reader_qos)?;
+        reader.ignore_reliable_writers();
+        self.readers.push(reader.guid);
+        self.announce();
+        discard_earlier(&reader);
         Ok(reader)
     }
 
@@ -334,6 +347,12 @@ impl Participant {
             tracing::warn!(node = self.node_name, %error, "ROS 2 graph entry not published");
         }
     }
+}
+
+/// Discards the samples that a new reader begins with: the library keeps them by topic, beyond the life of a
+/// reader, and what a former reader has taken would be taken once more.
+fn discard_earlier(reader: &RawReader) {
+    while reader.take(&mut |_, _| {}) != Take::Empty {}
 }
 
 fn make_topic(

@@ -66,8 +66,15 @@ impl RawReader {
         self.inner.drain_read_notifications();
     }
 
-    /// From now on samples that arrive in fragments are put together in memory of `memory`, as far as it
-    /// lends any. For the one reader of a topic in its participant.
+    /// Leaves RELIABLE writers to the RELIABLE reader of the same topic in this participant from now on, each
+    /// one as soon as that reader receives from it; for a BEST_EFFORT reader.
+    pub fn ignore_reliable_writers(&self) {
+        self.inner.ignore_reliable_writers();
+    }
+
+    /// From now on samples of the topic that arrive in fragments are put together in memory of `memory`, as
+    /// far as it lends any. Of two readers of a topic in one participant, one
+    /// [ignores](Self::ignore_reliable_writers) what the other takes.
     pub fn lend_memory(&self, memory: Arc<dyn SampleMemory>) {
         self.inner.set_sample_memory(Arc::new(Lender(memory)));
     }

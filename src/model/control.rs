@@ -150,15 +150,15 @@ pub struct IntruderRecord {
     pub since: MonotonicNs,
 }
 
-/// Readers of outputs whose nodes control names.
-pub const MAX_NAMED_READERS: usize = 128;
+/// Publishers of input topics and readers of outputs whose nodes control names.
+pub const MAX_NAMED_ENDPOINTS: usize = 128;
 
-/// The ROS 2 node that has a reader of an output.
+/// The ROS 2 node that has a writer of an input topic or a reader of an output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
-pub struct NamedReader {
-    /// The reader; all zero for none.
-    pub reader: Guid,
+pub struct NamedEndpoint {
+    /// The writer or reader; all zero for none.
+    pub endpoint: Guid,
     /// Its ROS 2 node; empty when the node has not announced itself.
     pub node: FixedText,
     /// The address of its host; empty when it is not known.

@@ -30,9 +30,19 @@ pub struct PublisherAccount {
     pub repeated: u64,
     /// When the last sample was taken.
     pub last_at: MonotonicNs,
+    /// What the writer offers, as discovery knows it at present: one of `OFFER_UNKNOWN`,
+    /// `OFFERS_BEST_EFFORT` and `OFFERS_RELIABLE`.
+    pub offered_reliability: u64,
 }
 
 impl PublisherAccount {
+    /// Discovery does not know the writer, or no more.
+    pub const OFFER_UNKNOWN: u64 = 0;
+    /// Samples that the network loses are not repaired.
+    pub const OFFERS_BEST_EFFORT: u64 = 1;
+    /// Samples that the network loses are repaired.
+    pub const OFFERS_RELIABLE: u64 = 2;
+
     /// The account of a writer whose first sample has this number, before that sample is taken.
     pub const fn new(writer: Guid, first_sequence: i64) -> Self {
         Self {
@@ -43,6 +53,7 @@ impl PublisherAccount {
             lost_upstream: 0,
             repeated: 0,
             last_at: MonotonicNs(0),
+            offered_reliability: Self::OFFER_UNKNOWN,
         }
     }
 

@@ -17,7 +17,7 @@ mod thresholds;
 mod time;
 
 pub use control::{
-    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_SUBSCRIBERS, NamedReader,
+    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint,
     SubscriberRecord, SubscriberWarning,
 };
 pub use drops::{DropCounts, DropReason};

@@ -1,12 +1,13 @@
-//! A DDS reader that wakes its role.
+//! DDS readers that wake their role.
 
+use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Wake, Waker};
 use std::thread::Thread;
 
 use crate::dds::{Payload, RawReader, Take};
-use crate::model::Encapsulation;
+use crate::model::{Encapsulation, Guid};
 
 /// Rung by the DDS library when a sample has arrived.
 pub(super) struct Bell {
@@ -47,30 +48,49 @@ impl Wake for Bell {
     }
 }
 
-/// A reader with a bell, so that looking costs next to nothing while nothing has come.
+/// A share of one in so many samples is taken from the last reader first, so that a flood at the first one
+/// cannot hold up the last.
+const TURN_OF_THE_LAST: u64 = 32;
+
+/// The readers of one topic with a bell, so that looking costs next to nothing while nothing has come.
 pub(super) struct Inbox {
-    reader: RawReader,
+    /// In the order in which they are read.
+    readers: Vec<RawReader>,
     bell: Arc<Bell>,
     waker: Waker,
+    takes: Cell<u64>,
 }
 
 impl Inbox {
-    /// For the thread that calls this, which is the one that is woken.
+    /// With one reader, for the thread that calls this, which is the one that is woken.
     pub fn new(reader: RawReader) -> Self {
         let thread = Some(std::thread::current());
-        Self::with_bell(reader, Arc::new(Bell { rung: AtomicBool::new(false), thread }))
+        let mut inbox = Self::with_bell(Arc::new(Bell { rung: AtomicBool::new(false), thread }));
+        inbox.add(reader);
+        inbox
     }
 
-    /// For those who look at that bell.
-    pub fn with_bell(reader: RawReader, bell: Arc<Bell>) -> Self {
+    /// Without a reader yet, for threads that look at that bell.
+    pub fn with_bell(bell: Arc<Bell>) -> Self {
+        Self { readers: Vec::new(), waker: Waker::from(Arc::clone(&bell)), bell, takes: Cell::new(0) }
+    }
+
+    /// Adds a reader, which is read after the others.
+    pub fn add(&mut self, reader: RawReader) {
+        self.readers.push(reader);
         // A new reader rings nobody yet: it is looked at first.
-        bell.ring();
-        Self { reader, waker: Waker::from(Arc::clone(&bell)), bell }
+        self.bell.ring();
     }
 
-    /// Its reader.
-    pub fn reader(&self) -> &RawReader {
-        &self.reader
+    /// Takes a reader out.
+    pub fn remove(&mut self, reader: Guid) -> Option<RawReader> {
+        let place = self.readers.iter().position(|known| known.guid() == reader)?;
+        Some(self.readers.remove(place))
+    }
+
+    /// The readers.
+    pub fn readers(&self) -> &[RawReader] {
+        &self.readers
     }
 
     /// As [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: an arrival after this look keeps
@@ -88,17 +108,30 @@ impl Inbox {
         if !self.bell.is_rung() {
             return Take::Empty;
         }
-        let take = take_one(&self.reader);
+        let take = self.take_first(&mut take_one);
         if take != Take::Empty {
             return take;
         }
         // Nothing there, so ask to be rung, and look again in case something came in between.
         self.bell.silence();
-        self.reader.arm(&self.waker);
-        let take = take_one(&self.reader);
+        for reader in &self.readers {
+            reader.arm(&self.waker);
+        }
+        let take = self.take_first(&mut take_one);
         if take != Take::Empty {
             self.bell.rung.store(true, Ordering::Release);
         }
         take
+    }
+
+    /// Takes from the first reader that has a sample.
+    fn take_first(&self, take_one: &mut impl FnMut(&RawReader) -> Take) -> Take {
+        let [first, last] = self.readers.as_slice() else {
+            return self.readers.first().map_or(Take::Empty, take_one);
+        };
+        let takes = self.takes.get().wrapping_add(1);
+        self.takes.set(takes);
+        let order = if takes % TURN_OF_THE_LAST == 0 { [last, first] } else { [first, last] };
+        order.into_iter().map(take_one).find(|take| *take != Take::Empty).unwrap_or(Take::Empty)
     }
 }

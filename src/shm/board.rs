@@ -19,8 +19,9 @@ use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
     ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
-    LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs,
-    NamedReader, OutputReaders, ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord, fnv1a,
+    LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs,
+    NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord,
+    fnv1a,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.
@@ -95,7 +96,7 @@ struct Layout {
     control: usize,
     subscribers: usize,
     intruders: usize,
-    named_readers: usize,
+    named_endpoints: usize,
     route_info: usize,
     ingress: usize,
     publishers: usize,
@@ -114,8 +115,8 @@ impl Layout {
         let control = policy + lanes * Cell::<LanePolicy>::WORDS;
         let subscribers = control + Cell::<ControlRecord>::WORDS;
         let intruders = subscribers + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
-        let named_readers = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
-        let route_info = named_readers + MAX_NAMED_READERS * Cell::<NamedReader>::WORDS;
+        let named_endpoints = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
+        let route_info = named_endpoints + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
         let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
         let publishers = ingress + routes * Cell::<IngressCounters>::WORDS;
         let lane = publishers + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
@@ -131,7 +132,7 @@ impl Layout {
             control,
             subscribers,
             intruders,
-            named_readers,
+            named_endpoints,
             route_info,
             ingress,
             publishers,
@@ -169,9 +170,9 @@ impl Layout {
         Cell::at(self.intruders + place * Cell::<IntruderRecord>::WORDS)
     }
 
-    fn named_reader(&self, place: usize) -> Cell<NamedReader> {
-        assert!(place < MAX_NAMED_READERS, "named reader {place} of {MAX_NAMED_READERS}");
-        Cell::at(self.named_readers + place * Cell::<NamedReader>::WORDS)
+    fn named_endpoint(&self, place: usize) -> Cell<NamedEndpoint> {
+        assert!(place < MAX_NAMED_ENDPOINTS, "named endpoint {place} of {MAX_NAMED_ENDPOINTS}");
+        Cell::at(self.named_endpoints + place * Cell::<NamedEndpoint>::WORDS)
     }
 
     fn output_readers(&self, lane: usize, route: usize) -> Cell<OutputReaders> {
@@ -352,14 +353,14 @@ impl Boards {
         self.writer(self.layout.intruder(place))
     }
 
-    /// The reader that control names at a place below [`MAX_NAMED_READERS`].
-    pub fn named_reader(&self, place: usize) -> Option<NamedReader> {
-        self.layout.named_reader(place).read(&self.segment)
+    /// The endpoint that control names at a place below [`MAX_NAMED_ENDPOINTS`].
+    pub fn named_endpoint(&self, place: usize) -> Option<NamedEndpoint> {
+        self.layout.named_endpoint(place).read(&self.segment)
     }
 
-    /// Writes the reader that control names at a place below [`MAX_NAMED_READERS`].
-    pub fn named_reader_writer(&self, place: usize) -> BoardWriter<NamedReader> {
-        self.writer(self.layout.named_reader(place))
+    /// Writes the endpoint that control names at a place below [`MAX_NAMED_ENDPOINTS`].
+    pub fn named_endpoint_writer(&self, place: usize) -> BoardWriter<NamedEndpoint> {
+        self.writer(self.layout.named_endpoint(place))
     }
 
     /// The readers that are matched with a lane's output of a route.

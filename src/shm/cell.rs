@@ -11,8 +11,8 @@ use std::sync::atomic::{Ordering, fence};
 
 use super::segment::Segment;
 use crate::model::{
-    ControlRecord, IngressCounters, IntruderRecord, LaneCounters, LanePolicy, LatencyHistogram, NamedReader,
-    OutputReaders, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
+    ControlRecord, IngressCounters, IntruderRecord, LaneCounters, LanePolicy, LatencyHistogram,
+    NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
 };
 
 /// Words of a cache line, on which every value begins, so that two writers never share one.
@@ -46,7 +46,7 @@ unsafe impl Plain for LaneCounters {}
 // SAFETY: `repr(C)`; records of a GUID of 16 bytes and four 64-bit integers.
 unsafe impl Plain for OutputReaders {}
 // SAFETY: `repr(C)`; a GUID of 16 bytes, then twice 128 bytes of text, which is checked when it is read.
-unsafe impl Plain for NamedReader {}
+unsafe impl Plain for NamedEndpoint {}
 // SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
 unsafe impl Plain for LanePolicy {}
 // SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
@@ -65,8 +65,8 @@ const _: () = {
     assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
     assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
     assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
-    assert!(size_of::<NamedReader>() == (2 + 2 * 16) * 8);
-    assert!(size_of::<PublisherAccount>() == 8 * 8);
+    assert!(size_of::<NamedEndpoint>() == (2 + 2 * 16) * 8);
+    assert!(size_of::<PublisherAccount>() == 9 * 8);
     assert!(size_of::<LanePolicy>() == 5 * 8);
     assert!(size_of::<RouteInfo>() == 16 * 8);
 };

@@ -98,6 +98,9 @@ pub(super) fn wide() -> Report {
             unmarked: 0,
             publishers: vec![PublisherReport {
                 writer: "0102030405060708090a0b0c:00000103".into(),
+                node: Some("/laser".into()),
+                host: Some("10.0.0.7".into()),
+                reliability: Some("RELIABLE"),
                 first_sequence: 1,
                 last_sequence: i64::MAX,
                 received: u64::MAX,

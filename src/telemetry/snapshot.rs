@@ -9,8 +9,8 @@ use crate::clock;
 use crate::config::Settings;
 use crate::model::{
     ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_READERS, MAX_PUBLISHERS, MAX_SUBSCRIBERS,
-    MonotonicNs, NamedReader, OutputReaders, ProcessHealth, PublisherAccount, RouteId, SubscriberRecord,
+    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS, MAX_SUBSCRIBERS,
+    MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId, SubscriberRecord,
     TopicName, TrafficClass, TypeName, WallNs,
 };
 use crate::policy::effective_mode;
@@ -46,7 +46,7 @@ pub struct Snapshot {
     /// The remote readers that reach past the bridge, as control found them.
     pub intruders: Vec<IntruderRecord>,
     /// The nodes of the outputs' readers, as control found them.
-    pub named_readers: Vec<NamedReader>,
+    pub named_endpoints: Vec<NamedEndpoint>,
 }
 
 /// One subscriber, as control sees it.
@@ -212,7 +212,7 @@ impl Snapshot {
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
             intruders: read_intruders(boards, &control)?,
-            named_readers: read_named_readers(boards)?,
+            named_endpoints: read_named_endpoints(boards)?,
             control,
             lanes,
         })
@@ -251,11 +251,11 @@ fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<Intrud
     Ok(intruders)
 }
 
-fn read_named_readers(boards: &Boards) -> Result<Vec<NamedReader>, ShmError> {
+fn read_named_endpoints(boards: &Boards) -> Result<Vec<NamedEndpoint>, ShmError> {
     let mut named = Vec::new();
-    for place in 0..MAX_NAMED_READERS {
-        let record = steady(boards.named_reader(place))?;
-        if record.reader != Guid::default() {
+    for place in 0..MAX_NAMED_ENDPOINTS {
+        let record = steady(boards.named_endpoint(place))?;
+        if record.endpoint != Guid::default() {
             named.push(record);
         }
     }

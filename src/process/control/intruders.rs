@@ -1,7 +1,7 @@
-//! Readers on other hosts that reach past the bridge, and the nodes of the outputs' readers: which of them
-//! miss samples.
+//! Readers on other hosts that reach past the bridge, the nodes of the inputs' publishers and of the outputs'
+//! readers, and which of these miss samples.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 
 use tracing::{info, warn};
@@ -9,9 +9,10 @@ use tracing::{info, warn};
 use super::super::role::RoleError;
 use super::networks;
 use crate::config::Settings;
-use crate::dds::{self, Discovery, GraphWatch, Participant};
+use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
 use crate::model::{
-    FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_READERS, MonotonicNs, NamedReader, TrafficClass,
+    FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
+    TrafficClass,
 };
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
 use crate::shm::{BoardWriter, Boards};
@@ -28,8 +29,10 @@ struct Watched {
     graph: GraphWatch,
     /// The outputs there, by DDS name: lane and route.
     outputs: BTreeMap<String, (usize, usize)>,
-    /// Their readers, by topic.
-    readers: Vec<(Guid, String, Location)>,
+    /// The input topics there, by DDS name.
+    inputs: BTreeSet<String>,
+    /// The readers of the outputs and the writers of the inputs, with their places.
+    endpoints: Vec<(Guid, Location)>,
 }
 
 /// Samples that one reader missed, as far as the log says.
@@ -44,7 +47,7 @@ pub(super) struct Guard {
     /// One for each network, in the order of the participants.
     networks: Vec<Watched>,
     overruns: Vec<LoggedOverrun>,
-    named: Vec<BoardWriter<NamedReader>>,
+    named: Vec<BoardWriter<NamedEndpoint>>,
     readers_at: MonotonicNs,
     own: Vec<IpAddr>,
     places: Vec<BoardWriter<IntruderRecord>>,
@@ -63,7 +66,9 @@ impl Guard {
         for (network, participant) in participants.iter().enumerate() {
             let mut guarded = Vec::new();
             let mut outputs = BTreeMap::new();
+            let mut inputs = BTreeSet::new();
             if network == 0 {
+                inputs.extend(settings.routes.iter().map(|route| route.input_topic.to_dds()));
                 guarded.extend(settings.routes.iter().enumerate().map(|(route, settings_of)| GuardedTopic {
                     topic: settings_of.input_topic.clone(),
                     guarded: Guarded::Input,
@@ -90,13 +95,14 @@ impl Guard {
                 watch: IntruderWatch::new(guarded),
                 graph: participant.watch_graph()?,
                 outputs,
-                readers: Vec::new(),
+                inputs,
+                endpoints: Vec::new(),
             });
         }
         let mut named: Vec<_> =
-            (0..MAX_NAMED_READERS).map(|place| boards.named_reader_writer(place)).collect();
+            (0..MAX_NAMED_ENDPOINTS).map(|place| boards.named_endpoint_writer(place)).collect();
         for place in &mut named {
-            place.update(|record| *record = NamedReader::default());
+            place.update(|record| *record = NamedEndpoint::default());
         }
         let mut places: Vec<_> = (0..MAX_INTRUDERS).map(|place| boards.intruder_writer(place)).collect();
         for place in &mut places {
@@ -159,7 +165,7 @@ impl Guard {
         }
         if now >= self.readers_at {
             self.readers_at = now.plus_ms(READERS_MS);
-            self.name_readers();
+            self.name_endpoints();
             self.log_overruns(settings, now);
         }
     }
@@ -182,13 +188,13 @@ impl Guard {
         }
     }
 
-    /// Shows the nodes of the outputs' readers.
-    fn name_readers(&mut self) {
-        let readers = self.networks.iter().flat_map(Watched::named_readers);
-        let mut readers = readers.chain(std::iter::repeat(NamedReader::default()));
-        for (place, reader) in self.named.iter_mut().zip(&mut readers) {
-            if *place.get() != reader {
-                place.update(|shown| *shown = reader);
+    /// Shows the nodes of the inputs' publishers and of the outputs' readers.
+    fn name_endpoints(&mut self) {
+        let named = self.networks.iter().flat_map(Watched::named_endpoints);
+        let mut named = named.chain(std::iter::repeat(NamedEndpoint::default()));
+        for (place, endpoint) in self.named.iter_mut().zip(&mut named) {
+            if *place.get() != endpoint {
+                place.update(|shown| *shown = endpoint);
             }
         }
     }
@@ -244,19 +250,22 @@ impl Watched {
         match change {
             Discovery::Reader(reader) if !participant.owns(reader.guid) => {
                 if self.outputs.contains_key(&reader.topic) {
-                    self.readers.retain(|(guid, _, _)| *guid != reader.guid);
-                    if self.readers.len() < MAX_NAMED_READERS {
-                        self.readers.push((reader.guid, reader.topic.clone(), reader.location.clone()));
-                    }
+                    self.note(&reader);
                 }
                 self.watch.found(reader.guid, &reader.topic, &reader.location, own, now);
             }
+            Discovery::Writer(writer) if !participant.owns(writer.guid) => {
+                if self.inputs.contains(&writer.topic) {
+                    self.note(&writer);
+                }
+            }
+            Discovery::WriterGone(guid) => self.endpoints.retain(|(writer, _)| *writer != guid),
             Discovery::ReaderGone(guid) => {
-                self.readers.retain(|(reader, _, _)| *reader != guid);
+                self.endpoints.retain(|(reader, _)| *reader != guid);
                 self.watch.gone(guid, now);
             }
             Discovery::ParticipantGone { prefix } => {
-                self.readers.retain(|(reader, _, _)| reader.prefix() != prefix);
+                self.endpoints.retain(|(endpoint, _)| endpoint.prefix() != prefix);
                 self.watch.participant_gone(prefix, now);
                 self.graph.participant_gone(prefix);
             }
@@ -264,10 +273,18 @@ impl Watched {
         }
     }
 
-    /// The outputs' readers with their nodes and hosts.
-    fn named_readers(&self) -> impl Iterator<Item = NamedReader> {
-        self.readers.iter().map(|(guid, _, location)| NamedReader {
-            reader: *guid,
+    /// Records where an endpoint is. Of more than can be shown, those that came first stay.
+    fn note(&mut self, endpoint: &Endpoint) {
+        self.endpoints.retain(|(guid, _)| *guid != endpoint.guid);
+        if self.endpoints.len() < MAX_NAMED_ENDPOINTS {
+            self.endpoints.push((endpoint.guid, endpoint.location.clone()));
+        }
+    }
+
+    /// The inputs' publishers and the outputs' readers with their nodes and hosts.
+    fn named_endpoints(&self) -> impl Iterator<Item = NamedEndpoint> {
+        self.endpoints.iter().map(|(guid, location)| NamedEndpoint {
+            endpoint: *guid,
             node: FixedText::new(self.graph.node_of(*guid).unwrap_or("")),
             host: FixedText::new(&location.host().map_or_else(String::new, |host| host.to_string())),
         })
@@ -275,7 +292,7 @@ impl Watched {
 
     /// A reader of an output by its node and host; `None` for a reader that discovery has not reported.
     fn name_of(&self, reader: Guid) -> Option<String> {
-        let (guid, _, location) = self.readers.iter().find(|(guid, _, _)| *guid == reader)?;
+        let (guid, location) = self.endpoints.iter().find(|(guid, _)| *guid == reader)?;
         let node = self.graph.node_of(*guid).map_or_else(|| guid.to_string(), str::to_owned);
         Some(match location.host() {
             Some(host) => format!("{node} on {host}"),

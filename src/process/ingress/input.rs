@@ -1,4 +1,4 @@
-//! One route in ingress: its reader, its pool, its counters.
+//! One route in ingress: its readers, its pool, its counters.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use super::clocks::Clocks;
 use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, Standing};
-use super::source::{Source, Wanted, label, still_suits};
+use super::source::{Source, Wanted, label};
 use crate::clock;
 use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
@@ -31,7 +31,11 @@ pub(super) struct Input {
     configured_type: Option<String>,
     route: Route,
     source: Source,
-    connection: Option<Connection>,
+    inbox: Inbox,
+    /// The reader of the RELIABLE publishers, or of all where the configuration says RELIABLE.
+    reliable: Option<Reading>,
+    /// The reader of the BEST_EFFORT publishers, or of all where the configuration says BEST_EFFORT.
+    best_effort: Option<Reading>,
     /// The type that the lanes have writers for: once read, it stays.
     settled_type: Option<String>,
     /// Whether the publishers have changed since the reader was last thought over.
@@ -40,7 +44,6 @@ pub(super) struct Input {
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
-    bell: Arc<Bell>,
     clocks: Clocks,
     publishers: Publishers,
     watch: DropWatch,
@@ -48,9 +51,12 @@ pub(super) struct Input {
     conflict: Option<(String, String)>,
 }
 
-struct Connection {
-    inbox: Inbox,
+/// One reader of the inbox.
+struct Reading {
+    reader: Guid,
     qos: ReaderQos,
+    /// Publishers matched.
+    writers: u64,
     /// Whether its last publisher is gone.
     idle: bool,
 }
@@ -66,7 +72,9 @@ impl Input {
             dds_topic: route.input_topic.to_dds(),
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
-            connection: None,
+            inbox: Inbox::with_bell(Arc::clone(bell)),
+            reliable: None,
+            best_effort: None,
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
@@ -76,7 +84,6 @@ impl Input {
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             clocks: Clocks::new(route.id.as_str()),
             publishers,
-            bell: Arc::clone(bell),
             remind_at: MonotonicNs(0),
             conflict: None,
             route,
@@ -85,7 +92,7 @@ impl Input {
 
     /// Whether a publisher was found and is read.
     pub fn is_connected(&self) -> bool {
-        self.connection.as_ref().is_some_and(|connection| !connection.idle)
+        self.readings().any(|reading| !reading.idle)
     }
 
     /// Whether a sample has come of each publisher that wrote until the predecessor of this process died.
@@ -106,16 +113,12 @@ impl Input {
     /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes. When there was none
     /// the bell is silent, and rings at the next arrival.
     pub fn step(&mut self, wake: impl FnOnce()) -> bool {
-        let Some(connection) = &self.connection else {
-            self.bell.silence();
-            return false;
-        };
         let pool = &self.pool;
         let mut received: Option<(Filled, Encapsulation)> = None;
         let mut receive = |payload: Payload<'_>, encapsulation: Encapsulation| {
             received = Some((pool.fill(payload), encapsulation));
         };
-        match connection.inbox.take_payload(&mut receive) {
+        match self.inbox.take_payload(&mut receive) {
             Take::Empty => return false,
             Take::Sample(origin) => match received {
                 Some((filled, encapsulation)) => {
@@ -252,25 +255,11 @@ impl Input {
     /// Connects to the publisher, attends to lanes that came, logs.
     pub fn keep_house(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
         self.connect(participant, now)?;
-        if let Some(connection) = &self.connection {
-            while let Some(event) = connection.inbox.reader().poll_event() {
-                match event {
-                    ReaderEvent::Matched { writers } => {
-                        self.counters.update(|counters| counters.writers = writers);
-                    }
-                    ReaderEvent::Incompatible { writer } => {
-                        warn!(
-                            route = self.id,
-                            ?writer,
-                            asked = label(connection.qos.reliability, connection.qos.durability),
-                            "a publisher offers less than the reader asks for: leave qos_overrides.input open"
-                        );
-                    }
-                }
-            }
-        }
+        self.follow_matching();
         self.pool.attend();
+        self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
+        counters.writers = self.matched_writers();
         self.clocks.keep_house(&mut counters, now);
         if counters != *self.counters.get() {
             self.counters.update(|present| *present = counters);
@@ -293,29 +282,19 @@ impl Input {
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
         let wanted = self.source.wanted(known_type, &self.route.input_qos, self.route.max_sample_bytes);
         match wanted {
-            Wanted::Reader { dds_type, qos } => {
-                if let Some(current) = &mut self.connection {
-                    // What a TRANSIENT_LOCAL publisher wrote before, it sends to a reader that asks for it.
-                    let idle = std::mem::take(&mut current.idle);
-                    if still_suits(&current.qos, &qos) && !(idle && current.qos.durability < qos.durability) {
-                        return Ok(());
-                    }
-                }
-                self.read(participant, dds_type, qos)
+            Wanted::Readers { dds_type, reliable, best_effort } => {
+                // First this one: until it is there, the BEST_EFFORT reader takes what a RELIABLE publisher
+                // writes that has just joined BEST_EFFORT ones.
+                self.adapt(participant, Reliability::Reliable, &dds_type, reliable)?;
+                self.adapt(participant, Reliability::BestEffort, &dds_type, best_effort)
             }
             Wanted::TypeConflict(one, other) => {
                 self.report_conflict((one, other));
                 Ok(())
             }
             Wanted::Unknown => {
-                // The last publisher is gone. The next one begins as soon as it finds a reader: a RELIABLE
-                // one stays for it, but behind a BEST_EFFORT one its first samples would not be repaired.
-                if let Some(current) = &mut self.connection {
-                    current.idle = true;
-                    if current.qos.reliability == Reliability::BestEffort {
-                        self.disconnect(participant);
-                    }
-                }
+                self.retire(participant, Reliability::Reliable);
+                self.retire(participant, Reliability::BestEffort);
                 if now >= self.remind_at {
                     info!(
                         route = self.id,
@@ -330,43 +309,152 @@ impl Input {
         }
     }
 
+    /// Brings the reader of that reliability in line with what is wanted.
+    fn adapt(
+        &mut self,
+        participant: &mut Participant,
+        reliability: Reliability,
+        dds_type: &str,
+        wanted: Option<ReaderQos>,
+    ) -> Result<(), RoleError> {
+        let Some(qos) = wanted else {
+            self.retire(participant, reliability);
+            return Ok(());
+        };
+        if let Some(current) = self.reading_mut(reliability) {
+            // A reader that asks for less than all publishers offer is matched with each of them, and to
+            // replace it would lose samples. But what a TRANSIENT_LOCAL publisher wrote before, it sends only
+            // to a reader that asks for it.
+            let idle = std::mem::take(&mut current.idle);
+            if current.qos.durability <= qos.durability && !(idle && current.qos.durability < qos.durability)
+            {
+                return Ok(());
+            }
+        }
+        self.read(participant, dds_type, qos)
+    }
+
+    /// The last publisher of the reader is gone. The next one begins as soon as it finds a reader, so a
+    /// RELIABLE reader stays for it. Behind a BEST_EFFORT one the first samples of a RELIABLE publisher would
+    /// not be repaired, and beside a RELIABLE one its publishers would send everything twice.
+    fn retire(&mut self, participant: &mut Participant, reliability: Reliability) {
+        if let Some(reading) = self.reading_mut(reliability) {
+            reading.idle = true;
+            if reliability == Reliability::BestEffort {
+                self.disconnect(participant, reliability);
+            }
+        }
+    }
+
     fn read(
         &mut self,
         participant: &mut Participant,
-        dds_type: String,
+        dds_type: &str,
         qos: ReaderQos,
     ) -> Result<(), RoleError> {
-        self.disconnect(participant);
+        self.disconnect(participant, qos.reliability);
         // Before the reader: a lane must be able to make its writer before the first sample reaches it.
-        self.info.update(|info| info.dds_type = FixedText::new(&dds_type));
-        let marks = self.publishers.marks();
-        let reader = participant.create_reader_after(&self.dds_topic, &dds_type, &qos, marks)?;
-        reader.lend_memory(self.pool.lender());
+        self.info.update(|info| info.dds_type = FixedText::new(dds_type));
+        let topic = self.dds_topic.as_str();
+        let reader = match qos.reliability {
+            Reliability::Reliable => {
+                participant.create_reader_after(topic, dds_type, &qos, self.publishers.marks())?
+            }
+            // A BEST_EFFORT reader takes by time, not by number.
+            Reliability::BestEffort if self.reliable.is_none() => {
+                participant.create_reader(topic, dds_type, &qos)?
+            }
+            Reliability::BestEffort => participant.create_reader_beside_reliable(topic, dds_type, &qos)?,
+        };
         info!(
             route = self.id,
-            topic = self.dds_topic,
+            topic,
             dds_type,
             qos = label(qos.reliability, qos.durability),
             depth = qos.depth,
             "reading"
         );
-        self.settled_type = Some(dds_type);
-        self.connection =
-            Some(Connection { inbox: Inbox::with_bell(reader, Arc::clone(&self.bell)), qos, idle: false });
+        if qos.reliability == Reliability::Reliable {
+            for other in self.inbox.readers() {
+                other.ignore_reliable_writers();
+            }
+        }
+        self.settled_type = Some(dds_type.to_owned());
+        *self.place(qos.reliability) = Some(Reading { reader: reader.guid(), qos, writers: 0, idle: false });
+        self.inbox.add(reader);
+        self.lend_memory();
         Ok(())
     }
 
-    /// Lets go of the reader, which the DDS library wants gone before the participant.
+    /// Lets go of the readers, which the DDS library wants gone before the participant.
     pub fn close(&mut self) {
-        self.connection = None;
+        for reading in [self.reliable.take(), self.best_effort.take()].into_iter().flatten() {
+            drop(self.inbox.remove(reading.reader));
+        }
     }
 
-    fn disconnect(&mut self, participant: &mut Participant) {
-        if let Some(former) = self.connection.take() {
-            let guid = former.inbox.reader().guid();
-            drop(former);
-            participant.forget(guid);
-            self.counters.update(|counters| counters.writers = 0);
+    fn disconnect(&mut self, participant: &mut Participant, reliability: Reliability) {
+        if let Some(former) = self.place(reliability).take() {
+            drop(self.inbox.remove(former.reader));
+            participant.forget(former.reader);
+            self.lend_memory();
+        }
+    }
+
+    /// Lends the readers the pool's memory. It is lent by topic, and a reader that goes ends it.
+    fn lend_memory(&self) {
+        for reader in self.inbox.readers() {
+            reader.lend_memory(self.pool.lender());
+        }
+    }
+
+    fn place(&mut self, reliability: Reliability) -> &mut Option<Reading> {
+        match reliability {
+            Reliability::Reliable => &mut self.reliable,
+            Reliability::BestEffort => &mut self.best_effort,
+        }
+    }
+
+    fn reading_mut(&mut self, reliability: Reliability) -> Option<&mut Reading> {
+        self.place(reliability).as_mut()
+    }
+
+    fn readings(&self) -> impl Iterator<Item = &Reading> {
+        [&self.reliable, &self.best_effort].into_iter().flatten()
+    }
+
+    /// Publishers matched. A RELIABLE one that the BEST_EFFORT reader has matched before there was a RELIABLE
+    /// reader counts once.
+    fn matched_writers(&self) -> u64 {
+        match (&self.reliable, &self.best_effort) {
+            (Some(reliable), Some(best_effort)) => {
+                reliable.writers + best_effort.writers.min(self.source.best_effort_writers())
+            }
+            _ => self.readings().map(|reading| reading.writers).sum(),
+        }
+    }
+
+    fn follow_matching(&mut self) {
+        for reader in self.inbox.readers() {
+            let mut readings = [&mut self.reliable, &mut self.best_effort].into_iter().flatten();
+            let Some(reading) = readings.find(|reading| reading.reader == reader.guid()) else { continue };
+            while let Some(event) = reader.poll_event() {
+                match event {
+                    ReaderEvent::Matched { writers } => reading.writers = writers,
+                    // The other reader has it.
+                    ReaderEvent::Incompatible { writer }
+                        if self.route.input_qos.reliability.is_none()
+                            && self.source.reliability_of(writer) != Some(Reliability::Reliable) => {}
+                    ReaderEvent::Incompatible { writer } => {
+                        warn!(
+                            route = self.id,
+                            ?writer,
+                            asked = label(reading.qos.reliability, reading.qos.durability),
+                            "a publisher offers less than the reader asks for: leave qos_overrides.input open"
+                        );
+                    }
+                }
+            }
         }
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::followed::Followed;
-use crate::model::{Guid, IngressCounters, MAX_PUBLISHERS, MonotonicNs, PublisherAccount};
+use crate::model::{Guid, IngressCounters, MAX_PUBLISHERS, MonotonicNs, PublisherAccount, Reliability};
 use crate::policy::publisher_place;
 use crate::shm::{BoardWriter, Boards};
 
@@ -93,6 +93,24 @@ impl Publishers {
         self.expected[place] = false;
         self.last_place = place;
         Standing::Next(place)
+    }
+
+    /// Records what each publisher offers; `reliability_of` yields `None` for one that discovery does not know.
+    pub fn set_reliabilities(&mut self, reliability_of: impl Fn(Guid) -> Option<Reliability>) {
+        for account in &mut self.accounts {
+            let present = *account.get();
+            if present.is_vacant() {
+                continue;
+            }
+            let offered = match reliability_of(present.writer) {
+                None => PublisherAccount::OFFER_UNKNOWN,
+                Some(Reliability::BestEffort) => PublisherAccount::OFFERS_BEST_EFFORT,
+                Some(Reliability::Reliable) => PublisherAccount::OFFERS_RELIABLE,
+            };
+            if present.offered_reliability != offered {
+                account.update(|account| account.offered_reliability = offered);
+            }
+        }
     }
 
     /// Whether each publisher that wrote until the predecessor of this process died has gone on or is gone.

@@ -14,19 +14,22 @@ pub(super) struct Source {
     writers: Vec<Endpoint>,
 }
 
-/// What a route's reader should be.
+/// What a route's readers should be.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Wanted {
     /// No publisher is known, and the configuration does not say enough to do without one.
     Unknown,
     /// Two publishers claim the topic with different types, and the configuration does not decide.
     TypeConflict(String, String),
-    /// This reader.
-    Reader {
+    /// At least one of these readers. A RELIABLE reader matches no BEST_EFFORT publisher, and a BEST_EFFORT
+    /// one repairs nothing, so publishers of both kinds take both readers.
+    Readers {
         /// DDS type.
         dds_type: String,
-        /// Policies.
-        qos: ReaderQos,
+        /// A RELIABLE reader.
+        reliable: Option<ReaderQos>,
+        /// A BEST_EFFORT reader.
+        best_effort: Option<ReaderQos>,
     },
 }
 
@@ -62,8 +65,20 @@ impl Source {
         self.writers.iter().find(|writer| writer.dds_type != dds_type)
     }
 
-    /// The reader that suits all publishers: RELIABLE if each offers that, TRANSIENT_LOCAL likewise. What the
-    /// configuration fixes stays fixed. A reader that asks for more than a publisher offers is not matched.
+    /// What the publisher offers, if it is known.
+    pub fn reliability_of(&self, writer: Guid) -> Option<Reliability> {
+        self.writers.iter().find(|known| known.guid == writer).map(|known| known.reliability)
+    }
+
+    /// How many publishers offer BEST_EFFORT.
+    pub fn best_effort_writers(&self) -> u64 {
+        let offers = |writer: &&Endpoint| writer.reliability == Reliability::BestEffort;
+        self.writers.iter().filter(offers).count() as u64
+    }
+
+    /// The readers that suit the publishers: one for the RELIABLE ones, one for the BEST_EFFORT ones, and each
+    /// TRANSIENT_LOCAL if each of its publishers offers that. Where the configuration fixes the reliability,
+    /// one reader is for all. A reader that asks for more than a publisher offers is not matched.
     pub fn wanted(&self, configured_type: Option<&str>, input: &InputQos, max_sample_bytes: usize) -> Wanted {
         let dds_type = match (configured_type, self.writers.first()) {
             (Some(configured), _) => configured,
@@ -75,20 +90,29 @@ impl Source {
             },
             (None, None) => return Wanted::Unknown,
         };
-        let offers = || self.writers.iter().filter(|writer| writer.dds_type == dds_type);
-        let reliability = input.reliability.or_else(|| offers().map(|writer| writer.reliability).min());
-        let durability = input.durability.or_else(|| offers().map(|writer| writer.durability).min());
-        let (Some(reliability), Some(durability)) = (reliability, durability) else {
-            return Wanted::Unknown;
-        };
         let depth = match input.history {
             Some(History::KeepLast { depth }) => depth,
             _ => waiting_depth(max_sample_bytes),
         };
-        Wanted::Reader {
-            dds_type: dds_type.to_owned(),
-            qos: ReaderQos { reliability, durability, depth, deadline_ms: input.deadline_ms },
+        let is_for = |reader: Reliability, writer: &Endpoint| match input.reliability {
+            Some(configured) => reader == configured,
+            None => reader == writer.reliability,
+        };
+        let reader = |reliability| {
+            let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+            let writers = writers.filter(|writer| is_for(reliability, writer));
+            let durability = match writers.map(|writer| writer.durability).min() {
+                Some(offered) => input.durability.unwrap_or(offered),
+                // Without a publisher only where the configuration says it all.
+                None => input.durability.filter(|_| input.reliability == Some(reliability))?,
+            };
+            Some(ReaderQos { reliability, durability, depth, deadline_ms: input.deadline_ms })
+        };
+        let [reliable, best_effort] = [Reliability::Reliable, Reliability::BestEffort].map(reader);
+        if reliable.is_none() && best_effort.is_none() {
+            return Wanted::Unknown;
         }
+        Wanted::Readers { dds_type: dds_type.to_owned(), reliable, best_effort }
     }
 }
 
@@ -96,14 +120,6 @@ impl Source {
 fn waiting_depth(max_sample_bytes: usize) -> u32 {
     let depth = (WAITING_BYTES / max_sample_bytes.max(1)).clamp(16, 1024);
     depth as u32
-}
-
-/// Whether a reader with `current` may stay although `wanted` would suit better: one that asks for less than
-/// all publishers offer is matched with each of them, and replacing it would lose samples.
-pub(super) fn still_suits(current: &ReaderQos, wanted: &ReaderQos) -> bool {
-    let reliability_ok = current.reliability <= wanted.reliability;
-    let durability_ok = current.durability <= wanted.durability;
-    reliability_ok && durability_ok
 }
 
 /// How a policy is called in the log.
@@ -142,6 +158,16 @@ mod tests {
         assert_eq!(wanted(&Source::default(), Some("T")), Wanted::Unknown);
     }
 
+    /// Durability of the RELIABLE and of the BEST_EFFORT reader.
+    fn durabilities(wanted: Wanted) -> [Option<Durability>; 2] {
+        let Wanted::Readers { reliable, best_effort, .. } = wanted else { panic!("{wanted:?}") };
+        for (qos, reliability) in [(reliable, Reliability::Reliable), (best_effort, Reliability::BestEffort)]
+        {
+            assert!(qos.is_none_or(|qos| qos.reliability == reliability));
+        }
+        [reliable, best_effort].map(|qos| qos.map(|qos| qos.durability))
+    }
+
     #[test]
     fn a_configuration_that_says_all_needs_no_publisher() {
         let input = InputQos {
@@ -149,23 +175,41 @@ mod tests {
             durability: Some(Durability::Volatile),
             ..InputQos::default()
         };
-        let wanted = Source::default().wanted(Some("T"), &input, 1 << 20);
-        assert!(matches!(wanted, Wanted::Reader { .. }), "{wanted:?}");
+        let mut source = Source::default();
+        let one = [Some(Durability::Volatile), None];
+        assert_eq!(durabilities(source.wanted(Some("T"), &input, 1 << 20)), one);
+        // And is obeyed, also where it leaves a publisher without a reader.
+        source.found(&writer(1, "T", Reliability::BestEffort, Durability::TransientLocal));
+        assert_eq!(durabilities(source.wanted(Some("T"), &input, 1 << 20)), one);
     }
 
     #[test]
-    fn the_reader_asks_for_what_the_weakest_publisher_offers() {
+    fn one_best_effort_reader_is_for_all_where_the_configuration_says_so() {
+        let input = InputQos { reliability: Some(Reliability::BestEffort), ..InputQos::default() };
+        let mut source = Source::default();
+        assert_eq!(source.wanted(Some("T"), &input, 1 << 20), Wanted::Unknown);
+        source.found(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
+        source.found(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
+        let wanted = source.wanted(Some("T"), &input, 1 << 20);
+        assert_eq!(durabilities(wanted), [None, Some(Durability::Volatile)]);
+    }
+
+    #[test]
+    fn publishers_of_each_reliability_have_a_reader_of_their_own() {
         let mut source = Source::default();
         source.found(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
-        let Wanted::Reader { qos, .. } = wanted(&source, None) else { panic!() };
-        assert_eq!((qos.reliability, qos.durability), (Reliability::Reliable, Durability::TransientLocal));
+        let [reliable, best_effort] = durabilities(wanted(&source, None));
+        assert_eq!((reliable, best_effort), (Some(Durability::TransientLocal), None));
         source.found(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
-        let Wanted::Reader { qos: weaker, .. } = wanted(&source, None) else { panic!() };
-        assert_eq!((weaker.reliability, weaker.durability), (Reliability::BestEffort, Durability::Volatile));
-        assert!(!still_suits(&qos, &weaker));
-        source.gone(Guid([2; 16]));
-        let Wanted::Reader { qos: stronger, .. } = wanted(&source, None) else { panic!() };
-        assert!(still_suits(&weaker, &stronger));
+        let both = [Some(Durability::TransientLocal), Some(Durability::Volatile)];
+        assert_eq!(durabilities(wanted(&source, None)), both);
+        assert_eq!(source.reliability_of(Guid([2; 16])), Some(Reliability::BestEffort));
+        // It asks for what the weakest of its publishers offers.
+        source.found(&writer(3, "T", Reliability::Reliable, Durability::Volatile));
+        assert_eq!(durabilities(wanted(&source, None)), [Some(Durability::Volatile); 2]);
+        source.gone(Guid([1; 16]));
+        source.gone(Guid([3; 16]));
+        assert_eq!(durabilities(wanted(&source, None)), [None, Some(Durability::Volatile)]);
     }
 
     #[test]
@@ -184,8 +228,9 @@ mod tests {
         source.found(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
         source.found(&writer(2, "U", Reliability::BestEffort, Durability::Volatile));
         assert_eq!(wanted(&source, None), Wanted::TypeConflict("T".into(), "U".into()));
-        let Wanted::Reader { dds_type, qos } = wanted(&source, Some("T")) else { panic!() };
-        assert_eq!((dds_type.as_str(), qos.reliability), ("T", Reliability::Reliable));
+        let decided = wanted(&source, Some("T"));
+        assert!(matches!(&decided, Wanted::Readers { dds_type, .. } if dds_type == "T"), "{decided:?}");
+        assert_eq!(durabilities(decided), [Some(Durability::Volatile), None]);
     }
 
     #[test]

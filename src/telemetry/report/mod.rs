@@ -15,7 +15,8 @@ use super::problems::{self, Problem};
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
 use crate::model::{
-    DropCounts, DropReason, FixedText, IngressCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
+    DropCounts, DropReason, FixedText, Guid, IngressCounters, LaneMode, MonotonicNs, PublisherAccount,
+    ReaderRecord,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; what cannot be told is null.
@@ -150,6 +151,12 @@ pub struct RouteReport {
 pub struct PublisherReport {
     /// Its DDS writer.
     pub writer: String,
+    /// Its ROS 2 node; null while it is not known.
+    pub node: Option<String>,
+    /// The address of its host; null while it is not known.
+    pub host: Option<String>,
+    /// `RELIABLE` or `BEST_EFFORT`; null when the publisher is gone.
+    pub reliability: Option<&'static str>,
     /// The number of the first sample taken.
     pub first_sequence: i64,
     /// The highest number taken.
@@ -334,8 +341,16 @@ impl Snapshot {
     }
 
     fn publisher_report(&self, account: &PublisherAccount) -> PublisherReport {
+        let (node, host) = self.node_and_host(account.writer);
         PublisherReport {
             writer: account.writer.to_string(),
+            node,
+            host,
+            reliability: match account.offered_reliability {
+                PublisherAccount::OFFERS_RELIABLE => Some("RELIABLE"),
+                PublisherAccount::OFFERS_BEST_EFFORT => Some("BEST_EFFORT"),
+                _ => None,
+            },
             first_sequence: account.first_sequence,
             last_sequence: account.last_sequence,
             received: account.received,
@@ -381,17 +396,32 @@ impl Snapshot {
 
 impl Snapshot {
     fn reader_report(&self, record: &ReaderRecord) -> ReaderReport {
-        let named = self.named_readers.iter().find(|named| named.reader == record.reader);
-        let text = |text: &FixedText| Some(printable(text.as_str())).filter(|text| !text.is_empty());
+        let (node, host) = self.node_and_host(record.reader);
         ReaderReport {
             guid: record.reader.to_string(),
-            node: named.and_then(|named| text(&named.node)),
-            host: named.and_then(|named| text(&named.host)),
+            node,
+            host,
             reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
             offered: record.offered,
             unacknowledged: record.unacknowledged,
             overrun: record.overrun,
         }
+    }
+
+    /// The ROS 2 node of an endpoint and the address of its host, as far as they are known.
+    fn node_and_host(&self, endpoint: Guid) -> (Option<String>, Option<String>) {
+        let Some(named) = self.named_endpoints.iter().find(|named| named.endpoint == endpoint) else {
+            return (None, None);
+        };
+        let text = |text: &FixedText| Some(printable(text.as_str())).filter(|text| !text.is_empty());
+        (text(&named.node), text(&named.host))
+    }
+
+    /// A publisher by its node and host, as far as they are known, for people.
+    pub(super) fn publisher_name(&self, writer: Guid) -> String {
+        let (node, host) = self.node_and_host(writer);
+        let node = node.unwrap_or_else(|| format!("the writer {writer}"));
+        host.map_or_else(|| node.clone(), |host| format!("{node} on {host}"))
     }
 
     /// A reader by its node and host, as far as they are known, for people.

@@ -1144,17 +1144,12 @@ impl InnerSubscriber {
     // status change channel from Reader to DataReader
     let (status_sender, status_receiver) = sync_status_channel::<DataReaderStatus>(STATUS_CHANNEL_CAPACITY)?;
 
-    // reader command channel from Datareader to Reader.
-    // Capacity 0 is a rendezvous, matching the previous mio-extras channel: the
-    // sender and the event loop meet at send/receive so a waker handoff cannot
-    // race a missed notification. The ready queue records which reader to drain.
-    // The receiver is built here; the sender is bound to the entity id below.
+    // reader command channel from Datareader to Reader. The ready queue records which
+    // reader to drain. The receiver is built here; the sender is bound to the entity
+    // id below. A command waits until the event loop has made the Reader: the loop
+    // handles additions before commands.
     let (reader_command_tx, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(0, &self.reader_ready.waker());
-    // The buffer length is zero, i.e. sender and receiver must rendezvous at
-    // send/receive. This is needed to synchronize sending of wakers from
-    // DataReader to Reader. If the capacity is increased, then some data
-    // available for reading notifications may be missed.
+      wake_channel::<ReaderCommand>(4, &self.reader_ready.waker());
 
     // Use subscriber QoS as basis, modify by Topic settings, and modify by
     // specified QoS.

@@ -145,6 +145,9 @@ pub(crate) struct Reader {
   requested_deadline_missed_count: i32,
   offered_incompatible_qos_count: i32,
 
+  // Whether further RELIABLE Writers are left to another Reader of the topic.
+  ignores_reliable_writers: bool,
+
   // Writers whose samples are to be acknowledged when the timer set for it
   // expires, and where to. See `ACKNACK_DELAY`.
   delayed_acknacks: Vec<(GUID, Vec<Locator>)>,
@@ -270,6 +273,7 @@ impl Reader {
       writer_match_count_total: 0,
       requested_deadline_missed_count: 0,
       offered_incompatible_qos_count: 0,
+      ignores_reliable_writers: false,
       delayed_acknacks: Vec::new(),
       timed_event_timer,
       data_reader_command_receiver: i.data_reader_command_receiver,
@@ -447,15 +451,17 @@ impl Reader {
           warn!("RESET_REQUESTED_DEADLINE_STATUS not implemented!");
           // TODO: This should be implemented.
         }
+        Ok(ReaderCommand::IgnoreReliableWriters) => {
+          // Those that are matched stay: the Reliable Reader does not receive from them
+          // until they have matched it.
+          self.ignores_reliable_writers = true;
+        }
         // Disconnected is normal when terminating
         Err(TryRecvError::Disconnected) => {
           trace!("DataReader disconnected");
           break;
         }
-        Err(TryRecvError::Empty) => {
-          warn!("There was no command. Spurious command event??");
-          break;
-        }
+        Err(TryRecvError::Empty) => break,
       }
     }
   }
@@ -505,6 +511,14 @@ impl Reader {
 
     debug!("update_writer_proxy topic={:?}", self.topic_name);
     let writer = proxy.remote_writer_guid;
+    let offers_reliable = matches!(
+      offered_qos.reliability(),
+      Some(policy::Reliability::Reliable { .. })
+    );
+    let is_new = !self.matched_writers.contains_key(&writer);
+    if self.ignores_reliable_writers && offers_reliable && is_new {
+      return;
+    }
 
     match offered_qos.compliance_failure_wrt(&self.qos_policy) {
       None => {
@@ -1879,6 +1893,67 @@ mod tests {
     assert_eq!(missing, [SequenceNumber::new(6), SequenceNumber::new(7)]);
     assert!(writer_proxy.should_ignore_change(SequenceNumber::new(5)));
     assert!(!writer_proxy.should_ignore_change(SequenceNumber::new(6)));
+  }
+
+  // The RELIABLE Reader of the topic has the RELIABLE Writers, and this one the others.
+  #[test]
+  fn reader_that_ignores_reliable_writers_keeps_those_that_it_has_matched() {
+    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
+    let best_effort_qos = QosPolicyBuilder::new().best_effort().build();
+    let reliable_qos = QosPolicyBuilder::new()
+      .reliable(Duration::from_millis(100))
+      .build();
+    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
+      "test_name".to_string(),
+      TypeDesc::new("test_type".to_string()),
+      &best_effort_qos,
+    );
+    let (notification_sender, _notification_receiver) =
+      crate::mio_source::notification_channel(100);
+    let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+    let (participant_status_sender, _participant_status_receiver) =
+      sync_status_channel(16).unwrap();
+    let (reader_command_sender, data_reader_command_receiver) =
+      wake_channel::<ReaderCommand>(4, &LoopWaker::new());
+    let mut reader = Reader::new(
+      ReaderIngredients {
+        guid: GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED),
+        notification_sender,
+        status_sender,
+        topic_name: "test_name".to_string(),
+        topic_cache_handle,
+        like_stateless: false,
+        qos_policy: best_effort_qos.clone(),
+        data_reader_command_receiver,
+        data_reader_waker: Arc::new(Mutex::new(None)),
+        poll_event_sender,
+        security_plugins: None,
+        discovery_notify: None,
+      },
+      Rc::new(UDPSender::new(0).unwrap()),
+      new_shared_timer(),
+      participant_status_sender,
+    );
+    let writer = |number| {
+      let mut guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
+      guid.prefix = GuidPrefix::new(&[number; 12]);
+      guid
+    };
+    let add = |reader: &mut Reader, number, qos: &QosPolicies| {
+      reader.matched_writer_add(writer(number), EntityId::UNKNOWN, vec![], vec![], qos);
+    };
+    add(&mut reader, 1, &best_effort_qos);
+    add(&mut reader, 2, &reliable_qos);
+
+    reader_command_sender
+      .try_send(ReaderCommand::IgnoreReliableWriters)
+      .unwrap();
+    reader.process_command();
+    add(&mut reader, 3, &reliable_qos);
+    add(&mut reader, 4, &best_effort_qos);
+    let matched = |number| reader.matched_writer(writer(number)).is_some();
+    assert_eq!([1, 2, 3, 4].map(matched), [true, true, false, true]);
   }
 
   #[test]

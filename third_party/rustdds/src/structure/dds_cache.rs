@@ -481,6 +481,11 @@ impl TopicCache {
       )
     }
   }
+  /// Whether a Reliable Reader receives from the Writer.
+  pub fn is_read_reliably(&self, writer: GUID) -> bool {
+    self.received_reliably_before.contains_key(&writer)
+  }
+
   fn reliable_before(&self, writer: GUID) -> SequenceNumber {
     self
       .received_reliably_before

@@ -59,6 +59,13 @@ where
     self.keyed_simpledatareader.set_sample_memory(memory);
   }
 
+  /// From now on this BEST_EFFORT reader matches no further RELIABLE writer, and
+  /// leaves what comes of RELIABLE writers to the RELIABLE reader of the same topic
+  /// in this participant, as soon as that one receives from them.
+  pub fn ignore_reliable_writers(&self) {
+    self.keyed_simpledatareader.ignore_reliable_writers();
+  }
+
   pub fn set_waker(&self, w: Option<Waker>) {
     self.keyed_simpledatareader.set_waker(w);
   }

@@ -47,6 +47,8 @@ use crate::{
 pub(crate) enum ReaderCommand {
   #[allow(dead_code)] // TODO: Implement this (resetting) feature
   ResetRequestedDeadlineStatus,
+  /// Match no further RELIABLE Writer.
+  IgnoreReliableWriters,
 }
 
 // This is helper struct.
@@ -110,8 +112,6 @@ pub struct SimpleDataReader<D: Keyed, DA: DeserializerAdapter<D> = CDRDeserializ
   discovery_command: WakeSender<DiscoveryCommand>,
   status_receiver: StatusChannelReceiver<DataReaderStatus>,
 
-  #[allow(dead_code)] // TODO: This is currently unused, because we do not implement
-  // resetting deadline missed status. Remove attribute when it is supported.
   reader_command: BoundSender<ReaderCommand>,
   data_reader_waker: Arc<Mutex<Option<Waker>>>,
 
@@ -120,6 +120,10 @@ pub struct SimpleDataReader<D: Keyed, DA: DeserializerAdapter<D> = CDRDeserializ
   // Whether the topic's samples are put together in memory of the application
   // because of this reader.
   lends_memory: AtomicBool,
+
+  // Whether samples of Writers that a Reliable Reader of the topic receives from
+  // are left to that Reader.
+  ignores_reliable_writers: AtomicBool,
 }
 
 impl<D, DA> Drop for SimpleDataReader<D, DA>
@@ -210,8 +214,23 @@ where
       data_reader_waker,
       event_source,
       lends_memory: AtomicBool::new(false),
+      ignores_reliable_writers: AtomicBool::new(false),
     })
   }
+
+  pub(crate) fn ignore_reliable_writers(&self) {
+    self.ignores_reliable_writers.store(true, Ordering::Relaxed);
+    if let Err(e) = self
+      .reader_command
+      .try_send(ReaderCommand::IgnoreReliableWriters)
+    {
+      error!(
+        "Reader of {} goes on matching RELIABLE Writers: {e}",
+        self.my_topic.name()
+      );
+    }
+  }
+
   pub(crate) fn set_sample_memory(&self, memory: Arc<dyn SampleMemory>) {
     self.lends_memory.store(true, Ordering::Relaxed);
     self.acquire_the_topic_cache_guard().lender = Lender(Some(memory));
@@ -402,12 +421,24 @@ where
     let mut changes =
       Self::try_take_undecoded(is_reliable, &topic_cache, latest_instant, last_read_sn);
 
+    let ignores_reliable = self.ignores_reliable_writers.load(Ordering::Relaxed);
+    let mut passed_instant = latest_instant;
+
     // loop in case we get a sample that should be ignored, so we try next.
     loop {
       let (timestamp, cc) = match changes.next() {
-        None => return Ok(None), // no more data available right now
+        None => {
+          // no more data available right now
+          drop(changes);
+          read_state_ref.latest_instant = passed_instant;
+          return Ok(None);
+        }
         Some((ts, cc)) => (ts, cc),
       };
+      if ignores_reliable && topic_cache.is_read_reliably(cc.writer_guid) {
+        passed_instant = max(passed_instant, timestamp);
+        continue;
+      }
 
       let result = self.deserialize_with(timestamp, cc, hash_to_key_map, decoder.clone());
 
