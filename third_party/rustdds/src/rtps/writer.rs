@@ -1306,11 +1306,15 @@ impl Writer {
             .iter()
             .any(|sn| sn < reader_proxy.all_acked_before);
           if requests_unoffered {
-            // From before it was matched, or acknowledged before.
-            let gap_message = MessageBuilder::new()
-              .dst_submessage(self.endianness, reader_guid.prefix)
+            // From before it was matched, or acknowledged before. The HEARTBEAT is for
+            // Fast DDS, see `withdraw_msg`.
+            let first_owed = reader_proxy.all_acked_before.max(SequenceNumber::from(1));
+            let message =
+              MessageBuilder::new().dst_submessage(self.endianness, reader_guid.prefix);
+            let gap_message = self
+              .begin_after_msg(message, first_owed - SequenceNumber::from(1), reader_guid)
               .gap_msg_before(
-                reader_proxy.all_acked_before.max(SequenceNumber::from(1)),
+                first_owed,
                 self.my_guid.entity_id,
                 self.endianness,
                 reader_guid,
@@ -1546,7 +1550,7 @@ impl Writer {
           evicted.len(),
           self.my_topic_name
         );
-        gap = gap.gap_msg(&evicted, self.entity_id(), self.endianness, reader_guid);
+        gap = self.withdraw_msg(gap, &evicted, reader_guid);
       } else if !pending_gaps.contains(&unsent_sn) {
         match self.send_buffer.get_by_sn(unsent_sn) {
           Some(cc) => cache_change = Some(cc),
@@ -1554,7 +1558,7 @@ impl Writer {
             // A write has evicted it since `first_available` was read, or the send
             // buffer has a hole there.
             let evicted = reader_proxy.take_evicted_requests(unsent_sn.plus_1());
-            gap = gap.gap_msg(&evicted, self.entity_id(), self.endianness, reader_guid);
+            gap = self.withdraw_msg(gap, &evicted, reader_guid);
           }
         }
       }
@@ -1622,6 +1626,46 @@ impl Writer {
       reader_proxy.repair_mode = false;
     }
   } // fn
+
+  // Tells a reader that it gets these samples no more: a HEARTBEAT that begins after
+  // them, then a GAP.
+  //
+  // Fast DDS (2.x and 3.x) frees a sample of which it has some fragments when a GAP
+  // names it, but keeps it in the list that the application takes from: the application
+  // then takes freed memory, without an end, and samples out of order. At a HEARTBEAT
+  // that begins after the sample it forgets it properly.
+  fn withdraw_msg(
+    &self,
+    message: MessageBuilder,
+    evicted: &BTreeSet<SequenceNumber>,
+    reader_guid: GUID,
+  ) -> MessageBuilder {
+    let Some(last) = evicted.last() else {
+      return message;
+    };
+    self
+      .begin_after_msg(message, *last, reader_guid)
+      .gap_msg(evicted, self.entity_id(), self.endianness, reader_guid)
+  }
+
+  // A HEARTBEAT to one reader that offers what comes after `last_withdrawn`.
+  fn begin_after_msg(
+    &self,
+    message: MessageBuilder,
+    last_withdrawn: SequenceNumber,
+    reader_guid: GUID,
+  ) -> MessageBuilder {
+    message.heartbeat_msg(
+      self.entity_id(),
+      last_withdrawn.plus_1(),
+      max(self.last_advertised(), last_withdrawn),
+      self.next_heartbeat_count(),
+      self.endianness,
+      reader_guid.entity_id,
+      true,  // final_flag: the repair round ends with a HEARTBEAT that requests ACKNACK
+      false, // liveliness_flag
+    )
+  }
 
   // Append `part` to the repair datagram being built for `reader_proxy`, first
   // sending the datagram if `part` (plus `invalidate_len` bytes for an INFO_TS
