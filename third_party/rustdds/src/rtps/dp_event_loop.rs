@@ -104,6 +104,8 @@ pub struct DPEventLoop {
   /// serves every queue, so the id is the reason.
   reader_ready: ReadyReceiver<EntityId>,
   writer_ready: ReadyReceiver<EntityId>,
+  // Writers that have more to send than one turn of the loop allows.
+  writers_with_more: BTreeSet<EntityId>,
   waker: LoopWaker,
 
   writers: HashMap<EntityId, Writer>,
@@ -272,6 +274,7 @@ impl DPEventLoop {
       stop_poll_receiver,
       reader_ready,
       writer_ready,
+      writers_with_more: BTreeSet::new(),
       waker,
       writers: HashMap::new(),
       bulk_ready: BTreeMap::new(),
@@ -332,7 +335,10 @@ impl DPEventLoop {
       } else {
         Duration::from_millis(2)
       };
-      let poll_timeout = if readable.is_empty() && !application_has_more {
+      let poll_timeout = if readable.is_empty()
+        && !application_has_more
+        && ev_wrapper.writers_with_more.is_empty()
+      {
         timeout_until(ev_wrapper.shared_timer.borrow().next_deadline(), idle_cap)
       } else {
         Duration::ZERO
@@ -491,7 +497,8 @@ impl DPEventLoop {
     // other way round, one that is added and rings in between is not known yet, and
     // what it wrote is not sent until it writes again.
     let ready_readers = self.reader_ready.drain_unique();
-    let ready_writers = self.writer_ready.drain_unique();
+    let mut ready_writers = std::mem::take(&mut self.writers_with_more);
+    ready_writers.extend(self.writer_ready.drain_unique());
 
     self.handle_reader_action(readers_to_remove);
     self.handle_writer_action(writers_to_remove);
@@ -552,7 +559,9 @@ impl DPEventLoop {
           (BTreeSet::new(), vec![])
         }
         Some(writer) => {
-          writer.process_pending();
+          if writer.process_pending() {
+            self.writers_with_more.insert(eid);
+          }
           (writer.take_blocked_sockets(), writer.local_readers())
         }
       };
@@ -636,7 +645,9 @@ impl DPEventLoop {
     while let Some(eid) = self.bulk_ready.get_mut(&sid).and_then(VecDeque::pop_front) {
       let blocked = match self.writers.get_mut(&eid) {
         Some(writer) => {
-          writer.process_pending();
+          if writer.process_pending() {
+            self.writers_with_more.insert(eid);
+          }
           writer.take_blocked_sockets()
         }
         None => BTreeSet::new(),

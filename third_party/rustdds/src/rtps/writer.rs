@@ -31,7 +31,7 @@ use crate::{
     constant::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
-      NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, REPAIR_BATCH_MAX_BYTES,
+      NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, PENDING_TURN_MAX_BYTES, REPAIR_BATCH_MAX_BYTES,
       REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
       REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
     },
@@ -82,6 +82,19 @@ pub(crate) enum SampleCursor {
   /// All fragments sent; only the trailing HEARTBEAT of a fragmented sample
   /// remains.
   Heartbeat,
+}
+
+/// Matched readers that get the same datagrams of a sample.
+#[derive(PartialEq, Eq, Clone, Copy, Debug)]
+enum Audience {
+  /// Every reader.
+  All,
+  /// Those whose path takes datagrams of at least twice the smallest path's size:
+  /// readers of this host, by loopback. One remote reader would else make a local one
+  /// receive 1 MiB in 780 datagrams in place of 17.
+  LargeDatagrams,
+  /// The others.
+  SmallDatagrams,
 }
 
 /// Item 1 (DATA aggregation): outcome of attempting to coalesce one or more
@@ -250,6 +263,13 @@ pub(crate) struct Writer {
   /// sockets' round-robin queues and arms write readiness.
   blocked_sockets: BTreeSet<SocketId>,
 
+  // The sample that `sample_cursor` is within. It is sent to its end although a
+  // write may evict it meanwhile: a KEEP_LAST writer of samples that come faster than
+  // the sockets take them would else begin each one and complete none.
+  partly_sent: Option<CacheChange>,
+  // Whom it is being sent to.
+  audience: Audience,
+
   /// Contains timer that needs to be set to timeout with duration of
   /// self.heartbeat_period timed_event_handler sends notification when timer
   /// is up via mio channel to poll in Dp_eventWrapper this also handles
@@ -354,6 +374,8 @@ impl Writer {
       send_buffer: i.send_buffer,
       sample_cursor: SampleCursor::Fresh,
       blocked_sockets: BTreeSet::new(),
+      partly_sent: None,
+      audience: Audience::All,
       timed_event_timer,
       like_stateless: i.like_stateless,
       qos_policies: i.qos_policies,
@@ -585,6 +607,44 @@ impl Writer {
     }
   }
 
+  // The same for a part of the readers.
+  fn audience_budget(
+    &self,
+    target_reader_opt: Option<&RtpsReaderProxy>,
+    audience: Audience,
+  ) -> usize {
+    if audience != Audience::LargeDatagrams {
+      return self.datagram_budget(target_reader_opt);
+    }
+    let readers = self.readers.values();
+    let large = readers.filter(|reader| self.is_in_audience(reader, audience));
+    large
+      .map(RtpsReaderProxy::max_datagram_payload)
+      .min()
+      .unwrap_or(self.min_datagram_payload)
+  }
+
+  fn takes_large_datagrams(&self, reader: &RtpsReaderProxy) -> bool {
+    reader.max_datagram_payload() >= 2 * self.min_datagram_payload
+  }
+
+  fn is_in_audience(&self, reader: &RtpsReaderProxy, audience: Audience) -> bool {
+    match audience {
+      Audience::All => true,
+      Audience::LargeDatagrams => self.takes_large_datagrams(reader),
+      Audience::SmallDatagrams => !self.takes_large_datagrams(reader),
+    }
+  }
+
+  // Whether a sample goes to the readers in two parts.
+  fn is_split(&self, payload_size: usize) -> bool {
+    payload_size > self.max_unfragmented_serialized_payload(None)
+      && self
+        .readers
+        .values()
+        .any(|reader| self.takes_large_datagrams(reader))
+  }
+
   /// Largest serialized payload that fits in one unfragmented DATA submessage
   /// within the per-peer datagram budget. Fragmentation is triggered only when
   /// the payload exceeds this, not when it exceeds [`FRAGMENT_SIZE`].
@@ -592,7 +652,11 @@ impl Writer {
     &self,
     target_reader_opt: Option<&RtpsReaderProxy>,
   ) -> usize {
-    let budget = self.datagram_budget(target_reader_opt);
+    self.max_unfragmented_in(self.datagram_budget(target_reader_opt))
+  }
+
+  // The same for a datagram budget.
+  fn max_unfragmented_in(&self, budget: usize) -> usize {
     let hb_reserve = if self.is_reliable() && !self.like_stateless {
       HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE
     } else {
@@ -768,16 +832,20 @@ impl Writer {
     }
   }
 
-  pub fn process_pending(&mut self) {
+  //
+  // Returns whether samples are left for another turn, and no full socket holds them
+  // back.
+  pub fn process_pending(&mut self) -> bool {
     // The doorbell enqueues this writer's id and then wakes. A sample admitted
     // while we are here pushes another id, so the next wake runs us again. The
     // shared buffer's `last_seq` is the source of truth.
     let send_buffer = self.send_buffer.clone();
     let _no_other_sender = send_buffer.direct_send().lock();
-    loop {
+    let mut turn_bytes = 0;
+    while turn_bytes < PENDING_TURN_MAX_BYTES {
       let last_available = self.send_buffer.last_change_sequence_number();
       if self.last_sent() >= last_available {
-        break;
+        return false;
       }
       let sequence_number = self.last_sent().plus_1();
 
@@ -807,7 +875,7 @@ impl Writer {
             // All-or-nothing: do not advance `last_sent`; the event loop resumes
             // us on write readiness and the batch is rebuilt from `sequence_number`.
             self.blocked_sockets.extend(blocked);
-            return;
+            return false;
           }
           None => { /* first sample not aggregatable; use the per-sample path */ }
         }
@@ -815,7 +883,14 @@ impl Writer {
 
       // Fetch an owned clone of the sample (cheap, Bytes-backed) so we hold the
       // buffer lock only momentarily and can serialize/send without it.
-      let Some(cc) = self.send_buffer.get_by_sn(sequence_number) else {
+      let partly_sent = self
+        .partly_sent
+        .take()
+        .filter(|cc| cc.sequence_number == sequence_number);
+      if partly_sent.is_none() {
+        self.audience = Audience::All;
+      }
+      let Some(cc) = partly_sent.or_else(|| self.send_buffer.get_by_sn(sequence_number)) else {
         // The sample is gone (e.g. evicted). Skip it; readers that need it will
         // be told via GAP during repair.
         self.set_last_sent(sequence_number);
@@ -825,6 +900,7 @@ impl Writer {
         continue;
       };
       let write_options = cc.write_options.clone();
+      turn_bytes += cc.data_value.payload_size();
 
       // Notify reader proxies once per sample (only when starting it fresh).
       if self.sample_cursor == SampleCursor::Fresh && !self.like_stateless {
@@ -846,13 +922,12 @@ impl Writer {
         // current fragment cursor. Compute the send in an inner scope so the
         // immutable borrow of `self.readers` (target reader) is released before
         // we mutate our cursor/frontier below.
-        let cursor = self.sample_cursor;
         // Best-effort has no acknowledgement/repair semantics, so a heartbeat
         // per sample is pure overhead (an extra submessage built and sent for
         // every DATA). Only reliable writers piggyback a heartbeat here;
         // best-effort skips it entirely.
         let send_also_heartbeat = self.is_reliable();
-        let (_fragmented, progress) = {
+        let progress = {
           let target_reader_opt = match write_options.to_single_reader() {
             Some(guid) => self.readers.get(&guid), // Sending only to this reader
             None => None,                          // Sending to all matched readers
@@ -872,13 +947,33 @@ impl Writer {
           } else {
             TrafficClass::Bulk
           };
-          self.send_cache_change_from(
-            &cc,
-            send_also_heartbeat,
-            target_reader_opt,
-            cursor,
-            push_class,
-          )
+          let is_split = target_reader_opt.is_none() && self.is_split(cc.data_value.payload_size());
+          let audiences = match (is_split, self.audience) {
+            (false, _) => &[Audience::All][..],
+            (true, Audience::SmallDatagrams) => &[Audience::SmallDatagrams],
+            (true, _) => &[Audience::LargeDatagrams, Audience::SmallDatagrams],
+          };
+          let mut cursor = self.sample_cursor;
+          let mut progress = SendProgress::Complete;
+          let mut blocked_audience = Audience::All;
+          for audience in audiences {
+            let (_fragmented, outcome) = self.send_cache_change_from(
+              &cc,
+              send_also_heartbeat,
+              target_reader_opt,
+              *audience,
+              cursor,
+              push_class,
+            );
+            progress = outcome;
+            if let SendProgress::Blocked { .. } = progress {
+              blocked_audience = *audience;
+              break;
+            }
+            cursor = SampleCursor::Fresh;
+          }
+          self.audience = blocked_audience;
+          progress
         };
         match progress {
           SendProgress::Complete => {
@@ -896,8 +991,11 @@ impl Writer {
               // Stop here; resume on write readiness. Back-pressure to the
               // application follows from `sent_frontier` not advancing.
               self.sample_cursor = cursor;
+              if cursor != SampleCursor::Fresh || self.audience == Audience::SmallDatagrams {
+                self.partly_sent = Some(cc);
+              }
               self.blocked_sockets.extend(blocked);
-              return;
+              return false;
             }
             // Drop: advance past this sample without recording blocked sockets,
             // so no write-readiness back-pressure is applied. The unsent
@@ -936,6 +1034,7 @@ impl Writer {
         self.send_buffer.set_sent_frontier(sequence_number);
       }
     }
+    self.last_sent() < self.send_buffer.last_change_sequence_number()
   }
 
   /// nonblocking-transmit: drain and return the sockets on which the last push
@@ -963,6 +1062,7 @@ impl Writer {
       cc,
       send_also_heartbeat,
       target_reader_opt,
+      Audience::All,
       SampleCursor::Fresh,
       TrafficClass::Control,
     );
@@ -977,6 +1077,7 @@ impl Writer {
     cc: &CacheChange,
     send_also_heartbeat: bool,
     target_reader_opt: Option<&RtpsReaderProxy>,
+    audience: Audience,
     cursor: SampleCursor,
     class: TrafficClass,
   ) -> (bool, SendProgress) {
@@ -1004,8 +1105,15 @@ impl Writer {
       }
     }
 
-    let messages_to_send =
-      FragmentationIter::new_resume(self, cc, target_reader_opt, send_also_heartbeat, cursor);
+    let budget = self.audience_budget(target_reader_opt, audience);
+    let messages_to_send = FragmentationIter::new_resume(
+      self,
+      cc,
+      target_reader_opt,
+      budget,
+      send_also_heartbeat,
+      cursor,
+    );
     let fragmentation_needed = messages_to_send.fragmentation_needed();
 
     // Send the messages, either to all readers or just one, stopping at the
@@ -1015,7 +1123,10 @@ impl Writer {
         None => self.send_message_to_readers(
           DeliveryMode::Multicast,
           msg,
-          &mut self.readers.values(),
+          &mut self
+            .readers
+            .values()
+            .filter(|reader| self.is_in_audience(reader, audience)),
           class,
         ),
         Some(reader_proxy) => self.send_message_to_readers(
@@ -2618,6 +2729,8 @@ struct FragmentationIter<'a> {
   writer: &'a Writer,
   cache_change: &'a CacheChange,
   target_reader_opt: Option<&'a RtpsReaderProxy>,
+  // Bytes for submessages in one datagram.
+  budget: usize,
   reader_entity_id: EntityId,
   send_heartbeat: bool,
   finished: bool,
@@ -2634,6 +2747,7 @@ impl<'a> FragmentationIter<'a> {
     writer: &'a Writer,
     cache_change: &'a CacheChange,
     target_reader_opt: Option<&'a RtpsReaderProxy>,
+    budget: usize,
     send_heartbeat: bool,
     cursor: SampleCursor,
   ) -> Self {
@@ -2642,8 +2756,7 @@ impl<'a> FragmentationIter<'a> {
       target_reader_opt.map_or(EntityId::UNKNOWN, |p| p.remote_reader_guid.entity_id);
 
     let data_size = cache_change.data_value.payload_size();
-    let fragmentation_needed =
-      data_size > writer.max_unfragmented_serialized_payload(target_reader_opt);
+    let fragmentation_needed = data_size > writer.max_unfragmented_in(budget);
 
     let state = if fragmentation_needed {
       let fragmented = match cursor {
@@ -2667,6 +2780,7 @@ impl<'a> FragmentationIter<'a> {
       writer,
       cache_change,
       target_reader_opt,
+      budget,
       state,
       reader_entity_id,
       finished: false,
@@ -2767,10 +2881,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
                   .dst_submessage(writer.endianness, reader.remote_reader_guid.prefix);
               }
 
-              // Per-peer datagram budget: the destination reader's path-MTU
-              // budget for a directed send, or the writer-wide minimum (over all
-              // matched readers) for a multicast-to-all send.
-              let budget = writer.datagram_budget(target_reader_opt);
+              let budget = self.budget;
               // How many contiguous fragments (starting at `start`) fit in one
               // DATAFRAG submessage within the remaining datagram budget. Fragment
               // *size* is constant (RTPS rule); only the *count* per submessage
