@@ -196,6 +196,10 @@ impl Program {
         Ok(program)
     }
 
+    pub fn signal(&self, signal: Signal) {
+        let _ = kill(Pid::from_raw(self.child.id().cast_signed()), signal);
+    }
+
     fn order(&mut self, line: &str) -> Result<(), String> {
         writeln!(self.orders, "{line}").map_err(|error| format!("a program of the bench died: {error}"))
     }
@@ -481,6 +485,18 @@ impl Bed {
             Self { kind, routes, publisher, subscriber, _drain: drain, relay, bridge, next_number: 0 };
         bed.warm_up()?;
         Ok(bed)
+    }
+
+    /// One more subscriber of the bridge's critical lane.
+    pub fn second_subscriber(&self) -> Result<Program, String> {
+        let bridge = self.bridge.as_ref().ok_or("no bridge")?;
+        let routes = Route::to_argument(&Route::all(&bridge.plan.routes));
+        let config = bridge.config.to_string_lossy();
+        let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
+        let mut subscriber =
+            Program::start("__subscriber", bridge.domain, anywhere, &[&routes, OUTPUT, &config])?;
+        subscriber.numbers("ready")?;
+        Ok(subscriber)
     }
 
     pub fn name(&self) -> &'static str {

@@ -1,4 +1,4 @@
-//! The critical lane while something is wrong with the noncritical one. There is no control process that
+//! The critical lane while something is wrong with the noncritical one, or with one of its own subscribers. There is no control process that
 //! could come to the rescue: what holds is the processes alone. The noncritical egress and its subscriber
 //! have a nice value that stands for the weights of the services' slices, and run on any CPU.
 //!
@@ -23,7 +23,7 @@ use super::system::Scheduling;
 
 const LANE: &str = "noncritical";
 
-/// What the noncritical lane does.
+/// What the noncritical lane does, or a second subscriber of the critical lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Condition {
     /// Its 10 Hz of 1 kHz.
@@ -36,6 +36,10 @@ enum Condition {
     /// `kill -9` and started again, every 300 ms.
     Killed,
     Repeat,
+    /// A second RELIABLE subscriber of the critical lane is stopped (SIGSTOP) and acknowledges nothing.
+    ReaderStopped,
+    /// A second RELIABLE subscriber of the critical lane was killed; its lease has not expired.
+    ReaderKilled,
     /// Its 10 Hz of 5 kHz.
     Fast,
     /// All of 5 kHz: no rate limit.
@@ -43,12 +47,14 @@ enum Condition {
 }
 
 impl Condition {
-    const ALL: [Self; 7] = [
+    const ALL: [Self; 9] = [
         Self::Undisturbed,
         Self::Stopped,
         Self::Spinning,
         Self::Killed,
         Self::Repeat,
+        Self::ReaderStopped,
+        Self::ReaderKilled,
         Self::Fast,
         Self::Flooding,
     ];
@@ -60,6 +66,8 @@ impl Condition {
             Self::Spinning => "spinning",
             Self::Killed => "killed",
             Self::Repeat => "repeat",
+            Self::ReaderStopped => "reader stopped",
+            Self::ReaderKilled => "reader killed",
             Self::Fast => "5 kHz",
             Self::Flooding => "flooding",
         }
@@ -205,13 +213,26 @@ enum Disturbance {
     Spinning(Program),
     Killed { stop: Arc<AtomicBool>, killer: JoinHandle<Result<(Process, u64), String>> },
     Flooding,
+    Reader(#[allow(dead_code)] Program),
 }
 
 impl Disturbance {
     fn begin(condition: Condition, bed: &mut Bed) -> Result<Self, String> {
+        if let Condition::ReaderStopped | Condition::ReaderKilled = condition {
+            let reader = bed.second_subscriber()?;
+            // Matched on both sides by then.
+            std::thread::sleep(Duration::from_secs(1));
+            let is_stopped = condition == Condition::ReaderStopped;
+            reader.signal(if is_stopped { Signal::SIGSTOP } else { Signal::SIGKILL });
+            return Ok(Self::Reader(reader));
+        }
         let bridge = bed.bridge.as_mut().ok_or("no bridge")?;
         Ok(match condition {
-            Condition::Undisturbed | Condition::Repeat | Condition::Fast => Self::None,
+            Condition::Undisturbed
+            | Condition::Repeat
+            | Condition::Fast
+            | Condition::ReaderStopped
+            | Condition::ReaderKilled => Self::None,
             Condition::Stopped => {
                 bridge.signal(LANE, Signal::SIGSTOP);
                 Self::Stopped
@@ -236,6 +257,8 @@ impl Disturbance {
         let bridge = bed.bridge.as_mut().ok_or("no bridge")?;
         match self {
             Self::None => {}
+            // Dropping it kills it.
+            Self::Reader(_) => return Ok(1),
             Self::Spinning(spinner) => drop(spinner),
             Self::Stopped => bridge.signal(LANE, Signal::SIGCONT),
             Self::Killed { stop, killer } => {
