@@ -125,6 +125,9 @@ pub(crate) struct MessageReceiver {
   // We send notification of remote DomainParticipant liveness to Discovery to
   // bypass Reader, DDSCache, DatasampleCache, and DataReader, because these will drop
   // repeated messages with duplicate SequenceNumbers, but Discovery needs to see them.
+  // Any datagram of a participant is a sign of its life, as in Fast DDS and Cyclone
+  // DDS: the latter announces itself each 8 s only, with a lease of 10 s, so that an
+  // outage of 3 s would end it.
   spdp_liveness_sender: WakeSender<GuidPrefix>,
   security_plugins: Option<SecurityPluginsHandle>,
 
@@ -298,7 +301,10 @@ impl MessageReceiver {
 
     // Record how this remote participant's traffic reaches us, so route
     // resolution can later narrow sends to the observed interface/address.
-    self.record_observation(rtps_message.header.guid_prefix, origin);
+    let source_prefix = rtps_message.header.guid_prefix;
+    if self.record_observation(source_prefix, origin) {
+      self.notify_life_sign(source_prefix);
+    }
 
     // And process message
     self.source_address = origin.source;
@@ -309,18 +315,28 @@ impl MessageReceiver {
 
   /// Note the interface/source a packet from `source_prefix` arrived on.
   /// Ignores our own traffic and packets without any usable origin metadata.
-  fn record_observation(&self, source_prefix: GuidPrefix, origin: PacketOrigin) {
+  /// Whether Discovery is to hear that the participant is alive.
+  fn record_observation(&self, source_prefix: GuidPrefix, origin: PacketOrigin) -> bool {
     if source_prefix == GuidPrefix::UNKNOWN || source_prefix == self.own_guid_prefix {
-      return;
+      return false;
     }
     let Some(source) = origin.source else {
       // Without a source address there is nothing actionable to record.
-      return;
+      return false;
     };
     self
       .interface_observations
       .borrow_mut()
-      .record(source_prefix, origin.local_if, source);
+      .record(source_prefix, origin.local_if, source)
+  }
+
+  fn notify_life_sign(&self, prefix: GuidPrefix) {
+    self
+      .spdp_liveness_sender
+      .try_send(prefix)
+      .unwrap_or_else(|e| {
+        debug!("spdp_liveness_sender.try_send(): {e:?}. Is Discovery alive?");
+      });
   }
 
   // This is also called directly from dp_event_loop in case of loopback messages.
@@ -661,12 +677,7 @@ impl MessageReceiver {
         if writer_entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
           && target_reader_entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_READER
         {
-          self
-            .spdp_liveness_sender
-            .try_send(source_guid_prefix)
-            .unwrap_or_else(|e| {
-              debug!("spdp_liveness_sender.try_send(): {e:?}. Is Discovery alive?");
-            });
+          self.notify_life_sign(source_guid_prefix);
         }
       }
 

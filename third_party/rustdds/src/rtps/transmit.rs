@@ -118,11 +118,12 @@ pub struct ObservedRoutes {
 }
 
 impl ObservedRoutes {
+  #[cfg(test)]
   fn record(&mut self, iface: Option<InterfaceSelector>, source: SocketAddr) {
     self.record_at(iface, source, Instant::now(), STICKY_SWITCH_MARGIN);
   }
 
-  /// Testable core of [`Self::record`]: `now` and `margin` are injected so the
+  /// Core of recording: `now` and `margin` are arguments so the
   /// hysteresis can be exercised deterministically.
   fn record_at(
     &mut self,
@@ -203,11 +204,18 @@ impl ObservedRoutes {
 /// Participants, real or made up, whose datagrams are remembered.
 const MAX_OBSERVED_PARTICIPANTS: usize = 1024;
 
+/// Discovery hears at most so often that datagrams of a participant arrive: often
+/// enough for leases of 10 s and more, which are the defaults.
+const LIFE_SIGN_INTERVAL: Duration = Duration::from_secs(2);
+
 /// Per-remote-participant record of observed receive interfaces / source
 /// addresses. Populated by the message receiver, consumed by route resolution.
 #[derive(Debug, Default)]
 pub struct InterfaceObservations {
   by_participant: BTreeMap<GuidPrefix, ObservedRoutes>,
+  /// When Discovery last heard of a participant, or its first datagram came. Kept
+  /// when it is lost, so that its next datagram counts at once.
+  life_signs: BTreeMap<GuidPrefix, Instant>,
   /// The addresses of this host at present.
   own_addresses: Vec<IpAddr>,
 }
@@ -218,13 +226,14 @@ impl InterfaceObservations {
   }
 
   /// Record that a packet from `prefix` arrived from `source`, on local
-  /// interface `iface` (if it could be determined).
+  /// interface `iface` (if it could be determined). Whether Discovery is to hear of
+  /// it.
   pub fn record(
     &mut self,
     prefix: GuidPrefix,
     iface: Option<InterfaceSelector>,
     source: SocketAddr,
-  ) {
+  ) -> bool {
     // The prefix is whatever a datagram says. What is cleared here of real
     // participants comes again with their next datagrams.
     if self.by_participant.len() >= MAX_OBSERVED_PARTICIPANTS
@@ -237,7 +246,26 @@ impl InterfaceObservations {
     if is_other_source && self.own_addresses.contains(&source.ip()) {
       routes.seen_from_own_address = true;
     }
-    routes.record(iface, source);
+    let now = Instant::now();
+    routes.record_at(iface, source, now, STICKY_SWITCH_MARGIN);
+    self.is_life_sign(prefix, now)
+  }
+
+  /// Not the first datagram of a prefix: one that is made up for each datagram is
+  /// never a life sign.
+  fn is_life_sign(&mut self, prefix: GuidPrefix, now: Instant) -> bool {
+    if let Some(last) = self.life_signs.get_mut(&prefix) {
+      let is_due = now.saturating_duration_since(*last) >= LIFE_SIGN_INTERVAL;
+      if is_due {
+        *last = now;
+      }
+      return is_due;
+    }
+    if self.life_signs.len() >= MAX_OBSERVED_PARTICIPANTS {
+      self.life_signs.clear();
+    }
+    self.life_signs.insert(prefix, now);
+    false
   }
 
   /// Takes over what addresses this host has now. What was observed on an address
@@ -556,6 +584,26 @@ mod tests {
     assert!(!set.insert(k2)); // duplicate
     assert!(set.insert(k3));
     assert_eq!(set.len(), 2);
+  }
+
+  #[test]
+  fn datagrams_of_a_participant_are_life_signs_but_for_the_first_one() {
+    let mut observations = InterfaceObservations::new();
+    let start = Instant::now();
+    let after = |ms| start + Duration::from_millis(ms);
+    let prefix = GuidPrefix::new(&[7; 12]);
+    let mut is_sign = |ms| observations.is_life_sign(prefix, after(ms));
+    assert!(!is_sign(0));
+    assert!(!is_sign(1_999));
+    assert!(is_sign(2_000));
+    assert!(!is_sign(2_001));
+    assert!(is_sign(60_000), "the first datagram after an outage");
+    for number in 0..2 * MAX_OBSERVED_PARTICIPANTS {
+      let mut forged = [0; 12];
+      forged[..8].copy_from_slice(&number.to_le_bytes());
+      assert!(!observations.is_life_sign(GuidPrefix::new(&forged), after(90_000)));
+    }
+    assert!(observations.life_signs.len() <= MAX_OBSERVED_PARTICIPANTS);
   }
 
   #[test]
