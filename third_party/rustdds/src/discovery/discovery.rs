@@ -275,6 +275,8 @@ pub(crate) struct Discovery {
 
   // Participants that are new, to be told of this one when the timer ends.
   unanswered: Vec<GuidPrefix>,
+  // Participants whose lease has ended lately, and when it did.
+  silent: Vec<(GuidPrefix, std::time::Instant)>,
 
   // The interfaces as they were last enumerated, and what notifies of changes. If it
   // cannot be had, they are enumerated before each announcement.
@@ -353,6 +355,11 @@ impl Discovery {
   // How long others wait for the acknowledgements of a participant that was
   // killed: five announcements, so that two or three of them may be lost.
   const LEASE: StdDuration = StdDuration::from_secs(15);
+  // So long after its lease has ended, a participant is reintroduced to with each
+  // announcement. It may remember this one for as long as the lease of this one, and
+  // then an announcement says nothing new to it and it does not answer: Cyclone DDS
+  // announces itself up to 8 s later.
+  const REINTRODUCE_FOR: StdDuration = Self::LEASE;
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -747,6 +754,7 @@ impl Discovery {
       announced_readers: Announced::default(),
       announced_writers: Announced::default(),
       unanswered: Vec::new(),
+      silent: Vec::new(),
       // Not as the participant has them: what has changed since is followed then.
       interfaces: Vec::new(),
       locators: HashMap::new(),
@@ -926,6 +934,7 @@ impl Discovery {
                   self.follow_interfaces_without_watch();
                   if let Some(dp) = self.domain_participant.clone().upgrade() {
                     self.spdp_publish(&dp);
+                    self.reintroduce_to_silent_participants();
                     // Once more, now that they know who says so.
                     self.say_goodbye_for_the_dead();
                   } else {
@@ -1102,11 +1111,25 @@ impl Discovery {
     // Also if only the carrier is back: others wait for an announcement.
     if !is_first {
       self.spdp_publish(&dp);
+      self.reintroduce_to_silent_participants();
       for after in Self::REPEAT_ON_NEW_LINK {
         self.discovery_timer.borrow_mut().set_timeout(
           after,
           DiscoveryTimerEvent::SendParticipantInfo { reschedule: false },
         );
+      }
+    }
+  }
+
+  fn reintroduce_to_silent_participants(&mut self) {
+    for (prefix, lease_end) in std::mem::take(&mut self.silent) {
+      if lease_end.elapsed() < Self::REINTRODUCE_FOR {
+        self.reintroduce_to(prefix);
+        self.silent.push((prefix, lease_end));
+      } else {
+        self.send_discovery_notification(DiscoveryNotificationType::ParticipantForgotten {
+          guid_prefix: prefix,
+        });
       }
     }
   }
@@ -1245,6 +1268,7 @@ impl Discovery {
     self.send_discovery_notification(DiscoveryNotificationType::ParticipantUpdated { guid_prefix });
 
     if was_new {
+      self.silent.retain(|(silent, _)| *silent != guid_prefix);
       // Inform DDS Applications
       self.send_participant_status(DomainParticipantStatusEvent::ParticipantDiscovered {
         dpd: participant_data.into(),
@@ -1311,8 +1335,10 @@ impl Discovery {
 
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
     discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true); // true = actively removed
+    self.silent.retain(|(silent, _)| *silent != participant_guidp);
     self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost {
       guid_prefix: participant_guidp,
+      is_silent: false,
     });
     self.send_participant_status(DomainParticipantStatusEvent::ParticipantLost {
       id: participant_guidp,
@@ -2008,11 +2034,15 @@ impl Discovery {
     }
   }
 
-  pub fn participant_cleanup(&self) {
+  pub fn participant_cleanup(&mut self) {
     let removed = discovery_db_write(&self.discovery_db).participant_cleanup();
     for (guid_prefix, reason) in removed {
       debug!("participant cleanup - timeout for {guid_prefix:?}");
-      self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost { guid_prefix });
+      self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost {
+        guid_prefix,
+        is_silent: true,
+      });
+      self.silent.push((guid_prefix, std::time::Instant::now()));
       self.send_participant_status(DomainParticipantStatusEvent::ParticipantLost {
         id: guid_prefix,
         reason,

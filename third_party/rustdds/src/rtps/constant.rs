@@ -537,6 +537,12 @@ pub(crate) enum DiscoveryNotificationType {
   },
   ParticipantLost {
     guid_prefix: GuidPrefix,
+    /// Its lease has ended without a goodbye: announcements to it go on until
+    /// `ParticipantForgotten`.
+    is_silent: bool,
+  },
+  ParticipantForgotten {
+    guid_prefix: GuidPrefix,
   },
   AssertTopicLiveliness {
     writer_guid: GUID,

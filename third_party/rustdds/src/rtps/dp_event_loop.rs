@@ -526,7 +526,11 @@ impl DPEventLoop {
             udp_sender.together(|| self.update_participant(guid_prefix));
           }
         }
-        ParticipantLost { guid_prefix } => self.remote_participant_lost(guid_prefix),
+        ParticipantLost {
+          guid_prefix,
+          is_silent,
+        } => self.remote_participant_lost(guid_prefix, is_silent),
+        ParticipantForgotten { guid_prefix } => self.forget_silent_participant(guid_prefix),
         InterfacesChanged { interfaces } => self.follow_interfaces(interfaces),
         AssertTopicLiveliness {
           writer_guid,
@@ -994,7 +998,7 @@ impl DPEventLoop {
     }
   }
 
-  fn remote_participant_lost(&mut self, participant_guid_prefix: GuidPrefix) {
+  fn remote_participant_lost(&mut self, participant_guid_prefix: GuidPrefix, is_silent: bool) {
     info!(
       "remote_participant_lost guid_prefix={:?}",
       participant_guid_prefix
@@ -1003,7 +1007,9 @@ impl DPEventLoop {
     // Now we have to remove any ReaderProxies and WriterProxies belonging
     // to that participant, so that we do not send messages to them anymore.
 
-    for writer in self.writers.values_mut() {
+    // Announcements still go to one that is silent.
+    let is_kept = |id: EntityId| is_silent && id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER;
+    for (_, writer) in self.writers.iter_mut().filter(|(id, _)| !is_kept(**id)) {
       writer.participant_lost(participant_guid_prefix);
     }
 
@@ -1023,6 +1029,13 @@ impl DPEventLoop {
         .get_plugins()
         .unregister_remote_participant(&participant_guid_prefix)
         .unwrap_or_else(|e| error!("{e}"));
+    }
+  }
+
+  fn forget_silent_participant(&mut self, prefix: GuidPrefix) {
+    let announcer = EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER;
+    if let Some(writer) = self.writers.get_mut(&announcer) {
+      writer.participant_lost(prefix);
     }
   }
 
