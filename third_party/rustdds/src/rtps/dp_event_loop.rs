@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-  net::SocketAddr,
+  net::{IpAddr, SocketAddr},
   rc::Rc,
   sync::{Arc, RwLock},
   time::{Duration, Instant},
@@ -129,9 +129,9 @@ pub struct DPEventLoop {
   // the send-route recompute).
   local_interfaces: Rc<[IfAddr]>,
   only_networks: Option<Arc<[NetworkSelector]>>,
-  // An address is gone, and remote participants are to discover this one anew as soon
-  // as there is another address to send that from.
-  is_reintroduction_due: bool,
+  // Addresses that are gone. Remote participants are to discover this one anew as soon
+  // as there are other addresses to send that from, and these are not among them.
+  gone_addresses: BTreeSet<IpAddr>,
 
   // One timer shared by all Readers, Writers and the periodic loop tasks.
   // Endpoints hold cloned handles to schedule timeouts; the loop owns it,
@@ -264,7 +264,7 @@ impl DPEventLoop {
       interface_observations,
       local_interfaces,
       only_networks,
-      is_reintroduction_due: false,
+      gone_addresses: BTreeSet::new(),
       #[cfg(feature = "security")]
       security_plugins_opt,
       add_reader_receiver,
@@ -961,15 +961,19 @@ impl DPEventLoop {
       .borrow_mut()
       .follow_addresses(interfaces.iter().map(|ifa| ifa.ip).collect());
 
-    let is_gone = |ifa: &IfAddr| !interfaces.iter().any(|present| present.ip == ifa.ip);
-    self.is_reintroduction_due |= self.local_interfaces.iter().any(is_gone);
+    // The transport is IPv4 only, and IPv6 addresses for privacy come and go by themselves.
+    let former = self.local_interfaces.iter().map(|ifa| ifa.ip);
+    self.gone_addresses.extend(former.filter(IpAddr::is_ipv4));
+    for present in &interfaces {
+      self.gone_addresses.remove(&present.ip);
+    }
     let reaches_others = interfaces.iter().any(|ifa| !ifa.ip.is_loopback());
     self.local_interfaces = Rc::from(interfaces);
     for writer in self.writers.values_mut() {
       writer.follow_interfaces(Rc::clone(&self.local_interfaces));
     }
-    if self.is_reintroduction_due && reaches_others {
-      self.is_reintroduction_due = false;
+    if reaches_others && !self.gone_addresses.is_empty() {
+      self.gone_addresses.clear();
       self.reintroduce_to_remote_participants();
     }
   }
