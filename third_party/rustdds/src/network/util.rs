@@ -245,7 +245,9 @@ fn get_local_unicast_locators_inner(
     // loopback -- would try to send there and get EAFNOSUPPORT per datagram.
     // Link-local IPv6 is doubly useless, as a `Locator` carries no scope id.
     .filter(|ifa| ifa.ip.is_ipv4())
-    .filter(|ifa| is_selected(ifa, only_networks))
+    // The loopback address whatever the networks are: announcements go to participants
+    // on this host over it in any case, and these can answer when a network is away.
+    .filter(|ifa| ifa.is_loopback || is_selected(ifa, only_networks))
     .map(|ifa| Locator::from(SocketAddr::new(ifa.ip, port)))
     .collect()
 }
