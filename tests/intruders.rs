@@ -160,7 +160,7 @@ impl Turn {
                     self.watch.found(reader.guid, &reader.topic, &reader.location, &self.own, now);
                 }
                 Discovery::ReaderGone(guid) => self.watch.gone(guid, now),
-                Discovery::ParticipantGone { prefix } => {
+                Discovery::ParticipantGone { prefix, .. } => {
                     self.graph.participant_gone(prefix);
                     self.watch.participant_gone(prefix, now);
                 }

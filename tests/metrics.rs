@@ -84,6 +84,7 @@ fn report() -> Report {
         control,
         subscribers: vec![SubscriberReading { lane: Some(0), record: subscriber }],
         named_endpoints: Vec::new(),
+        absences: Vec::new(),
         intruders: Vec::new(),
     };
     let mut report = snapshot.since(&snapshot);

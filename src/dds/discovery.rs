@@ -1,7 +1,7 @@
 //! What other participants have, as discovery reports it.
 
 use super::qos::{durability_of, reliability_of};
-use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription};
+use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription, LostReason};
 use crate::model::{Durability, Guid, Reliability};
 use crate::policy::Location;
 
@@ -40,6 +40,8 @@ pub enum Discovery {
     ParticipantGone {
         /// The prefix that their GUIDs have in common.
         prefix: [u8; 12],
+        /// For how long nothing was heard of it, if its lease has ended; `None` if it said goodbye.
+        silent_ms: Option<u64>,
     },
     /// A reader of ours asks for more than a writer offers, or a reader for more than ours offers.
     Incompatible {
@@ -62,8 +64,14 @@ pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery
         }
         Event::WriterLost { guid, .. } => Some(Discovery::WriterGone(Guid(guid.to_bytes()))),
         Event::ReaderLost { guid, .. } => Some(Discovery::ReaderGone(Guid(guid.to_bytes()))),
-        Event::ParticipantLost { id, .. } => {
-            Some(Discovery::ParticipantGone { prefix: id.as_ref().try_into().ok()? })
+        Event::ParticipantLost { id, reason } => {
+            let silent_ms = match reason {
+                LostReason::Disposed => None,
+                LostReason::Timeout { elapsed, .. } => {
+                    Some(u64::try_from(elapsed.to_std().as_millis()).unwrap_or(u64::MAX))
+                }
+            };
+            Some(Discovery::ParticipantGone { prefix: id.as_ref().try_into().ok()?, silent_ms })
         }
         Event::RemoteReaderQosIncompatible { local_writer, remote_reader, .. } => {
             Some(Discovery::Incompatible {

@@ -4,10 +4,13 @@ use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
+use nix::net::if_::InterfaceFlags;
+use nix::sys::socket::SockaddrStorage;
 
 use super::error::DdsError;
 use super::rustdds;
 use crate::config::NetworkSelector;
+use crate::policy::HostInterface;
 
 /// The interfaces asked for in the DDS library's terms.
 pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustdds::NetworkSelector> {
@@ -72,6 +75,31 @@ pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
             v4.or_else(|| address.as_sockaddr_in6().map(|v6| IpAddr::V6(v6.ip())))
         })
         .collect())
+}
+
+/// The interfaces of this host at present, once for each IPv4 address, and those without one.
+///
+/// # Errors
+/// The kernel does not list them.
+pub fn interfaces() -> Result<Vec<HostInterface>, DdsError> {
+    let mut interfaces: Vec<HostInterface> = Vec::new();
+    for listed in interface_addresses()? {
+        let v4 = |address: Option<SockaddrStorage>| Some(address?.as_sockaddr_in()?.ip());
+        let address = v4(listed.address).zip(v4(listed.netmask));
+        let name = listed.interface_name;
+        // Listed once for each address of any family.
+        let place = interfaces.iter().position(|known| known.name == name && known.address.is_none());
+        match place {
+            Some(place) if address.is_some() => interfaces[place].address = address,
+            _ if address.is_none() && interfaces.iter().any(|known| known.name == name) => {}
+            _ => {
+                let running = InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING;
+                let has_link = listed.flags.contains(running);
+                interfaces.push(HostInterface { name, address, has_link });
+            }
+        }
+    }
+    Ok(interfaces)
 }
 
 fn interface_addresses() -> Result<impl Iterator<Item = InterfaceAddress>, DdsError> {

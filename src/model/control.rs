@@ -150,6 +150,60 @@ pub struct IntruderRecord {
     pub since: MonotonicNs,
 }
 
+/// Interfaces and peers that are shown as away, or as back, at once; those that are away come first.
+pub const MAX_ABSENCES: usize = 32;
+
+/// What is or was away.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u8)]
+pub enum AbsenceKind {
+    /// A network interface of this host.
+    #[default]
+    Interface = 0,
+    /// A participant on another host.
+    Peer = 1,
+}
+
+impl AbsenceKind {
+    /// `interface` or `peer`.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Interface => "interface",
+            Self::Peer => "peer",
+        }
+    }
+}
+
+/// A network interface of this host, or a peer on another one, that was there and is or was away.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct AbsenceRecord {
+    /// Since when it is away; 0 for a place that is free.
+    pub since: MonotonicNs,
+    /// When it came back; 0 while it is away.
+    pub back_at: MonotonicNs,
+    /// What it is, as [`AbsenceKind`]'s number.
+    pub kind: u64,
+    /// The interface as configured; or the peer's node, empty where it has none.
+    pub name: FixedText,
+    /// The address of the interface, or of the peer's host; empty where it is not known.
+    pub host: FixedText,
+    /// What the interface lacks; or what the peer subscribes to and publishes.
+    pub detail: FixedText,
+}
+
+impl AbsenceRecord {
+    /// What it is; a number that is none reads as a peer.
+    pub fn kind(&self) -> AbsenceKind {
+        if self.kind == AbsenceKind::Interface as u64 { AbsenceKind::Interface } else { AbsenceKind::Peer }
+    }
+
+    /// Whether it is away.
+    pub fn is_away(&self) -> bool {
+        self.since.0 != 0 && self.back_at.0 == 0
+    }
+}
+
 /// Publishers of input topics and readers of outputs whose nodes control names.
 pub const MAX_NAMED_ENDPOINTS: usize = 128;
 

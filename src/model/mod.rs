@@ -17,8 +17,8 @@ mod thresholds;
 mod time;
 
 pub use control::{
-    ControlRecord, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint,
-    SubscriberRecord, SubscriberWarning,
+    AbsenceKind, AbsenceRecord, ControlRecord, IntruderRecord, MAX_ABSENCES, MAX_INTRUDERS,
+    MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint, SubscriberRecord, SubscriberWarning,
 };
 pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;

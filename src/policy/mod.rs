@@ -17,9 +17,11 @@
 //! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
 //! - [`SubscriberWarnings`]: which figures of a subscriber are worth a warning.
 //! - [`IntruderWatch`]: which readers on other hosts reach past the bridge, and what to say of them.
+//! - [`AbsenceWatch`]: which network interfaces and peers on other hosts are away.
 //! - [`Location`]: whether a DDS endpoint is on this host.
 //! - [`RestartBackoff`]: when a supervised child is started again.
 
+mod absences;
 mod classifier;
 mod clock_offset;
 mod intruders;
@@ -37,6 +39,9 @@ mod token_bucket;
 mod warnings;
 mod whereabouts;
 
+pub use absences::{
+    Absence, AbsenceEvent, AbsenceWatch, HostInterface, MAX_WATCHED_PEERS, REMEMBER_ABSENCE_MS,
+};
 pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
 };

@@ -18,10 +18,10 @@ use super::segment::Segment;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
-    ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName, LanePolicy,
-    LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs,
-    NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord,
-    fnv1a,
+    AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName,
+    LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
+    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId,
+    RouteInfo, SubscriberRecord, fnv1a,
 };
 
 /// What the boards must have room for. All processes of an instance must agree on it.
@@ -97,6 +97,7 @@ struct Layout {
     subscribers: usize,
     intruders: usize,
     named_endpoints: usize,
+    absences: usize,
     route_info: usize,
     ingress: usize,
     publishers: usize,
@@ -116,7 +117,8 @@ impl Layout {
         let subscribers = control + Cell::<ControlRecord>::WORDS;
         let intruders = subscribers + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
         let named_endpoints = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
-        let route_info = named_endpoints + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
+        let absences = named_endpoints + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
+        let route_info = absences + MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS;
         let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
         let publishers = ingress + routes * Cell::<IngressCounters>::WORDS;
         let lane = publishers + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
@@ -133,6 +135,7 @@ impl Layout {
             subscribers,
             intruders,
             named_endpoints,
+            absences,
             route_info,
             ingress,
             publishers,
@@ -173,6 +176,11 @@ impl Layout {
     fn named_endpoint(&self, place: usize) -> Cell<NamedEndpoint> {
         assert!(place < MAX_NAMED_ENDPOINTS, "named endpoint {place} of {MAX_NAMED_ENDPOINTS}");
         Cell::at(self.named_endpoints + place * Cell::<NamedEndpoint>::WORDS)
+    }
+
+    fn absence(&self, place: usize) -> Cell<AbsenceRecord> {
+        assert!(place < MAX_ABSENCES, "absence {place} of {MAX_ABSENCES}");
+        Cell::at(self.absences + place * Cell::<AbsenceRecord>::WORDS)
     }
 
     fn output_readers(&self, lane: usize, route: usize) -> Cell<OutputReaders> {
@@ -361,6 +369,16 @@ impl Boards {
     /// Writes the endpoint that control names at a place below [`MAX_NAMED_ENDPOINTS`].
     pub fn named_endpoint_writer(&self, place: usize) -> BoardWriter<NamedEndpoint> {
         self.writer(self.layout.named_endpoint(place))
+    }
+
+    /// The interface or peer at a place below [`MAX_ABSENCES`] that is or was away.
+    pub fn absence(&self, place: usize) -> Option<AbsenceRecord> {
+        self.layout.absence(place).read(&self.segment)
+    }
+
+    /// Writes the interface or peer at a place below [`MAX_ABSENCES`].
+    pub fn absence_writer(&self, place: usize) -> BoardWriter<AbsenceRecord> {
+        self.writer(self.layout.absence(place))
     }
 
     /// The readers that are matched with a lane's output of a route.

@@ -11,8 +11,9 @@ use std::sync::atomic::{Ordering, fence};
 
 use super::segment::Segment;
 use crate::model::{
-    ControlRecord, IngressCounters, IntruderRecord, LaneCounters, LanePolicy, LatencyHistogram,
-    NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
+    AbsenceRecord, ControlRecord, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
+    LatencyHistogram, NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo,
+    SubscriberRecord,
 };
 
 /// Words of a cache line, on which every value begins, so that two writers never share one.
@@ -55,6 +56,8 @@ unsafe impl Plain for ControlRecord {}
 unsafe impl Plain for SubscriberRecord {}
 // SAFETY: `repr(C)`; four times 128 bytes of text, then a word.
 unsafe impl Plain for IntruderRecord {}
+// SAFETY: `repr(C)`; three words, then three times 128 bytes of text.
+unsafe impl Plain for AbsenceRecord {}
 // SAFETY: `repr(C)`, 128 bytes of text, which is checked when it is looked at.
 unsafe impl Plain for RouteInfo {}
 // SAFETY: `repr(C)`, 64-bit integers only.
@@ -65,6 +68,7 @@ const _: () = {
     assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
     assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
     assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
+    assert!(size_of::<AbsenceRecord>() == (3 + 3 * 16) * 8);
     assert!(size_of::<NamedEndpoint>() == (2 + 2 * 16) * 8);
     assert!(size_of::<PublisherAccount>() == 9 * 8);
     assert!(size_of::<LanePolicy>() == 5 * 8);

@@ -3,8 +3,9 @@
 use super::liveness::ProcessState;
 use super::problems::{Level, Problem};
 use super::report::{
-    Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
-    PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+    AbsenceReport, Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
+    ProcessReport, PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport,
+    SubscriberReport,
 };
 use crate::model::{DropCounts, DropReason, ProbeRefusal, RefusalCounts};
 
@@ -151,6 +152,14 @@ pub(super) fn wide() -> Report {
             since_s: Some(3.0),
         }],
         intruders_seen: u64::MAX,
+        absences: vec![AbsenceReport {
+            kind: "interface",
+            name: Some("wlan0".into()),
+            host: Some("192.168.100.100".into()),
+            detail: "has no link".into(),
+            away_s: 15.0,
+            back_s: None,
+        }],
     }
 }
 

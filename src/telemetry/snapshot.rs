@@ -8,10 +8,10 @@ use super::liveness::ProcessState;
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{
-    ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS, MAX_SUBSCRIBERS,
-    MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId, SubscriberRecord,
-    TopicName, TrafficClass, TypeName, WallNs,
+    AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
+    LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
+    MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
+    PublisherAccount, RouteId, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
 };
 use crate::policy::effective_mode;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -45,6 +45,8 @@ pub struct Snapshot {
     pub subscribers: Vec<SubscriberReading>,
     /// The remote readers that reach past the bridge, as control found them.
     pub intruders: Vec<IntruderRecord>,
+    /// Network interfaces and peers that are or were away, as control found them.
+    pub absences: Vec<AbsenceRecord>,
     /// The nodes of the outputs' readers, as control found them.
     pub named_endpoints: Vec<NamedEndpoint>,
 }
@@ -212,6 +214,7 @@ impl Snapshot {
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
             intruders: read_intruders(boards, &control)?,
+            absences: read_absences(boards)?,
             named_endpoints: read_named_endpoints(boards)?,
             control,
             lanes,
@@ -249,6 +252,17 @@ fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<Intrud
         }
     }
     Ok(intruders)
+}
+
+fn read_absences(boards: &Boards) -> Result<Vec<AbsenceRecord>, ShmError> {
+    let mut absences = Vec::new();
+    for place in 0..MAX_ABSENCES {
+        let record = steady(boards.absence(place))?;
+        if record.since != MonotonicNs::default() {
+            absences.push(record);
+        }
+    }
+    Ok(absences)
 }
 
 fn read_named_endpoints(boards: &Boards) -> Result<Vec<NamedEndpoint>, ShmError> {

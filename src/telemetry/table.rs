@@ -4,8 +4,8 @@ use std::fmt::{self, Write};
 
 use super::liveness::ProcessState;
 use super::report::{
-    Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, PublisherReport,
-    Report, RouteReport, SafetyReport, SubscriberReport,
+    AbsenceReport, Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
+    PublisherReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 
 /// No line is longer, but for a sentence that says what is wrong, where names may be of any length.
@@ -36,6 +36,7 @@ impl fmt::Display for Report {
             f.write_str(&safety_text(&self.safety))?;
             f.write_str(&probes_text(&self.probes))?;
             f.write_str(&subscribers_text(&self.subscribers))?;
+            f.write_str(&absences_text(&self.absences))?;
             f.write_str(&intruders_text(&self.intruders, self.intruders_seen))?;
         }
         if let Some(ingress) = process("ingress") {
@@ -159,6 +160,22 @@ fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
             why += "; not listed under subscribers";
         }
         text += &wrapped("    ", "      ", why.split(' '), " ");
+    }
+    text
+}
+
+fn absences_text(absences: &[AbsenceReport]) -> String {
+    let mut text = String::new();
+    for absence in absences {
+        let name = absence.name.as_deref().unwrap_or("a node without a name");
+        let host = absence.host.as_ref().map_or_else(String::new, |host| format!(" ({host})"));
+        let away = duration_text(absence.away_s);
+        let line = match absence.back_s {
+            None => format!("{name}{host} {}, for {away}", absence.detail),
+            Some(back_s) => format!("{name}{host} for {}, was away for {away}", duration_text(back_s)),
+        };
+        let first = if absence.back_s.is_none() { "  away: " } else { "  back: " };
+        text += &wrapped(first, "    ", line.split(' '), " ");
     }
     text
 }

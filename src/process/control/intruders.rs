@@ -7,6 +7,7 @@ use std::net::IpAddr;
 use tracing::{info, warn};
 
 use super::super::role::RoleError;
+use super::absences::Absences;
 use super::networks;
 use crate::config::Settings;
 use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
@@ -46,6 +47,7 @@ struct LoggedOverrun {
 pub(super) struct Guard {
     /// One for each network, in the order of the participants.
     networks: Vec<Watched>,
+    absences: Absences,
     overruns: Vec<LoggedOverrun>,
     named: Vec<BoardWriter<NamedEndpoint>>,
     readers_at: MonotonicNs,
@@ -110,6 +112,7 @@ impl Guard {
         }
         Ok(Self {
             networks: watched,
+            absences: Absences::new(boards, settings),
             overruns: Vec::new(),
             named,
             readers_at: MonotonicNs(0),
@@ -134,7 +137,7 @@ impl Guard {
     /// Takes in what discovery says; warns of what is new.
     pub fn keep_house(&mut self, participants: &mut [Participant], settings: &Settings, now: MonotonicNs) {
         let mut changed = false;
-        for (network, participant) in self.networks.iter_mut().zip(participants) {
+        for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
             let mut are_addresses_current = false;
             while let Some(change) = participant.poll_discovery() {
                 // Anew for what discovery says: an endpoint of this host that is announced again after a
@@ -148,9 +151,22 @@ impl Guard {
                         }
                     }
                 }
+                let is_of_bridge = |topic: &str, publishes: bool| {
+                    if publishes {
+                        network.inputs.iter().any(|input| input == topic)
+                    } else {
+                        network.outputs.contains_key(topic)
+                    }
+                };
+                if let Discovery::ParticipantGone { .. } = change {
+                    // Its node is not known any more once it is gone.
+                    self.absences.name_nodes(number, &network.graph);
+                }
+                self.absences.take_in(number, &change, is_of_bridge, participant, &self.own, now);
                 network.take_in(change, participant, &self.own, now);
             }
             network.graph.poll();
+            self.absences.name_nodes(number, &network.graph);
             while let Some(event) = network.watch.poll(now, |reader| network.graph.node_of(reader)) {
                 changed = true;
                 match event {
@@ -167,6 +183,7 @@ impl Guard {
             self.readers_at = now.plus_ms(READERS_MS);
             self.name_endpoints();
             self.log_overruns(settings, now);
+            self.absences.look(now);
         }
     }
 
@@ -264,7 +281,7 @@ impl Watched {
                 self.endpoints.retain(|(reader, _)| *reader != guid);
                 self.watch.gone(guid, now);
             }
-            Discovery::ParticipantGone { prefix } => {
+            Discovery::ParticipantGone { prefix, .. } => {
                 self.endpoints.retain(|(endpoint, _)| endpoint.prefix() != prefix);
                 self.watch.participant_gone(prefix, now);
                 self.graph.participant_gone(prefix);

@@ -4,6 +4,7 @@
 //! Nothing of the data plane waits for it. What it decides stands on the policy board, which it confirms ten
 //! times a second; when it no longer does, the lanes fall back to safe modes by themselves.
 
+mod absences;
 mod diagnostics;
 mod intruders;
 mod link;

@@ -173,7 +173,7 @@ impl Ingress {
                         Ok(())
                     })?;
                 }
-                Discovery::ParticipantGone { prefix } => {
+                Discovery::ParticipantGone { prefix, .. } => {
                     self.visit(|input, _| {
                         input.participant_gone(prefix);
                         Ok(())

@@ -30,6 +30,7 @@ pub(super) fn of(report: &Report) -> Vec<Part> {
     parts.extend(report.routes.iter().map(route));
     parts.push(probes(report));
     parts.extend(report.subscribers.iter().map(subscriber));
+    parts.push(network(report));
     parts.push(intruders(report));
     parts
 }
@@ -93,6 +94,15 @@ fn subscriber(subscriber: &SubscriberReport) -> Part {
     let forced = if subscriber.forced { ", forced" } else { "" };
     let message = format!("{}{forced}: {}", subscriber.state, subscriber.figures());
     part(format!("subscriber {}", subscriber.id), message, flat(subscriber))
+}
+
+fn network(report: &Report) -> Part {
+    let values = report.absences.iter().map(|absence| {
+        let name = absence.name.clone().or_else(|| absence.host.clone()).unwrap_or_default();
+        let state = if absence.back_s.is_some() { "was away" } else { "away" };
+        (name, format!("{state} for {} s: {}", number(absence.away_s), absence.detail))
+    });
+    part("network", "no interface and no peer is away".to_owned(), values.collect())
 }
 
 fn intruders(report: &Report) -> Part {

@@ -115,6 +115,7 @@ fn every_part_has_a_status_with_the_keys_of_the_report() {
         "adaptive_bridge: control",
         "adaptive_bridge: intruders",
         &format!("adaptive_bridge: lane {lane}"),
+        "adaptive_bridge: network",
         "adaptive_bridge: probes",
         "adaptive_bridge: route scan",
         "adaptive_bridge: safety",
@@ -178,7 +179,7 @@ fn however_much_there_is_to_say_no_array_is_too_large() {
     let arrays = diagnostic_arrays(&report);
     assert!(arrays.len() > 1);
     let found = read(&arrays);
-    assert_eq!(found.len(), 5 + report.lanes.len() + report.routes.len() + report.subscribers.len());
+    assert_eq!(found.len(), 6 + report.lanes.len() + report.routes.len() + report.subscribers.len());
     assert!(
         found["adaptive_bridge_an_instance_of_24_chars_: route route_7"]
             .values

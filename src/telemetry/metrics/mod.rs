@@ -241,6 +241,8 @@ fn control(page: &mut Page, report: &Report) {
     let present = report.intruders.len() as u64;
     one("adaptive_bridge_intruders", Gauge, "Remote readers that reach past the bridge at present.", present);
     one("adaptive_bridge_intruders_seen_total", Counter, "Such readers ever seen.", report.intruders_seen);
+    let away = report.absences.iter().filter(|absence| absence.back_s.is_none()).count() as u64;
+    one("adaptive_bridge_absences", Gauge, "Network interfaces and peers that are away at present.", away);
     page.family("adaptive_bridge_probe_refusals_total", Counter, "Probe messages refused, by reason.");
     for reason in ProbeRefusal::ALL {
         page.sample(&[("reason", reason.label())], Some(probes.refused.0.get(*reason)));

@@ -1,11 +1,14 @@
 //! What control found to be wrong, and what is wrong with control and the settings.
 
 use super::{Level, Problem};
-use crate::model::{MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
+use crate::model::{AbsenceKind, MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
 use crate::shm::ProcessRole;
 use crate::telemetry::report::SubscriberReport;
 use crate::telemetry::snapshot::{ModeReason, Snapshot};
 use crate::telemetry::text::printable;
+
+/// An answer this old is worth a word: at the default rate ten probes are unanswered.
+const SILENT_RESPONDER_MS: f64 = 2_000.0;
 
 /// Control is asked for and never ran. One that ran and is gone is named among the processes.
 pub(super) fn missing(now: &Snapshot) -> Option<Problem> {
@@ -93,6 +96,38 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems
 }
 
+/// Network interfaces and peers that are away.
+pub(super) fn absences(now: &Snapshot) -> impl Iterator<Item = Problem> {
+    now.absences.iter().filter(|absence| absence.is_away()).map(|absence| {
+        let report = now.absence_report(absence);
+        let name = report.name.as_deref();
+        let away_s = report.away_s;
+        let (level, text) = match absence.kind() {
+            AbsenceKind::Interface => {
+                let address = report.host.map_or_else(String::new, |address| format!(" ({address})"));
+                let name = name.unwrap_or_default();
+                let text = format!(
+                    "network interface {name}{address} {} for {away_s:.0} s: peers behind it are not reached; \
+                     `ip addr show` tells, and it is used again as soon as it is back",
+                    report.detail
+                );
+                (Level::Warn, text)
+            }
+            AbsenceKind::Peer => {
+                let node = name.unwrap_or("a node without a name");
+                let host = report.host.map_or_else(String::new, |host| format!(" on {host}"));
+                let text = format!(
+                    "{node}{host}, which {}, is silent for {away_s:.0} s: its link is down, or it ended without \
+                     a goodbye",
+                    report.detail
+                );
+                (Level::Stale, text)
+            }
+        };
+        Problem::new("network", level, text)
+    })
+}
+
 /// Subscribers whose link is bad, or of whom nothing is heard.
 pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
     now.subscribers.iter().filter_map(|subscriber| {
@@ -106,7 +141,10 @@ pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
             };
             (Level::Stale, format!("{heard}; does `adaptive-bridge responder --id {}` run there?", report.id))
         } else if degraded {
-            (Level::Warn, format!("is NONCRITICAL: {}", report.figures()))
+            let silent_ms = report.last_response_age_ms.filter(|&age_ms| age_ms > SILENT_RESPONDER_MS);
+            let silent = silent_ms
+                .map_or_else(String::new, |age_ms| format!(", last answer {:.0} s ago", age_ms / 1e3));
+            (Level::Warn, format!("is NONCRITICAL: {}{silent}", report.figures()))
         } else if report.warnings.is_empty() {
             return None;
         } else {

@@ -62,8 +62,8 @@ impl Level {
 /// Something that is wrong. Its JSON is the sentence.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
-    /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `intruders`, `lane NAME`,
-    /// `route ID` or `subscriber ID`.
+    /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `network`, `intruders`,
+    /// `lane NAME`, `route ID` or `subscriber ID`.
     pub about: String,
     /// How grave.
     pub level: Level,
@@ -84,7 +84,7 @@ impl serde::Serialize for Problem {
 }
 
 /// What is wrong, the gravest first: processes, accounts that do not add up, safety, lanes that forward
-/// nothing, drops, subscribers, intruders, then what is only missing.
+/// nothing, drops, what is away, subscribers, intruders, then what is only missing.
 pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     let mut problems = Vec::new();
     for process in &now.processes {
@@ -110,6 +110,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         overrun(now, output, former, &mut problems);
     }
     problems.extend(control::settings(now, before));
+    problems.extend(control::absences(now));
     problems.extend(control::subscribers(now));
     problems.extend(control::intruders(now));
     problems.extend(control::refusals(now, before));
@@ -477,6 +478,7 @@ pub(super) mod tests {
             subscribers: Vec::new(),
             intruders: Vec::new(),
             named_endpoints: Vec::new(),
+            absences: Vec::new(),
         }
     }
 

@@ -4,8 +4,8 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use super::age_ms;
 use crate::model::{
-    IntruderRecord, LaneMode, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState, SubscriberWarning,
-    TrafficClass,
+    AbsenceRecord, IntruderRecord, LaneMode, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState,
+    SubscriberWarning, TrafficClass,
 };
 use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
@@ -113,6 +113,23 @@ pub struct IntruderReport {
     pub since_s: Option<f64>,
 }
 
+/// A network interface or peer that is or was away.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct AbsenceReport {
+    /// `interface` or `peer`.
+    pub kind: &'static str,
+    /// The interface, or the peer's node; null when it has none.
+    pub name: Option<String>,
+    /// The address of the interface, or of the peer's host; null when it is not known.
+    pub host: Option<String>,
+    /// What the interface lacks; or what the peer subscribes to and publishes.
+    pub detail: String,
+    /// For how long it is or was away.
+    pub away_s: f64,
+    /// For how long it has been back; null while it is away.
+    pub back_s: Option<f64>,
+}
+
 impl Snapshot {
     pub(super) fn safety_report(&self) -> SafetyReport {
         let control = &self.control;
@@ -167,6 +184,18 @@ impl Snapshot {
             host: printable(intruder.host.as_str()),
             remedy: printable(intruder.remedy.as_str()),
             since_s: age_s(intruder.since, self.at),
+        }
+    }
+
+    pub(in crate::telemetry) fn absence_report(&self, absence: &AbsenceRecord) -> AbsenceReport {
+        let end = if absence.is_away() { self.at } else { absence.back_at };
+        AbsenceReport {
+            kind: absence.kind().label(),
+            name: some_text(absence.name.as_str()),
+            host: some_text(absence.host.as_str()),
+            detail: printable(absence.detail.as_str()),
+            away_s: end.since(absence.since) as f64 / 1e9,
+            back_s: age_s(absence.back_at, self.at),
         }
     }
 

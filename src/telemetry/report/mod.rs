@@ -7,7 +7,7 @@ mod latency;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-pub use control::{IntruderReport, ProbesReport, Refusals, SafetyReport, SubscriberReport};
+pub use control::{AbsenceReport, IntruderReport, ProbesReport, Refusals, SafetyReport, SubscriberReport};
 pub use latency::{Latency, LatencyTotal};
 
 use super::liveness::ProcessState;
@@ -46,6 +46,8 @@ pub struct Report {
     pub intruders: Vec<IntruderReport>,
     /// Such readers ever seen since control came up, those not shown included.
     pub intruders_seen: u64,
+    /// The network interfaces and peers that are away, and those that came back lately.
+    pub absences: Vec<AbsenceReport>,
 }
 
 /// One process.
@@ -278,6 +280,7 @@ impl Snapshot {
             subscribers: self.subscribers.iter().map(|one| self.subscriber_report(one)).collect(),
             intruders: self.intruders.iter().map(|one| self.intruder_report(one)).collect(),
             intruders_seen: self.control.intruders_seen,
+            absences: self.absences.iter().map(|one| self.absence_report(one)).collect(),
         }
     }
 
@@ -528,6 +531,7 @@ mod tests {
         for (list, item) in [
             ("subscribers", &report["subscribers"][0]),
             ("intruders", &report["intruders"][0]),
+            ("absences", &report["absences"][0]),
             ("routes[].publishers", publisher),
         ] {
             let item = item.as_object().unwrap();

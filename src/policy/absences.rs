@@ -1,0 +1,496 @@
+//! Network interfaces and peers on other hosts that are away: which, since when, and when they came back.
+
+// Addresses only: `core::net` has no sockets.
+use core::net::{IpAddr, Ipv4Addr};
+use std::collections::VecDeque;
+
+use crate::model::{AbsenceKind, Guid, MonotonicNs};
+
+/// An absence is remembered for so long: after its end, and from its beginning where nothing says that the
+/// interface or peer is still wanted. Longer than a robot drives through a gap in its Wi-Fi.
+pub const REMEMBER_ABSENCE_MS: u64 = 900_000;
+
+/// Participants on other hosts that are watched; of further ones nothing is said.
+pub const MAX_WATCHED_PEERS: usize = 128;
+
+/// Readers and writers of one participant that are remembered.
+const MAX_PEER_ENDPOINTS: usize = 32;
+
+/// Interfaces that are watched beside the configured ones.
+const MAX_FOUND_INTERFACES: usize = 16;
+
+/// An IPv4 address of a network interface of this host, or an interface that has none.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HostInterface {
+    /// Its name, such as `wlan0`.
+    pub name: String,
+    /// The address and its network mask.
+    pub address: Option<(Ipv4Addr, Ipv4Addr)>,
+    /// Whether it is up and has a carrier, or is associated.
+    pub has_link: bool,
+}
+
+impl HostInterface {
+    fn reaches(&self, host: IpAddr) -> bool {
+        let (Some((own, mask)), IpAddr::V4(host)) = (self.address, host) else { return false };
+        own.to_bits() & mask.to_bits() == host.to_bits() & mask.to_bits()
+    }
+}
+
+/// An interface or a peer that is or was away.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Absence {
+    /// Which of the two.
+    pub kind: AbsenceKind,
+    /// The interface as configured; or the node, empty where it is not known.
+    pub name: String,
+    /// The address that the interface had; or that of the peer's host.
+    pub host: Option<IpAddr>,
+    /// What is wrong with the interface; or what the peer subscribes to and publishes.
+    pub detail: String,
+    /// Since when it is away.
+    pub since: MonotonicNs,
+    /// When it came back.
+    pub back_at: Option<MonotonicNs>,
+}
+
+/// A change that the log should have.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum AbsenceEvent {
+    /// It is away.
+    Away(Absence),
+    /// It came back.
+    Back(Absence),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Presence {
+    Present,
+    Away { since: MonotonicNs },
+    Back { since: MonotonicNs, at: MonotonicNs },
+}
+
+impl Presence {
+    /// When it was away, and when it came back.
+    fn absence(self) -> Option<(MonotonicNs, Option<MonotonicNs>)> {
+        match self {
+            Self::Present => None,
+            Self::Away { since } => Some((since, None)),
+            Self::Back { since, at } => Some((since, Some(at))),
+        }
+    }
+
+    fn is_away(self) -> bool {
+        matches!(self, Self::Away { .. })
+    }
+}
+
+#[derive(Clone, Debug)]
+struct Interface {
+    /// Its name, or an address where one is configured.
+    name: String,
+    is_configured: bool,
+    address: Option<Ipv4Addr>,
+    detail: &'static str,
+    presence: Presence,
+}
+
+impl Interface {
+    fn absence(&self) -> Option<Absence> {
+        let (since, back_at) = self.presence.absence()?;
+        Some(Absence {
+            kind: AbsenceKind::Interface,
+            name: self.name.clone(),
+            host: self.address.map(IpAddr::V4),
+            detail: self.detail.to_owned(),
+            since,
+            back_at,
+        })
+    }
+}
+
+#[derive(Clone, Debug)]
+struct Endpoint {
+    guid: Guid,
+    topic: String,
+    publishes: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Peer {
+    network: usize,
+    prefix: [u8; 12],
+    node: Option<String>,
+    host: IpAddr,
+    endpoints: Vec<Endpoint>,
+    presence: Presence,
+}
+
+impl Peer {
+    fn absence(&self) -> Option<Absence> {
+        let (since, back_at) = self.presence.absence()?;
+        let of = |publishes: bool| {
+            let topics = self.endpoints.iter().filter(move |endpoint| endpoint.publishes == publishes);
+            topics.map(|endpoint| endpoint.topic.as_str()).collect::<Vec<_>>().join(", ")
+        };
+        let parts = [("subscribes to ", of(false)), ("publishes ", of(true))];
+        let parts = parts.iter().filter(|(_, topics)| !topics.is_empty());
+        let detail: Vec<String> = parts.map(|(verb, topics)| format!("{verb}{topics}")).collect();
+        Some(Absence {
+            kind: AbsenceKind::Peer,
+            name: self.node.clone().unwrap_or_default(),
+            host: Some(self.host),
+            detail: detail.join(" and "),
+            since,
+            back_at,
+        })
+    }
+}
+
+/// Watches the interfaces that are configured, those by which peers were reached, and the peers. Memory is
+/// bounded whatever the network says.
+#[derive(Clone, Debug, Default)]
+pub struct AbsenceWatch {
+    interfaces: Vec<Interface>,
+    peers: Vec<Peer>,
+    events: VecDeque<AbsenceEvent>,
+}
+
+impl AbsenceWatch {
+    /// Watches these interfaces, by name or address, and those by which peers are reached.
+    pub fn new(configured: impl IntoIterator<Item = String>) -> Self {
+        let mut watch = Self::default();
+        for name in configured {
+            if !watch.interfaces.iter().any(|known| known.name == name) {
+                watch.interfaces.push(Interface {
+                    name,
+                    is_configured: true,
+                    address: None,
+                    detail: "",
+                    presence: Presence::Present,
+                });
+            }
+        }
+        watch
+    }
+
+    /// Takes in the interfaces that this host has now, and forgets what is long past.
+    pub fn look(&mut self, present: &[HostInterface], now: MonotonicNs) {
+        let is_past = |presence: Presence, is_wanted: bool| match presence {
+            Presence::Present => false,
+            Presence::Away { since } => !is_wanted && now >= since.plus_ms(REMEMBER_ABSENCE_MS),
+            Presence::Back { at, .. } => now >= at.plus_ms(REMEMBER_ABSENCE_MS),
+        };
+        self.interfaces.retain(|interface| {
+            interface.is_configured || !is_past(interface.presence, interface.is_configured)
+        });
+        for interface in &mut self.interfaces {
+            if is_past(interface.presence, interface.is_configured) {
+                interface.presence = Presence::Present;
+            }
+        }
+        self.peers.retain(|peer| !(peer.presence.is_away() && is_past(peer.presence, false)));
+        for peer in &mut self.peers {
+            if is_past(peer.presence, false) {
+                peer.presence = Presence::Present;
+            }
+        }
+        self.find_interfaces(present);
+        for interface in &mut self.interfaces {
+            let trouble = trouble(&interface.name, present);
+            match (trouble, interface.presence) {
+                (Ok(address), presence) => {
+                    interface.address = Some(address);
+                    if let Presence::Away { since } = presence {
+                        interface.presence = Presence::Back { since, at: now };
+                        self.events.extend(interface.absence().map(AbsenceEvent::Back));
+                    }
+                }
+                (Err(detail), Presence::Away { .. }) => interface.detail = detail,
+                (Err(detail), _) => {
+                    interface.detail = detail;
+                    interface.presence = Presence::Away { since: now };
+                    self.events.extend(interface.absence().map(AbsenceEvent::Away));
+                }
+            }
+        }
+    }
+
+    /// Watches interfaces by which a peer is reached. Others come and go with containers and tunnels.
+    fn find_interfaces(&mut self, present: &[HostInterface]) {
+        for found in present.iter().filter(|found| found.has_link) {
+            let Some((address, _)) = found.address else { continue };
+            let is_known = self
+                .interfaces
+                .iter()
+                .any(|known| known.name == found.name || known.name == address.to_string());
+            let count = self.interfaces.iter().filter(|known| !known.is_configured).count();
+            if is_known || count >= MAX_FOUND_INTERFACES {
+                continue;
+            }
+            if self.peers.iter().any(|peer| !peer.presence.is_away() && found.reaches(peer.host)) {
+                self.interfaces.push(Interface {
+                    name: found.name.clone(),
+                    is_configured: false,
+                    address: Some(address),
+                    detail: "",
+                    presence: Presence::Present,
+                });
+            }
+        }
+    }
+
+    /// Discovery sees a reader or writer, new or changed, of a participant on another host, in the network of
+    /// that number.
+    pub fn found(
+        &mut self,
+        network: usize,
+        guid: Guid,
+        topic: &str,
+        publishes: bool,
+        host: IpAddr,
+        now: MonotonicNs,
+    ) {
+        let prefix = guid.prefix();
+        let is_it = |peer: &Peer| peer.network == network && peer.prefix == prefix;
+        let place = match self.peers.iter().position(is_it) {
+            Some(place) => place,
+            None => {
+                // A program that was started again in the place of one that is away.
+                let is_replaced = |peer: &Peer| {
+                    let has =
+                        |endpoint: &Endpoint| endpoint.topic == topic && endpoint.publishes == publishes;
+                    peer.presence.is_away()
+                        && peer.network == network
+                        && peer.host == host
+                        && peer.endpoints.iter().any(has)
+                };
+                match self.peers.iter().position(is_replaced) {
+                    Some(place) => {
+                        let peer = &mut self.peers[place];
+                        peer.prefix = prefix;
+                        peer.endpoints.clear();
+                        place
+                    }
+                    None if self.peers.len() == MAX_WATCHED_PEERS => return,
+                    None => {
+                        self.peers.push(Peer {
+                            network,
+                            prefix,
+                            node: None,
+                            host,
+                            endpoints: Vec::new(),
+                            presence: Presence::Present,
+                        });
+                        self.peers.len() - 1
+                    }
+                }
+            }
+        };
+        let peer = &mut self.peers[place];
+        peer.host = host;
+        if !peer.endpoints.iter().any(|endpoint| endpoint.guid == guid)
+            && peer.endpoints.len() < MAX_PEER_ENDPOINTS
+        {
+            peer.endpoints.push(Endpoint { guid, topic: topic.to_owned(), publishes });
+        }
+        if let Presence::Away { since } = peer.presence {
+            peer.presence = Presence::Back { since, at: now };
+            self.events.extend(peer.absence().map(AbsenceEvent::Back));
+        }
+    }
+
+    /// A reader or writer said goodbye.
+    pub fn gone(&mut self, guid: Guid) {
+        for peer in &mut self.peers {
+            peer.endpoints.retain(|endpoint| endpoint.guid != guid);
+        }
+        self.peers.retain(|peer| !peer.endpoints.is_empty());
+    }
+
+    /// A participant said goodbye, or has been silent for so long that its lease has ended.
+    pub fn participant_gone(
+        &mut self,
+        network: usize,
+        prefix: [u8; 12],
+        silent_ms: Option<u64>,
+        now: MonotonicNs,
+    ) {
+        let is_it = |peer: &Peer| peer.network == network && peer.prefix == prefix;
+        let Some(silent_ms) = silent_ms else { return self.peers.retain(|peer| !is_it(peer)) };
+        if let Some(peer) = self.peers.iter_mut().find(|peer| is_it(peer))
+            && !peer.presence.is_away()
+        {
+            let silent_ns = silent_ms.saturating_mul(1_000_000);
+            peer.presence = Presence::Away { since: MonotonicNs(now.0.saturating_sub(silent_ns)) };
+            self.events.extend(peer.absence().map(AbsenceEvent::Away));
+        }
+    }
+
+    /// Asks for the nodes of peers in that network.
+    pub fn name_nodes<'graph>(&mut self, network: usize, node_of: impl Fn(Guid) -> Option<&'graph str>) {
+        let peers = self.peers.iter_mut().filter(|peer| peer.network == network && !peer.presence.is_away());
+        for peer in peers {
+            let node = peer.endpoints.iter().find_map(|endpoint| node_of(endpoint.guid));
+            if node.is_some() && node != peer.node.as_deref() {
+                peer.node = node.map(str::to_owned);
+            }
+        }
+    }
+
+    /// The next change, if there is one.
+    pub fn poll(&mut self) -> Option<AbsenceEvent> {
+        self.events.pop_front()
+    }
+
+    /// What is away, interfaces first, then what has come back.
+    pub fn absences(&self) -> Vec<Absence> {
+        let interfaces = self.interfaces.iter().filter_map(Interface::absence);
+        let mut all: Vec<Absence> = interfaces.chain(self.peers.iter().filter_map(Peer::absence)).collect();
+        all.sort_by_key(|absence| absence.back_at.is_some());
+        all
+    }
+}
+
+/// The address of the interface, or what keeps it from being used.
+fn trouble(name: &str, present: &[HostInterface]) -> Result<Ipv4Addr, &'static str> {
+    let by_address: Option<Ipv4Addr> = name.parse().ok();
+    let is_it = |found: &&HostInterface| match by_address {
+        Some(address) => found.address.is_some_and(|(own, _)| own == address),
+        None => found.name == name,
+    };
+    let mut detail =
+        if by_address.is_some() { "is the address of no interface" } else { "is not on this host" };
+    for found in present.iter().filter(is_it) {
+        match found.address {
+            Some((address, _)) if found.has_link => return Ok(address),
+            Some(_) => detail = "has no link",
+            None if detail != "has no link" => {
+                detail = if found.has_link { "has no IPv4 address" } else { "has no link" }
+            }
+            None => {}
+        }
+    }
+    Err(detail)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: u64) -> MonotonicNs {
+        MonotonicNs(1_000_000_000).plus_ms(ms)
+    }
+
+    fn guid(participant: u8, entity: u8) -> Guid {
+        let mut guid = [participant; 16];
+        guid[15] = entity;
+        Guid(guid)
+    }
+
+    fn interface(name: &str, address: Option<[u8; 4]>, has_link: bool) -> HostInterface {
+        let address = address.map(|of| (Ipv4Addr::from(of), Ipv4Addr::new(255, 255, 255, 0)));
+        HostInterface { name: name.into(), address, has_link }
+    }
+
+    const LAPTOP: IpAddr = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 4));
+
+    /// What is away, and what came back.
+    fn said(watch: &AbsenceWatch) -> Vec<String> {
+        let line = |absence: Absence| {
+            let state = if absence.back_at.is_some() { "back" } else { "away" };
+            format!("{state} {} {}", absence.name, absence.detail)
+        };
+        watch.absences().into_iter().map(line).collect()
+    }
+
+    #[test]
+    fn a_configured_interface_is_away_until_it_has_an_address_and_a_link() {
+        let mut watch = AbsenceWatch::new(["wlan0".to_owned(), "10.0.0.9".to_owned(), "lo".to_owned()]);
+        let lo = interface("lo", Some([127, 0, 0, 1]), true);
+        watch.look(std::slice::from_ref(&lo), at(0));
+        assert_eq!(
+            said(&watch),
+            ["away wlan0 is not on this host", "away 10.0.0.9 is the address of no interface"]
+        );
+        assert!(matches!(watch.poll(), Some(AbsenceEvent::Away(absence)) if absence.name == "wlan0"));
+        let other = interface("eth0", Some([10, 0, 0, 9]), true);
+        watch.look(&[lo.clone(), other.clone(), interface("wlan0", None, true)], at(1_000));
+        assert_eq!(
+            said(&watch),
+            ["away wlan0 has no IPv4 address", "back 10.0.0.9 is the address of no interface"]
+        );
+        let wlan = |has_link| interface("wlan0", Some([10, 0, 1, 2]), has_link);
+        watch.look(&[lo.clone(), other.clone(), wlan(false)], at(2_000));
+        assert_eq!(said(&watch)[0], "away wlan0 has no link");
+        watch.look(&[lo.clone(), other.clone(), wlan(true)], at(3_000));
+        let back = &watch.absences()[0];
+        assert_eq!((back.since, back.back_at), (at(0), Some(at(3_000))));
+        assert_eq!(back.host, Some(IpAddr::V4(Ipv4Addr::new(10, 0, 1, 2))));
+        watch.look(&[lo, other, wlan(true)], at(3_000 + REMEMBER_ABSENCE_MS));
+        assert_eq!(said(&watch), [""; 0], "forgotten");
+    }
+
+    #[test]
+    fn without_configured_interfaces_those_with_peers_behind_them_count() {
+        let mut watch = AbsenceWatch::new([]);
+        let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);
+        let docker = |has_link| interface("docker0", Some([172, 17, 0, 1]), has_link);
+        watch.look(&[eth(true), docker(true)], at(0));
+        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.look(&[eth(true), docker(true)], at(1_000));
+        watch.look(&[eth(false), docker(false)], at(2_000));
+        assert_eq!(said(&watch), ["away eth0 has no link"]);
+        watch.look(&[], at(2_000 + REMEMBER_ABSENCE_MS));
+        assert_eq!(said(&watch), [""; 0], "an interface that is not configured is forgotten");
+    }
+
+    #[test]
+    fn a_peer_is_away_when_it_is_silent_and_not_when_it_said_goodbye() {
+        let mut watch = AbsenceWatch::new([]);
+        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.found(0, guid(1, 3), "/odom", true, LAPTOP, at(0));
+        watch.found(0, guid(2, 4), "/scan", false, LAPTOP, at(0));
+        watch.found(0, guid(3, 4), "/scan", false, LAPTOP, at(0));
+        watch.name_nodes(0, |endpoint| (endpoint.prefix() == [1; 12]).then_some("/rviz"));
+        watch.participant_gone(0, [2; 12], None, at(100));
+        watch.gone(guid(3, 4));
+        watch.participant_gone(0, [3; 12], Some(10_000), at(20_000));
+        watch.participant_gone(1, [1; 12], Some(10_000), at(20_000));
+        assert_eq!(said(&watch), [""; 0]);
+        watch.participant_gone(0, [1; 12], Some(10_000), at(20_000));
+        assert_eq!(said(&watch), ["away /rviz subscribes to /scan and publishes /odom"]);
+        assert_eq!(watch.absences()[0].since, at(10_000));
+        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(25_000));
+        assert_eq!(said(&watch), ["back /rviz subscribes to /scan and publishes /odom"]);
+        let events: Vec<_> = std::iter::from_fn(|| watch.poll()).collect();
+        assert!(matches!(&events[..], [AbsenceEvent::Away(_), AbsenceEvent::Back(_)]), "{events:?}");
+    }
+
+    #[test]
+    fn a_program_that_is_started_again_is_back_and_one_that_is_not_is_forgotten() {
+        let mut watch = AbsenceWatch::new([]);
+        for participant in [1, 2] {
+            watch.found(0, guid(participant, 4), "/scan", false, LAPTOP, at(0));
+        }
+        for participant in [1, 2] {
+            watch.participant_gone(0, [participant; 12], Some(10_000), at(20_000));
+        }
+        watch.found(0, guid(3, 4), "/scan", false, LAPTOP, at(30_000));
+        assert_eq!(said(&watch), ["away  subscribes to /scan", "back  subscribes to /scan"]);
+        watch.look(&[], at(20_000 + REMEMBER_ABSENCE_MS));
+        assert_eq!(said(&watch), ["back  subscribes to /scan"]);
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut watch = AbsenceWatch::new([]);
+        for participant in 0..=255 {
+            for entity in 0..=255 {
+                watch.found(0, guid(participant, entity), "/scan", false, LAPTOP, at(0));
+            }
+        }
+        assert_eq!(watch.peers.len(), MAX_WATCHED_PEERS);
+        assert!(watch.peers.iter().all(|peer| peer.endpoints.len() <= MAX_PEER_ENDPOINTS));
+    }
+}
