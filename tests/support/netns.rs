@@ -115,13 +115,8 @@ impl Net {
             let address = Ipv4Addr::new(10, 64 + (pid % 128) as u8, (number % 256) as u8, index as u8 + 1);
             ip(&format!("netns add {namespace}"));
             let host = Host { name: (*name).to_owned(), namespace, address, switch: switch.clone(), port };
-            let (namespace, port) = (&host.namespace, &host.port);
-            ip(&format!("link add {port} netns {switch} type veth peer name eth0 netns {namespace}"));
-            ip(&format!("-n {switch} link set {port} master br0 up"));
-            ip(&format!("-n {namespace} link set lo up"));
-            ip(&format!("-n {namespace} addr add {address}/24 dev eth0"));
-            ip(&format!("-n {namespace} link set eth0 up"));
-            ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"));
+            ip(&format!("-n {} link set lo up", host.namespace));
+            host.plug_in();
             net.hosts.push(host);
         }
         net
@@ -217,6 +212,12 @@ impl Host {
             ip(&format!("-n {namespace} addr add {address} dev {interface}"));
             ip(&format!("-n {namespace} link set {interface} up"));
         }
+        // The kernel says up to a second later that there is a carrier; a program that starts before does not
+        // use the interface.
+        for host in [self, other] {
+            let operstate = || host.run("ip", &["-br", "link", "show", "dev", interface]);
+            super::wait_until("a carrier", || operstate().split_whitespace().nth(1) == Some("UP"));
+        }
     }
 
     /// An interface of this host that leads nowhere, as the bridge of a container engine without containers.
@@ -236,6 +237,21 @@ impl Host {
             ip(&format!("-n {namespace} addr add {address}/24 dev eth0"));
             ip(&format!("-n {namespace} route replace 239.0.0.0/8 dev eth0"));
         }
+    }
+
+    /// Makes `eth0`, with the host's address, and connects it to the switch.
+    pub fn plug_in(&self) {
+        let Host { namespace, address, switch, port, .. } = self;
+        ip(&format!("link add {port} netns {switch} type veth peer name eth0 netns {namespace}"));
+        ip(&format!("-n {switch} link set {port} master br0 up"));
+        ip(&format!("-n {namespace} addr add {address}/24 dev eth0"));
+        ip(&format!("-n {namespace} link set eth0 up"));
+        ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"));
+    }
+
+    /// Deletes `eth0`, as a USB adapter that is unplugged.
+    pub fn unplug(&self) {
+        ip(&format!("-n {} link del eth0", self.namespace));
     }
 
     /// Connects the host to the switch, or pulls its cable at the switch's end.

@@ -392,15 +392,17 @@ impl RunningPeer {
 
     /// What a subscriber has received so far, without duplicates; up to 100 ms late.
     pub fn received(&self) -> u64 {
-        let mut received = 0;
-        for event in self.events() {
-            if event["event"] == "progress" || event["event"] == "summary" {
-                received = event["received"].as_u64().unwrap_or(received);
-            } else if event["event"] == "sample" {
-                received += 1;
+        let mut after = 0;
+        // From the end: there are thousands of events after some minutes.
+        for line in self.process.stdout_lines().iter().rev() {
+            let event = event_of(line);
+            if event["event"] == "sample" {
+                after += 1;
+            } else if let Some(received) = event["received"].as_u64() {
+                return received + after;
             }
         }
-        received
+        after
     }
 
     /// Waits until a subscriber has received so many samples.
