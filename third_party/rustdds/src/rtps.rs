@@ -9,6 +9,8 @@ pub(crate) mod message_receiver;
 pub(crate) mod outbound;
 pub(crate) mod reader;
 pub(crate) mod reader_progress;
+pub(crate) mod repair_turns;
+pub(crate) mod repairs_under_way;
 pub(crate) mod rtps_reader_proxy;
 pub(crate) mod rtps_writer_proxy;
 pub(crate) mod timed_event;

@@ -26,6 +26,19 @@ pub const CACHE_CLEAN_PERIOD: Duration = Duration::from_secs(4);
 pub const NACK_RESPONSE_DELAY: Duration = Duration::from_millis(5);
 pub const NACK_SUPPRESSION_DURATION: Duration = Duration::from_millis(0);
 
+// For how long a reader's requests for a sample are ignored after the sample was sent
+// as a repair: one and a half times as long as it takes the reader to acknowledge one,
+// within these limits. Before that is known, half of HEARTBEAT_PERIOD_FAST, so that the
+// request after the next HEARTBEAT counts; not shorter than the time between two repair
+// rounds.
+pub const NACK_SUPPRESSION_INITIAL: Duration = Duration::from_millis(50);
+pub const NACK_SUPPRESSION_MIN: Duration = REPAIR_INTERVAL_DEFAULT;
+pub const NACK_SUPPRESSION_MAX: Duration = Duration::from_millis(500);
+
+// Of how many repairs of one reader it is remembered when they were sent: four times
+// what one ACKNACK can request.
+pub const MAX_REPAIRS_UNDER_WAY: usize = 1024;
+
 // How long a Reliable Reader waits before it acknowledges samples that came in
 // one message with the HEARTBEAT and after which none is missing. The application
 // gets them first, and several are acknowledged at once at high rates. RTPS v2.5
@@ -46,11 +59,19 @@ pub const REPAIR_INTERVAL_MAX: Duration = Duration::from_millis(100);
 // one reader. A round always sends at least one sample, even a larger one.
 pub const REPAIR_BATCH_MAX_BYTES: usize = 8192;
 
-// The same for a reader that is reached over loopback, where no link can be
-// congested. With 8 KiB each 10 ms a reader that missed 0.2 s of 3 KB samples at
-// 1 kHz is repaired slower than new samples push the missing ones out of a history
-// of 256; 64 KiB is less than half of what the kernel's default receive buffer
-// of 208 KiB holds in datagrams of that size.
+// At a high rate of samples a round may send more: this many times what is written
+// between two rounds. A KEEP_LAST Writer retains 256 samples, a quarter of a second at
+// 1 kHz, and a reader that joins needs nearly as long to learn of the Writer. Repaired
+// slower than new samples push the missing ones out, it got some of them and missed
+// others in between.
+pub const REPAIR_RATE_FACTOR: u64 = 2;
+
+// The rate of samples is measured over this at least.
+pub const WRITE_RATE_PERIOD: Duration = Duration::from_millis(100);
+
+// The most of a round for a reader that is reached over loopback, where no link can be
+// congested, and at any rate of samples: less than half of what the kernel's default
+// receive buffer of 208 KiB holds in datagrams of 3 KB.
 pub const REPAIR_BATCH_MAX_BYTES_LOOPBACK: usize = 65536;
 
 // Most bytes of fragments one repair round sends to one reader: what 256 fragments
@@ -58,6 +79,29 @@ pub const REPAIR_BATCH_MAX_BYTES_LOOPBACK: usize = 65536;
 // that was lost altogether is repaired in 80 ms, and a burst of this size is smaller
 // than the one that the sample was sent in.
 pub const REPAIR_FRAGS_MAX_BYTES: usize = 4 * 256 * FRAGMENT_SIZE;
+
+// All repair rounds of a participant together get this part of its event loop's time
+// (one divided by it). What is written for the first time is sent by the same thread,
+// and goes first: without a bound, twenty readers that requested large samples again
+// and again took all of the time that was left, and live samples came 30 ms late. A
+// quarter still repairs some 80 MB/s on a machine that sends 1.4 KB in 4 us.
+pub const REPAIR_TIME_DIVISOR: u32 = 4;
+
+// Repairs that take no longer than this together wait for nothing: several rounds of
+// 64 KiB, or one sample of 1 MiB.
+pub const REPAIR_TIME_BURST: Duration = Duration::from_millis(5);
+
+// How many requests of one reader are answered: one each NACK_RESPONSE_DELAY, after
+// REQUESTS_BURST at once. ACKNACKs beyond that only acknowledge. An ACKNACK says all
+// that one before it said, and a repair round, which follows REPAIR_INTERVAL_DEFAULT
+// after the last one, serves no more than the latest.
+pub const REQUESTS_BURST: u32 = 16;
+
+// Most addresses of one reader that are taken from its announcement. Until it was
+// observed at which of them the reader is reached, each sample is sent to all, and a
+// forged announcement of 64 KB has room for 2,700. A host with more interfaces than
+// this announces the first ones.
+pub const MAX_LOCATORS_PER_READER: usize = 16;
 
 // Periodic HEARTBEAT period for reliable Writers. The period is adaptive: while
 // some matched reader is behind (has unacknowledged samples), heartbeats are

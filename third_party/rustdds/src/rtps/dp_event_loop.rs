@@ -40,11 +40,12 @@ use crate::{
     message_receiver::MessageReceiver,
     outbound::SocketId,
     reader::{Reader, ReaderIngredients},
+    repair_turns::RepairTurns,
     rtps_reader_proxy::RtpsReaderProxy,
     rtps_writer_proxy::RtpsWriterProxy,
     timed_event::DpTimerEvent,
     transmit::InterfaceObservations,
-    writer::{Writer, WriterIngredients},
+    writer::{self, Writer, WriterIngredients},
   },
   structure::{
     dds_cache::DDSCache,
@@ -137,6 +138,10 @@ pub struct DPEventLoop {
   // Endpoints hold cloned handles to schedule timeouts; the loop owns it,
   // registers it once and drains it. This replaces one OS thread per timer.
   shared_timer: SharedTimer<DpTimerEvent>,
+
+  // Repair rounds that are due; DpTimerEvent::Repairs is pending while some wait.
+  repair_turns: RepairTurns,
+  repairs_scheduled: bool,
 
   participant_status_sender: StatusChannelSender<DomainParticipantStatusEvent>,
 
@@ -280,6 +285,8 @@ impl DPEventLoop {
       bulk_ready: BTreeMap::new(),
       writable_armed: BTreeSet::new(),
       shared_timer,
+      repair_turns: RepairTurns::default(),
+      repairs_scheduled: false,
       ack_nack_receiver: acknack_receiver,
       discovery_update_notification_receiver,
       participant_status_sender,
@@ -610,6 +617,13 @@ impl DPEventLoop {
             trace!("Timed event for unknown reader {entity_id:?}");
           }
         }
+        DpTimerEvent::Writer {
+          entity_id,
+          event:
+            event @ (writer::TimedEvent::SendRepairData { .. }
+            | writer::TimedEvent::SendRepairFrags { .. }),
+        } => self.repair_turns.due((entity_id, event)),
+        DpTimerEvent::Repairs => self.repairs_scheduled = false,
         DpTimerEvent::Writer { entity_id, event } => {
           if let Some(writer) = self.writers.get_mut(&entity_id) {
             writer.handle_timed_event(event);
@@ -617,6 +631,29 @@ impl DPEventLoop {
             trace!("Timed event for unknown writer {entity_id:?}");
           }
         }
+      }
+    }
+    self.repair();
+  }
+
+  // Runs the repair rounds that are due, as far as their share of this thread's time
+  // goes.
+  fn repair(&mut self) {
+    let mut now = Instant::now();
+    while let Some((entity_id, event)) = self.repair_turns.next(now) {
+      if let Some(writer) = self.writers.get_mut(&entity_id) {
+        writer.handle_timed_event(event);
+      }
+      let began = std::mem::replace(&mut now, Instant::now());
+      self.repair_turns.ran(now, now - began);
+    }
+    if let Some(wait) = self.repair_turns.wait(now) {
+      if !self.repairs_scheduled {
+        self.repairs_scheduled = true;
+        self
+          .shared_timer
+          .borrow_mut()
+          .set_timeout(wait, DpTimerEvent::Repairs);
       }
     }
   }

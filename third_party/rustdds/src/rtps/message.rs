@@ -627,9 +627,10 @@ impl MessageBuilder {
     self
   }
 
-  // GAP for range 1 <= SN < irrelevant_sns_before
-  pub fn gap_msg_before(
+  // GAP for range irrelevant_sns_from <= SN < irrelevant_sns_before
+  pub fn gap_msg_range(
     mut self,
+    irrelevant_sns_from: SequenceNumber,
     irrelevant_sns_before: SequenceNumber,
     writer_entity_id: EntityId,
     writer_endianness: Endianness,
@@ -639,7 +640,7 @@ impl MessageBuilder {
     let gap = Gap {
       reader_id: reader_guid.entity_id,
       writer_id: writer_entity_id,
-      gap_start: SequenceNumber::from(1),
+      gap_start: irrelevant_sns_from,
       gap_list,
     };
 
@@ -648,6 +649,23 @@ impl MessageBuilder {
       .create_submessage(gap_flags)
       .map(|s| self.submessages.push(s));
     self
+  }
+
+  // GAP for range 1 <= SN < irrelevant_sns_before
+  pub fn gap_msg_before(
+    self,
+    irrelevant_sns_before: SequenceNumber,
+    writer_entity_id: EntityId,
+    writer_endianness: Endianness,
+    reader_guid: GUID,
+  ) -> Self {
+    self.gap_msg_range(
+      SequenceNumber::from(1),
+      irrelevant_sns_before,
+      writer_entity_id,
+      writer_endianness,
+      reader_guid,
+    )
   }
 
   #[allow(clippy::too_many_arguments)] // Heartbeat just is complicated.

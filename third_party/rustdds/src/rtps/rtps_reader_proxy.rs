@@ -2,6 +2,7 @@ use std::{
   cmp::max,
   collections::{BTreeMap, BTreeSet},
   net::{Ipv4Addr, SocketAddr},
+  time::Instant,
 };
 
 use bit_vec::BitVec;
@@ -20,14 +21,31 @@ use crate::{
   structure::{
     guid::{EntityId, GUID},
     locator::Locator,
-    sequence_number::{FragmentNumberSet, SequenceNumber, SequenceNumberRange},
+    sequence_number::{FragmentNumberSet, SequenceNumber},
   },
 };
-use super::{reader::ReaderIngredients, reader_progress::SharedProgress};
+use super::{
+  reader::ReaderIngredients, reader_progress::SharedProgress, repairs_under_way::RepairsUnderWay,
+};
 
 // Requested samples that are gone, from which on a reader is taken to lack all that
 // is gone: half of what one ACKNACK can request (RTPS v2.5 Section 8.3.5.5).
 const BULK_GAP_MIN_SAMPLES: usize = 128;
+
+// What one GAP can list (RTPS v2.5 Section 8.3.5.5).
+const GAP_MAX_SPAN: i64 = 256;
+
+/// Samples that a reader requested and that are no longer retained.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum EvictedRequests {
+  /// These.
+  Listed(BTreeSet<SequenceNumber>),
+  /// All from `first` to the one before `before`.
+  AllFrom {
+    first: SequenceNumber,
+    before: SequenceNumber,
+  },
+}
 
 #[derive(Debug, PartialEq, Eq, Clone)]
 /// ReaderProxy class represents the information an RTPS StatefulWriter
@@ -91,6 +109,9 @@ pub(crate) struct RtpsReaderProxy {
   // from the beginning again, so an equal count alone makes no copy.
   pub last_acknack_base: SequenceNumber,
   pub last_nackfrag_count: Option<i32>,
+  // When requests of this reader would have come one each NACK_RESPONSE_DELAY.
+  requests_spaced_until: Option<Instant>,
+  repairs_under_way: RepairsUnderWay,
   qos: QosPolicies,
   frags_requested: BTreeMap<SequenceNumber, BitVec>,
 
@@ -130,6 +151,8 @@ impl RtpsReaderProxy {
       last_acknack_count: None,
       last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
+      requests_spaced_until: None,
+      repairs_under_way: RepairsUnderWay::default(),
       qos,
       frags_requested: BTreeMap::new(),
       send_route: SendRoute::default(),
@@ -235,35 +258,53 @@ impl RtpsReaderProxy {
     }
   }
 
-  /// Takes the samples that the reader requested and that are no longer retained,
-  /// those before `first_available`, counts them as missed, and returns them for a
-  /// GAP. A reader that lacks nearly everything gets one GAP for all that is gone:
-  /// 256 samples in each round trip would not catch up with 1 kHz behind 200 ms.
-  pub fn take_evicted_requests(
-    &mut self,
-    first_available: SequenceNumber,
-  ) -> BTreeSet<SequenceNumber> {
+  /// Whether a request of this reader is answered, or one too many.
+  pub fn accepts_request(&mut self, now: Instant) -> bool {
+    let spaced_until = self
+      .requests_spaced_until
+      .map_or(now, |spaced_until| spaced_until.max(now));
+    let is_accepted = spaced_until - now < NACK_RESPONSE_DELAY * REQUESTS_BURST;
+    if is_accepted {
+      self.requests_spaced_until = Some(spaced_until + NACK_RESPONSE_DELAY);
+    }
+    is_accepted
+  }
+
+  /// Takes samples that the reader requested and that are no longer retained, those
+  /// before `first_available`, counts them as missed, and returns them for a GAP:
+  /// the first ones, as many as a GAP can list. A reader that lacks nearly everything
+  /// gets one GAP for all that is gone: 256 samples in each round trip would not catch
+  /// up with 1 kHz behind 200 ms.
+  pub fn take_evicted_requests(&mut self, first_available: SequenceNumber) -> EvictedRequests {
     let still_retained = self.unsent_changes.split_off(&first_available);
     let mut evicted = std::mem::replace(&mut self.unsent_changes, still_retained);
+    let Some(&first) = evicted.first() else {
+      return EvictedRequests::Listed(evicted);
+    };
+    let mut further = evicted.split_off(&(first + SequenceNumber::from(GAP_MAX_SPAN)));
+    let last = evicted.last().copied().unwrap_or(first);
+
     let uncounted =
       |sn: &&SequenceNumber| **sn >= self.overrun_counted_before && **sn >= self.first_offered();
-    let mut missed = evicted.iter().filter(uncounted).count() as u64;
-    let Some((&first, &last)) = evicted.first().zip(evicted.last()) else {
-      return evicted;
-    };
-    let mut counted_before = last.plus_1();
-    let span = i64::from(last) - i64::from(first) + 1;
+    let missed = evicted.iter().filter(uncounted).count() as u64;
+    let counted_before = last.plus_1();
+    let span = i64::from(counted_before) - i64::from(first);
     if evicted.len() >= BULK_GAP_MIN_SAMPLES && span <= 2 * evicted.len() as i64 {
       let unknown_from = max(counted_before, self.overrun_counted_before);
-      missed += u64::try_from(i64::from(first_available) - i64::from(unknown_from)).unwrap_or(0);
-      evicted.extend(SequenceNumberRange::new(
-        counted_before,
-        first_available - SequenceNumber::from(1),
-      ));
-      counted_before = first_available;
+      let unknown = i64::from(first_available) - i64::from(unknown_from);
+      self.add_overrun(
+        missed + u64::try_from(unknown).unwrap_or(0),
+        first_available,
+      );
+      return EvictedRequests::AllFrom {
+        first,
+        before: first_available,
+      };
     }
+    further.append(&mut self.unsent_changes);
+    self.unsent_changes = further;
     self.add_overrun(missed, counted_before);
-    evicted
+    EvictedRequests::Listed(evicted)
   }
 
   pub fn unsent_changes_iter(
@@ -283,6 +324,12 @@ impl RtpsReaderProxy {
 
   pub fn mark_change_sent(&mut self, seq_num: SequenceNumber) {
     self.unsent_changes.remove(&seq_num);
+  }
+
+  /// The sample was sent to this reader as a repair.
+  pub fn mark_change_repaired(&mut self, seq_num: SequenceNumber, now: Instant) {
+    self.mark_change_sent(seq_num);
+    self.repairs_under_way.sent(seq_num, now);
   }
 
   // Changes are actually sent (via DATA/DATAFRAG) or reported missing as GAP
@@ -323,6 +370,8 @@ impl RtpsReaderProxy {
       last_acknack_count: None,
       last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
+      requests_spaced_until: None,
+      repairs_under_way: RepairsUnderWay::default(),
       qos: reader.qos_policy.clone(),
       frags_requested: BTreeMap::new(),
       send_route: SendRoute::default(),
@@ -331,11 +380,12 @@ impl RtpsReaderProxy {
   }
 
   fn discovered_or_default(drd: &[Locator], default: &[Locator]) -> Vec<Locator> {
-    if drd.is_empty() {
-      default.to_vec()
-    } else {
-      drd.to_vec()
-    }
+    let announced = if drd.is_empty() { default } else { drd };
+    announced
+      .iter()
+      .take(MAX_LOCATORS_PER_READER)
+      .copied()
+      .collect()
   }
 
   // OpenDDS (and RustDDS itself) advertise the loopback address as a Locator,
@@ -404,6 +454,8 @@ impl RtpsReaderProxy {
       last_acknack_count: None,
       last_acknack_base: SequenceNumber::zero(),
       last_nackfrag_count: None,
+      requests_spaced_until: None,
+      repairs_under_way: RepairsUnderWay::default(),
       qos: discovered_reader_data.subscription_topic_data.qos(),
       frags_requested: BTreeMap::new(),
       send_route: SendRoute::default(),
@@ -563,6 +615,9 @@ impl RtpsReaderProxy {
           return;
         }
 
+        let now = Instant::now();
+        self.repairs_under_way.acknowledged(acknack, now);
+
         // The reader acknowledges less than before. Either an older ACKNACK was
         // overtaken by a newer one, or the reader's participant discarded ours when
         // our lease expired there, and has matched us anew: then the reader has no
@@ -582,7 +637,10 @@ impl RtpsReaderProxy {
             // What it acknowledged is not delivered a second time: the Writer answers
             // with a GAP. What it has not acknowledged, as far as it is retained, is sent.
             for nack_sn in acknack.reader_sn_state.iter() {
-              if nack_sn >= self.all_acked_before && nack_sn <= last_available {
+              if nack_sn >= self.all_acked_before
+                && nack_sn <= last_available
+                && !self.repairs_under_way.is_under_way(nack_sn, now)
+              {
                 self.unsent_changes.insert(nack_sn);
               }
             }
@@ -606,7 +664,9 @@ impl RtpsReaderProxy {
         // Insert the requested changes. These are (by construction) greater
         // then new_all_acked_before.
         for nack_sn in acknack.reader_sn_state.iter() {
-          if nack_sn >= new_all_acked_before {
+          if nack_sn >= new_all_acked_before
+            && !self.repairs_under_way.is_under_way(nack_sn, now)
+          {
             self.unsent_changes.insert(nack_sn);
           }
         }

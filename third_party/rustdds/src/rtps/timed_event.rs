@@ -19,6 +19,8 @@ pub(crate) enum DpTimerEvent {
     entity_id: EntityId,
     event: writer::TimedEvent,
   },
+  /// Repair rounds that have waited may run.
+  Repairs,
   PreemptiveAcknack,
   CacheGc,
 }

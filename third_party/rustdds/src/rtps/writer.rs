@@ -6,6 +6,7 @@ use std::{
   ops::Bound::Included,
   rc::Rc,
   sync::mpsc::TrySendError,
+  time::Instant,
 };
 
 #[allow(unused_imports)]
@@ -24,7 +25,7 @@ use crate::{
       CountWithChange, DataWriterStatus, DomainParticipantStatusEvent, StatusChannelSender,
     },
   },
-  messages::submessages::submessages::AckSubmessage,
+  messages::submessages::submessages::{AckNack, AckSubmessage},
   network::{udp_sender::UDPSender, util::IfAddr},
   polling::SharedTimer,
   rtps::{
@@ -33,11 +34,11 @@ use crate::{
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, PENDING_TURN_MAX_BYTES, REPAIR_BATCH_MAX_BYTES,
       REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
-      REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN,
+      REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
     },
     direct_send::Plan,
     outbound::{SocketId, TrafficClass},
-    rtps_reader_proxy::RtpsReaderProxy,
+    rtps_reader_proxy::{EvictedRequests, RtpsReaderProxy},
     timed_event::DpTimerEvent,
     transmit::{DefaultRouteSelector, InterfaceObservations, RouteKey},
     writer_send_buffer::WriterSendBuffer,
@@ -49,7 +50,7 @@ use crate::{
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
     locator::Locator,
-    sequence_number::{FragmentNumber, SequenceNumber},
+    sequence_number::{FragmentNumber, SequenceNumber, SequenceNumberSet},
     time::Timestamp,
   },
 };
@@ -258,6 +259,9 @@ pub(crate) struct Writer {
   /// (the one currently being pushed). `Fresh` unless a large sample was
   /// interrupted mid-way by a full socket.
   sample_cursor: SampleCursor,
+  // Payload bytes written a second, and since when and how many bytes that is measured.
+  write_rate_bytes_per_s: u64,
+  write_rate_since: (Instant, u64),
   /// nonblocking-transmit: sockets on which the last push attempt hit
   /// WouldBlock. Drained by the event loop, which enqueues this writer on those
   /// sockets' round-robin queues and arms write readiness.
@@ -373,6 +377,8 @@ impl Writer {
       my_topic_name: i.topic_name,
       send_buffer: i.send_buffer,
       sample_cursor: SampleCursor::Fresh,
+      write_rate_bytes_per_s: 0,
+      write_rate_since: (Instant::now(), 0),
       blocked_sockets: BTreeSet::new(),
       partly_sent: None,
       audience: Audience::All,
@@ -1290,13 +1296,13 @@ impl Writer {
           );
         }
 
-        let my_topic = self.my_topic_name.clone(); // for debugging
-
         let mut start_repair = false;
         let mut has_progressed = false;
         let mut went_back = false;
+        let mut frontier_moved = false;
 
-        if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
+        if let Some(reader_proxy) = self.readers.get_mut(&reader_guid) {
+          let my_topic = &self.my_topic_name; // for debugging
           if reader_proxy.last_acknack_count == Some(an.count)
             && reader_proxy.last_acknack_base == an.reader_sn_state.base()
           {
@@ -1311,6 +1317,27 @@ impl Writer {
           reader_proxy.last_acknack_count = Some(an.count);
           reader_proxy.last_acknack_base = an.reader_sn_state.base();
 
+          // One that requests something, or says again what is known already, wants an
+          // answer. A reader that wants too many is not answered, and what it
+          // acknowledges counts all the same.
+          let acknowledges_more = an.reader_sn_state.base() > reader_proxy.all_acked_before;
+          let requests = an.reader_sn_state.iter().next().is_some();
+          let is_one_too_many =
+            (requests || !acknowledges_more) && !reader_proxy.accepts_request(Instant::now());
+          if is_one_too_many && !acknowledges_more {
+            return;
+          }
+          let acknowledgement;
+          let ack_submessage = if is_one_too_many {
+            acknowledgement = AckSubmessage::AckNack(AckNack {
+              reader_sn_state: SequenceNumberSet::new_empty(an.reader_sn_state.base()),
+              ..an.clone()
+            });
+            &acknowledgement
+          } else {
+            ack_submessage
+          };
+
           // Mark requested SNs as "unsent changes"
 
           //TODO: We should drop SNs in "pending gap" from unsent changes
@@ -1319,7 +1346,15 @@ impl Writer {
           went_back = an.reader_sn_state.base().max(SequenceNumber::from(1)) < acked_before;
           let serves_history =
             is_builtin || !(writer_is_volatile || reader_proxy.qos().is_volatile());
+          let frontier = reader_proxy.all_acked_before;
           reader_proxy.handle_ack_nack(ack_submessage, last_seq, advertised_first, serves_history);
+          frontier_moved = reader_proxy.all_acked_before != frontier;
+          if is_one_too_many {
+            if frontier_moved {
+              self.refresh_acked_frontier();
+            }
+            return;
+          }
           has_progressed = reader_proxy.all_acked_before > acked_before;
           if let Some(last_sent) = last_sent {
             reader_proxy.forget_unsent_after(last_sent);
@@ -1470,6 +1505,13 @@ impl Writer {
             );
           }
         }
+        // Acknowledgement frontier may have advanced: push it into the shared send
+        // buffer so any back-pressured producer (or `wait_for_acknowledgments`
+        // waiter) can make progress. It looks at every reader, so not for each of the
+        // ACKNACKs that move nothing.
+        if frontier_moved {
+          self.refresh_acked_frontier();
+        }
       } // AckNack
       AckSubmessage::NackFrag(ref nackfrag) => {
         // NackFrag is negative acknowledgement only, i.e. requesting missing fragments.
@@ -1493,7 +1535,9 @@ impl Writer {
         let Some(cc) = self.send_buffer.get_by_sn(nackfrag.writer_sn) else {
           // The sample is gone: the repair round answers with a GAP and counts it.
           if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
-            if nackfrag.writer_sn >= reader_proxy.all_acked_before {
+            if nackfrag.writer_sn >= reader_proxy.all_acked_before
+              && reader_proxy.accepts_request(Instant::now())
+            {
               reader_proxy.request_change(nackfrag.writer_sn);
               reader_proxy.repair_mode = true;
               self.schedule_repair_data(reader_guid, self.nack_response_delay);
@@ -1514,11 +1558,6 @@ impl Writer {
         }
       }
     }
-
-    // Acknowledgement frontier may have advanced: push it into the shared send
-    // buffer so any back-pressured producer (or `wait_for_acknowledgments`
-    // waiter) can make progress.
-    self.refresh_acked_frontier();
   }
 
   // Recompute the reliable acknowledgement frontier (the smallest
@@ -1640,7 +1679,7 @@ impl Writer {
     let round_max_bytes = if reader_proxy.is_reached_over_loopback() {
       REPAIR_BATCH_MAX_BYTES_LOOPBACK
     } else {
-      REPAIR_BATCH_MAX_BYTES
+      self.repair_batch_max_bytes(Instant::now())
     };
 
     while round_bytes < round_max_bytes {
@@ -1656,9 +1695,8 @@ impl Writer {
         // The reader requests samples that are gone.
         let evicted = reader_proxy.take_evicted_requests(first_available);
         debug!(
-          "Reader {reader_guid:?} missed {} samples from {unsent_sn:?} on. I have only from \
+          "Reader {reader_guid:?} missed samples from {unsent_sn:?} on. I have only from \
            {first_available:?}. Topic {:?}",
-          evicted.len(),
           self.my_topic_name
         );
         gap = self.withdraw_msg(gap, &evicted, reader_guid);
@@ -1729,7 +1767,7 @@ impl Writer {
         self.add_to_repair_datagram(&mut datagram, data, invalidate_len, reader_proxy);
         ts_active = source_timestamp.is_some();
       }
-      reader_proxy.mark_change_sent(unsent_sn);
+      reader_proxy.mark_change_repaired(unsent_sn, Instant::now());
     }
 
     self.flush_repair_datagram(&mut datagram, reader_proxy);
@@ -1748,15 +1786,24 @@ impl Writer {
   fn withdraw_msg(
     &self,
     message: MessageBuilder,
-    evicted: &BTreeSet<SequenceNumber>,
+    evicted: &EvictedRequests,
     reader_guid: GUID,
   ) -> MessageBuilder {
-    let Some(last) = evicted.last() else {
-      return message;
-    };
-    self
-      .begin_after_msg(message, *last, reader_guid)
-      .gap_msg(evicted, self.entity_id(), self.endianness, reader_guid)
+    let writer = self.entity_id();
+    match evicted {
+      EvictedRequests::Listed(listed) => match listed.last() {
+        Some(last) => self.begin_after_msg(message, *last, reader_guid).gap_msg(
+          listed,
+          writer,
+          self.endianness,
+          reader_guid,
+        ),
+        None => message,
+      },
+      EvictedRequests::AllFrom { first, before } => self
+        .begin_after_msg(message, *before - SequenceNumber::from(1), reader_guid)
+        .gap_msg_range(*first, *before, writer, self.endianness, reader_guid),
+    }
   }
 
   // A HEARTBEAT to one reader that offers what comes after `last_withdrawn`.
@@ -1776,6 +1823,22 @@ impl Writer {
       true,  // final_flag: the repair round ends with a HEARTBEAT that requests ACKNACK
       false, // liveliness_flag
     )
+  }
+
+  // Most bytes of one repair round for a reader on another host.
+  fn repair_batch_max_bytes(&mut self, now: Instant) -> usize {
+    let written = self.send_buffer.written_bytes();
+    let (since, written_then) = self.write_rate_since;
+    let elapsed = now.saturating_duration_since(since);
+    if elapsed >= WRITE_RATE_PERIOD {
+      self.write_rate_bytes_per_s = ((written - written_then) as f64 / elapsed.as_secs_f64()) as u64;
+      self.write_rate_since = (now, written);
+    }
+    let interval_ns = self.repair_interval().as_nanos() as u64;
+    let between_rounds = self.write_rate_bytes_per_s.saturating_mul(interval_ns) / 1_000_000_000;
+    usize::try_from(between_rounds * REPAIR_RATE_FACTOR)
+      .unwrap_or(usize::MAX)
+      .clamp(REPAIR_BATCH_MAX_BYTES, REPAIR_BATCH_MAX_BYTES_LOOPBACK)
   }
 
   // Append `part` to the repair datagram being built for `reader_proxy`, first
@@ -3793,6 +3856,76 @@ mod tests {
       assert!(f.unsent() <= 3);
       write(&f, 300, 8);
       assert_eq!(only_reader(&f).unacknowledged, 300);
+    }
+
+    // At 1 kHz of 3 KB a round repairs more than is written meanwhile, at 30 Hz no more
+    // than a slow link takes, and never more than a receive buffer does.
+    #[test]
+    fn repair_keeps_ahead_of_what_is_written() {
+      for (samples, payload_len, expected) in [
+        (30, 3_000, 8_192..=8_192),
+        (1_000, 3_000, 59_000..=61_000),
+        (30, 1 << 20, 65_536..=65_536),
+      ] {
+        let mut f = keep_last();
+        let began = f.writer.write_rate_since.0;
+        write(&f, samples, payload_len);
+        let second = began + StdDuration::from_secs(1);
+        let max = f.writer.repair_batch_max_bytes(second);
+        assert!(expected.contains(&max), "{samples} samples: {max}");
+        assert_eq!(f.writer.repair_batch_max_bytes(second), max);
+      }
+    }
+
+    // Of a thousand requests in a row those of REQUESTS_BURST are answered, and what the
+    // others acknowledge counts.
+    #[test]
+    fn one_reader_is_not_answered_without_end() {
+      let mut f = keep_last();
+      write(&f, 300, 8);
+      let before = f.writer.next_heartbeat_count();
+      let began = Instant::now();
+      for count in 0..1_000 {
+        acknowledge(&mut f, 1, &[], count); // answered with a HEARTBEAT
+      }
+      let answers = f.writer.next_heartbeat_count() - before - 1;
+      let meanwhile = began.elapsed().as_nanos() / NACK_RESPONSE_DELAY.as_nanos();
+      assert!(answers >= 16 && answers as u128 <= 17 + meanwhile, "{answers}");
+
+      for count in 1_000..1_100 {
+        acknowledge(&mut f, i64::from(count) - 900, &[299], count);
+      }
+      assert_eq!(only_reader(&f).unacknowledged, 300 - 198);
+      assert!(f.unsent() <= 1);
+    }
+
+    // What is gone is told of in one range, however much it is, and in several GAPs where
+    // it is scattered.
+    #[test]
+    fn what_is_gone_is_not_listed_one_by_one() {
+      let from = |number: i64| SequenceNumber::new(number);
+      let mut f = keep_last();
+      write(&f, 1, 8);
+      let reader = f.writer.readers.get_mut(&f.reader_guid).unwrap();
+      (1..=200).for_each(|number| reader.request_change(from(number)));
+      let day_at_1_khz = from(86_400_000);
+      assert_eq!(
+        reader.take_evicted_requests(day_at_1_khz),
+        EvictedRequests::AllFrom {
+          first: from(1),
+          before: day_at_1_khz
+        }
+      );
+      [300, 301, 555, 556, 5_000]
+        .into_iter()
+        .for_each(|number| reader.request_change(from(number)));
+      for expected in [&[300, 301, 555][..], &[556], &[5_000], &[]] {
+        let expected = expected.iter().copied().map(from).collect();
+        assert_eq!(
+          reader.take_evicted_requests(day_at_1_khz),
+          EvictedRequests::Listed(expected)
+        );
+      }
     }
 
     // Nobody acknowledges what a BestEffort writer sends.

@@ -44,6 +44,7 @@ struct Inner {
   // Writer's outgoing samples (send, repair, fragmentation, eviction).
   changes: BTreeMap<SequenceNumber, CacheChange>,
   retained_bytes: usize,     // payload bytes of `changes`
+  written_bytes: u64,        // payload bytes of all samples ever written
   first_seq: SequenceNumber, // oldest still retained (default 1)
   last_seq: SequenceNumber,  // latest allocated (default 0 == nothing yet)
 
@@ -163,6 +164,7 @@ impl WriterSendBuffer {
         inner: Mutex::new(Inner {
           changes: BTreeMap::new(),
           retained_bytes: 0,
+          written_bytes: 0,
           readers: BTreeMap::new(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
@@ -355,6 +357,7 @@ impl WriterSendBuffer {
     let seq = inner.last_seq.plus_1();
     let cc = CacheChange::new(shared.writer_guid, seq, write_options, data);
     inner.retained_bytes += cc.data_value.payload_size();
+    inner.written_bytes += cc.data_value.payload_size() as u64;
     inner.changes.insert(seq, cc);
     inner.last_seq = seq;
 
@@ -460,6 +463,11 @@ impl WriterSendBuffer {
       inner.sent_frontier = sent_frontier;
       Self::wake_all(&mut inner, &shared.progress);
     }
+  }
+
+  /// Payload bytes of all samples that were ever written.
+  pub fn written_bytes(&self) -> u64 {
+    self.shared.inner.lock().unwrap().written_bytes
   }
 
   /// The sequence number of the latest allocated sample (0 if none yet).
