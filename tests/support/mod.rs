@@ -17,6 +17,7 @@ pub mod peer;
 pub mod process;
 pub mod prometheus;
 pub mod ros;
+pub mod rtps;
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};

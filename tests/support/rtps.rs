@@ -1,0 +1,374 @@
+//! Forged RTPS (version 2.5 of the specification): participants that announce themselves and one RELIABLE
+//! reader as a DDS library does, and whose acknowledgements say whatever a test wants.
+//!
+//! Each has one UDP socket, at which it is told to be reached for discovery and samples alike.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+
+use super::netns::Host;
+
+/// Of a GUID: the participant.
+pub type Prefix = [u8; 12];
+/// Of a GUID: the reader or writer.
+pub type EntityId = [u8; 4];
+
+const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
+const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
+const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
+const SEDP_SUBSCRIPTIONS_WRITER: EntityId = [0, 0, 4, 0xc2];
+const SEDP_SUBSCRIPTIONS_READER: EntityId = [0, 0, 4, 0xc7];
+/// A reader of an application, of a topic without a key.
+const READER: EntityId = [0, 0, 1, 0x04];
+/// The kind of a writer of an application, of a topic without a key: the last byte of its entity id.
+const WRITER_KIND: u8 = 0x03;
+
+/// Where the participants of domain 0 find each other.
+const SPDP_MULTICAST: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
+/// Announcers and detectors of participants, publications and subscriptions.
+const BUILTIN_ENDPOINTS: u32 = 0x3f;
+/// No test takes longer.
+const LEASE_S: u32 = 600;
+
+/// Submessages (clause 9.4.5.1.1).
+mod kind {
+    pub const ACKNACK: u8 = 0x06;
+    pub const HEARTBEAT: u8 = 0x07;
+    pub const INFO_DST: u8 = 0x0e;
+    pub const NACK_FRAG: u8 = 0x12;
+    pub const DATA: u8 = 0x15;
+    pub const DATA_FRAG: u8 = 0x16;
+}
+
+/// Parameters of discovery (clause 9.6.4).
+mod pid {
+    pub const SENTINEL: u16 = 0x0001;
+    pub const PARTICIPANT_LEASE_DURATION: u16 = 0x0002;
+    pub const TOPIC_NAME: u16 = 0x0005;
+    pub const TYPE_NAME: u16 = 0x0007;
+    pub const PROTOCOL_VERSION: u16 = 0x0015;
+    pub const VENDOR_ID: u16 = 0x0016;
+    pub const RELIABILITY: u16 = 0x001a;
+    pub const DURABILITY: u16 = 0x001d;
+    pub const UNICAST_LOCATOR: u16 = 0x002f;
+    pub const DEFAULT_UNICAST_LOCATOR: u16 = 0x0031;
+    pub const METATRAFFIC_UNICAST_LOCATOR: u16 = 0x0032;
+    pub const PARTICIPANT_GUID: u16 = 0x0050;
+    pub const BUILTIN_ENDPOINT_SET: u16 = 0x0058;
+    pub const ENDPOINT_GUID: u16 = 0x005a;
+}
+
+/// A set of numbers as ACKNACK and NACK_FRAG carry it (clause 9.4.2.6): `bits` numbers from `base` on, of
+/// which `words` marks some. Nothing makes the three agree.
+#[derive(Clone, Debug)]
+pub struct NumberSet {
+    pub base: i64,
+    pub bits: u32,
+    pub words: Vec<u32>,
+}
+
+impl NumberSet {
+    /// No number: everything before `base` is acknowledged.
+    pub fn none(base: i64) -> Self {
+        Self { base, bits: 0, words: Vec::new() }
+    }
+
+    /// All that one set can hold: 256 numbers.
+    pub fn all(base: i64) -> Self {
+        Self { base, bits: 256, words: vec![u32::MAX; 8] }
+    }
+}
+
+/// A datagram.
+#[derive(Clone, Debug)]
+#[must_use]
+pub struct Message(Vec<u8>);
+
+impl Message {
+    /// Of that participant.
+    pub fn of(source: Prefix) -> Self {
+        let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+        bytes.extend(source);
+        Self(bytes)
+    }
+
+    /// What follows is for that participant.
+    pub fn to(self, destination: Prefix) -> Self {
+        self.submessage(kind::INFO_DST, 0x01, &destination)
+    }
+
+    /// ACKNACK: the reader has everything before the base, and requests what the set marks.
+    pub fn ack_nack(self, reader: EntityId, writer: EntityId, set: &NumberSet, count: i32) -> Self {
+        let mut body = [reader, writer].concat();
+        body.extend(number(set.base));
+        body.extend(set.bits.to_le_bytes());
+        body.extend(set.words.iter().flat_map(|word| word.to_le_bytes()));
+        body.extend(count.to_le_bytes());
+        self.submessage(kind::ACKNACK, 0x01, &body)
+    }
+
+    /// NACK_FRAG: the reader requests the fragments of a sample that the set marks.
+    pub fn nack_frag(
+        self,
+        reader: EntityId,
+        writer: EntityId,
+        sample: i64,
+        set: &NumberSet,
+        count: i32,
+    ) -> Self {
+        let mut body = [reader, writer].concat();
+        body.extend(number(sample));
+        body.extend((set.base as u32).to_le_bytes());
+        body.extend(set.bits.to_le_bytes());
+        body.extend(set.words.iter().flat_map(|word| word.to_le_bytes()));
+        body.extend(count.to_le_bytes());
+        self.submessage(kind::NACK_FRAG, 0x01, &body)
+    }
+
+    /// DATA with a list of parameters, little endian.
+    fn data(self, reader: EntityId, writer: EntityId, sequence: i64, parameters: &Parameters) -> Self {
+        // No flags beyond; 16 bytes from here to what would be the inline QoS.
+        let mut body = vec![0, 0, 16, 0];
+        body.extend([reader, writer].concat());
+        body.extend(number(sequence));
+        body.extend([0x00, 0x03, 0, 0]);
+        body.extend(&parameters.0);
+        body.extend(pid::SENTINEL.to_le_bytes());
+        body.extend([0, 0]);
+        self.submessage(kind::DATA, 0x05, &body)
+    }
+
+    fn heartbeat(self, reader: EntityId, writer: EntityId, first: i64, last: i64, count: i32) -> Self {
+        let mut body = [reader, writer].concat();
+        body.extend(number(first));
+        body.extend(number(last));
+        body.extend(count.to_le_bytes());
+        self.submessage(kind::HEARTBEAT, 0x01, &body)
+    }
+
+    fn submessage(mut self, kind: u8, flags: u8, body: &[u8]) -> Self {
+        self.0.extend([kind, flags]);
+        self.0.extend((body.len() as u16).to_le_bytes());
+        self.0.extend(body);
+        self
+    }
+}
+
+/// A sequence number: the high half comes first.
+fn number(value: i64) -> [u8; 8] {
+    let [high, low] = [(value >> 32) as u32, value as u32].map(u32::to_le_bytes);
+    [high, low].concat().try_into().unwrap()
+}
+
+/// Parameters of discovery.
+#[derive(Default)]
+struct Parameters(Vec<u8>);
+
+impl Parameters {
+    fn with(mut self, id: u16, value: &[u8]) -> Self {
+        let padded = value.len().next_multiple_of(4);
+        self.0.extend(id.to_le_bytes());
+        self.0.extend((padded as u16).to_le_bytes());
+        self.0.extend(value);
+        self.0.resize(self.0.len() + padded - value.len(), 0);
+        self
+    }
+
+    fn with_text(self, id: u16, text: &str) -> Self {
+        let mut value = (text.len() as u32 + 1).to_le_bytes().to_vec();
+        value.extend(text.as_bytes());
+        value.push(0);
+        self.with(id, &value)
+    }
+
+    fn with_locator(self, id: u16, address: SocketAddrV4) -> Self {
+        let mut value = 1_u32.to_le_bytes().to_vec();
+        value.extend(u32::from(address.port()).to_le_bytes());
+        value.extend([0; 12]);
+        value.extend(address.ip().octets());
+        self.with(id, &value)
+    }
+}
+
+/// A participant of which an announcement has come.
+#[derive(Clone, Copy, Debug)]
+pub struct Announced {
+    /// Where it hears of endpoints.
+    pub discovery: SocketAddrV4,
+    /// Where its readers and writers are reached.
+    pub traffic: SocketAddrV4,
+}
+
+/// A writer from which something has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Writer {
+    pub participant: Prefix,
+    pub entity: EntityId,
+    /// The first sample that came of it or that it announced.
+    pub first: i64,
+    /// The last one.
+    pub last: i64,
+}
+
+/// A forged participant with one RELIABLE, VOLATILE reader.
+pub struct ForgedReader {
+    prefix: Prefix,
+    socket: UdpSocket,
+    address: SocketAddrV4,
+    announced: BTreeMap<Prefix, Announced>,
+    writer: Option<Writer>,
+}
+
+impl ForgedReader {
+    /// One on a host; `identity` tells it from others.
+    pub fn new(host: &Host, identity: u8) -> Self {
+        let socket = host.udp_socket();
+        socket.set_nonblocking(true).unwrap();
+        let address = SocketAddrV4::new(host.address(), socket.local_addr().unwrap().port());
+        // The first two bytes are those of Fast DDS.
+        let prefix = [1, 0x0f, b'f', b'o', b'r', b'g', b'e', b'd', 0, 0, 0, identity];
+        Self { prefix, socket, address, announced: BTreeMap::new(), writer: None }
+    }
+
+    /// Its GUID as the bridge shows it.
+    pub fn guid(&self) -> String {
+        let hexadecimal =
+            |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };
+        format!("{}:{}", hexadecimal(&self.prefix), hexadecimal(&READER))
+    }
+
+    pub fn prefix(&self) -> Prefix {
+        self.prefix
+    }
+
+    pub fn entity(&self) -> EntityId {
+        READER
+    }
+
+    /// Announces the participant to all (SPDP), and to those who have answered the reader (SEDP) of a topic.
+    pub fn announce(&self, topic: &str, type_name: &str) {
+        let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
+        let participant = Parameters::default()
+            .with(pid::PROTOCOL_VERSION, &[2, 3])
+            .with(pid::VENDOR_ID, &[1, 0x0f])
+            .with(pid::PARTICIPANT_GUID, &guid(PARTICIPANT))
+            .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, self.address)
+            .with_locator(pid::DEFAULT_UNICAST_LOCATOR, self.address)
+            .with(pid::PARTICIPANT_LEASE_DURATION, &[LEASE_S, 0].map(u32::to_le_bytes).concat())
+            .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
+        let announcement = Message::of(self.prefix).data(SPDP_READER, SPDP_WRITER, 1, &participant);
+        self.send(&announcement, SocketAddrV4::new(SPDP_MULTICAST.0, SPDP_MULTICAST.1));
+
+        let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();
+        let reader = Parameters::default()
+            .with(pid::ENDPOINT_GUID, &guid(READER))
+            .with(pid::PARTICIPANT_GUID, &guid(PARTICIPANT))
+            .with_text(pid::TOPIC_NAME, topic)
+            .with_text(pid::TYPE_NAME, type_name)
+            .with(pid::RELIABILITY, &reliable_100_ms)
+            .with(pid::DURABILITY, &[0; 4])
+            .with_locator(pid::UNICAST_LOCATOR, self.address);
+        for (prefix, announced) in &self.announced {
+            let endpoint = Message::of(self.prefix)
+                .to(*prefix)
+                .data(SEDP_SUBSCRIPTIONS_READER, SEDP_SUBSCRIPTIONS_WRITER, 1, &reader)
+                .heartbeat(SEDP_SUBSCRIPTIONS_READER, SEDP_SUBSCRIPTIONS_WRITER, 1, 1, 1);
+            self.send(&endpoint, announced.discovery);
+        }
+    }
+
+    /// Takes what has come.
+    pub fn listen(&mut self) {
+        let mut buffer = [0; 1 << 16];
+        while let Ok(length) = self.socket.recv(&mut buffer) {
+            self.take(&buffer[..length]);
+        }
+    }
+
+    /// The writer of the topic, and where it is reached, as soon as something has come from it.
+    pub fn writer(&self) -> Option<(Writer, SocketAddrV4)> {
+        let writer = self.writer?;
+        Some((writer, self.announced.get(&writer.participant)?.traffic))
+    }
+
+    /// Sends a datagram; what can't be sent is lost, as datagrams are.
+    pub fn send(&self, message: &Message, to: SocketAddrV4) {
+        let _ = self.socket.send_to(&message.0, to);
+    }
+
+    fn take(&mut self, datagram: &[u8]) -> Option<()> {
+        let source: Prefix = datagram.get(8..20)?.try_into().ok()?;
+        let mut rest = &datagram[20..];
+        while let [kind, flags, low, high, following @ ..] = rest {
+            let length = usize::from(u16::from_le_bytes([*low, *high]));
+            let length = if length == 0 { following.len() } else { length };
+            let body = following.get(..length)?;
+            rest = &following[length..];
+            match *kind {
+                kind::DATA if body.get(8..12)? == SPDP_WRITER => {
+                    if let Some(announced) = announcement(*flags, body) {
+                        self.announced.insert(source, announced);
+                    }
+                }
+                kind::DATA | kind::DATA_FRAG if *body.get(11)? == WRITER_KIND => {
+                    self.heard(source, body.get(8..12)?, body.get(12..20)?)?;
+                }
+                kind::HEARTBEAT if *body.get(7)? == WRITER_KIND => {
+                    self.heard(source, body.get(4..8)?, body.get(16..24)?)?;
+                }
+                _ => {}
+            }
+        }
+        Some(())
+    }
+
+    fn heard(&mut self, participant: Prefix, entity: &[u8], number: &[u8]) -> Option<()> {
+        let half = |at: usize| Some(u32::from_le_bytes(number.get(at..at + 4)?.try_into().ok()?));
+        let number = i64::from(half(0)?) << 32 | i64::from(half(4)?);
+        let first = self.writer.map_or(number, |writer| writer.first);
+        let last = self.writer.map_or(number, |writer| writer.last.max(number));
+        self.writer = Some(Writer { participant, entity: entity.try_into().ok()?, first, last });
+        Some(())
+    }
+}
+
+/// The addresses in the announcement of a participant that has IPv4 and writes little endian, as the bridge
+/// does.
+fn announcement(flags: u8, data: &[u8]) -> Option<Announced> {
+    let mut rest = data.get(20..)?;
+    if flags & 0x02 != 0 {
+        rest = parameters(rest, |_, _| ())?;
+    }
+    let (mut discovery, mut traffic) = (None, None);
+    parameters(rest.get(4..)?, |id, value| {
+        let place = match id {
+            pid::METATRAFFIC_UNICAST_LOCATOR => &mut discovery,
+            pid::DEFAULT_UNICAST_LOCATOR => &mut traffic,
+            _ => return,
+        };
+        if let Some(address) = address(value).filter(|address| !address.ip().is_loopback()) {
+            place.get_or_insert(address);
+        }
+    })?;
+    Some(Announced { discovery: discovery?, traffic: traffic? })
+}
+
+/// Calls `each` for every parameter of a list; yields what follows the list.
+fn parameters(mut list: &[u8], mut each: impl FnMut(u16, &[u8])) -> Option<&[u8]> {
+    loop {
+        let [id_low, id_high, low, high, following @ ..] = list else { return None };
+        let id = u16::from_le_bytes([*id_low, *id_high]);
+        let length = usize::from(u16::from_le_bytes([*low, *high]));
+        if id == pid::SENTINEL {
+            return Some(following);
+        }
+        each(id, following.get(..length)?);
+        list = &following[length..];
+    }
+}
+
+fn address(locator: &[u8]) -> Option<SocketAddrV4> {
+    let port = u32::from_le_bytes(locator.get(4..8)?.try_into().ok()?);
+    let ip: [u8; 4] = locator.get(20..24)?.try_into().ok()?;
+    (locator.get(..4)? == 1_u32.to_le_bytes()).then(|| SocketAddrV4::new(ip.into(), port as u16))
+}
