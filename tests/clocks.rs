@@ -130,7 +130,7 @@ fn wait_offset(bridge: &Bridge, offset_s: Option<f64>) {
 
 #[test]
 fn a_publisher_whose_clock_disagrees_is_served_and_named_and_its_late_samples_are_stale() {
-    // Samples this late would suspend the noncritical lane as well, and then count as suspended, not as stale.
+    // Samples this late would suspend the noncritical lane as well, and count as suspended, not as stale.
     let bridge = Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {DOMAIN_ID}}}\n\
          topics: [{{id: scan, input_topic: /scan, message_type: std_msgs/msg/UInt8MultiArray, \

@@ -1,5 +1,5 @@
-//! Crowds of bad subscribers of the critical lane: eight ways to be bad, all at once, beside subscribers of three
-//! libraries that keep up. Each test is one rate and size.
+//! Crowds of bad subscribers of the critical lane: eight ways to be bad, all at once, beside subscribers of
+//! three libraries that keep up. Each test is one rate and size.
 
 mod support;
 
@@ -82,8 +82,8 @@ fn mute(bed: &Bed, host: &str) {
     bed.host(host).run("iptables", &["-A", "OUTPUT", "-p", "udp", "-d", &bridge, "-j", "DROP"]);
 }
 
-/// The flow past subscribers that are killed, that stop for 1 s, for 10 s and past their lease, that lose 28 %
-/// in bursts, that are 200 ms away, that read nothing, and whose acknowledgements never arrive.
+/// The flow past subscribers that are killed, that stop for 1 s, for 10 s and past their lease, that lose
+/// 28 % in bursts, that are 200 ms away, that read nothing, and whose acknowledgements never arrive.
 fn crowd(test: &str, flow: &Flow) {
     if let Some(reason) = ros::missing() {
         return support::skip(test, &reason);

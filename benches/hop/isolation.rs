@@ -1,6 +1,7 @@
-//! The critical lane while something is wrong with the noncritical one, or with one of its own subscribers. There is no control process that
-//! could come to the rescue: what holds is the processes alone. The noncritical egress and its subscriber
-//! have a nice value that stands for the weights of the services' slices, and run on any CPU.
+//! The critical lane while something is wrong with the noncritical one, or with one of its own subscribers.
+//! There is no control process that could come to the rescue: what holds is the processes alone. The
+//! noncritical egress and its subscriber have a nice value that stands for the weights of the services'
+//! slices, and run on any CPU.
 //!
 //! Conditions take turns. `repeat` is `undisturbed` once more: what those two differ by is what any two
 //! conditions may differ by for no reason.

@@ -224,8 +224,8 @@ impl Participant {
         Ok(reader)
     }
 
-    /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the same
-    /// topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from the beginning.
+    /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the
+    /// same topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from the beginning.
     ///
     /// # Errors
     /// The DDS library refused.

@@ -131,7 +131,7 @@ impl Inbox {
         };
         let takes = self.takes.get().wrapping_add(1);
         self.takes.set(takes);
-        let order = if takes % TURN_OF_THE_LAST == 0 { [last, first] } else { [first, last] };
+        let order = if takes.is_multiple_of(TURN_OF_THE_LAST) { [last, first] } else { [first, last] };
         order.into_iter().map(take_one).find(|take| *take != Take::Empty).unwrap_or(Take::Empty)
     }
 }

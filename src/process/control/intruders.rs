@@ -271,10 +271,10 @@ impl Watched {
                 }
                 self.watch.found(reader.guid, &reader.topic, &reader.location, own, now);
             }
-            Discovery::Writer(writer) if !participant.owns(writer.guid) => {
-                if self.inputs.contains(&writer.topic) {
-                    self.note(&writer);
-                }
+            Discovery::Writer(writer)
+                if !participant.owns(writer.guid) && self.inputs.contains(&writer.topic) =>
+            {
+                self.note(&writer);
             }
             Discovery::WriterGone(guid) => self.endpoints.retain(|(writer, _)| *writer != guid),
             Discovery::ReaderGone(guid) => {

@@ -95,7 +95,8 @@ impl Publishers {
         Standing::Next(place)
     }
 
-    /// Records what each publisher offers; `reliability_of` yields `None` for one that discovery does not know.
+    /// Records what each publisher offers; `reliability_of` yields `None` for one that discovery does not
+    /// know.
     pub fn set_reliabilities(&mut self, reliability_of: impl Fn(Guid) -> Option<Reliability>) {
         for account in &mut self.accounts {
             let present = *account.get();

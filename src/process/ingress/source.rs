@@ -76,9 +76,10 @@ impl Source {
         self.writers.iter().filter(offers).count() as u64
     }
 
-    /// The readers that suit the publishers: one for the RELIABLE ones, one for the BEST_EFFORT ones, and each
-    /// TRANSIENT_LOCAL if each of its publishers offers that. Where the configuration fixes the reliability,
-    /// one reader is for all. A reader that asks for more than a publisher offers is not matched.
+    /// The readers that suit the publishers: one for the RELIABLE ones, one for the BEST_EFFORT ones, and
+    /// each TRANSIENT_LOCAL if each of its publishers offers that. Where the configuration fixes the
+    /// reliability, one reader is for all. A reader that asks for more than a publisher offers is not
+    /// matched.
     pub fn wanted(&self, configured_type: Option<&str>, input: &InputQos, max_sample_bytes: usize) -> Wanted {
         let dds_type = match (configured_type, self.writers.first()) {
             (Some(configured), _) => configured,

@@ -1,18 +1,16 @@
 //! What is wrong with a bridge, in words.
 
 mod control;
+mod publishers;
 
 use super::liveness::ProcessState;
-use super::report::{clock_offset_s, drops_since};
+use super::report::drops_since;
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
-use crate::model::{DropReason, LaneCounters, LaneMode, PublisherAccount, TrafficClass};
+use crate::model::{DropReason, LaneCounters, LaneMode, TrafficClass};
 use crate::shm::ProcessRole;
 
 /// A lane writes the mode that it applies ten times a second; one that has not after so long does not look.
 const APPLY_MS: u64 = 1_000;
-
-/// A sentence names so many publishers at most.
-const MAX_NAMED_PUBLISHERS: usize = 3;
 
 /// Fewer samples may be on their way at the moment of the reading.
 const SILENT_LANE_SAMPLES: u64 = 5;
@@ -114,9 +112,9 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems.extend(control::subscribers(now));
     problems.extend(control::intruders(now));
     problems.extend(control::refusals(now, before));
-    problems.extend(now.routes.iter().filter_map(|route| clock_offset(now, route)));
-    problems.extend(now.routes.iter().filter_map(|route| unrepaired(now, route)));
-    problems.extend(now.routes.iter().filter_map(no_publisher));
+    problems.extend(now.routes.iter().filter_map(|route| publishers::clock_offset(now, route)));
+    problems.extend(now.routes.iter().filter_map(|route| publishers::unrepaired(now, route)));
+    problems.extend(now.routes.iter().filter_map(publishers::no_publisher));
     problems
 }
 
@@ -274,7 +272,7 @@ fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, 
         let text = format!(
             "route {}: {lost} samples lost just now on their way from the publisher to the bridge{}",
             route.id,
-            lost_by_publisher(now, route, former)
+            publishers::lost_by_publisher(now, route, former)
         );
         problems.push(Problem::new(about, Level::Warn, text));
     }
@@ -318,29 +316,6 @@ fn overrun(
     }
 }
 
-/// The publishers whose samples were lost, those with most losses first.
-fn lost_by_publisher(now: &Snapshot, route: &RouteReading, former: &RouteReading) -> String {
-    let lost_before = |writer| {
-        let before = former.publishers.iter().find(|account| account.writer == writer);
-        before.map_or(0, |account| account.lost_upstream)
-    };
-    let lost = |account: &PublisherAccount| account.lost_upstream.saturating_sub(lost_before(account.writer));
-    let mut losses: Vec<_> = route
-        .publishers
-        .iter()
-        .map(|account| (lost(account), account.writer))
-        .filter(|of| of.0 > 0)
-        .collect();
-    losses.sort_by_key(|&(lost, _)| std::cmp::Reverse(lost));
-    if losses.is_empty() {
-        return String::new();
-    }
-    let named = losses.iter().take(MAX_NAMED_PUBLISHERS);
-    let named = named.map(|(lost, writer)| format!("{lost} of {}", now.publisher_name(*writer)));
-    let and_others = if losses.len() > MAX_NAMED_PUBLISHERS { ", and others" } else { "" };
-    format!(": {}{and_others}", named.collect::<Vec<_>>().join(", "))
-}
-
 /// Who may be to blame for a write that failed: one of the matched readers, and not always a remote one.
 fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
     match (reason, output.counters.readers) {
@@ -348,52 +323,6 @@ fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
         (DropReason::WriteFailed, readers) => format!("; {readers} readers are matched"),
         _ => String::new(),
     }
-}
-
-fn clock_offset(now: &Snapshot, route: &RouteReading) -> Option<Problem> {
-    let offset_s = clock_offset_s(&route.counters)?;
-    let side = if offset_s < 0.0 { "behind" } else { "ahead of" };
-    let text = format!(
-        "route {}: the clock of {} is {:.1} s {side} this computer's, so that the age of its samples runs \
-         from their arrival; synchronise the clocks (chrony, PTP)",
-        route.id,
-        now.publisher_name(route.counters.clock_writer),
-        offset_s.abs()
-    );
-    Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
-}
-
-/// BEST_EFFORT publishers beside RELIABLE ones. Where all are BEST_EFFORT, that is the topic's QoS.
-fn unrepaired(now: &Snapshot, route: &RouteReading) -> Option<Problem> {
-    let offering =
-        |offered| route.publishers.iter().filter(move |account| account.offered_reliability == offered);
-    offering(PublisherAccount::OFFERS_RELIABLE).next()?;
-    let mut best_effort: Vec<_> = offering(PublisherAccount::OFFERS_BEST_EFFORT).collect();
-    if best_effort.is_empty() {
-        return None;
-    }
-    let beyond = best_effort.len().saturating_sub(MAX_NAMED_PUBLISHERS);
-    best_effort.truncate(MAX_NAMED_PUBLISHERS);
-    let names: Vec<_> = best_effort.into_iter().map(|account| now.publisher_name(account.writer)).collect();
-    let and_others = if beyond > 0 { format!(" and {beyond} others") } else { String::new() };
-    let text = format!(
-        "route {}: {}{and_others} publish {} BEST_EFFORT beside RELIABLE publishers: samples of theirs that the \
-         network loses can't be repaired; let them offer RELIABLE",
-        route.id,
-        names.join(", "),
-        route.input_topic
-    );
-    Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
-}
-
-fn no_publisher(route: &RouteReading) -> Option<Problem> {
-    (route.counters.writers == 0).then(|| {
-        let text = match route.counters.received {
-            0 => format!("route {}: waits for a publisher of {}", route.id, route.input_topic),
-            _ => format!("route {}: the publisher of {} is gone", route.id, route.input_topic),
-        };
-        Problem::new(format!("route {}", route.id), Level::Stale, text)
-    })
 }
 
 /// Drops that are how a noncritical lane works. A critical lane has none of these.
@@ -413,9 +342,8 @@ pub(super) mod tests {
     use super::super::snapshot::ModeReason;
     use super::*;
     use crate::model::{
-        ControlRecord, FixedText, Guid, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy,
-        LatencyHistogram, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth, RouteId, TopicName,
-        WallNs,
+        ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
+        MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
     };
 
     /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
@@ -581,27 +509,6 @@ pub(super) mod tests {
         let mut before = sound();
         drop_on(&mut before, 0, DropReason::WriteFailed, 3);
         assert_eq!(of(&before, &before), []);
-    }
-
-    #[test]
-    fn best_effort_publishers_beside_reliable_ones_are_named() {
-        let publisher = |id: u8, offered_reliability| PublisherAccount {
-            offered_reliability,
-            ..PublisherAccount::new(Guid([id; 16]), 1)
-        };
-        let best_effort = |id| publisher(id, PublisherAccount::OFFERS_BEST_EFFORT);
-        let gone = publisher(8, PublisherAccount::OFFER_UNKNOWN);
-        let problems = after(|now| now.routes[0].publishers = vec![best_effort(1), gone]);
-        assert_eq!(problems, [""; 0]);
-        let reliable = publisher(9, PublisherAccount::OFFERS_RELIABLE);
-        let problems = after(|now| {
-            now.routes[0].publishers = vec![best_effort(1), reliable, best_effort(2)];
-            let (node, host) = (FixedText::new("/imu"), FixedText::new("10.0.0.7"));
-            now.named_endpoints.push(NamedEndpoint { endpoint: Guid([1; 16]), node, host });
-        });
-        let [problem] = problems.as_slice() else { panic!("{problems:?}") };
-        let second = format!("the writer {}", Guid([2; 16]));
-        assert!(problem.starts_with(&format!("route scan: /imu on 10.0.0.7, {second} publish")), "{problem}");
     }
 
     #[test]
