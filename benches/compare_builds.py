@@ -1,0 +1,161 @@
+#!/usr/bin/env python3
+"""Hop and CPU of two builds of the bridge, beside each other, between independent Cyclone DDS programs.
+
+    make peers && cargo build --release
+    benches/compare_builds.py OLD/adaptive-bridge target/release/adaptive-bridge
+
+Both builds run all the time, each in a DDS domain of its own; only one of them, or a direct flow, is sent to at a
+time, and each round begins with another one. A hop is the median latency of a round through a build, less that of
+the direct flow in the same round. Printed are the medians over the rounds, and of their ratio the interval at 95 %
+(bootstrap over the rounds). Nothing is pinned, and scheduling is normal.
+"""
+
+import argparse
+import json
+import os
+import random
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+PEER = Path(__file__).resolve().parent.parent / "tests/peers/build/cyclone_peer"
+OUTPUT = "rt/adaptive_bridge/critical/scan"
+INPUT = "rt/scan"
+# Rate in Hz and bytes of a sample.
+CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20)}
+DIRECT_DOMAIN = 63
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class Build:
+    """A running bridge."""
+
+    def __init__(self, name, program, domain, folder):
+        self.name, self.domain = name, domain
+        config = folder / f"{name}.yaml"
+        config.write_text(
+            f"instance: compare_{os.getpid()}_{name}\nros: {{domain_id: {domain}}}\n"
+            "topics: [{id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, "
+            "max_sample_bytes: 2097152}]\n"
+            f"shared_memory: {{root_path: {folder}/{name}}}\n"
+            "lanes: {critical: {queue_depth: 512}}\nclassifier: {enabled: false}\n")
+        environment = {**os.environ, "RUST_LOG": "info", "NO_COLOR": "1"}
+        self.log = folder / f"{name}.log"
+        with open(self.log, "w") as log:
+            self.process = subprocess.Popen(
+                [program, "up", "--config", config], stdout=log, stderr=log, env=environment)
+        deadline = time.monotonic() + 30
+        while self.log.read_text().count("egress is up") < 2 or "ingress is up" not in self.log.read_text():
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                sys.exit(f"{program} does not come up:\n{self.log.read_text()}")
+            time.sleep(0.1)
+        started = [line for line in self.log.read_text().splitlines() if "started child=" in line]
+        on_the_way = [line for line in started if '"ingress"' in line or '"egress-critical"' in line]
+        self.pids = [int(line.split("pid=")[1].split()[0]) for line in on_the_way]
+
+    def cpu_s(self):
+        """CPU time of ingress and the critical lane so far."""
+        ticks = 0
+        for pid in self.pids:
+            fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+            ticks += int(fields[11]) + int(fields[12])
+        return ticks / TICKS_PER_S
+
+    def end(self):
+        self.process.terminate()
+        self.process.wait()
+
+
+def summary(process):
+    output, _ = process.communicate(timeout=60)
+    events = [json.loads(line) for line in output.splitlines()]
+    return next(event for event in events if event["event"] == "summary")
+
+
+def measure(build, rate_hz, size, seconds):
+    """Median latency in us, CPU in us a sample, and samples missing; of the direct flow without a build."""
+    domain = build.domain if build else DIRECT_DOMAIN
+    common = ["--domain", str(domain), "--size", str(size), "--summary", "--history", "1000"]
+    subscriber = subprocess.Popen(
+        [PEER, "--role", "sub", "--topic", OUTPUT if build else INPUT, *common], stdout=subprocess.PIPE, text=True)
+    # Matched on both sides by then.
+    time.sleep(1.0)
+    before_s = build.cpu_s() if build else 0
+    publisher = subprocess.Popen(
+        [PEER, "--role", "pub", "--topic", INPUT, "--wait-match", "1", "--rate", str(rate_hz),
+         "--count", str(int(rate_hz * seconds)), *common], stdout=subprocess.PIPE, text=True)
+    sent = summary(publisher)
+    time.sleep(0.3)
+    cpu_s = build.cpu_s() - before_s if build else 0
+    subscriber.terminate()
+    received = summary(subscriber)
+    return received["latency_us"]["p50"], cpu_s * 1e6 / max(sent["ok"], 1), sent["ok"] - received["received"]
+
+
+def ratio_of_medians(pairs):
+    old, new = (statistics.median(values) for values in zip(*pairs))
+    return new / old if old > 0 else float("nan")
+
+
+def interval(pairs):
+    """The middle 95 % of the ratio over 2,000 resamplings of the rounds."""
+    source = random.Random(1)
+    values = sorted(ratio_of_medians([source.choice(pairs) for _ in pairs]) for _ in range(2_000))
+    return values[50], values[-51]
+
+
+def show(case, rows):
+    missing = {name: sum(row[name][2] for row in rows) for name in ("direct", "old", "new")}
+    print(f"{case}: missing {missing}")
+    hops = [(row["old"][0] - row["direct"][0], row["new"][0] - row["direct"][0]) for row in rows]
+    cpus = [(row["old"][1], row["new"][1]) for row in rows]
+    for what, pairs in (("hop", hops), ("CPU a sample", cpus)):
+        low, high = interval(pairs)
+        old, new = (statistics.median(values) for values in zip(*pairs))
+        print(f"  {what}: old {old:.1f} us, new {new:.1f} us, new/old {ratio_of_medians(pairs):.3f} "
+              f"({low:.3f} to {high:.3f})")
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("old", help="a build of adaptive-bridge")
+    parser.add_argument("new", help="the other")
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each flow in each round")
+    parser.add_argument("--case", choices=CASES, action="append", help="all unless given")
+    parser.add_argument("--json", help="also write every round to this file")
+    options = parser.parse_args()
+    if not PEER.exists():
+        sys.exit(f"{PEER} is not built: run `make peers`")
+    rounds = {}
+    with tempfile.TemporaryDirectory() as folder:
+        builds = [
+            Build(name, program, domain, Path(folder))
+            for name, program, domain in (("old", options.old, 61), ("new", options.new, 62))]
+        try:
+            for case in options.case or CASES:
+                rate_hz, size = CASES[case]
+                rounds[case] = []
+                for number in range(options.rounds):
+                    print(f"{case}: round {number + 1} of {options.rounds}", file=sys.stderr)
+                    flows = [None, *builds]
+                    turn = number % len(flows)
+                    row = {}
+                    for build in flows[turn:] + flows[:turn]:
+                        name = build.name if build else "direct"
+                        row[name] = measure(build, rate_hz, size, options.seconds)
+                    rounds[case].append(row)
+        finally:
+            for build in builds:
+                build.end()
+    if options.json:
+        Path(options.json).write_text(json.dumps(rounds))
+    for case, rows in rounds.items():
+        show(case, rows)
+
+
+main()
