@@ -452,6 +452,59 @@ fn a_late_joiner_of_a_reliable_transient_local_writer_gets_its_history() {
     assert_eq!(take_one(&reader).unwrap().0, b"kept");
 }
 
+#[test]
+fn a_second_reader_of_a_participant_costs_the_first_no_sample() {
+    let (mut here, mut there) = (participant("here", 77), participant("there", 77));
+    let writer = here.create_writer("rt/twins", TYPE, &QosProfile::CRITICAL, 1024).unwrap();
+    let qos = ReaderQos { depth: 1024, ..reader_qos(Reliability::Reliable, Durability::Volatile) };
+    let best_effort = ReaderQos { reliability: Reliability::BestEffort, ..qos };
+    let first = there.create_reader("rt/twins", TYPE, &qos).unwrap();
+    wait_for_reader(&writer);
+    let mut numbers: Vec<u64> = Vec::new();
+    let take_all = |numbers: &mut Vec<u64>| {
+        let mut lend = |payload: &[u8], _| numbers.push(u64::from_le_bytes(payload[..8].try_into().unwrap()));
+        while first.take(&mut lend) != Take::Empty {}
+    };
+    let stop = AtomicBool::new(false);
+    let written = std::thread::scope(|threads| {
+        let publisher = threads.spawn(|| {
+            let mut number = 0u64;
+            while !stop.load(Ordering::Relaxed) {
+                // In fragments, so that another thread sends it, some time after it is written.
+                let mut payload = vec![0; 100_000];
+                payload[..8].copy_from_slice(&number.to_le_bytes());
+                writer.write(payload.into(), Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+                number += 1;
+                // In bursts: some are yet to be sent when a reader is matched.
+                if number.is_multiple_of(8) {
+                    std::thread::sleep(Duration::from_millis(8));
+                }
+            }
+            number
+        });
+        for _ in 0..150 {
+            // BEST_EFFORT: the library has one record of what is missing for all RELIABLE readers of a topic.
+            let second = there.create_reader("rt/twins", TYPE, &best_effort).unwrap();
+            let until = Instant::now() + Duration::from_millis(12);
+            while Instant::now() < until {
+                take_all(&mut numbers);
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            let guid = second.guid();
+            drop(second);
+            there.forget(guid);
+        }
+        stop.store(true, Ordering::Relaxed);
+        publisher.join().unwrap()
+    });
+    let give_up = Instant::now() + Duration::from_secs(20);
+    while numbers.last() != Some(&(written - 1)) && Instant::now() < give_up {
+        take_all(&mut numbers);
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert!(numbers.iter().copied().eq(0..written), "{} of {written}", numbers.len());
+}
+
 /// Says when the payload it stands for is let go of.
 struct Held(Arc<AtomicBool>);
 

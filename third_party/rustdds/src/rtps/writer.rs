@@ -2450,38 +2450,12 @@ impl Writer {
           // send burst is never told what we have and never NACKs, so reliable
           // data (notably builtin SEDP DiscoveredWriterData) is never delivered
           // and the endpoints stay unmatched. Unicast to just the new reader.
-          if self.is_reliable() && !self.like_stateless {
-            let new_reader_guid = reader_proxy.remote_reader_guid;
-            let first = self.readers.get(&new_reader_guid).map_or_else(
-              || self.send_buffer.first_change_sequence_number(),
-              |rp| {
-                max(
-                  self.send_buffer.first_change_sequence_number(),
-                  rp.first_offered(),
-                )
-              },
-            );
-            let last = self.send_buffer.last_change_sequence_number();
-            let hb_message = MessageBuilder::new()
-              .ts_msg(self.endianness, Some(Timestamp::now()))
-              .heartbeat_msg(
-                self.entity_id(),
-                first,
-                last,
-                self.next_heartbeat_count(),
-                self.endianness,
-                EntityId::UNKNOWN,
-                false, // final_flag: require the reader to respond with ACKNACK
-                false, // liveliness_flag
-              )
-              .add_header_and_build(self.my_guid.prefix);
-            if let Some(rp) = self.readers.get(&new_reader_guid) {
-              self.send_control_to_readers(
-                DeliveryMode::Unicast,
-                hb_message,
-                &mut std::iter::once(rp),
-              );
-            }
+          // A BestEffort reader takes no HEARTBEAT.
+          if self.is_reliable()
+            && !self.like_stateless
+            && (reader_proxy.qos().is_reliable() || self.my_guid.entity_id.kind().is_built_in())
+          {
+            self.offer_to_new_reader(reader_proxy.remote_reader_guid);
           }
           info!(
             "Matched new remote reader on topic={:?} reader={:?}",
@@ -2576,6 +2550,49 @@ impl Writer {
     self.min_datagram_payload = self.smallest_datagram_payload();
     *no_other_sender = self.direct_plan();
     is_new
+  }
+
+  // The first HEARTBEAT to a reader that was matched a moment ago.
+  //
+  // It is for that reader alone: another one of its participant would take samples
+  // before `first` for gone, although they are yet to be sent or repaired. Cyclone DDS
+  // has one state for all readers of a participant, so what they lack stays on offer.
+  fn offer_to_new_reader(&self, new_reader_guid: GUID) {
+    let Some(new_reader) = self.readers.get(&new_reader_guid) else {
+      return;
+    };
+    let first_retained = self.send_buffer.first_change_sequence_number();
+    let has_sibling = self
+      .readers
+      .range(new_reader_guid.prefix.range())
+      .any(|(guid, _)| *guid != new_reader_guid);
+    let first = if has_sibling {
+      self.send_buffer.advertised_first()
+    } else {
+      max(first_retained, new_reader.first_offered())
+    };
+    let last = max(
+      self.last_advertised(),
+      first - SequenceNumber::from(1),
+    );
+    let hb_message = MessageBuilder::new()
+      .ts_msg(self.endianness, Some(Timestamp::now()))
+      .heartbeat_msg(
+        self.entity_id(),
+        first,
+        last,
+        self.next_heartbeat_count(),
+        self.endianness,
+        new_reader_guid.entity_id,
+        false, // final_flag: require the reader to respond with ACKNACK
+        false, // liveliness_flag
+      )
+      .add_header_and_build(self.my_guid.prefix);
+    self.send_control_to_readers(
+      DeliveryMode::Unicast,
+      hb_message,
+      &mut std::iter::once(new_reader),
+    );
   }
 
   /// Recompute [`min_datagram_payload`](Self::min_datagram_payload) as the
