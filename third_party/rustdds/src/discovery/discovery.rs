@@ -360,6 +360,9 @@ impl Discovery {
   // then an announcement says nothing new to it and it does not answer: Cyclone DDS
   // announces itself up to 8 s later.
   const REINTRODUCE_FOR: StdDuration = Self::LEASE;
+  // Of more participants whose lease has ended, those that have been silent for longest
+  // are not reintroduced to: a flood of forged ones costs no more than this.
+  const MAX_SILENT: usize = 64;
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -1122,8 +1125,10 @@ impl Discovery {
   }
 
   fn reintroduce_to_silent_participants(&mut self) {
-    for (prefix, lease_end) in std::mem::take(&mut self.silent) {
-      if lease_end.elapsed() < Self::REINTRODUCE_FOR {
+    let beyond = self.silent.len().saturating_sub(Self::MAX_SILENT);
+    let silent = std::mem::take(&mut self.silent);
+    for (number, (prefix, lease_end)) in silent.into_iter().enumerate() {
+      if number >= beyond && lease_end.elapsed() < Self::REINTRODUCE_FOR {
         self.reintroduce_to(prefix);
         self.silent.push((prefix, lease_end));
       } else {
