@@ -120,11 +120,14 @@ fn wait_offset(bridge: &Bridge, offset_s: Option<f64>) {
         }
     });
     let problems = status["problems"].as_array().unwrap().iter();
-    let named = problems.filter_map(Value::as_str).find(|problem| problem.contains("the clock of publisher"));
+    let named = problems.filter_map(Value::as_str).find(|problem| problem.contains("the clock of "));
     assert_eq!(named.is_some(), offset_s.is_some(), "{status}");
     if let Some(problem) = named {
-        let writer = status["routes"][0]["clock_offset_writer"].as_str().unwrap();
-        assert!(problem.contains(writer), "{problem}");
+        let route = &status["routes"][0];
+        let writer = route["clock_offset_writer"].as_str().unwrap();
+        let account = route["publishers"].as_array().unwrap().iter().find(|one| one["writer"] == writer);
+        let name = account.and_then(|one| one["node"].as_str()).unwrap_or(writer);
+        assert!(problem.contains(name), "{problem} of {name}");
     }
 }
 

@@ -52,7 +52,8 @@ impl Wake for Bell {
 /// cannot hold up the last.
 const TURN_OF_THE_LAST: u64 = 32;
 
-/// The readers of one topic with a bell, so that looking costs next to nothing while nothing has come.
+/// The one or two readers of a topic with a bell, so that looking costs next to nothing while nothing has
+/// come.
 pub(super) struct Inbox {
     /// In the order in which they are read.
     readers: Vec<RawReader>,
