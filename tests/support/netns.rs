@@ -1,6 +1,7 @@
 //! Hosts on one Ethernet switch, as network namespaces: each has its own addresses, ports and multicast.
 
 use std::cell::Cell;
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::Path;
@@ -75,6 +76,26 @@ fn remove_stale() {
     }
 }
 
+/// Removes the shared memory that Fast DDS peers and ROS 2 nodes which were killed have left: hosts share
+/// `/dev/shm`, and another version of Fast DDS aborts at what it finds there. What a process has mapped stays.
+fn remove_stale_shared_memory() {
+    let is_of_fast_dds = |name: &str| name.starts_with("fastrtps_") || name.starts_with("sem.fastrtps_");
+    let mut mapped = BTreeSet::new();
+    for process in fs::read_dir("/proc").into_iter().flatten().flatten() {
+        let maps = fs::read_to_string(process.path().join("maps")).unwrap_or_default();
+        let names = maps.lines().filter_map(|line| line.split_once("/dev/shm/"));
+        mapped.extend(names.map(|(_, name)| name.to_owned()).filter(|name| is_of_fast_dds(name)));
+    }
+    for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+        let Ok(name) = entry.file_name().into_string() else { continue };
+        // Beside each segment there is a file that is only locked.
+        let segment = name.strip_suffix("_el").unwrap_or(&name);
+        if is_of_fast_dds(&name) && !mapped.contains(segment) {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
 thread_local! {
     /// A second [`Net`] in one test would wait for the first for ever.
     static HAS_NET: Cell<bool> = const { Cell::new(false) };
@@ -95,6 +116,7 @@ impl Net {
         assert!(!HAS_NET.replace(true), "a test has one Net: drop the first before making another");
         let exclusive = exclusive();
         remove_stale();
+        remove_stale_shared_memory();
 
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
         let pid = std::process::id();
