@@ -886,6 +886,7 @@ fn diagnostics_are_read_by_a_peer_that_knows_only_their_definitions() {
         "safety",
         "probes",
         "intruders",
+        "network",
     ];
     let whole = array.wait_decoded("every part of the bridge in order", |message| {
         parts.iter().all(|name| part(message, name)["level"] == 0)

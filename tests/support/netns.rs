@@ -77,7 +77,8 @@ fn remove_stale() {
 }
 
 /// Removes the shared memory that Fast DDS peers and ROS 2 nodes which were killed have left: hosts share
-/// `/dev/shm`, and another version of Fast DDS aborts at what it finds there. What a process has mapped stays.
+/// `/dev/shm`, and another version of Fast DDS aborts at what it finds there. What a process has mapped
+/// stays.
 fn remove_stale_shared_memory() {
     let is_of_fast_dds = |name: &str| name.starts_with("fastrtps_") || name.starts_with("sem.fastrtps_");
     let mut mapped = BTreeSet::new();
