@@ -27,7 +27,6 @@ INPUT = "rt/scan"
 # Rate in Hz and bytes of a sample.
 CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20)}
 DIRECT_DOMAIN = 63
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Build:
@@ -57,12 +56,9 @@ class Build:
         self.pids = [int(line.split("pid=")[1].split()[0]) for line in on_the_way]
 
     def cpu_s(self):
-        """CPU time of ingress and the critical lane so far."""
-        ticks = 0
-        for pid in self.pids:
-            fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-            ticks += int(fields[11]) + int(fields[12])
-        return ticks / TICKS_PER_S
+        """CPU time of ingress and the critical lane so far, of all threads."""
+        tasks = [task for pid in self.pids for task in Path(f"/proc/{pid}/task").iterdir()]
+        return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
     def end(self):
         self.process.terminate()
