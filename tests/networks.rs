@@ -346,8 +346,8 @@ fn another_address_of_the_robot_disturbs_no_local_subscriber_and_is_announced() 
     // What joins now has to find the built-in endpoints at the new address.
     let late = bed.subscribe("slow", Peer::fast(), CRITICAL);
     late.wait_received(30);
-    // Whoever discovers the bridge anew has what it acknowledged, and that acknowledgement did not arrive for
-    // what was on its way when the address went.
+    // A subscriber that discovers the bridge anew receives again what it had received and whose
+    // acknowledgement was lost with the address.
     scene.end_with(&bed, 3);
     bed.end();
 }

@@ -192,8 +192,7 @@ impl Participant {
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.readers.push(reader.guid);
-        self.announce();
+        self.enlist(&reader);
         discard_earlier(&reader);
         Ok(reader)
     }
@@ -219,8 +218,7 @@ impl Participant {
             .begin_after(&made_topic, taken)
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.readers.push(reader.guid);
-        self.announce();
+        self.enlist(&reader);
         Ok(reader)
     }
 
@@ -237,10 +235,15 @@ impl Participant {
     ) -> Result<RawReader, DdsError> {
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         reader.ignore_reliable_writers();
-        self.readers.push(reader.guid);
-        self.announce();
+        self.enlist(&reader);
         discard_earlier(&reader);
         Ok(reader)
+    }
+
+    /// Adds the reader to the node's graph entry.
+    fn enlist(&mut self, reader: &RawReader) {
+        self.readers.push(reader.guid);
+        self.announce();
     }
 
     /// Learns from now on which nodes the other participants have. As in ROS 2 itself, the reader for that is

@@ -1,7 +1,7 @@
 //! Forged RTPS (version 2.5 of the specification): participants that announce themselves and one RELIABLE
 //! reader as a DDS library does, and whose acknowledgements say whatever a test wants.
 //!
-//! Each has one UDP socket, at which it is told to be reached for discovery and samples alike.
+//! Each has one UDP socket, whose address it announces for discovery and for samples.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};

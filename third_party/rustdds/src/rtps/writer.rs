@@ -838,9 +838,8 @@ impl Writer {
     }
   }
 
-  //
-  // Returns whether samples are left for another turn, and no full socket holds them
-  // back.
+  /// Sends what is pending, at most `PENDING_TURN_MAX_BYTES`. Returns whether samples
+  /// are left for another turn that no full socket holds back.
   pub fn process_pending(&mut self) -> bool {
     // The doorbell enqueues this writer's id and then wakes. A sample admitted
     // while we are here pushes another id, so the next wake runs us again. The
@@ -3916,8 +3915,8 @@ mod tests {
       assert!(f.unsent() <= 1);
     }
 
-    // What is gone is told of in one range, however much it is, and in several GAPs where
-    // it is scattered.
+    // One GAP of a range withdraws any number of evicted samples in a row, and several
+    // GAPs withdraw scattered ones.
     #[test]
     fn what_is_gone_is_not_listed_one_by_one() {
       let from = |number: i64| SequenceNumber::new(number);

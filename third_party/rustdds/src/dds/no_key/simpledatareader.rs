@@ -60,8 +60,8 @@ where
   }
 
   /// From now on this BEST_EFFORT reader matches no further RELIABLE writer, and
-  /// leaves what comes of RELIABLE writers to the RELIABLE reader of the same topic
-  /// in this participant, as soon as that one receives from them.
+  /// leaves samples of RELIABLE writers to the RELIABLE reader of the same topic in
+  /// this participant, as soon as that reader receives from them.
   pub fn ignore_reliable_writers(&self) {
     self.keyed_simpledatareader.ignore_reliable_writers();
   }
