@@ -369,8 +369,8 @@ fn a_writer_takes_every_sample_and_the_reader_that_lags_misses_the_oldest() {
     // 200 MiB at once: more than any socket buffer holds, and far more than the writer retains.
     for number in 0..200_u8 {
         let payload = Bytes::from(vec![number; 1 << 20]);
-        let readers = writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
-        assert_eq!(readers, 1);
+        let written = writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+        assert_eq!(written.readers, 1);
     }
     let mut last = None;
     while last != Some(199) {

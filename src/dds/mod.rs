@@ -27,7 +27,7 @@ pub use network::{AbsentInterface, absent_interfaces, host_addresses, interfaces
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};
-pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent};
+pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent, Written};
 
 /// RustDDS, in the version that ros2-client uses, so that there is one of it.
 use ros2_client::dds::rustdds;

@@ -52,6 +52,15 @@ pub enum WriterEvent {
     },
 }
 
+/// A sample that was handed to the DDS library.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Written {
+    /// Matched readers that the sample is offered to.
+    pub readers: usize,
+    /// The sample's RTPS sequence number, from 1 on.
+    pub sequence: i64,
+}
+
 /// A matched reader: what it was offered, has acknowledged and missed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MatchedReader {
@@ -79,9 +88,9 @@ impl RawWriter {
         self.guid
     }
 
-    /// Hands a sample to the DDS library and returns how many matched readers it is offered to: at once, or,
-    /// of a writer that was made to wait, within its blocking time. The library keeps `payload` until every
-    /// matched RELIABLE reader has acknowledged it, or until newer samples take its place.
+    /// Hands a sample to the DDS library: at once, or, of a writer that was made to wait, within its blocking
+    /// time. The library keeps `payload` until every matched RELIABLE reader has acknowledged it, or until newer
+    /// samples take its place. [`sent_through`](Self::sent_through) tells when it was sent.
     ///
     /// # Errors
     /// The library did not take the sample, and `payload` is dropped.
@@ -90,7 +99,7 @@ impl RawWriter {
         payload: Bytes,
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
-    ) -> Result<usize, WriteError> {
+    ) -> Result<Written, WriteError> {
         self.write_with(payload, encapsulation, timestamp, None)
     }
 
@@ -107,6 +116,12 @@ impl RawWriter {
         timestamp: SourceTimestamp,
     ) -> Result<(), WriteError> {
         self.write_with(payload, encapsulation, timestamp, Some(reader)).map(|_| ())
+    }
+
+    /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. What the
+    /// library can't send on the thread that writes it waits for the library's own thread.
+    pub fn sent_through(&self) -> i64 {
+        self.inner.sent_through().into()
     }
 
     /// Every matched reader.
@@ -132,7 +147,7 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
         reader: Option<Guid>,
-    ) -> Result<usize, WriteError> {
+    ) -> Result<Written, WriteError> {
         let mut options = WriteOptionsBuilder::new();
         if timestamp != SourceTimestamp::NONE {
             options = options.source_timestamp(Timestamp::from_ticks(timestamp.0));
@@ -141,7 +156,7 @@ impl RawWriter {
             options = options.to_single_reader(GUID::from_bytes(reader.0));
         }
         match self.inner.write_counting_readers(RawPayload { bytes, encapsulation }, options.build()) {
-            Ok((_, readers)) => Ok(readers),
+            Ok((sample, readers)) => Ok(Written { readers, sequence: i64::from(sample.sequence_number) }),
             Err(DdsWriteError::WouldBlock { .. }) => Err(WriteError::WindowFull),
             Err(_) => Err(WriteError::Refused),
         }

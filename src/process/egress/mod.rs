@@ -9,6 +9,7 @@ mod critical;
 mod late_joiners;
 mod noncritical;
 mod output;
+mod unsent;
 
 use std::fmt::Write;
 use std::time::Duration;
@@ -36,6 +37,10 @@ const LAST_SAMPLES_MS: u64 = 200;
 /// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping
 /// it stays well within the second that a role has to end.
 const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
+
+/// How often a lane checks whether the DDS library has sent the samples that it accepted. The library's thread
+/// takes some 100 µs for a small sample in fragments.
+const UNSENT_POLL_NS: u64 = 250_000;
 
 /// What a turn of a lane came to.
 enum Turn {
@@ -174,8 +179,12 @@ impl Egress {
             Turn::UntilWoken(until) => (until, true),
             Turn::Until(until) => (until, false),
         };
-        let until = MonotonicNs(until.0.min(self.housekeeping_at.0));
-        let wait_ns = until.since(clock::monotonic());
+        let mut until = MonotonicNs(until.0.min(self.housekeeping_at.0));
+        let now = clock::monotonic();
+        if self.count_sent() {
+            until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
+        }
+        let wait_ns = until.since(now);
         if wait_ns == 0 {
             return;
         }
@@ -184,6 +193,15 @@ impl Egress {
         } else {
             std::thread::sleep(Duration::from_nanos(wait_ns));
         }
+    }
+
+    /// Counts the samples that the DDS library has sent by now; whether it has accepted more than that.
+    fn count_sent(&mut self) -> bool {
+        let mut unsent = false;
+        for output in &mut self.outputs {
+            unsent |= output.count_sent();
+        }
+        unsent
     }
 
     fn keep_house(&mut self, now: MonotonicNs) {
@@ -235,6 +253,12 @@ impl Egress {
                     "a reader had not acknowledged the last samples when the lane shut down"
                 );
             }
+        }
+        while self.count_sent() && clock::monotonic() < give_up_at {
+            std::thread::sleep(Duration::from_nanos(UNSENT_POLL_NS));
+        }
+        for output in &mut self.outputs {
+            output.drop_unsent();
         }
     }
 }

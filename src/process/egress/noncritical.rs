@@ -43,7 +43,7 @@ impl Noncritical {
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
             let rates = rates_of(rates, output.durability());
             shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
-            output.set_waiting(shaper.waiting());
+            output.set_queued(shaper.waiting());
         }
     }
 
@@ -94,7 +94,7 @@ impl Noncritical {
                     Decision::Closed => break,
                 }
             }
-            output.set_waiting(shaper.waiting());
+            output.set_queued(shaper.waiting());
         }
         if sent {
             // More may have come meanwhile, for a token that is there.
@@ -111,7 +111,7 @@ impl Noncritical {
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
             take_in(shaper, output);
             shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
-            output.set_waiting(0);
+            output.set_queued(0);
         }
     }
 }

@@ -9,6 +9,7 @@ use super::super::arena::CopyArena;
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
 use super::late_joiners::{Kept, LateJoiners};
+use super::unsent::{Unsent, UnsentSamples};
 use crate::clock;
 use crate::config::{self, DropPolicy, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
@@ -26,6 +27,17 @@ use crate::shm::{
 /// within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that is not back by
 /// then is taken to be gone.
 const FORMER_READERS_MS: u64 = 5_000;
+
+/// What the account of a forwarded sample needs.
+struct Forwarded {
+    bytes: u64,
+    by_reference: bool,
+    caught_up: bool,
+    sequence: u64,
+    written_at: MonotonicNs,
+    writer: Guid,
+    writer_sequence: i64,
+}
 
 /// One route on one lane.
 pub(super) struct Output {
@@ -46,6 +58,9 @@ pub(super) struct Output {
     expected_drops: &'static [DropReason],
     subscriber: SampleSubscriber,
     writer: Option<RawWriter>,
+    unsent: UnsentSamples<Forwarded>,
+    /// Samples taken that wait for a token.
+    queued: u64,
     late_joiners: Option<LateJoiners>,
     tracker: SequenceTracker,
     counters: BoardWriter<LaneCounters>,
@@ -112,6 +127,8 @@ impl Output {
             expected_drops: expected_drops(lane.class),
             subscriber,
             writer: None,
+            unsent: UnsentSamples::new(lane.window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
+            queued: 0,
             late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             watch: DropWatch::new(former.drops),
@@ -216,23 +233,34 @@ impl Output {
         let outcome = writer.write(payload, header.encapsulation, header.source_timestamp);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
-        let caught_up = u64::from(header.published_at < self.started_at);
+        let forwarded = Forwarded {
+            bytes: bytes as u64,
+            by_reference,
+            caught_up: header.published_at < self.started_at,
+            sequence: header.sequence,
+            written_at: began_at,
+            writer: header.writer_guid,
+            writer_sequence: header.writer_sequence,
+        };
+        let sent_through = writer.sent_through();
+        let (unsent, queued) = (&mut self.unsent, self.queued);
         self.counters.update(|counters| {
+            while let Some(sent) = unsent.pop_sent(sent_through) {
+                count_forwarded(counters, &sent);
+            }
             account(counters, &self.tracker);
             match outcome {
-                Ok(readers) if readers == 0 || !complete => counters.drops.add(DropReason::NoReader, 1),
-                Ok(_) => {
-                    counters.forwarded += 1;
-                    counters.forwarded_bytes += bytes as u64;
-                    counters.by_reference += u64::from(by_reference);
-                    counters.caught_up += caught_up;
-                    counters.last_forwarded_sequence = header.sequence;
-                    counters.last_forwarded_at = began_at;
-                    counters.last_writer_guid = header.writer_guid;
-                    counters.last_writer_sequence = header.writer_sequence;
+                Ok(written) if written.readers == 0 || !complete => {
+                    counters.drops.add(DropReason::NoReader, 1);
+                }
+                Ok(written) if written.sequence <= sent_through => count_forwarded(counters, &forwarded),
+                Ok(written) => {
+                    let evicted = unsent.push(Unsent { sequence: written.sequence, account: forwarded });
+                    counters.drops.add(DropReason::WriteFailed, u64::from(evicted.is_some()));
                 }
                 Err(_) => counters.drops.add(DropReason::WriteFailed, 1),
             }
+            counters.waiting = queued + unsent.len() as u64;
         });
         if outcome.is_ok() {
             if let (Some(late_joiners), Some(kept)) = (&mut self.late_joiners, kept) {
@@ -273,9 +301,41 @@ impl Output {
         self.set_mode(self.mode);
     }
 
-    /// Shows how many taken samples wait in the lane.
-    pub fn set_waiting(&mut self, waiting: usize) {
-        let waiting = waiting as u64;
+    /// Counts what was sent since it was written; whether there is more to be sent.
+    pub fn count_sent(&mut self) -> bool {
+        if self.unsent.len() == 0 {
+            return false;
+        }
+        let sent_through = self.writer.as_ref().map_or(i64::MAX, RawWriter::sent_through);
+        if let Some(first) = self.unsent.pop_sent(sent_through) {
+            let (unsent, queued) = (&mut self.unsent, self.queued);
+            self.counters.update(|counters| {
+                count_forwarded(counters, &first);
+                while let Some(sent) = unsent.pop_sent(sent_through) {
+                    count_forwarded(counters, &sent);
+                }
+                counters.waiting = queued + unsent.len() as u64;
+            });
+        }
+        self.unsent.len() > 0
+    }
+
+    /// Counts what is still unsent when the lane ends.
+    pub fn drop_unsent(&mut self) {
+        let unsent = self.unsent.clear() as u64;
+        if unsent > 0 {
+            let queued = self.queued;
+            self.counters.update(|counters| {
+                counters.drops.add(DropReason::Shutdown, unsent);
+                counters.waiting = queued;
+            });
+        }
+    }
+
+    /// Shows how many taken samples wait in the lane for a token.
+    pub fn set_queued(&mut self, queued: usize) {
+        self.queued = queued as u64;
+        let waiting = self.queued + self.unsent.len() as u64;
         if self.counters.get().waiting != waiting || self.counters.get().last_sequence != self.tracker.last()
         {
             self.counters.update(|counters| {
@@ -454,6 +514,17 @@ impl Output {
             warn!(route = self.id, lane = self.lane, %failure, "history not restored after a restart");
         }
     }
+}
+
+fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
+    counters.forwarded += 1;
+    counters.forwarded_bytes += sample.bytes;
+    counters.by_reference += u64::from(sample.by_reference);
+    counters.caught_up += u64::from(sample.caught_up);
+    counters.last_forwarded_sequence = sample.sequence;
+    counters.last_forwarded_at = sample.written_at;
+    counters.last_writer_guid = sample.writer;
+    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 /// Brings the account up to the last sample taken.

@@ -117,6 +117,11 @@ where
       .map_err(unwrap_no_key_write_error)
   }
 
+  /// The highest sequence number that was sent to every reader matched at that time.
+  pub fn sent_through(&self) -> crate::structure::sequence_number::SequenceNumber {
+    self.keyed_datawriter.sent_through()
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.keyed_datawriter.matched_readers()

@@ -426,6 +426,12 @@ where
     }
   }
 
+  /// The highest sequence number that was sent to every reader matched at that time.
+  /// Later ones wait for the event loop, or for room in a socket.
+  pub fn sent_through(&self) -> SequenceNumber {
+    self.send_buffer.direct_send().last_sent()
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.send_buffer.matched_readers()
