@@ -340,7 +340,7 @@ fn status_says_in_words_what_is_wrong() {
     let pid = ingress.pid();
     ingress.stop();
     let stopped = wait_status(&bridge, "ingress to be stopped", |status| {
-        problems(status).contains(&format!("ingress (pid {pid}) is stopped: nothing is taken in"))
+        problems(status).contains(&format!("ingress (pid {pid}) is stopped: the bridge receives no samples"))
     });
     assert_eq!(stopped["processes"][0]["state"], "stopped");
     ingress.cont();

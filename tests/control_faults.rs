@@ -638,7 +638,8 @@ fn without_its_secret_control_goes_on_and_says_so() {
     let up = up(&bridge, host);
     let flow = flow(&bridge, host);
     up.wait_for_log("nobody is probed");
-    let status = bridge.wait_status("the problem", |status| problems(status).contains("nobody is probed"));
+    let status =
+        bridge.wait_status("the problem", |status| problems(status).contains("no subscriber is probed"));
     assert_eq!(status["probes"]["sent"], 0);
     assert!(is_in(&status, "noncritical", "normal", "control"), "{status}");
 
@@ -647,7 +648,7 @@ fn without_its_secret_control_goes_on_and_says_so() {
     let reloaded = bridge.run("reload");
     assert!(reloaded.status.success(), "{reloaded:?}");
     let status = wait_state(&bridge, "CRITICAL", "normal");
-    assert!(!problems(&status).contains("nobody is probed"), "{status}");
+    assert!(!problems(&status).contains("no subscriber is probed"), "{status}");
     assert!(!up.log().contains(SECRET));
     flow.end_whole(&bridge);
     end(up, &bridge);

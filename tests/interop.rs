@@ -141,8 +141,9 @@ fn a_reliable_publisher_stays_repaired_beside_best_effort_ones_that_come_and_go(
         });
         bed.bridge.wait_status("a problem that names the BEST_EFFORT publisher", |status| {
             let problems = status["problems"].as_array().unwrap();
-            let is_meant =
-                |problem: &&Value| problem.as_str().unwrap().contains("BEST_EFFORT beside RELIABLE");
+            let is_meant = |problem: &&Value| {
+                problem.as_str().unwrap().contains("BEST_EFFORT publishers beside RELIABLE ones")
+            };
             problems.iter().filter(is_meant).count() == 1
         });
         bed.host("bridge").lose_incoming(0.0);

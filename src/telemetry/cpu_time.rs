@@ -1,6 +1,7 @@
-//! What the machine's CPUs did with their time: measurements on a shared machine say what was taken from it.
+//! The share of CPU time that the hypervisor gave to other machines (steal), to judge measurements on a
+//! shared host.
 
-/// Time of all CPUs since the machine started, in ticks.
+/// CPU time of all CPUs since the machine started, in ticks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CpuTime {
     all: u64,
@@ -8,20 +9,20 @@ pub struct CpuTime {
 }
 
 impl CpuTime {
-    /// Until now. Where `/proc` does not tell, nothing was stolen.
+    /// Reads the CPU time until now. Without a readable `/proc/stat` all of it is 0.
     pub fn now() -> Self {
         Self::parse(&std::fs::read_to_string("/proc/stat").unwrap_or_default())
     }
 
-    /// What of the time since `earlier` the hypervisor gave to others while a thread here wanted to run
-    /// (steal), in percent, 0 to 100.
+    /// The share of the time since `earlier` that the hypervisor gave to other machines while a thread here
+    /// was ready to run (steal), in percent, 0 to 100.
     pub fn stolen_percent_since(self, earlier: Self) -> f64 {
         let all = self.all.saturating_sub(earlier.all).max(1);
         100.0 * self.stolen.saturating_sub(earlier.stolen) as f64 / all as f64
     }
 
-    /// The first line of `/proc/stat` is of all CPUs: user, nice, system, idle, iowait, irq, softirq and
-    /// steal (proc_stat(5)). What follows is within these.
+    /// Parses the first line of `/proc/stat`, the sum over all CPUs: user, nice, system, idle, iowait, irq,
+    /// softirq and steal (proc_stat(5)). The fields after these are included in them.
     fn parse(stat: &str) -> Self {
         let first = stat.lines().next().unwrap_or_default();
         let ticks = first.split_whitespace().skip(1).take(8).filter_map(|word| word.parse::<u64>().ok());
@@ -43,9 +44,9 @@ mod tests {
     }
 
     #[test]
-    fn what_says_nothing_is_no_stolen_time() {
-        let nothing = CpuTime::parse("");
-        assert_eq!(nothing.stolen_percent_since(nothing), 0.0);
-        assert_eq!(CpuTime::parse("cpu  1 2 3").stolen_percent_since(nothing), 0.0);
+    fn missing_fields_are_no_stolen_time() {
+        let empty = CpuTime::parse("");
+        assert_eq!(empty.stolen_percent_since(empty), 0.0);
+        assert_eq!(CpuTime::parse("cpu  1 2 3").stolen_percent_since(empty), 0.0);
     }
 }

@@ -4,27 +4,28 @@ use std::collections::VecDeque;
 
 use crate::model::{MonotonicNs, SampleHeader};
 
-/// Samples looked back at; as many as `ros2 topic hz` does.
+/// The default window in samples, the same as that of `ros2 topic hz`.
 pub const WINDOW_SAMPLES: usize = 10_000;
 
-/// The arrivals of the last samples.
+/// The arrivals of the last samples of a route.
 ///
-/// They are those at ingress, which the samples carry, so it does not matter when they are looked at. The
-/// rate counts sequence numbers, so that samples which the tap itself missed do not lower it.
+/// An arrival is the time at which ingress took the sample. It is in the sample's header, so a delay of the
+/// tap does not change the statistics. The rate counts sequence numbers, so samples that the tap itself
+/// missed do not lower it.
 #[derive(Clone, Debug)]
 pub struct Intervals {
     window_samples: usize,
     arrivals: VecDeque<(u64, MonotonicNs)>,
 }
 
-/// What the samples of the window say.
+/// The rate and the intervals of the samples in the window.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IntervalStatistics {
     /// Samples per second.
     pub rate_hz: f64,
-    /// The shortest interval between two samples that follow one another.
+    /// The shortest interval between two consecutive samples.
     pub min_ms: f64,
-    /// The longest.
+    /// The longest interval between two consecutive samples.
     pub max_ms: f64,
     /// The standard deviation of the intervals.
     pub std_ms: f64,
@@ -39,13 +40,13 @@ impl Default for Intervals {
 }
 
 impl Intervals {
-    /// Over the last `window_samples` samples, at least 2.
+    /// Creates an empty window of `window_samples` samples, at least 2.
     pub fn new(window_samples: usize) -> Self {
         Self { window_samples: window_samples.max(2), arrivals: VecDeque::new() }
     }
 
-    /// A sample was seen. One that is not newer than the last is that of a new bridge: everything begins
-    /// anew.
+    /// Adds a sample. A sequence number that is not above the last one comes from a restarted bridge: the
+    /// window is cleared first.
     pub fn see(&mut self, header: &SampleHeader) {
         if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
             self.arrivals.clear();
@@ -56,7 +57,7 @@ impl Intervals {
         self.arrivals.push_back((header.sequence, header.taken_at));
     }
 
-    /// The statistics; `None` before two samples that follow one another were seen.
+    /// The statistics of the window; `None` while it has no two consecutive samples.
     pub fn statistics(&self) -> Option<IntervalStatistics> {
         let (&(first, began_at), &(last, ended_at)) = (self.arrivals.front()?, self.arrivals.back()?);
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
@@ -77,7 +78,7 @@ impl Intervals {
             rate_hz: (last - first) as f64 * 1e9 / span_ns as f64,
             min_ms,
             max_ms,
-            // Rounding may take it below 0 where all intervals are alike.
+            // Rounding may make the variance negative when all intervals are equal.
             std_ms: (squares / count - mean * mean).max(0.0).sqrt(),
             samples: self.arrivals.len(),
         })
@@ -102,7 +103,7 @@ mod tests {
         }
     }
 
-    fn of(samples: &[(u64, u64)], window: usize) -> Option<IntervalStatistics> {
+    fn statistics_of(samples: &[(u64, u64)], window: usize) -> Option<IntervalStatistics> {
         let mut intervals = Intervals::new(window);
         for &(sequence, at_ms) in samples {
             intervals.see(&sample(sequence, at_ms));
@@ -112,34 +113,34 @@ mod tests {
 
     #[test]
     fn rate_and_spread_are_those_of_the_arrivals() {
-        let found = of(&[(1, 0), (2, 8), (3, 20), (4, 28), (5, 40)], 10).unwrap();
+        let found = statistics_of(&[(1, 0), (2, 8), (3, 20), (4, 28), (5, 40)], 10).unwrap();
         assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 8.0, 12.0));
         assert!((found.std_ms - 2.0).abs() < 1e-9, "{found:?}");
         assert_eq!(found.samples, 5);
     }
 
     #[test]
-    fn missed_samples_lower_no_rate_and_make_no_interval() {
-        let found = of(&[(1, 0), (2, 10), (7, 60), (8, 70)], 10).unwrap();
+    fn missed_samples_do_not_lower_the_rate_and_add_no_interval() {
+        let found = statistics_of(&[(1, 0), (2, 10), (7, 60), (8, 70)], 10).unwrap();
         assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 10.0, 10.0));
     }
 
     #[test]
     fn only_the_window_counts() {
-        let found = of(&[(1, 0), (2, 1_000), (3, 1_010), (4, 1_020)], 3).unwrap();
+        let found = statistics_of(&[(1, 0), (2, 1_000), (3, 1_010), (4, 1_020)], 3).unwrap();
         assert_eq!((found.rate_hz, found.samples), (100.0, 3));
     }
 
     #[test]
-    fn a_sequence_that_goes_back_begins_anew() {
-        let found = of(&[(900, 0), (901, 1), (1, 5_000), (2, 5_010)], 10).unwrap();
+    fn a_sequence_number_that_goes_back_clears_the_window() {
+        let found = statistics_of(&[(900, 0), (901, 1), (1, 5_000), (2, 5_010)], 10).unwrap();
         assert_eq!((found.rate_hz, found.samples), (100.0, 2));
     }
 
     #[test]
     fn one_sample_has_no_rate() {
-        assert_eq!(of(&[], 10), None);
-        assert_eq!(of(&[(1, 5)], 10), None);
-        assert_eq!(of(&[(1, 5), (3, 6)], 10), None);
+        assert_eq!(statistics_of(&[], 10), None);
+        assert_eq!(statistics_of(&[(1, 5)], 10), None);
+        assert_eq!(statistics_of(&[(1, 5), (3, 6)], 10), None);
     }
 }

@@ -1,6 +1,7 @@
-//! Logs for journald, in its native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): each field of an event is
-//! a field of the journal's entry, so that `journalctl BRIDGE_ROUTE=scan` finds it, and stands in the
-//! message, too, so that nobody has to know that.
+//! Sends log events to journald in its native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
+//!
+//! Each field of an event becomes a field of the journal entry, so that `journalctl BRIDGE_ROUTE=scan` finds
+//! it. The fields are also appended to the message, for readers who do not filter by field.
 
 use std::ffi::OsString;
 use std::fmt::{Debug, Write};
@@ -18,19 +19,19 @@ use tracing_subscriber::layer::Context;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
 
-/// A datagram of a unix socket is at most some 200 KiB long (`net.core.wmem_default`); no event of ours comes
-/// near.
+/// The maximum length of a field's value. A datagram of a unix socket holds about 200 KiB
+/// (`net.core.wmem_default`), far more than an event of the bridge needs.
 const MAX_MESSAGE_BYTES: usize = 32 * 1024;
 
-/// Sends events to journald.
+/// The tracing layer that sends events to journald.
 pub(super) struct Journal {
     socket: UnixDatagram,
 }
 
 impl Journal {
-    /// If `log` goes to the journal, as `JOURNAL_STREAM` says of the standard error that a service is started
-    /// with.
-    pub fn behind(log: impl AsFd, journal_stream: Option<OsString>) -> Option<Self> {
+    /// Connects to journald if `log` is connected to the journal. systemd sets `JOURNAL_STREAM` to the device
+    /// and inode of a service's standard error.
+    pub fn for_log(log: impl AsFd, journal_stream: Option<OsString>) -> Option<Self> {
         let named = journal_stream?.into_string().ok()?;
         let metadata = fstat(log).ok()?;
         if named != format!("{}:{}", metadata.st_dev, metadata.st_ino) {
@@ -42,7 +43,7 @@ impl Journal {
     fn connect(socket: &Path) -> io::Result<Self> {
         let journal = Self { socket: UnixDatagram::unbound()? };
         journal.socket.connect(socket)?;
-        // A log that is full may not hold up the data path; what does not fit is lost.
+        // A full socket buffer must not block the data path: entries that do not fit are lost.
         journal.socket.set_nonblocking(true)?;
         Ok(journal)
     }
@@ -51,7 +52,7 @@ impl Journal {
 impl<S: Subscriber> Layer<S> for Journal {
     fn on_event(&self, event: &Event<'_>, _context: Context<'_, S>) {
         let entry = Entry::of(event);
-        // Nobody can be told that the log is gone.
+        // There is no other place to report a failed log write to.
         let _ = self.socket.send(&entry.encode());
     }
 }
@@ -61,13 +62,13 @@ struct Entry {
     priority: u8,
     target: String,
     message: String,
-    /// The fields of the event but for its message, in upper case and with a prefix.
+    /// The fields of the event without its message, in upper case and with [`PREFIX`].
     fields: Vec<(String, String)>,
 }
 
 impl Entry {
     fn of(event: &Event<'_>) -> Self {
-        // What comes from the `log` crate has its level and target in fields of their own.
+        // Events from the `log` crate carry their level and target in fields of their own.
         let normalized = event.normalized_metadata();
         let metadata = normalized.as_ref().unwrap_or_else(|| event.metadata());
         let mut entry = Self {
@@ -78,7 +79,7 @@ impl Entry {
         };
         event.record(&mut entry);
         for (name, value) in &entry.fields {
-            // Writing to a String cannot fail.
+            // Writing to a String does not fail.
             let _ = write!(entry.message, " {}={value}", name[PREFIX.len()..].to_ascii_lowercase());
         }
         entry
@@ -116,7 +117,7 @@ impl Visit for Entry {
     }
 }
 
-/// syslog(3).
+/// The priority of a level, as in syslog(3).
 fn priority(level: Level) -> u8 {
     match level {
         Level::ERROR => 3,
@@ -126,16 +127,16 @@ fn priority(level: Level) -> u8 {
     }
 }
 
-/// Without it a field `priority` would be the entry's own.
+/// The prefix of the event's fields. Without it, an event field `priority` would overwrite the entry's own.
 const PREFIX: &str = "BRIDGE_";
 
-/// journald takes names of upper case letters, digits and underscores.
+/// The name of an event field in the journal, which accepts upper case letters, digits and underscores.
 fn journal_name(name: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
     PREFIX.chars().chain(name.chars().map(allowed)).collect()
 }
 
-/// A field with its length before it, as a value of several lines needs it.
+/// Appends a field in the form with an explicit length, which also allows line breaks in the value.
 fn put(bytes: &mut Vec<u8>, name: &str, value: &str) {
     let mut end = value.len().min(MAX_MESSAGE_BYTES);
     while !value.is_char_boundary(end) {
@@ -158,7 +159,7 @@ mod tests {
 
     use super::*;
 
-    /// The fields of an entry.
+    /// Decodes an entry into its fields.
     fn decode(mut bytes: &[u8]) -> BTreeMap<String, String> {
         let mut fields = BTreeMap::new();
         while let Some(end) = bytes.iter().position(|&byte| byte == b'\n') {
@@ -172,7 +173,7 @@ mod tests {
         fields
     }
 
-    /// What journald receives of the events.
+    /// Logs events and returns the entries that journald receives.
     fn received(events: impl FnOnce()) -> Vec<BTreeMap<String, String>> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("journal");
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn an_event_is_an_entry_with_a_field_for_each_of_its_own() {
+    fn each_field_of_an_event_is_a_field_of_its_entry() {
         let entries = received(|| {
             tracing::warn!(
                 route = "scan",
@@ -218,10 +219,10 @@ mod tests {
     }
 
     #[test]
-    fn the_journal_is_used_only_if_it_is_what_the_log_goes_to() {
+    fn the_journal_is_used_only_if_the_log_is_connected_to_it() {
         let log = File::open("/dev/null").unwrap();
-        assert!(Journal::behind(&log, None).is_none());
-        assert!(Journal::behind(&log, Some("0:0".into())).is_none());
-        assert!(Journal::behind(&log, Some("what".into())).is_none());
+        assert!(Journal::for_log(&log, None).is_none());
+        assert!(Journal::for_log(&log, Some("0:0".into())).is_none());
+        assert!(Journal::for_log(&log, Some("what".into())).is_none());
     }
 }

@@ -1,5 +1,6 @@
-//! The JSON messages of the original package: diagnostics, and the decisions of the classifier. Each is a
-//! `std_msgs/String`. Fields may be added; a reader skips those that it does not know.
+//! The JSON messages of the original package: diagnostics and classifier decisions, each a `std_msgs/String`.
+//!
+//! Fields may be added; a reader should skip fields that it does not know.
 
 use byteorder::LittleEndian;
 use bytes::Bytes;
@@ -12,7 +13,7 @@ use crate::model::{SubscriberState, WallNs};
 /// The DDS type of `std_msgs/String`.
 pub const STRING_TYPE: &str = "std_msgs::msg::dds_::String_";
 
-/// Where decisions are published, as in the original.
+/// The topic of the classifier's decisions, as in the original package.
 pub const DECISION_TOPIC: &str = "/adaptive_bridge/classifier/state";
 
 /// The version of these messages.
@@ -29,13 +30,13 @@ struct Message<'a, T> {
     body: &'a T,
 }
 
-/// The report as the message for `diagnostics.topic`: the JSON of `status --json` with `v` and `type` before
-/// it. As large as the configured routes and lanes make it.
+/// The report as a message for `diagnostics.topic`: the JSON of `status --json`, with `v` and `type` added in
+/// front. Its size grows with the number of routes and lanes.
 pub fn diagnostics_json(report: &Report) -> Bytes {
     message("diagnostics", report)
 }
 
-/// What the classifier says of one subscriber: published with each change, and once a second.
+/// The classifier's state of one subscriber. Control publishes it with each change and once a second.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Decision<'a> {
     /// The id of its responder.
@@ -45,22 +46,22 @@ pub struct Decision<'a> {
     /// Its state.
     #[serde(serialize_with = "state_label")]
     pub state: SubscriberState,
-    /// The state before the last change; the same as `state` before there was one.
+    /// The state before the last change; the same as `state` before the first change.
     #[serde(serialize_with = "state_label")]
     pub previous_state: SubscriberState,
-    /// Why.
+    /// The reason of the state, as text for users.
     pub reason: &'a str,
-    /// Mean round trip within the sliding window, in milliseconds; null when no probe of it was answered.
+    /// Mean round trip within the sliding window, in milliseconds; null when it has no response.
     pub rtt_ms: Option<f64>,
-    /// Share of the probes lost, 0 to 1; null while the fate of none is known.
+    /// Share of lost probes, 0 to 1; null while no probe has been answered or has timed out.
     pub loss: Option<f64>,
-    /// When, in nanoseconds since the Unix epoch.
+    /// The time of the decision, in nanoseconds since the Unix epoch.
     #[serde(rename = "time_ns", serialize_with = "wall_ns")]
     pub time: WallNs,
 }
 
 impl Decision<'_> {
-    /// The message for [`DECISION_TOPIC`], of some hundred bytes: texts are cut.
+    /// The message for [`DECISION_TOPIC`]. Long texts are cut, so it has at most 2 KiB.
     pub fn payload(&self) -> Bytes {
         let short = |text: &str| shortened(&printable(text), MAX_TEXT_BYTES);
         let (subscriber_id, lane, reason) = (short(self.subscriber_id), short(self.lane), short(self.reason));
@@ -80,11 +81,11 @@ fn wall_ns<S: serde::Serializer>(time: &WallNs, serializer: S) -> Result<S::Ok, 
 }
 
 fn message(r#type: &'static str, body: &impl Serialize) -> Bytes {
-    // Numbers, texts and lists under keys that are texts: none of this can fail.
+    // Serializing numbers, strings and lists under string keys does not fail.
     string_message(&serde_json::to_string(&Message { v: VERSION, r#type, body }).unwrap_or_default())
 }
 
-/// A `std_msgs/String` in plain little-endian CDR, without the encapsulation header.
+/// Serializes a `std_msgs/String` in plain little-endian CDR, without the encapsulation header.
 pub fn string_message(data: &str) -> Bytes {
     #[derive(Serialize)]
     struct StringMessage<'a> {
@@ -93,9 +94,10 @@ pub fn string_message(data: &str) -> Bytes {
     cdr(&StringMessage { data }, data.len() + 5)
 }
 
-/// Plain little-endian CDR ([`Encapsulation::CDR_LE`](crate::model::Encapsulation::CDR_LE)).
+/// Serializes a message in plain little-endian CDR
+/// ([`Encapsulation::CDR_LE`](crate::model::Encapsulation::CDR_LE)).
 pub(super) fn cdr(message: &impl Serialize, expected_bytes: usize) -> Bytes {
-    // Writing to memory does not fail, and the messages are of types that CDR has.
+    // Writing to memory does not fail, and the messages contain only types that CDR supports.
     let bytes = cdr_encoding::to_vec_with_size_hint::<_, LittleEndian>(message, expected_bytes);
     Bytes::from(bytes.unwrap_or_default())
 }
@@ -104,10 +106,10 @@ pub(super) fn cdr(message: &impl Serialize, expected_bytes: usize) -> Bytes {
 mod tests {
     use serde_json::{Value, json};
 
-    use super::super::samples::wide;
+    use super::super::test_report::wide_report;
     use super::*;
 
-    /// The JSON of a `std_msgs/String`, by the definition of CDR.
+    /// Parses the JSON in a `std_msgs/String`, decoded by hand after the definition of CDR.
     fn read(payload: &[u8]) -> Value {
         let length = u32::from_le_bytes(payload[..4].try_into().unwrap()) as usize;
         assert_eq!((payload.len(), payload[payload.len() - 1]), (4 + length, 0));
@@ -122,15 +124,15 @@ mod tests {
 
     #[test]
     fn diagnostics_are_the_report_with_a_version_and_a_type() {
-        let mut found = read(&diagnostics_json(&wide()));
+        let mut found = read(&diagnostics_json(&wide_report()));
         let head = found.as_object_mut().unwrap();
         assert_eq!(head.remove("v"), Some(json!(1)));
         assert_eq!(head.remove("type"), Some(json!("diagnostics")));
-        assert_eq!(found, serde_json::to_value(wide()).unwrap());
+        assert_eq!(found, serde_json::to_value(wide_report()).unwrap());
     }
 
     #[test]
-    fn a_decision_has_the_fields_that_readers_look_for() {
+    fn a_decision_has_the_documented_fields() {
         let decision = Decision {
             subscriber_id: "laptop",
             lane: "noncritical",
@@ -150,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn a_decision_is_small_whatever_the_texts_are() {
+    fn a_decision_is_small_even_with_long_texts() {
         let long = "\"\\\n\u{1}é".repeat(10_000);
         let payload = Decision {
             subscriber_id: &long,

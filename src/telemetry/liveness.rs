@@ -1,4 +1,4 @@
-//! Whether a process that shows its health is still there, and whether it turns.
+//! Determines the state of a bridge process from its health board and from the kernel.
 
 use std::fs;
 
@@ -6,28 +6,28 @@ use serde::Serialize;
 
 use crate::model::{MonotonicNs, ProcessHealth};
 
-/// Roles turn at least ten times a second. One that turned this recently is there, even where its process id
-/// means nothing to us because it runs in another container.
+/// A process that made a turn this recently runs, even when its process id does not exist here because it
+/// runs in another container. Every process makes at least ten turns a second.
 const RECENT_MS: u64 = 500;
 
-/// A role that did not turn for so long hangs, or gets no CPU.
+/// A process that made no turn for this long hangs or gets no CPU time.
 const SILENT_MS: u64 = 2_000;
 
 /// The state of a process of the bridge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ProcessState {
-    /// It never ran in this bridge.
+    /// The process never ran in this bridge.
     NotStarted,
-    /// It is there and turns.
+    /// The process exists and makes turns.
     Running,
-    /// It is stopped by a signal (SIGSTOP), or by a debugger.
+    /// A signal (SIGSTOP) or a debugger has stopped the process.
     Stopped,
-    /// It is there and its data path has not turned for more than 2 s.
+    /// The process exists, but its data path has made no turn for more than 2 s.
     Silent,
-    /// It has ended in good order, because it was told to.
+    /// The process has shut down normally, on request.
     Ended,
-    /// It is gone without a word.
+    /// The process was killed or crashed.
     Dead,
 }
 
@@ -44,13 +44,13 @@ impl ProcessState {
         }
     }
 
-    /// Whether there is such a process, whatever it does.
+    /// Whether the process exists, in any state.
     pub const fn exists(self) -> bool {
         matches!(self, Self::Running | Self::Stopped | Self::Silent)
     }
 
-    /// The state, of what the process showed last and of what the kernel says of it at `now`.
-    pub(super) fn look(health: &ProcessHealth, now: MonotonicNs) -> Self {
+    /// The state at `now`, from the process's last health record and the kernel's state of its process id.
+    pub(super) fn read(health: &ProcessHealth, now: MonotonicNs) -> Self {
         Self::of(health, kernel_state(health.pid), now)
     }
 
@@ -60,7 +60,7 @@ impl ProcessState {
             _ if health.pid == 0 => Self::NotStarted,
             _ if health.ended != 0 => Self::Ended,
             Some('T' | 't') => Self::Stopped,
-            // A zombie has ended, and its parent has not looked.
+            // A zombie has exited, and its parent has not waited for it yet.
             Some('Z' | 'X') => Self::Dead,
             None if silent_for_ns > RECENT_MS * 1_000_000 => Self::Dead,
             Some(_) if silent_for_ns > SILENT_MS * 1_000_000 => Self::Silent,
@@ -69,10 +69,10 @@ impl ProcessState {
     }
 }
 
-/// The state letter of a process (proc_pid_stat(5)); `None` when there is none of that number.
+/// The state letter of a process (proc_pid_stat(5)); `None` when no process has that id.
 fn kernel_state(pid: u64) -> Option<char> {
     let stat = fs::read(format!("/proc/{pid}/stat")).ok()?;
-    // The name before it is in parentheses, and may have any character in it.
+    // The command name before it is in parentheses and may contain any character.
     let end_of_name = stat.iter().rposition(|&byte| byte == b')')?;
     stat.get(end_of_name + 2).copied().map(char::from)
 }
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_is_what_the_kernel_and_its_own_turns_say() {
+    fn the_state_depends_on_the_kernel_and_the_last_turn() {
         assert_eq!(state(0, None, 0), ProcessState::NotStarted);
         assert_eq!(state(7, Some('S'), 100), ProcessState::Running);
         assert_eq!(state(7, Some('R'), 2_001), ProcessState::Silent);
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_said_goodbye_has_ended_and_is_not_dead() {
+    fn a_process_that_shut_down_normally_has_ended_and_is_not_dead() {
         for kernel_state in [None, Some('S'), Some('Z')] {
             let health = ProcessHealth { pid: 7, ended: 1, ..ProcessHealth::default() };
             let state = ProcessState::of(&health, kernel_state, MonotonicNs(u64::MAX));
@@ -107,12 +107,12 @@ mod tests {
     }
 
     #[test]
-    fn a_process_of_another_container_runs_while_it_turns() {
+    fn a_process_of_another_container_runs_while_it_makes_turns() {
         assert_eq!(state(7, None, 500), ProcessState::Running);
     }
 
     #[test]
-    fn the_kernel_knows_us_and_nobody_of_a_number_that_no_process_has() {
+    fn only_an_existing_process_has_a_kernel_state() {
         assert!(kernel_state(u64::from(std::process::id())).is_some_and(|state| "RSD".contains(state)));
         assert_eq!(kernel_state(u64::MAX), None);
     }

@@ -1,4 +1,4 @@
-//! Logs, on stderr or in the journal.
+//! Sets up logging to stderr or to the journal.
 
 use std::io::IsTerminal;
 use std::sync::OnceLock;
@@ -11,47 +11,50 @@ use tracing_subscriber::{EnvFilter, Registry, reload};
 use super::journal::Journal;
 use crate::config::Verbosity;
 
-/// The filter, where `RUST_LOG` leaves it to the configuration.
+/// The handle that changes the filter; set only when `RUST_LOG` is unset and the configuration decides.
 static CONFIGURED: OnceLock<reload::Handle<EnvFilter, Registry>> = OnceLock::new();
 
-/// Starts logging to stderr, or to the journal where stderr leads there, as that of a systemd service does;
-/// filtered by `RUST_LOG`, without it as [`set_verbosity`] says, and until then as [`Verbosity::Info`]. What
-/// the libraries log through the `log` crate comes too.
+/// Starts logging to stderr, or to the journal when stderr is connected to it, as in a systemd service.
+///
+/// `RUST_LOG` sets the filter. Without it, [`set_verbosity`] does, and [`Verbosity::Info`] applies until
+/// then. Events of libraries that use the `log` crate are logged, too.
 pub fn start_logs() {
     let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
-    let asked_for = environment.and_then(|text| EnvFilter::try_new(text).ok());
-    let is_configured = asked_for.is_none();
-    let (filter, handle) = reload::Layer::new(asked_for.unwrap_or_else(|| filter(Verbosity::Info)));
-    let journal = Journal::behind(std::io::stderr(), std::env::var_os("JOURNAL_STREAM"));
+    let from_environment = environment.and_then(|text| EnvFilter::try_new(text).ok());
+    let is_configured = from_environment.is_none();
+    let (filter, handle) = reload::Layer::new(from_environment.unwrap_or_else(|| filter(Verbosity::Info)));
+    let journal = Journal::for_log(std::io::stderr(), std::env::var_os("JOURNAL_STREAM"));
     let lines = journal.is_none().then(|| {
         tracing_subscriber::fmt::layer()
             .with_writer(std::io::stderr)
-            // It would say on stderr that stderr is gone, a closed terminal say, and panic because it cannot.
+            // Otherwise the layer reports a closed stderr, such as that of a closed terminal, on stderr
+            // itself, which fails and panics.
             .log_internal_errors(false)
             .with_ansi(std::io::stderr().is_terminal())
     });
     match tracing_subscriber::registry().with(filter).with(journal).with(lines).try_init() {
         Ok(()) if is_configured => {
-            // It is set once: logs cannot be started twice.
+            // `try_init` succeeds only once, so this is set only once.
             let _ = CONFIGURED.set(handle);
         }
         Ok(()) => {}
-        Err(error) => eprintln!("no logs: {error}"),
+        Err(error) => eprintln!("cannot start logging: {error}"),
     }
 }
 
-/// From now on logs what the configuration asks for (`diagnostics.verbosity`). Does nothing where `RUST_LOG`
-/// says what to log.
+/// Applies `diagnostics.verbosity` of the configuration to the log. Does nothing when `RUST_LOG` sets the
+/// filter.
 pub fn set_verbosity(verbosity: Verbosity) {
     if let Some(handle) = CONFIGURED.get()
         && let Err(error) = handle.reload(filter(verbosity))
     {
-        warn!(%error, "the verbosity of the log stays as it is");
+        warn!(%error, "cannot change the log verbosity (diagnostics.verbosity); the previous one stays");
     }
 }
 
-/// Ourselves as asked; of the libraries what is an error. A RELIABLE writer of RustDDS warns of each sample
-/// that its full window refuses; those are counted and named here.
+/// The filter for a verbosity: it applies to the bridge, while libraries log errors only. A RELIABLE writer
+/// of RustDDS would warn about each sample that its full window refuses; the bridge counts and reports those
+/// itself.
 fn filter(verbosity: Verbosity) -> EnvFilter {
     let own = match verbosity {
         Verbosity::Error => "error",

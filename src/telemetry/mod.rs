@@ -1,4 +1,5 @@
-//! What the processes show: readings of the boards, what they mean, and logs.
+//! Observes a running bridge: snapshots of its boards, the report with its problems, its output formats, and
+//! logging.
 
 mod cpu_time;
 mod diagnostics;
@@ -10,10 +11,10 @@ mod logs;
 mod metrics;
 mod problems;
 mod report;
-#[cfg(test)]
-mod samples;
 mod snapshot;
 mod table;
+#[cfg(test)]
+mod test_report;
 mod text;
 
 pub use cpu_time::CpuTime;

@@ -1,4 +1,4 @@
-//! One reading of all boards of a bridge.
+//! Snapshot: one reading of all boards of a bridge.
 
 use std::path::Path;
 use std::thread;
@@ -16,96 +16,98 @@ use crate::model::{
 use crate::policy::effective_mode;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 
-/// Within a turn a lane has counted a sample here and not yet there. A lane that does not add up is looked at
-/// again so often, with this pause between: 20 ms, in which every turn ends.
+/// Attempts to read counts of a lane that add up. In the middle of a turn, a lane has updated only some of
+/// its counts; with [`WHOLE_PAUSE`] between the attempts they take 20 ms, and every turn ends within that
+/// time.
 const WHOLE_ATTEMPTS: usize = 100;
+/// See [`WHOLE_ATTEMPTS`].
 const WHOLE_PAUSE: Duration = Duration::from_micros(200);
 
-/// All that the processes of a bridge show of themselves, read at one instant as nearly as can be without
-/// making anybody wait.
+/// The state of a bridge at one time, read from its boards. Reading blocks no process, so the boards are read
+/// one after the other and may differ by the time that this takes.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
-    /// The bridge.
+    /// The name of the bridge's instance.
     pub instance: InstanceName,
-    /// When it was read.
+    /// The time of the reading.
     pub at: MonotonicNs,
-    /// The same by the wall clock.
+    /// The time of the reading by the wall clock.
     pub at_wall: WallNs,
-    /// Ingress, control where it ever ran, then the egress of each lane.
+    /// Ingress, control if it ever ran, then the egress of each lane.
     pub processes: Vec<ProcessReading>,
     /// The lanes, in the order of the configuration.
     pub lanes: Vec<LaneReading>,
     /// The routes, in the order of the configuration.
     pub routes: Vec<RouteReading>,
-    /// Whether the configuration asks for what only the control process does: probes or classification.
+    /// Whether the configuration enables probes or classification, which only the control process does.
     pub needs_control: bool,
-    /// What control found and decided for the bridge as a whole.
+    /// The control process's record for the whole bridge.
     pub control: ControlRecord,
-    /// The subscribers that control follows.
+    /// The subscribers that control tracks.
     pub subscribers: Vec<SubscriberReading>,
-    /// The remote readers that reach past the bridge, as control found them.
+    /// The intruders that control found.
     pub intruders: Vec<IntruderRecord>,
-    /// Network interfaces and peers that are or were away, as control found them.
+    /// The network interfaces and peers that are or were away.
     pub absences: Vec<AbsenceRecord>,
-    /// The nodes of the outputs' readers, as control found them.
+    /// The nodes of the inputs' publishers and of the outputs' readers.
     pub named_endpoints: Vec<NamedEndpoint>,
 }
 
-/// One subscriber, as control sees it.
+/// The record of one subscriber.
 #[derive(Clone, Copy, Debug)]
 pub struct SubscriberReading {
-    /// Its lane, as an index into [`Snapshot::lanes`]; `None` when control named none that there is.
+    /// Its lane, as an index into [`Snapshot::lanes`]; `None` when the record has no valid lane.
     pub lane: Option<usize>,
-    /// What control shows of it.
+    /// The record that control writes.
     pub record: SubscriberRecord,
 }
 
-/// One process.
+/// The health and the state of one process.
 #[derive(Clone, Debug)]
 pub struct ProcessReading {
-    /// `ingress`, `control`, `egress-critical`, …
+    /// Its name: `ingress`, `control`, `egress-critical`, …
     pub name: String,
     /// Its role.
     pub role: ProcessRole,
-    /// What it shows of itself.
+    /// Its health record.
     pub health: ProcessHealth,
-    /// Whether it is there.
+    /// Its state.
     pub state: ProcessState,
 }
 
-/// One lane.
+/// The policy and the mode of one lane.
 #[derive(Clone, Debug)]
 pub struct LaneReading {
     /// Its name.
     pub name: LaneName,
     /// Critical or noncritical.
     pub class: TrafficClass,
-    /// What the policy board says to it.
+    /// Its policy, from the policy board.
     pub policy: LanePolicy,
-    /// The mode that this comes to.
+    /// The mode that results from the policy.
     pub mode: LaneMode,
-    /// Why.
+    /// The reason of the mode.
     pub reason: ModeReason,
-    /// When the policy ends, unless it is confirmed or set anew.
+    /// The time at which the policy ends unless it is confirmed or set again.
     pub ends_at: Option<MonotonicNs>,
-    /// What its process shows of itself, and with it the mode that it applies.
+    /// The health record of its process, which includes the applied mode.
     pub health: ProcessHealth,
 }
 
-/// Why a lane is in its mode.
+/// The reason of a lane's mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ModeReason {
-    /// Nobody has set one.
+    /// No mode was ever set.
     Default,
-    /// An operator set it.
+    /// An operator has set the mode.
     ByHand,
-    /// The control process decided on it, and runs.
+    /// The control process has set the mode and runs.
     Control,
-    /// The safety supervisor allows no milder one.
+    /// The safety supervisor requires this mode at least.
     Safety,
-    /// The control process decided on it and does not run; it holds for `policy_hold_s`.
+    /// The control process has set the mode and no longer runs; the mode holds for `policy_hold_s`.
     Held,
-    /// The control process is gone for longer than `policy_hold_s`.
+    /// The control process has not run for longer than `policy_hold_s`.
     Expired,
 }
 
@@ -123,60 +125,60 @@ impl ModeReason {
     }
 }
 
-/// One route.
+/// The counters and latencies of one route.
 #[derive(Clone, Debug)]
 pub struct RouteReading {
     /// Its id.
     pub id: RouteId,
-    /// What ingress subscribes to.
+    /// The topic that ingress subscribes to.
     pub input_topic: TopicName,
-    /// The message type as far as it is known, in the terms of ROS 2 where it is one of those.
+    /// The message type if it is known; the ROS 2 name if it is a ROS 2 type.
     pub message_type: Option<String>,
-    /// What ingress counted.
+    /// The counters of ingress.
     pub counters: IngressCounters,
-    /// The accounts of its publishers; one of which no sample came has none.
+    /// The accounts of its publishers; a publisher that has sent no sample has none.
     pub publishers: Vec<PublisherAccount>,
-    /// From the publisher's source timestamp to ingress.
+    /// Latency from the publisher's source timestamp to ingress.
     pub dds_in: LatencyHistogram,
-    /// The lanes that serve it.
+    /// Its outputs, one for each lane that serves it.
     pub outputs: Vec<OutputReading>,
 }
 
-/// One route on one lane.
+/// The counters and latencies of one output, which is a route on a lane.
 #[derive(Clone, Debug)]
 pub struct OutputReading {
     /// The lane, as an index into [`Snapshot::lanes`].
     pub lane: usize,
-    /// What the lane publishes to.
+    /// The topic that the lane publishes to.
     pub topic: TopicName,
-    /// What the lane counted.
+    /// The counters of the lane.
     pub counters: LaneCounters,
-    /// The readers that are matched with it.
+    /// The matched readers.
     pub readers: OutputReaders,
-    /// From ingress to the lane.
+    /// Latency from ingress to the lane.
     pub shm: LatencyHistogram,
-    /// Within the lane, up to its DDS writer.
+    /// Latency within the lane, up to its DDS writer.
     pub dds_out: LatencyHistogram,
-    /// From the source timestamp to the lane's DDS writer.
+    /// Age of the samples when the lane's DDS writer gets them, by their source timestamp.
     pub age: LatencyHistogram,
 }
 
 impl Snapshot {
-    /// Reads the boards of the bridge that these settings describe, below `root`. `None` when it does not
-    /// run; nothing is created then, and nothing of it is written or locked at any time.
+    /// Reads the boards of the bridge with these settings below `root`; `None` when it does not run. It only
+    /// reads: it creates, writes and locks nothing.
     ///
     /// # Errors
-    /// The boards are those of other settings or of another version, or may not be opened.
+    /// The boards have other settings or another version, or cannot be opened.
     pub fn take(root: &Path, settings: &Settings) -> Result<Option<Self>, ShmError> {
         let boards = Boards::find(root, &settings.instance, &BridgeShape::of(settings))?;
         let snapshot = boards.map(|boards| Self::read(&boards, settings)).transpose()?;
         Ok(snapshot.filter(Self::is_running))
     }
 
-    /// Reads boards, whether anybody runs or not.
+    /// Reads boards, whether the bridge runs or not.
     ///
     /// # Errors
-    /// A value changes faster than it can be read, which no process of ours does.
+    /// A value changes faster than it can be read, which no process of the bridge does.
     pub fn read(boards: &Boards, settings: &Settings) -> Result<Self, ShmError> {
         let now = clock::monotonic();
         let ingress = process(boards, "ingress".to_owned(), ProcessRole::Ingress, now)?;
@@ -187,7 +189,7 @@ impl Snapshot {
         let mut lanes = Vec::with_capacity(settings.lanes.len());
         for (index, lane) in settings.lanes.iter().enumerate() {
             let egress = process(boards, format!("egress-{}", lane.name), ProcessRole::Egress(index), now)?;
-            let policy = steady(boards.policy(index))?;
+            let policy = consistent(boards.policy(index))?;
             let hold_ms = settings.policy_hold_ms;
             let (reason, ends_at) = reason(&policy, control_runs, now, hold_ms);
             lanes.push(LaneReading {
@@ -204,7 +206,7 @@ impl Snapshot {
         let routes = (0..settings.routes.len())
             .map(|route| read_route(boards, settings, route))
             .collect::<Result<_, _>>()?;
-        let control = steady(boards.control())?;
+        let control = consistent(boards.control())?;
         Ok(Self {
             instance: settings.instance.clone(),
             at: now,
@@ -221,7 +223,7 @@ impl Snapshot {
         })
     }
 
-    /// Whether any process of the bridge is there.
+    /// Whether any process of the bridge exists.
     pub fn is_running(&self) -> bool {
         self.processes.iter().any(|process| process.state.exists())
     }
@@ -234,7 +236,7 @@ fn read_subscribers(
 ) -> Result<Vec<SubscriberReading>, ShmError> {
     let mut subscribers = Vec::new();
     for place in places(control.subscribers, MAX_SUBSCRIBERS) {
-        let record = steady(boards.subscriber(place))?;
+        let record = consistent(boards.subscriber(place))?;
         if !record.id.as_str().is_empty() {
             let lane = usize::try_from(record.lane).ok().filter(|lane| *lane < lanes);
             subscribers.push(SubscriberReading { lane, record });
@@ -246,7 +248,7 @@ fn read_subscribers(
 fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<IntruderRecord>, ShmError> {
     let mut intruders = Vec::new();
     for place in places(control.intruders, MAX_INTRUDERS) {
-        let record = steady(boards.intruder(place))?;
+        let record = consistent(boards.intruder(place))?;
         if !record.topic.as_str().is_empty() {
             intruders.push(record);
         }
@@ -257,7 +259,7 @@ fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<Intrud
 fn read_absences(boards: &Boards) -> Result<Vec<AbsenceRecord>, ShmError> {
     let mut absences = Vec::new();
     for place in 0..MAX_ABSENCES {
-        let record = steady(boards.absence(place))?;
+        let record = consistent(boards.absence(place))?;
         if record.since != MonotonicNs::default() {
             absences.push(record);
         }
@@ -268,7 +270,7 @@ fn read_absences(boards: &Boards) -> Result<Vec<AbsenceRecord>, ShmError> {
 fn read_named_endpoints(boards: &Boards) -> Result<Vec<NamedEndpoint>, ShmError> {
     let mut named = Vec::new();
     for place in 0..MAX_NAMED_ENDPOINTS {
-        let record = steady(boards.named_endpoint(place))?;
+        let record = consistent(boards.named_endpoint(place))?;
         if record.endpoint != Guid::default() {
             named.push(record);
         }
@@ -276,7 +278,7 @@ fn read_named_endpoints(boards: &Boards) -> Result<Vec<NamedEndpoint>, ShmError>
     Ok(named)
 }
 
-/// The places of a table that are taken; the board may say any number.
+/// The places in use of a table with `size` places. The board may contain any number.
 fn places(taken: u64, size: usize) -> std::ops::Range<usize> {
     0..usize::try_from(taken).unwrap_or(size).min(size)
 }
@@ -287,11 +289,11 @@ fn process(
     role: ProcessRole,
     now: MonotonicNs,
 ) -> Result<ProcessReading, ShmError> {
-    let health = steady(boards.health(role))?;
-    Ok(ProcessReading { name, role, health, state: ProcessState::look(&health, now) })
+    let health = consistent(boards.health(role))?;
+    Ok(ProcessReading { name, role, health, state: ProcessState::read(&health, now) })
 }
 
-/// As `effective_mode`, which says what and not why.
+/// The reason of the mode that `effective_mode` returns, and the time at which the policy ends.
 fn reason(
     policy: &LanePolicy,
     control_runs: bool,
@@ -318,8 +320,8 @@ fn reason(
 
 fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<RouteReading, ShmError> {
     let route = &settings.routes[index];
-    let found = steady(boards.route_info(index))?;
-    let found = match found.dds_type.as_str() {
+    let info = consistent(boards.route_info(index))?;
+    let discovered_type = match info.dds_type.as_str() {
         "" => None,
         dds_type => Some(TypeName::from_dds(dds_type).map_or(dds_type.to_owned(), |name| name.to_string())),
     };
@@ -330,20 +332,20 @@ fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<Rout
                 lane,
                 topic: output.topic.clone(),
                 counters: read_lane(boards, lane, index)?,
-                readers: steady(boards.output_readers(lane, index))?,
+                readers: consistent(boards.output_readers(lane, index))?,
                 shm: boards.histogram(Stage::Shm(lane), index),
                 dds_out: boards.histogram(Stage::DdsOut(lane), index),
                 age: boards.histogram(Stage::Age(lane), index),
             });
         }
     }
-    let counters = steady(boards.ingress(index))?;
+    let counters = consistent(boards.ingress(index))?;
     Ok(RouteReading {
         publishers: read_publishers(boards, index, &counters)?,
         counters,
         id: route.id.clone(),
         input_topic: route.input_topic.clone(),
-        message_type: found.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
+        message_type: discovered_type.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
         dds_in: boards.histogram(Stage::DdsIn, index),
         outputs,
     })
@@ -356,8 +358,9 @@ fn read_publishers(
 ) -> Result<Vec<PublisherAccount>, ShmError> {
     let mut accounts = Vec::new();
     for place in 0..MAX_PUBLISHERS {
-        let account = steady(boards.publisher(route, place))?;
-        // While a process counts a sample, and after it died there, the account is with the counts only.
+        let account = consistent(boards.publisher(route, place))?;
+        // While ingress counts a sample, and after it died at that point, the new account is only in the
+        // counters.
         let changed = &counters.changed_account;
         let is_behind = counters.changed_place == place as u64
             && !changed.is_vacant()
@@ -371,21 +374,21 @@ fn read_publishers(
 }
 
 fn read_lane(boards: &Boards, lane: usize, route: usize) -> Result<LaneCounters, ShmError> {
-    let mut counters = steady(boards.lane(lane, route))?;
+    let mut counters = consistent(boards.lane(lane, route))?;
     for _ in 0..WHOLE_ATTEMPTS {
         if counters.is_whole() {
             break;
         }
         thread::sleep(WHOLE_PAUSE);
-        counters = steady(boards.lane(lane, route))?;
+        counters = consistent(boards.lane(lane, route))?;
     }
     Ok(counters)
 }
 
-/// A value that was read while it stood still.
-fn steady<T>(value: Option<T>) -> Result<T, ShmError> {
+/// The value of a board that was read without a change meanwhile, or an error.
+fn consistent<T>(value: Option<T>) -> Result<T, ShmError> {
     value.ok_or_else(|| ShmError::Failed {
-        what: "to read a board".to_owned(),
+        what: "reading a board".to_owned(),
         path: "/dev/shm".into(),
         reason: "its writer changes it faster than it can be read".to_owned(),
     })
@@ -400,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_has_the_reason_that_its_policy_gives() {
+    fn the_reason_follows_from_the_policy() {
         let mut policy = LanePolicy::default();
         let of = |policy: &LanePolicy, control_runs, ms| reason(policy, control_runs, at(ms), 5_000);
         assert_eq!(of(&policy, true, 1), (ModeReason::Default, None));
@@ -420,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn each_reason_names_the_part_of_the_policy_that_gives_the_mode() {
+    fn the_reason_agrees_with_the_effective_mode() {
         let modes = LaneMode::ALL.map(|mode| mode as u8);
         for (mode, safety_floor, mode_by_hand, by_hand, at_ms) in modes
             .iter()

@@ -1,4 +1,4 @@
-//! The report as text: what is wrong first, then a table for ingress and for each lane, in 100 columns.
+//! The report as text: the problems first, then a table for ingress and one for each lane, in 100 columns.
 
 use std::fmt::{self, Write};
 
@@ -7,8 +7,9 @@ use super::report::{
     AbsenceReport, Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
     PublisherReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
+use super::text::counted;
 
-/// No line is longer, but for a sentence that says what is wrong, where names may be of any length.
+/// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
 const COLUMNS: usize = 100;
 const TOPIC_COLUMNS: usize = 31;
 
@@ -23,9 +24,9 @@ impl fmt::Display for Report {
             latency_text(self.window_ms * 1e3)
         )?;
         match self.problems.len() {
-            0 => writeln!(f, "nothing is wrong")?,
-            1 => writeln!(f, "1 thing is wrong:")?,
-            count => writeln!(f, "{count} things are wrong:")?,
+            0 => writeln!(f, "no problems")?,
+            1 => writeln!(f, "1 problem:")?,
+            count => writeln!(f, "{count} problems:")?,
         }
         for problem in &self.problems {
             f.write_str(&wrapped("  ! ", "    ", problem.text.split(' '), " "))?;
@@ -42,7 +43,7 @@ impl fmt::Display for Report {
         if let Some(ingress) = process("ingress") {
             write!(f, "\n{}", process_line("ingress", ingress))?;
         }
-        f.write_str(&row(["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST BEFORE"]))?;
+        f.write_str(&row(["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST UPSTREAM"]))?;
         for route in &self.routes {
             f.write_str(&route_text(route))?;
         }
@@ -87,7 +88,7 @@ fn route_text(route: &RouteReport) -> String {
         let PublisherReport { writer, received, lost_upstream, repeated, .. } = publisher;
         let counts = [
             format!("{received} received, "),
-            format!("{lost_upstream} lost before, "),
+            format!("{lost_upstream} lost upstream, "),
             format!("{repeated} repeated"),
         ];
         let first = format!("    publisher {writer}: ");
@@ -128,8 +129,9 @@ fn probes_text(probes: &ProbesReport) -> String {
 
 fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
     let mut text = String::new();
-    let row = |[id, lane, state, rtt, jitter, loss, heard]: [&str; 7]| {
-        let line = format!("  {id:<24} {lane:<13} {state:<12} {rtt:>13} {jitter:>7} {loss:>7} {heard:>15}");
+    let row = |[id, lane, state, rtt, jitter, loss, response_age]: [&str; 7]| {
+        let line =
+            format!("  {id:<24} {lane:<13} {state:<12} {rtt:>13} {jitter:>7} {loss:>7} {response_age:>15}");
         format!("{}\n", line.trim_end())
     };
     if !subscribers.is_empty() {
@@ -137,7 +139,7 @@ fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
     }
     for subscriber in subscribers {
         let ms = |ms: Option<f64>| ms.map_or("-".to_owned(), |ms| latency_text(ms * 1e3));
-        let heard = subscriber.last_response_age_ms;
+        let response_age_ms = subscriber.last_response_age_ms;
         text += &row([
             &end_of(&subscriber.id, 24),
             &end_of(subscriber.lane.as_deref().unwrap_or("-"), 13),
@@ -145,21 +147,22 @@ fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
             &format!("{}/{}", ms(subscriber.rtt_mean_ms), ms(subscriber.rtt_p95_ms)),
             &ms(subscriber.jitter_ms),
             &subscriber.loss.map_or("-".to_owned(), |loss| format!("{:.1} %", loss * 100.0)),
-            &heard.map_or("never".to_owned(), |age_ms| format!("{} ago", latency_text(age_ms * 1e3))),
+            &response_age_ms
+                .map_or("never".to_owned(), |age_ms| format!("{} ago", latency_text(age_ms * 1e3))),
         ]);
         let since = subscriber
             .state_since_s
             .map_or(String::new(), |since_s| format!("for {}, ", duration_text(since_s)));
-        let mut why = format!("{since}{}", counted(subscriber.transitions, "change"));
+        let mut reason = format!("{since}{}", counted(subscriber.transitions, "change"));
         if subscriber.forced {
-            why += ", forced by the configuration";
+            reason += ", forced by the configuration";
         } else if !subscriber.reason.is_empty() {
-            let _ = write!(why, ": {}", subscriber.reason);
+            let _ = write!(reason, ": {}", subscriber.reason);
         }
         if !subscriber.listed {
-            why += "; not listed under subscribers";
+            reason += "; not listed under subscribers";
         }
-        text += &wrapped("    ", "      ", why.split(' '), " ");
+        text += &wrapped("    ", "      ", reason.split(' '), " ");
     }
     text
 }
@@ -167,7 +170,7 @@ fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
 fn absences_text(absences: &[AbsenceReport]) -> String {
     let mut text = String::new();
     for absence in absences {
-        let name = absence.name.as_deref().unwrap_or("a node without a name");
+        let name = absence.name.as_deref().unwrap_or("a node of unknown name");
         let host = absence.host.as_ref().map_or_else(String::new, |host| format!(" ({host})"));
         let away = duration_text(absence.away_s);
         let line = match absence.back_s {
@@ -183,19 +186,19 @@ fn absences_text(absences: &[AbsenceReport]) -> String {
 fn intruders_text(intruders: &[IntruderReport], seen: u64) -> String {
     let mut text = String::new();
     if seen > 0 {
-        let _ =
-            writeln!(text, "  past the bridge: {} remote readers at present, {seen} ever", intruders.len());
+        let _ = writeln!(
+            text,
+            "  intruders: {} remote subscribers bypass the bridge, {seen} since control started",
+            intruders.len()
+        );
     }
     for intruder in intruders {
-        let node = intruder.node.as_deref().unwrap_or("a node without a name");
-        let line = format!("{node} on {} reads {}: {}", intruder.host, intruder.topic, intruder.remedy);
+        let node = intruder.node.as_deref().unwrap_or("a node of unknown name");
+        let line =
+            format!("{node} on {} subscribes to {}: {}", intruder.host, intruder.topic, intruder.remedy);
         text += &wrapped("    ", "      ", line.split(' '), " ");
     }
     text
-}
-
-fn counted(count: u64, what: &str) -> String {
-    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 fn drops_text(drops: &Drops, in_window: &Drops) -> String {
@@ -217,7 +220,7 @@ fn drops_text(drops: &Drops, in_window: &Drops) -> String {
     wrapped("    dropped: ", "      ", entries.iter().map(String::as_str), "")
 }
 
-/// Parts joined into lines of at most [`COLUMNS`], as long as no part is longer by itself.
+/// Joins parts into lines of at most [`COLUMNS`]. A part that is longer gets a line of its own.
 fn wrapped<'a>(first: &str, next: &str, parts: impl Iterator<Item = &'a str>, between: &str) -> String {
     let mut text = String::new();
     let mut line = first.to_owned();
@@ -245,7 +248,7 @@ fn mode_text(lane: &LaneReport) -> String {
         "by_hand" => "by hand",
         other => other,
     };
-    // What control confirms again and again does not really end.
+    // Control confirms these modes before they end, so the remaining time means nothing to users.
     match lane.mode_ends_in_s.filter(|_| !matches!(lane.mode_reason, "control" | "safety")) {
         Some(left_s) => format!("{} ({reason}, {left_s:.0} s left)", lane.mode),
         None => format!("{} ({reason})", lane.mode),
@@ -262,22 +265,22 @@ fn process_text(process: &ProcessReport) -> String {
         return process.state.label().to_owned();
     }
     let restarts = counted(process.starts.saturating_sub(1), "restart");
-    let mut news = String::new();
+    let mut failures = String::new();
     if process.errors > 0 {
-        let _ = write!(news, ", {}", counted(process.errors, "error"));
+        let _ = write!(failures, ", {}", counted(process.errors, "error"));
     }
     if process.refused_reloads > 0 {
-        let _ = write!(news, ", {} refused", counted(process.refused_reloads, "reload"));
+        let _ = write!(failures, ", {} refused", counted(process.refused_reloads, "reload"));
     }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
-    format!("process {} {}{up}, {restarts}{news}", process.pid, process.state.label())
+    format!("process {} {}{up}, {restarts}{failures}", process.pid, process.state.label())
 }
 
 fn topic_text(topic: &str) -> String {
     end_of(topic, TOPIC_COLUMNS)
 }
 
-/// The end of a long name tells more than its beginning.
+/// Shortens a long name to its end, which distinguishes topics better than the beginning.
 fn end_of(name: &str, columns: usize) -> String {
     let length = name.chars().count();
     if length <= columns {
@@ -331,13 +334,13 @@ fn duration_text(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::super::problems::{Level, Problem};
-    use super::super::samples::wide;
+    use super::super::test_report::wide_report;
     use super::*;
     use crate::model::DropReason;
 
     #[test]
     fn no_line_is_longer_than_100_columns() {
-        let text = wide().to_string();
+        let text = wide_report().to_string();
         for line in text.lines() {
             assert!(line.chars().count() <= COLUMNS, "{} columns: {line}", line.chars().count());
         }
@@ -347,22 +350,22 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_comes_first() {
-        let mut report = wide();
+    fn problems_come_first() {
+        let mut report = wide_report();
         let problem = |text: &str| Problem { about: "bridge".into(), level: Level::Error, text: text.into() };
-        report.problems = vec![problem("ingress is dead"), problem("lane critical is not whole")];
+        report.problems = vec![problem("ingress is dead"), problem("lane critical has not applied its mode")];
         let text = report.to_string();
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1..4],
-            ["2 things are wrong:", "  ! ingress is dead", "  ! lane critical is not whole"]
+            ["2 problems:", "  ! ingress is dead", "  ! lane critical has not applied its mode"]
         );
         report.problems.clear();
-        assert_eq!(report.to_string().lines().nth(1), Some("nothing is wrong"));
+        assert_eq!(report.to_string().lines().nth(1), Some("no problems"));
     }
 
     #[test]
-    fn figures_are_short_and_have_their_unit() {
+    fn numbers_are_short_and_have_their_unit() {
         for (us, text) in [
             (0.0, "0µs"),
             (999.4, "999µs"),

@@ -1,11 +1,12 @@
-//! Texts of others: names of nodes and hosts come from the network and end on terminals and in log files.
+//! Text helpers. Names of nodes and hosts come from the network, so they are made safe for terminals and
+//! logs.
 
-/// The text with each control character replaced, so that it can steer no terminal and end no line or string.
+/// Replaces each control character, so that the text cannot control a terminal or end a line or a string.
 pub(super) fn printable(text: &str) -> String {
     text.chars().map(|char| if char.is_control() { char::REPLACEMENT_CHARACTER } else { char }).collect()
 }
 
-/// The text, cut to so many bytes at most, an ellipsis in place of what is missing.
+/// Cuts the text to at most `max_bytes`; an ellipsis marks the cut.
 pub(super) fn shortened(text: &str, max_bytes: usize) -> String {
     const ELLIPSIS: &str = "…";
     if text.len() <= max_bytes {
@@ -18,12 +19,17 @@ pub(super) fn shortened(text: &str, max_bytes: usize) -> String {
     format!("{}{ELLIPSIS}", &text[..cut])
 }
 
+/// A count with its noun, such as `1 sample` or `3 samples`.
+pub(super) fn counted(count: u64, noun: &str) -> String {
+    if count == 1 { format!("1 {noun}") } else { format!("{count} {noun}s") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn nothing_steers_a_terminal() {
+    fn control_characters_are_replaced() {
         assert_eq!(printable("a\x1b[2Jb\n\0\u{85}ü"), "a\u{fffd}[2Jb\u{fffd}\u{fffd}\u{fffd}ü");
     }
 

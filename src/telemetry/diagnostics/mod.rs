@@ -1,8 +1,8 @@
 //! The report as `diagnostic_msgs/DiagnosticArray`, for `/diagnostics` and its aggregator.
 //!
 //! Each part of the bridge has a status, named as diagnostic_updater does it: the node, a colon, the part.
-//! So `startswith: ["adaptive_bridge"]` finds all of them, and a part that is no longer reported becomes
-//! stale by itself. The keys of a status are those of `status --json`.
+//! `startswith: ["adaptive_bridge"]` matches all of them, and the aggregator marks a part that is no longer
+//! reported as stale. The keys of a status are those of `status --json`.
 
 mod parts;
 
@@ -15,28 +15,29 @@ use super::report::Report;
 use super::text::{printable, shortened};
 use parts::Part;
 
-/// Where diagnostics are published.
+/// The topic of the diagnostics.
 pub const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
 
 /// The DDS type of `diagnostic_msgs/DiagnosticArray`.
 pub const DIAGNOSTIC_ARRAY_TYPE: &str = "diagnostic_msgs::msg::dds_::DiagnosticArray_";
 
-/// No array is larger, so that each fits in one UDP datagram. A bridge with more to say sends several: an
-/// aggregator goes by the names of the statuses.
+/// The maximum size of an array, so that each fits in one UDP datagram. A larger report is split into several
+/// arrays; an aggregator identifies statuses by their names.
 pub const MAX_ARRAY_BYTES: usize = 48 * 1024;
 
-/// The node in the names of the statuses; an instance of another name than this default has it appended.
+/// The node in the names of the statuses. The name of an instance other than the default is appended to it.
 const NODE: &str = "adaptive_bridge";
 const DEFAULT_INSTANCE: &str = "default";
 
-/// The longest name, message, key and value in bytes, and the most values of a status.
+/// The maximum length of names, messages, keys and values in bytes, and the maximum number of values of a
+/// status.
 const MAX_NAME_BYTES: usize = 256;
 const MAX_MESSAGE_BYTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 96;
 const MAX_VALUE_BYTES: usize = 192;
 const MAX_VALUES: usize = 128;
 
-// A status of the largest size fits in an array.
+// A status of the maximum size fits in an array.
 const _: () = {
     let values = (MAX_VALUES + 1) * (MAX_KEY_BYTES + MAX_VALUE_BYTES + 16);
     assert!(HEADER_BYTES + MAX_NAME_BYTES + MAX_MESSAGE_BYTES + 256 + values <= MAX_ARRAY_BYTES);
@@ -75,7 +76,7 @@ struct KeyValue {
 }
 
 /// The report as messages for [`DIAGNOSTICS_TOPIC`], each of at most [`MAX_ARRAY_BYTES`], in plain
-/// little-endian CDR without the encapsulation header. One for most bridges.
+/// little-endian CDR without the encapsulation header. Most bridges need one message.
 pub fn diagnostic_arrays(report: &Report) -> Vec<Bytes> {
     let header = Header {
         stamp_sec: i32::try_from(report.time_unix_ms / 1_000).unwrap_or(i32::MAX),
@@ -92,7 +93,7 @@ pub fn diagnostic_arrays(report: &Report) -> Vec<Bytes> {
             bytes += status.max_encoded_bytes();
             bytes <= MAX_ARRAY_BYTES
         });
-        // One always fits, as its limits have it.
+        // The limits of a status ensure that one always fits.
         let (now, later) = rest.split_at(fitting.count().max(1));
         arrays.push(cdr(&DiagnosticArray { header: &header, status: now }, bytes));
         rest = later;
@@ -100,15 +101,15 @@ pub fn diagnostic_arrays(report: &Report) -> Vec<Bytes> {
     arrays
 }
 
-/// Stamp, an empty string with its padding, and the number of statuses.
+/// The encoded size of the stamp, an empty string with its padding, and the number of statuses.
 const HEADER_BYTES: usize = 8 + 8 + 4;
 
 impl DiagnosticStatus {
     fn of(part: Part, report: &Report) -> Self {
         let about = || report.problems.iter().filter(|problem| problem.about == part.name);
         let level = about().fold(part.level, |level, problem| level.worse(problem.level));
-        let said: Vec<&str> = about().map(|problem| problem.text.as_str()).collect();
-        let message = if said.is_empty() { part.message } else { said.join("; ") };
+        let problems: Vec<&str> = about().map(|problem| problem.text.as_str()).collect();
+        let message = if problems.is_empty() { part.message } else { problems.join("; ") };
         let node = match report.instance.as_str() {
             DEFAULT_INSTANCE => NODE.to_owned(),
             instance => format!("{NODE}_{instance}"),
@@ -134,7 +135,7 @@ impl DiagnosticStatus {
         }
     }
 
-    /// What it takes at most: each string has a length, a zero and up to three bytes of padding.
+    /// The maximum encoded size: each string has a length, a zero byte and up to three bytes of padding.
     fn max_encoded_bytes(&self) -> usize {
         let string = |text: &str| 4 + text.len() + 1 + 3;
         let values: usize = self.values.iter().map(|pair| string(&pair.key) + string(&pair.value)).sum();
@@ -142,7 +143,7 @@ impl DiagnosticStatus {
     }
 }
 
-/// A zero within a string ends it early in C and C++, and a line break spoils their consoles.
+/// Replaces control characters and cuts the text. A zero byte would end the string early in C and C++.
 fn bounded(text: &str, max_bytes: usize) -> String {
     shortened(&printable(text), max_bytes)
 }

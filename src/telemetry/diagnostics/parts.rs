@@ -1,4 +1,5 @@
-//! The parts of the bridge that have a status of their own, and what is said of each while nothing is wrong.
+//! The parts of the bridge that have a status of their own, with the message and level of each without
+//! problems.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -7,19 +8,19 @@ use super::Level;
 use crate::telemetry::liveness::ProcessState;
 use crate::telemetry::report::{LaneReport, ProcessReport, Report, RouteReport, SubscriberReport};
 
-/// A part of the bridge.
+/// A part of the bridge with its own diagnostic status.
 pub(super) struct Part {
-    /// As [`Problem::about`](crate::telemetry::Problem) names it.
+    /// Its name, as in [`Problem::about`](crate::telemetry::Problem).
     pub(super) name: String,
-    /// How it is when no problem is about it.
+    /// Its level when no problem is about it.
     pub(super) level: Level,
-    /// The same in words.
+    /// Its message when no problem is about it.
     pub(super) message: String,
-    /// Its figures.
+    /// Its keys and values.
     pub(super) values: Vec<(String, String)>,
 }
 
-/// Every part, in an order that does not change from one report to the next.
+/// All parts, in the same order in each report.
 pub(super) fn of(report: &Report) -> Vec<Part> {
     let mut parts = vec![bridge(report)];
     for name in ["ingress", "control"] {
@@ -111,10 +112,10 @@ fn intruders(report: &Report) -> Part {
         ("intruders_seen".to_owned(), report.intruders_seen.to_string()),
     ];
     for intruder in &report.intruders {
-        let node = intruder.node.as_deref().unwrap_or("a node without a name");
+        let node = intruder.node.as_deref().unwrap_or("a node of unknown name");
         values.push((intruder.topic.clone(), format!("{node} on {}: {}", intruder.host, intruder.remedy)));
     }
-    part("intruders", "no remote reader reaches past the bridge".to_owned(), values)
+    part("intruders", "no remote subscriber bypasses the bridge".to_owned(), values)
 }
 
 fn flat(value: &impl Serialize) -> Vec<(String, String)> {
@@ -124,14 +125,14 @@ fn flat(value: &impl Serialize) -> Vec<(String, String)> {
 }
 
 fn put(values: &mut Vec<(String, String)>, path: &str, value: &impl Serialize) {
-    // The types of the report always have a JSON.
+    // Serializing the types of the report does not fail.
     if let Ok(value) = serde_json::to_value(value) {
         flatten(path, &value, values);
     }
 }
 
-/// The leaves of a JSON value by their paths. Drops and refusals are listed where there were any, and not for
-/// the window once more: whoever looks has the last value to compare with.
+/// Collects the leaves of a JSON value by their paths. It omits drop and refusal counts of 0, and the counts
+/// of the window, because a monitor sees the change from one message to the next.
 fn flatten(path: &str, value: &Value, values: &mut Vec<(String, String)>) {
     let text = match value {
         Value::Object(fields) => {
@@ -155,7 +156,7 @@ fn flatten(path: &str, value: &Value, values: &mut Vec<(String, String)>) {
     values.push((path.to_owned(), text));
 }
 
-/// At most three decimals, none of them for nothing.
+/// A number with at most three decimals, without trailing zeros.
 fn number(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()

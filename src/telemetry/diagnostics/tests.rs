@@ -1,9 +1,9 @@
-//! Diagnostics, byte by byte and by their meaning. The reader here knows only the message definitions.
+//! Tests of the encoded diagnostics, with a decoder that is written after the message definitions.
 
 use std::collections::BTreeMap;
 
 use super::super::problems::Problem;
-use super::super::samples::wide;
+use super::super::test_report::wide_report;
 use super::*;
 
 struct Reader<'a> {
@@ -41,7 +41,7 @@ struct Status {
     values: BTreeMap<String, String>,
 }
 
-/// The statuses by name.
+/// Decodes the statuses of all arrays, by name.
 fn read(arrays: &[Bytes]) -> BTreeMap<String, Status> {
     let mut found = BTreeMap::new();
     for array in arrays {
@@ -63,10 +63,10 @@ fn read(arrays: &[Bytes]) -> BTreeMap<String, Status> {
 
 /// diagnostic_msgs/DiagnosticArray: `Header header, DiagnosticStatus[] status`. Header: `Time stamp` of
 /// `int32 sec, uint32 nanosec`, `string frame_id`. DiagnosticStatus: `byte level, string name, string
-/// message, string hardware_id, KeyValue[] values`. KeyValue: `string key, string value`. What has 4 bytes
-/// begins at a multiple of 4.
+/// message, string hardware_id, KeyValue[] values`. KeyValue: `string key, string value`. Values of 4 bytes
+/// are aligned to 4 bytes.
 #[test]
-fn an_array_is_laid_out_as_the_message_definitions_say() {
+fn an_array_has_the_layout_of_the_message_definitions() {
     let header = Header { stamp_sec: 0x0102_0304, stamp_nanosec: 5, frame_id: "" };
     let pair = |key: &str, value: &str| KeyValue { key: key.into(), value: value.into() };
     let status = |level, name: &str, values| DiagnosticStatus {
@@ -101,7 +101,7 @@ fn an_array_is_laid_out_as_the_message_definitions_say() {
 
 #[test]
 fn every_part_has_a_status_with_the_keys_of_the_report() {
-    let mut report = wide();
+    let mut report = wide_report();
     report.instance = "default".into();
     report.time_unix_ms = 1_763_000_000_123;
     let arrays = diagnostic_arrays(&report);
@@ -132,7 +132,7 @@ fn every_part_has_a_status_with_the_keys_of_the_report() {
 
 #[test]
 fn a_problem_gives_its_part_a_level_and_a_message() {
-    let mut report = wide();
+    let mut report = wide_report();
     report.instance = "left".into();
     let problem = |about: &str, level, text: &str| Problem { about: about.into(), level, text: text.into() };
     report.problems = vec![
@@ -151,8 +151,8 @@ fn a_problem_gives_its_part_a_level_and_a_message() {
 }
 
 #[test]
-fn however_much_there_is_to_say_no_array_is_too_large() {
-    let mut report = wide();
+fn a_large_report_is_split_into_arrays_of_limited_size() {
+    let mut report = wide_report();
     let (route, subscriber) = (report.routes[0].clone(), report.subscribers[0].clone());
     for number in 0..300 {
         let mut route = route.clone();

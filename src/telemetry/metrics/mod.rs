@@ -1,7 +1,7 @@
-//! The metrics page: the report in the text format of Prometheus, and the server that hands it out.
+//! The metrics page: the report in the text format of Prometheus, and the HTTP server for it.
 //!
-//! Names begin with `adaptive_bridge_`; counters end in `_total` and begin anew when the bridge does, times
-//! are in seconds. `docs/diagnostics.md` lists them.
+//! Names begin with `adaptive_bridge_`. Counters end in `_total` and restart at 0 with the bridge. Times are
+//! in seconds. `docs/diagnostics.md` lists all metrics.
 
 mod page;
 mod server;
@@ -16,7 +16,7 @@ use crate::model::{DropReason, LaneMode, ProbeRefusal, SafetyMode, SubscriberSta
 use page::Kind::{Counter, Gauge, Histogram};
 use page::{Page, Value};
 
-/// The report as a page of [`CONTENT_TYPE`]. As large as the configured routes and lanes make it: some 15 KiB
+/// The report as a page of [`CONTENT_TYPE`]. Its size grows with the number of routes and lanes: about 15 KiB
 /// for each route on two lanes.
 pub fn metrics_page(report: &Report) -> String {
     let mut page = Page::default();
@@ -31,16 +31,16 @@ pub fn metrics_page(report: &Report) -> String {
 }
 
 fn bridge(page: &mut Page, report: &Report) {
-    page.family("adaptive_bridge_info", Gauge, "Which bridge this is and its version; always 1.");
+    page.family("adaptive_bridge_info", Gauge, "The instance and the version of the bridge; always 1.");
     let version = env!("CARGO_PKG_VERSION");
     page.sample(&[("instance", &report.instance), ("version", version)], Some(1));
     page.family(
         "adaptive_bridge_report_timestamp_seconds",
         Gauge,
-        "When the figures of this page were read, since the Unix epoch.",
+        "Time at which the values of this page were read, since the Unix epoch.",
     );
     page.sample(&[], Some(report.time_unix_ms as f64 / 1e3));
-    page.family("adaptive_bridge_problems", Gauge, "Things that are wrong, by level.");
+    page.family("adaptive_bridge_problems", Gauge, "Problems, by level.");
     for level in [Level::Warn, Level::Error, Level::Stale] {
         let count = report.problems.iter().filter(|problem| problem.level == level).count();
         page.sample(&[("level", level.label())], Some(count as u64));
@@ -54,7 +54,7 @@ fn processes(page: &mut Page, report: &Report) {
             page.sample(&[("process", &process.name)], value(process));
         }
     };
-    each("adaptive_bridge_process_up", Gauge, "1 while the process is there and turns.", &|process| {
+    each("adaptive_bridge_process_up", Gauge, "1 while the process runs and makes turns.", &|process| {
         Some((process.state == ProcessState::Running).into())
     });
     each("adaptive_bridge_process_starts_total", Counter, "Starts of the process.", &|process| {
@@ -63,23 +63,23 @@ fn processes(page: &mut Page, report: &Report) {
     each("adaptive_bridge_process_turns_total", Counter, "Turns of its data path.", &|process| {
         Some(process.turns.into())
     });
-    each("adaptive_bridge_process_errors_total", Counter, "What failed, samples apart.", &|process| {
+    each("adaptive_bridge_process_errors_total", Counter, "Errors, except dropped samples.", &|process| {
         Some(process.errors.into())
     });
     each(
         "adaptive_bridge_process_refused_reloads_total",
         Counter,
-        "Reloads refused because the file was bad.",
+        "Reloads refused because of errors in the configuration file.",
         &|process| Some(process.refused_reloads.into()),
     );
-    each("adaptive_bridge_process_last_turn_age_seconds", Gauge, "Time since it last turned.", &|process| {
+    each("adaptive_bridge_process_last_turn_age_seconds", Gauge, "Time since its last turn.", &|process| {
         seconds(process.last_turn_age_ms)
     });
 }
 
 fn lanes(page: &mut Page, report: &Report) {
     let modes = LaneMode::ALL.map(LaneMode::label);
-    page.family("adaptive_bridge_lane_mode", Gauge, "1 for the mode that the lane is to be in.");
+    page.family("adaptive_bridge_lane_mode", Gauge, "1 for the mode that the lane should be in.");
     for lane in &report.lanes {
         page.states(&[("lane", &lane.name), ("class", lane.class)], "mode", &modes, lane.mode);
     }
@@ -102,44 +102,47 @@ fn routes(page: &mut Page, report: &Report) {
             page.sample(&[("route", &route.id)], Some(value(route)));
         }
     };
-    each("adaptive_bridge_route_publishers", Gauge, "Publishers matched.", &|route| route.writers.into());
+    each("adaptive_bridge_route_publishers", Gauge, "Matched publishers.", &|route| route.writers.into());
     each("adaptive_bridge_route_received_samples_total", Counter, "Samples taken from DDS.", &|route| {
         route.received.into()
     });
-    each("adaptive_bridge_route_received_bytes_total", Counter, "Payload bytes of those.", &|route| {
-        route.received_bytes.into()
-    });
+    each(
+        "adaptive_bridge_route_received_bytes_total",
+        Counter,
+        "Payload bytes of the received samples.",
+        &|route| route.received_bytes.into(),
+    );
     each("adaptive_bridge_route_published_samples_total", Counter, "Samples given to the lanes.", &|route| {
         route.published.into()
     });
     each(
         "adaptive_bridge_route_in_place_samples_total",
         Counter,
-        "Of those, the ones that were put together in shared memory, and not copied there.",
+        "Published samples that were assembled in shared memory, not copied there.",
         &|route| route.in_place.into(),
     );
     each(
         "adaptive_bridge_route_lost_upstream_samples_total",
         Counter,
-        "Samples that the publisher numbered and that never reached the bridge.",
+        "Samples lost before ingress, by gaps in the publishers' sequence numbers.",
         &|route| route.lost_upstream.into(),
     );
     each(
         "adaptive_bridge_route_repeated_samples_total",
         Counter,
-        "Samples that arrived again, or after younger ones, and were discarded; not among the received.",
+        "Discarded samples that arrived again or after newer ones; not included in the received samples.",
         &|route| route.repeated.into(),
     );
     each(
         "adaptive_bridge_route_unmarked_samples_total",
         Counter,
-        "Of the received, those of publishers beyond 64, whose repetitions are not recognised.",
+        "Received samples of publishers beyond 64, whose repetitions are not recognised.",
         &|route| route.unmarked.into(),
     );
     page.family(
         "adaptive_bridge_route_dropped_samples_total",
         Counter,
-        "Samples received and not given to the lanes, by reason.",
+        "Samples received but not given to the lanes, by reason.",
     );
     for route in &report.routes {
         for reason in DropReason::ALL {
@@ -165,11 +168,11 @@ fn outputs(page: &mut Page, report: &Report) {
             page.sample(&[("lane", &output.lane), ("route", &route.id)], Some(value(output)));
         }
     };
-    each("adaptive_bridge_lane_subscribers", Gauge, "Subscribers matched.", &|output| output.readers);
+    each("adaptive_bridge_lane_subscribers", Gauge, "Matched subscribers.", &|output| output.readers);
     each(
         "adaptive_bridge_lane_reader_overrun_samples_total",
         Counter,
-        "Samples that single subscribers missed because they did not keep up.",
+        "Samples that left the lane's history before single subscribers acknowledged them.",
         &|output| output.reader_overrun,
     );
     each("adaptive_bridge_lane_offered_samples_total", Counter, "Samples offered to the lane.", &|output| {
@@ -178,19 +181,22 @@ fn outputs(page: &mut Page, report: &Report) {
     each("adaptive_bridge_lane_forwarded_samples_total", Counter, "Samples given to DDS.", &|output| {
         output.forwarded
     });
-    each("adaptive_bridge_lane_forwarded_bytes_total", Counter, "Payload bytes of those.", &|output| {
-        output.forwarded_bytes
-    });
+    each(
+        "adaptive_bridge_lane_forwarded_bytes_total",
+        Counter,
+        "Payload bytes of the forwarded samples.",
+        &|output| output.forwarded_bytes,
+    );
     each(
         "adaptive_bridge_lane_by_reference_samples_total",
         Counter,
-        "Of the forwarded, those without a copy.",
+        "Forwarded samples that were not copied.",
         &|output| output.by_reference,
     );
     each(
         "adaptive_bridge_lane_caught_up_samples_total",
         Counter,
-        "Of the forwarded, those that had come while the lane was down.",
+        "Forwarded samples that were published while the lane was down.",
         &|output| output.caught_up,
     );
     each("adaptive_bridge_lane_waiting_samples", Gauge, "Samples waiting in the lane.", &|output| {
@@ -236,11 +242,16 @@ fn control(page: &mut Page, report: &Report) {
     };
     let (safety, probes) = (&report.safety, &report.probes);
     one("adaptive_bridge_safety_changes_total", Counter, "Changes of the safety mode.", safety.transitions);
-    one("adaptive_bridge_probes_sent_total", Counter, "Probes sent.", probes.sent);
-    one("adaptive_bridge_probe_responses_total", Counter, "Responses accepted.", probes.accepted);
+    one("adaptive_bridge_probes_sent_total", Counter, "Probe requests sent.", probes.sent);
+    one("adaptive_bridge_probe_responses_total", Counter, "Probe responses accepted.", probes.accepted);
     let present = report.intruders.len() as u64;
-    one("adaptive_bridge_intruders", Gauge, "Remote readers that reach past the bridge at present.", present);
-    one("adaptive_bridge_intruders_seen_total", Counter, "Such readers ever seen.", report.intruders_seen);
+    one("adaptive_bridge_intruders", Gauge, "Remote subscribers that bypass the bridge at present.", present);
+    one(
+        "adaptive_bridge_intruders_seen_total",
+        Counter,
+        "Remote subscribers seen to bypass the bridge.",
+        report.intruders_seen,
+    );
     let away = report.absences.iter().filter(|absence| absence.back_s.is_none()).count() as u64;
     one("adaptive_bridge_absences", Gauge, "Network interfaces and peers that are away at present.", away);
     page.family("adaptive_bridge_probe_refusals_total", Counter, "Probe messages refused, by reason.");
@@ -278,16 +289,19 @@ fn subscribers(page: &mut Page, report: &Report) {
     each("adaptive_bridge_subscriber_rtt_mean_seconds", Gauge, "Mean round trip.", &|subscriber| {
         seconds(subscriber.rtt_mean_ms)
     });
-    each("adaptive_bridge_subscriber_rtt_p95_seconds", Gauge, "95th percentile of it.", &|subscriber| {
-        seconds(subscriber.rtt_p95_ms)
-    });
-    each("adaptive_bridge_subscriber_jitter_seconds", Gauge, "Its jitter.", &|subscriber| {
+    each(
+        "adaptive_bridge_subscriber_rtt_p95_seconds",
+        Gauge,
+        "95th percentile of the round trip.",
+        &|subscriber| seconds(subscriber.rtt_p95_ms),
+    );
+    each("adaptive_bridge_subscriber_jitter_seconds", Gauge, "Jitter of the round trip.", &|subscriber| {
         seconds(subscriber.jitter_ms)
     });
     each(
         "adaptive_bridge_subscriber_last_response_age_seconds",
         Gauge,
-        "Time since its last response.",
+        "Time since its last probe response.",
         &|subscriber| seconds(subscriber.last_response_age_ms),
     );
 }
@@ -301,7 +315,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::telemetry::samples::wide;
+    use crate::telemetry::test_report::wide_report;
 
     #[test]
     fn every_metric_is_documented_with_its_type_and_labels() {
@@ -310,7 +324,7 @@ mod tests {
             .filter(|line| line.starts_with("| `adaptive_bridge_"))
             .map(|line| line.rsplit_once(" | ").map_or(line, |(row, _meaning)| row).to_owned())
             .collect();
-        let page = metrics_page(&wide());
+        let page = metrics_page(&wide_report());
         let labels = |name: &str| -> String {
             let sample = page.lines().find(|line| !line.starts_with('#') && line.starts_with(name));
             let Some((_, labels)) = sample.and_then(|line| line.split_once('{')) else {

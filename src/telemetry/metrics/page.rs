@@ -1,4 +1,4 @@
-//! The text that Prometheus reads: its exposition format, version 0.0.4.
+//! Writes the text exposition format of Prometheus, version 0.0.4.
 
 use std::fmt::Write;
 
@@ -7,19 +7,19 @@ use crate::telemetry::report::LatencyTotal;
 /// The media type of the format.
 pub const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
 
-/// The labels of a sample: names, which are ours, and values, which may be anything.
+/// The labels of a sample: fixed names, and values that may be any text.
 pub(super) type Labels<'a> = &'a [(&'static str, &'a str)];
 
-/// The page, while it is written.
+/// A page that is being written.
 #[derive(Debug, Default)]
 pub(super) struct Page {
     text: String,
-    /// The head of the family whose first sample has not come: one without samples is left out.
+    /// The head of the current family until its first sample is written. A family without samples is omitted.
     head: Option<String>,
     name: &'static str,
 }
 
-/// What a family is.
+/// The type of a metric family.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Kind {
     Counter,
@@ -27,11 +27,11 @@ pub(super) enum Kind {
     Histogram,
 }
 
-/// A value: a count, which is written out in full, or a figure.
+/// The value of a sample: an integer count, or a floating-point number.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Value {
     Count(u64),
-    Figure(f64),
+    Float(f64),
 }
 
 impl From<u64> for Value {
@@ -41,8 +41,8 @@ impl From<u64> for Value {
 }
 
 impl From<f64> for Value {
-    fn from(figure: f64) -> Self {
-        Self::Figure(figure)
+    fn from(float: f64) -> Self {
+        Self::Float(float)
     }
 }
 
@@ -53,7 +53,7 @@ impl From<bool> for Value {
 }
 
 impl Page {
-    /// Begins a family; its samples follow. `help` is of ours and has neither line breaks nor backslashes.
+    /// Begins a family; its samples follow. `help` must not contain line breaks or backslashes.
     pub(super) fn family(&mut self, name: &'static str, kind: Kind, help: &str) {
         let kind = match kind {
             Kind::Counter => "counter",
@@ -64,14 +64,14 @@ impl Page {
         self.name = name;
     }
 
-    /// A sample of the family; `None` is left out.
+    /// Adds a sample to the family; `None` adds nothing.
     pub(super) fn sample(&mut self, labels: Labels<'_>, value: Option<impl Into<Value>>) {
         if let Some(value) = value {
             self.put("", labels, None, value.into());
         }
     }
 
-    /// One sample of each state there is, 1 for the one that it is in.
+    /// Adds one sample for each possible state: 1 for the present state, 0 for the others.
     pub(super) fn states(&mut self, labels: Labels<'_>, name: &'static str, all: &[&str], present: &str) {
         for state in all {
             let mut labels = labels.to_vec();
@@ -80,7 +80,7 @@ impl Page {
         }
     }
 
-    /// A histogram of the family.
+    /// Adds a histogram to the family.
     pub(super) fn histogram(&mut self, labels: Labels<'_>, total: &LatencyTotal) {
         for (edge_ns, below) in LatencyTotal::EDGES_NS.iter().zip(total.below) {
             let edge = (*edge_ns as f64 / 1e9).to_string();
@@ -115,15 +115,15 @@ impl Page {
         // Writing to a string does not fail.
         let _ = match value {
             Value::Count(count) => writeln!(self.text, " {count}"),
-            Value::Figure(figure) if figure.is_nan() => writeln!(self.text, " NaN"),
-            Value::Figure(f64::INFINITY) => writeln!(self.text, " +Inf"),
-            Value::Figure(f64::NEG_INFINITY) => writeln!(self.text, " -Inf"),
-            Value::Figure(figure) => writeln!(self.text, " {figure}"),
+            Value::Float(float) if float.is_nan() => writeln!(self.text, " NaN"),
+            Value::Float(f64::INFINITY) => writeln!(self.text, " +Inf"),
+            Value::Float(f64::NEG_INFINITY) => writeln!(self.text, " -Inf"),
+            Value::Float(float) => writeln!(self.text, " {float}"),
         };
     }
 }
 
-/// In the value of a label, backslash, quote and line feed are escaped; all else stands for itself.
+/// Appends the value of a label with backslash, quote and line feed escaped.
 fn escape(value: &str, text: &mut String) {
     for char in value.chars() {
         match char {
@@ -145,7 +145,7 @@ mod tests {
         page.family("a_total", Kind::Counter, "What a is.");
         page.sample(&[("route", "scan")], Some(u64::MAX));
         page.sample(&[], Some(0.5));
-        page.family("b", Kind::Gauge, "Never there.");
+        page.family("b", Kind::Gauge, "Without samples.");
         page.sample(&[], None::<u64>);
         page.family("c", Kind::Gauge, "States.");
         page.states(&[("lane", "x")], "mode", &["on", "off"], "off");
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_label_of_any_value_stays_one_label_of_one_line() {
+    fn the_value_of_a_label_is_escaped() {
         let mut page = Page::default();
         page.family("a", Kind::Gauge, "A.");
         page.sample(&[("id", "x\"} 1\nb{c=\"\\")], Some(f64::NAN));
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_histogram_grows_up_to_infinity() {
+    fn a_histogram_ends_with_an_infinite_bucket() {
         let mut total = LatencyTotal { count: 9, sum_ns: 1_500_000_000, ..LatencyTotal::default() };
         total.below[20] = 7;
         let mut page = Page::default();

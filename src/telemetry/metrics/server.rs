@@ -1,12 +1,12 @@
-//! Hands the page out over HTTP: TCP on a loopback address, or a unix socket.
+//! Serves the metrics page over HTTP: TCP on a loopback address, or a unix socket.
 //!
-//! One thread of its own serves all connections, none of which it waits for: a slow client costs a place
-//! until its time is over, and nothing else. Whoever has the report hands it over under a lock that is held
-//! for a copy of a pointer; the page is written when it is asked for.
+//! One thread serves all connections without blocking on any of them: a slow client only takes one of the
+//! places until its timeout. The caller passes each report under a lock that is held for the copy of a
+//! pointer; the thread writes the page when a client requests it.
 //!
-//! The server is our own because it is this small: HTTP/1.1 with one method, one page, and a connection that
-//! ends after the answer. tiny_http, the one small library without an asynchronous runtime, has no timeouts
-//! (its issue 143) and no release since 2022.
+//! The server is written here because it is small: HTTP/1.1 with GET and HEAD, one page, and a connection
+//! that ends after the response. tiny_http, the only small library without an asynchronous runtime, has no
+//! timeouts (its issue 143) and no release since 2022.
 
 use std::fmt;
 use std::io::{self, ErrorKind, Read, Write};
@@ -31,18 +31,18 @@ use crate::config::MetricsListener;
 use crate::model::MonotonicNs;
 use crate::telemetry::report::Report;
 
-/// Clients that are served at once; further ones wait in the kernel's queue.
+/// Clients served at once; further clients wait in the kernel's queue.
 const MAX_CLIENTS: usize = 8;
-/// A client has so long to ask and to read the answer.
+/// The time that a client has to send its request and to read the response.
 const CLIENT_MS: u64 = 5_000;
-/// No request of a scraper is longer.
+/// The maximum size of a request; requests of scrapers are smaller.
 const MAX_REQUEST_BYTES: usize = 8 * 1024;
-/// Before what failed for want of resources is tried again.
-const PAUSE: Duration = Duration::from_millis(100);
-/// Reads and writes of one client in one turn, so that one which is fast does not keep the others waiting.
+/// The pause before a retry when the system lacks resources.
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
+/// Reads and writes for one client in one turn, so that a fast client does not delay the others.
 const MAX_STEPS: usize = 16;
 
-/// Why there is no metrics page.
+/// The reason why the metrics page cannot be served.
 #[derive(Debug)]
 pub struct MetricsError {
     address: String,
@@ -51,7 +51,7 @@ pub struct MetricsError {
 
 impl fmt::Display for MetricsError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "no metrics page on {} (diagnostics.metrics): {}", self.address, self.cause)
+        write!(f, "cannot serve the metrics page on {} (diagnostics.metrics): {}", self.address, self.cause)
     }
 }
 
@@ -61,7 +61,7 @@ impl std::error::Error for MetricsError {
     }
 }
 
-/// The server. Dropping it ends it, and removes the file of a unix socket.
+/// The HTTP server of the metrics page. Dropping it stops the thread and removes the file of a unix socket.
 #[derive(Debug)]
 pub struct MetricsServer {
     latest: Arc<Mutex<Option<Arc<Report>>>>,
@@ -71,11 +71,11 @@ pub struct MetricsServer {
 }
 
 impl MetricsServer {
-    /// Listens and serves. Before the first report it answers 503.
+    /// Starts to listen and to serve. Before the first report it responds with 503.
     ///
     /// # Errors
-    /// The address is in use or cannot be listened on, or there is no thread to be had. The file of a unix
-    /// socket that nobody listens on any more is replaced; another kind of file is not.
+    /// The address is in use, listening on it fails, or the thread cannot be started. The file of a unix
+    /// socket without a listener is replaced; a file of another kind is an error.
     pub fn start(listener: &MetricsListener) -> Result<Self, MetricsError> {
         let address = match listener {
             MetricsListener::Tcp(ip, port) => std::net::SocketAddr::new(*ip, *port).to_string(),
@@ -85,23 +85,23 @@ impl MetricsServer {
     }
 
     fn try_start(listener: &MetricsListener) -> io::Result<Self> {
-        let door = match listener {
-            MetricsListener::Tcp(ip, port) => Door::Tcp(TcpListener::bind((*ip, *port))?),
-            MetricsListener::Unix(path) => Door::Unix(SocketFile::listen(path)?),
+        let listening = match listener {
+            MetricsListener::Tcp(ip, port) => Listener::Tcp(TcpListener::bind((*ip, *port))?),
+            MetricsListener::Unix(path) => Listener::Unix(SocketFile::listen(path)?),
         };
-        door.set_nonblocking()?;
+        listening.set_nonblocking()?;
         let (stop, stopped) = UnixStream::pair()?;
         let latest = Arc::new(Mutex::new(None));
         let reports = latest.clone();
-        let serve = move || serve(&door, &stopped, &reports);
+        let serve = move || serve(&listening, &stopped, &reports);
         let thread = thread::Builder::new().name("metrics".to_owned()).spawn(serve)?;
         Ok(Self { latest, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Shows this report from now on. Waits for nothing but another thread's copy of a pointer.
+    /// Serves this report from now on. It waits at most for another thread to copy a pointer.
     pub fn show(&self, report: Arc<Report>) {
         let former = self.latest.lock().unwrap_or_else(PoisonError::into_inner).replace(report);
-        // Freed after the lock is.
+        // The former report is freed after the lock is released.
         drop(former);
     }
 }
@@ -112,18 +112,18 @@ impl Drop for MetricsServer {
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {
-            tracing::error!("the metrics page ended in a panic");
+            tracing::error!("the thread of the metrics page panicked");
         }
     }
 }
 
-/// What clients come in by.
-enum Door {
+/// The listening socket.
+enum Listener {
     Tcp(TcpListener),
     Unix(SocketFile),
 }
 
-impl Door {
+impl Listener {
     fn set_nonblocking(&self) -> io::Result<()> {
         match self {
             Self::Tcp(listener) => listener.set_nonblocking(true),
@@ -144,7 +144,7 @@ impl Door {
     }
 }
 
-impl AsFd for Door {
+impl AsFd for Listener {
     fn as_fd(&self) -> BorrowedFd<'_> {
         match self {
             Self::Tcp(listener) => listener.as_fd(),
@@ -153,11 +153,11 @@ impl AsFd for Door {
     }
 }
 
-/// A listening unix socket, whose file goes with it.
+/// A listening unix socket. Dropping it removes its file.
 struct SocketFile {
     listener: UnixListener,
     path: PathBuf,
-    /// Device and inode of the file that is ours.
+    /// Device and inode of the file that this process created.
     identity: (u64, u64),
 }
 
@@ -166,7 +166,8 @@ impl SocketFile {
         Self::remove_stale(path)?;
         let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
         let fd = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
-        // The file gets the mode of the socket, less the umask: nobody else can come in before it is changed.
+        // The file gets the mode of the socket, less the umask, so no other user can connect before the mode
+        // is set below.
         fchmod(&fd, Mode::S_IRUSR | Mode::S_IWUSR)?;
         bind(fd.as_raw_fd(), &UnixAddr::new(path)?)?;
         listen(&fd, Backlog::new(MAX_CLIENTS as i32)?)?;
@@ -177,14 +178,15 @@ impl SocketFile {
         Ok(bound)
     }
 
-    /// What a process left that was killed.
+    /// Removes the socket file of a process that was killed.
     fn remove_stale(path: &Path) -> io::Result<()> {
         match fs::symlink_metadata(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
             Err(error) => Err(error),
-            Ok(file) if !file.file_type().is_socket() => {
-                Err(io::Error::new(ErrorKind::AlreadyExists, "there is a file of that name"))
-            }
+            Ok(file) if !file.file_type().is_socket() => Err(io::Error::new(
+                ErrorKind::AlreadyExists,
+                "the path exists and is not a socket; remove it or choose another path",
+            )),
             Ok(_) => match UnixStream::connect(path) {
                 Ok(_) => Err(ErrorKind::AddrInUse.into()),
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => fs::remove_file(path),
@@ -223,7 +225,7 @@ impl Stream {
         }
     }
 
-    fn end_output(&self) -> io::Result<()> {
+    fn shut_down_write(&self) -> io::Result<()> {
         match self {
             Self::Tcp(stream) => stream.shutdown(Shutdown::Write),
             Self::Unix(stream) => stream.shutdown(Shutdown::Write),
@@ -240,29 +242,36 @@ impl AsFd for Stream {
     }
 }
 
-/// Serves until `stopped` is closed at its other end.
-fn serve(door: &Door, stopped: &UnixStream, reports: &Mutex<Option<Arc<Report>>>) {
+/// Serves until the other end of `stopped` is closed.
+fn serve(listener: &Listener, stopped: &UnixStream, reports: &Mutex<Option<Arc<Report>>>) {
     let latest = || reports.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let mut clients: Vec<Client> = Vec::with_capacity(MAX_CLIENTS);
     loop {
         let now = clock::monotonic();
         clients.retain(|client| now < client.until);
-        let Some(ready) = wait(door, stopped, &clients, now) else { continue };
+        let Some(ready) = wait(listener, stopped, &clients, now) else { continue };
         if ready[0] {
             return;
         }
-        let mut turns = ready[2..].iter();
-        clients.retain_mut(|client| turns.next() != Some(&true) || client.turn(&latest));
+        let mut client_ready = ready[2..].iter();
+        clients.retain_mut(|client| client_ready.next() != Some(&true) || client.turn(&latest));
         if ready[1] {
-            accept(door, &mut clients);
+            accept(listener, &mut clients);
         }
     }
 }
 
-/// What is ready: the end, the door, then each client. `None` when the time of a client is over.
-fn wait(door: &Door, stopped: &UnixStream, clients: &[Client], now: MonotonicNs) -> Option<Vec<bool>> {
-    let at_door = if clients.len() < MAX_CLIENTS { PollFlags::POLLIN } else { PollFlags::empty() };
-    let mut fds = vec![PollFd::new(stopped.as_fd(), PollFlags::POLLIN), PollFd::new(door.as_fd(), at_door)];
+/// Waits for an event: whether `stopped`, the listener and each client are ready. `None` when a client's time
+/// is over.
+fn wait(
+    listener: &Listener,
+    stopped: &UnixStream,
+    clients: &[Client],
+    now: MonotonicNs,
+) -> Option<Vec<bool>> {
+    let for_new_clients = if clients.len() < MAX_CLIENTS { PollFlags::POLLIN } else { PollFlags::empty() };
+    let mut fds =
+        vec![PollFd::new(stopped.as_fd(), PollFlags::POLLIN), PollFd::new(listener.as_fd(), for_new_clients)];
     fds.extend(clients.iter().map(|client| PollFd::new(client.stream.as_fd(), client.waits_for())));
     let left_ms = clients.iter().map(|client| client.until.since(now) / 1_000_000 + 1).min();
     let timeout =
@@ -271,29 +280,29 @@ fn wait(door: &Door, stopped: &UnixStream, clients: &[Client], now: MonotonicNs)
         Ok(1..) => Some(fds.iter().map(|fd| fd.any().unwrap_or(true)).collect()),
         Ok(_) | Err(nix::errno::Errno::EINTR) => None,
         Err(error) => {
-            tracing::error!(%error, "the metrics page cannot wait for clients");
-            thread::sleep(PAUSE);
+            tracing::error!(%error, "the metrics page cannot poll its clients; it retries in 100 ms");
+            thread::sleep(RETRY_PAUSE);
             None
         }
     }
 }
 
-fn accept(door: &Door, clients: &mut Vec<Client>) {
+fn accept(listener: &Listener, clients: &mut Vec<Client>) {
     while clients.len() < MAX_CLIENTS {
-        match door.accept() {
+        match listener.accept() {
             Ok(stream) => clients.push(Client {
                 stream,
                 until: clock::monotonic().plus_ms(CLIENT_MS),
                 request: Vec::new(),
-                state: State::Asks,
+                state: State::ReadingRequest,
             }),
             Err(error) if error.kind() == ErrorKind::WouldBlock => return,
-            // One that has gone again.
+            // The client has disconnected already.
             Err(error) if matches!(error.kind(), ErrorKind::ConnectionAborted | ErrorKind::Interrupted) => {}
             Err(error) => {
-                // No file descriptor, for example; it will be tried again.
-                tracing::warn!(%error, "a client of the metrics page was not let in");
-                thread::sleep(PAUSE);
+                // For example, no file descriptor is free.
+                tracing::warn!(%error, "the metrics page cannot accept a client; it retries in 100 ms");
+                thread::sleep(RETRY_PAUSE);
                 return;
             }
         }
@@ -309,25 +318,25 @@ struct Client {
 }
 
 enum State {
-    Asks,
-    Reads {
-        answer: Vec<u8>,
+    ReadingRequest,
+    WritingResponse {
+        response: Vec<u8>,
         written: usize,
     },
-    /// It has the answer. A connection that is closed while bytes of the client are unread is reset, and the
-    /// answer may be lost with it; so they are read up to its end.
-    Leaves,
+    /// The response is sent, and what the client still sends is read and discarded. Closing a connection with
+    /// unread bytes resets it, and the client may lose the response.
+    Draining,
 }
 
 impl Client {
     fn waits_for(&self) -> PollFlags {
         match self.state {
-            State::Asks | State::Leaves => PollFlags::POLLIN,
-            State::Reads { .. } => PollFlags::POLLOUT,
+            State::ReadingRequest | State::Draining => PollFlags::POLLIN,
+            State::WritingResponse { .. } => PollFlags::POLLOUT,
         }
     }
 
-    /// Goes on as far as it can without waiting; whether the client stays.
+    /// Proceeds as far as possible without blocking; returns whether the client stays connected.
     fn turn(&mut self, latest: &dyn Fn() -> Option<Arc<Report>>) -> bool {
         for _ in 0..MAX_STEPS {
             match self.step(latest) {
@@ -344,26 +353,27 @@ impl Client {
     fn step(&mut self, latest: &dyn Fn() -> Option<Arc<Report>>) -> io::Result<bool> {
         let mut buffer = [0; 2048];
         match &mut self.state {
-            State::Asks => {
+            State::ReadingRequest => {
                 let count = self.stream.read(&mut buffer)?;
                 self.request.extend_from_slice(&buffer[..count]);
-                let is_whole = self.request.windows(4).any(|bytes| bytes == b"\r\n\r\n");
-                if is_whole || self.request.len() > MAX_REQUEST_BYTES {
-                    let answer = if is_whole { answer(&self.request, latest) } else { refusal(TOO_LARGE) };
-                    self.state = State::Reads { answer, written: 0 };
+                let is_complete = self.request.windows(4).any(|bytes| bytes == b"\r\n\r\n");
+                if is_complete || self.request.len() > MAX_REQUEST_BYTES {
+                    let response =
+                        if is_complete { respond(&self.request, latest) } else { refusal(TOO_LARGE) };
+                    self.state = State::WritingResponse { response, written: 0 };
                     self.request = Vec::new();
                 }
                 Ok(count > 0)
             }
-            State::Reads { answer, written } => {
-                *written += self.stream.write(&answer[*written..])?;
-                if *written == answer.len() {
-                    self.stream.end_output()?;
-                    self.state = State::Leaves;
+            State::WritingResponse { response, written } => {
+                *written += self.stream.write(&response[*written..])?;
+                if *written == response.len() {
+                    self.stream.shut_down_write()?;
+                    self.state = State::Draining;
                 }
                 Ok(true)
             }
-            State::Leaves => Ok(self.stream.read(&mut buffer)? > 0),
+            State::Draining => Ok(self.stream.read(&mut buffer)? > 0),
         }
     }
 }
@@ -374,8 +384,8 @@ const NOT_ALLOWED: &str = "405 Method Not Allowed";
 const TOO_LARGE: &str = "431 Request Header Fields Too Large";
 const NOT_YET: &str = "503 Service Unavailable";
 
-/// The answer to a request whose head is whole (RFC 9112).
-fn answer(request: &[u8], latest: &dyn Fn() -> Option<Arc<Report>>) -> Vec<u8> {
+/// The response to a request with a complete head (RFC 9112).
+fn respond(request: &[u8], latest: &dyn Fn() -> Option<Arc<Report>>) -> Vec<u8> {
     let line = request.split(|&byte| byte == b'\r').next().unwrap_or_default();
     let words: Vec<&str> = std::str::from_utf8(line).unwrap_or_default().split(' ').collect();
     let (method, target) = match words[..] {
@@ -396,9 +406,9 @@ fn answer(request: &[u8], latest: &dyn Fn() -> Option<Arc<Report>>) -> Vec<u8> {
 
 fn refusal(status: &str) -> Vec<u8> {
     let body = match status {
-        NOT_FOUND => "the page is /metrics\n",
-        NOT_ALLOWED => "GET and HEAD only\n",
-        NOT_YET => "the bridge has no figures yet\n",
+        NOT_FOUND => "no such page; the metrics are at /metrics\n",
+        NOT_ALLOWED => "only GET and HEAD are allowed\n",
+        NOT_YET => "control has made no report yet; retry in a few seconds\n",
         _ => "",
     };
     response(status, "text/plain; charset=utf-8", body, false)

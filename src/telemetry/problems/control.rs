@@ -1,35 +1,37 @@
-//! What control found to be wrong, and what is wrong with control and the settings.
+//! Problems that control found, and problems of control itself and of the settings.
 
 use super::{Level, Problem};
 use crate::model::{AbsenceKind, MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
 use crate::shm::ProcessRole;
 use crate::telemetry::report::SubscriberReport;
 use crate::telemetry::snapshot::{ModeReason, Snapshot};
-use crate::telemetry::text::printable;
+use crate::telemetry::text::{counted, printable};
 
-/// An answer this old is worth a word: at the default rate ten probes are unanswered.
-const SILENT_RESPONDER_MS: f64 = 2_000.0;
+/// The problem of a NONCRITICAL subscriber shows the age of the last probe response when it is above this
+/// value: ten unanswered probes at the default rate.
+const OLD_RESPONSE_MS: f64 = 2_000.0;
 
-/// Control is asked for and never ran. One that ran and is gone is named among the processes.
+/// Control is needed but never ran. A control process that ran before is a problem of `processes`.
 pub(super) fn missing(now: &Snapshot) -> Option<Problem> {
     let ran = now.processes.iter().any(|process| process.role == ProcessRole::Control);
     (now.needs_control && !ran).then(|| {
-        let text = "control was never started: nobody is probed, and lanes stay in their default modes";
+        let text = "control was never started: no subscriber is probed, and lanes keep their default modes; start its \
+                    service or run `adaptive-bridge control`";
         Problem::new("control", Level::Warn, text.to_owned())
     })
 }
 
-/// Control runs, and cannot probe.
+/// Control runs but cannot probe, because it has no secret to sign probe requests with.
 pub(super) fn without_secret(now: &Snapshot) -> Option<Problem> {
     let mut runs = now.processes.iter().filter(|process| process.role == ProcessRole::Control);
     (now.control.without_secret != 0 && runs.any(|process| process.state.exists())).then(|| {
-        let text = "nobody is probed: the secret of the probes cannot be had; the log of control says why, \
-                    and after a reload it is tried again";
+        let text = "no subscriber is probed: control has no secret for the probes; read its log for the cause, correct \
+                    it, then run `adaptive-bridge reload`";
         Problem::new("probes", Level::Error, text.to_owned())
     })
 }
 
-/// The safety supervisor has taken something away.
+/// The safety mode is not normal.
 pub(super) fn safety(now: &Snapshot) -> Option<Problem> {
     let mode = now.control.safety();
     let (level, consequence) = match mode {
@@ -37,21 +39,24 @@ pub(super) fn safety(now: &Snapshot) -> Option<Problem> {
         SafetyMode::Degraded => (Level::Warn, limited_lanes(now)),
         SafetyMode::Emergency => (Level::Error, "all forwarding is stopped".to_owned()),
     };
-    let why = match now.control.safety_reason.as_str() {
+    let cause = match now.control.safety_reason.as_str() {
         "" => String::new(),
-        reason => format!(": {}", printable(reason)),
+        reason => format!("; cause: {}", printable(reason)),
     };
-    Some(Problem::new("safety", level, format!("safety is {mode}, {consequence}{why}")))
+    let text = format!(
+        "the safety mode is {mode}, {consequence}{cause}; it returns to normal by itself when the cause is removed"
+    );
+    Some(Problem::new("safety", level, text))
 }
 
-/// The lanes that the safety mode takes something from; the configuration may forbid it.
+/// The lanes whose mode the safety mode sets. None where `safety.allow_noncritical_degrade` forbids it.
 fn limited_lanes(now: &Snapshot) -> String {
     let limited = now.lanes.iter().filter(|lane| lane.reason == ModeReason::Safety);
     let limited: Vec<String> = limited.map(|lane| format!("lane {} is {}", lane.name, lane.mode)).collect();
-    if limited.is_empty() { "all lanes go on".to_owned() } else { limited.join(", ") }
+    if limited.is_empty() { "no lane is limited".to_owned() } else { limited.join(", ") }
 }
 
-/// Processes that apply different settings, and files that were refused.
+/// Processes that apply different settings, refused reloads, and errors of the processes.
 pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     let mut problems = Vec::new();
     let mut groups: Vec<(u64, Vec<&str>)> = Vec::new();
@@ -66,11 +71,13 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     if groups.len() > 1 {
         let groups: Vec<String> = groups.iter().map(|(_, names)| names.join(" and ")).collect();
         let text = format!(
-            "the processes apply different settings: {}; reload or restart those that are behind",
-            groups.join(" other ones than ")
+            "the processes use different settings: {}; run `adaptive-bridge reload`, and restart a process that still \
+             differs",
+            groups.join(" versus ")
         );
         problems.push(Problem::new("bridge", Level::Warn, text));
     }
+    let window = super::window_text(now, before);
     for process in &now.processes {
         let Some(former) = before.processes.iter().find(|former| former.name == process.name) else {
             continue;
@@ -82,14 +89,15 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         };
         if grown(process.health.refused_reloads, former.health.refused_reloads).is_some() {
             let text = format!(
-                "{} refused a reload just now and goes on with its former settings; `adaptive-bridge check` \
-                 says what is wrong with the file",
+                "{} refused a reload in the last {window} and keeps its settings; run `adaptive-bridge check` to see \
+                 the errors of the configuration file",
                 process.name
             );
             problems.push(Problem::new(about.clone(), Level::Warn, text));
         }
         if let Some(errors) = grown(process.health.errors, former.health.errors) {
-            let text = format!("{}: {errors} errors just now; its log names them", process.name);
+            let errors = counted(errors, "error");
+            let text = format!("{}: {errors} in the last {window}; read its log", process.name);
             problems.push(Problem::new(about, Level::Warn, text));
         }
     }
@@ -107,18 +115,18 @@ pub(super) fn absences(now: &Snapshot) -> impl Iterator<Item = Problem> {
                 let address = report.host.map_or_else(String::new, |address| format!(" ({address})"));
                 let name = name.unwrap_or_default();
                 let text = format!(
-                    "network interface {name}{address} {} for {away_s:.0} s: peers behind it are not reached; \
-                     `ip addr show` tells, and it is used again as soon as it is back",
+                    "network interface {name}{address} {}, away for {away_s:.0} s: the bridge does not reach the peers \
+                     behind it; check it with `ip addr show`; the bridge uses it again as soon as it is back",
                     report.detail
                 );
                 (Level::Warn, text)
             }
             AbsenceKind::Peer => {
-                let node = name.unwrap_or("a node without a name");
+                let node = name.unwrap_or("a node of unknown name");
                 let host = report.host.map_or_else(String::new, |host| format!(" on {host}"));
                 let text = format!(
-                    "{node}{host}, which {}, is silent for {away_s:.0} s: its link is down, or it ended without \
-                     a goodbye",
+                    "{node}{host}, which {}, has been silent for {away_s:.0} s: its link is down, or its process \
+                     crashed; check both on its host; the bridge serves it again when it is back",
                     report.detail
                 );
                 (Level::Stale, text)
@@ -128,37 +136,46 @@ pub(super) fn absences(now: &Snapshot) -> impl Iterator<Item = Problem> {
     })
 }
 
-/// Subscribers whose link is bad, or of whom nothing is heard.
+/// Subscribers whose link is bad, or that answer no probes.
 pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
     now.subscribers.iter().filter_map(|subscriber| {
         let record = &subscriber.record;
         let report = now.subscriber_report(subscriber);
         let degraded = record.state() == SubscriberState::Noncritical && record.forced == 0;
-        let (level, what) = if record.settled > 0 && record.lost >= record.settled {
-            let heard = match report.last_response_age_ms {
-                Some(age_ms) => format!("does not answer for {:.0} s", age_ms / 1e3),
-                None => "has never answered".to_owned(),
+        let (level, trouble) = if record.settled > 0 && record.lost >= record.settled {
+            let silence = match report.last_response_age_ms {
+                Some(age_ms) => format!("has not answered a probe for {:.0} s", age_ms / 1e3),
+                None => "has never answered a probe".to_owned(),
             };
-            (Level::Stale, format!("{heard}; does `adaptive-bridge responder --id {}` run there?", report.id))
+            let remedy = format!(
+                "check its link, and that `adaptive-bridge responder --id {}` runs on its host",
+                report.id
+            );
+            (Level::Stale, format!("{silence}; {remedy}"))
         } else if degraded {
-            let silent_ms = report.last_response_age_ms.filter(|&age_ms| age_ms > SILENT_RESPONDER_MS);
-            let silent = silent_ms
-                .map_or_else(String::new, |age_ms| format!(", last answer {:.0} s ago", age_ms / 1e3));
-            (Level::Warn, format!("is NONCRITICAL: {}{silent}", report.figures()))
+            let old_ms = report.last_response_age_ms.filter(|&age_ms| age_ms > OLD_RESPONSE_MS);
+            let age =
+                old_ms.map_or_else(String::new, |ms| format!(", last response {:.0} s ago", ms / 1e3));
+            let text = format!(
+                "is NONCRITICAL because its link is bad: {}{age}; check its link; it becomes CRITICAL when the link is \
+                 good again",
+                report.figures()
+            );
+            (Level::Warn, text)
         } else if report.warnings.is_empty() {
             return None;
         } else {
             (
                 Level::Warn,
                 format!(
-                    "is above its warning threshold of {}: {}",
+                    "is above the warning threshold of {}: {}; check its link, or raise probes.*_threshold",
                     report.warnings.join(", "),
                     full_figures(&report)
                 ),
             )
         };
         let on_lane = report.lane.as_ref().map_or(String::new(), |lane| format!(" on lane {lane}"));
-        let text = format!("subscriber {}{on_lane} {what}", report.id);
+        let text = format!("subscriber {}{on_lane} {trouble}", report.id);
         Some(Problem::new(format!("subscriber {}", report.id), level, text))
     })
 }
@@ -168,7 +185,7 @@ fn full_figures(report: &SubscriberReport) -> String {
     format!("{}{jitter}", report.figures())
 }
 
-/// Remote readers that take samples past the bridge, each with what mends it.
+/// Intruders, each with its remedy.
 pub(super) fn intruders(now: &Snapshot) -> Vec<Problem> {
     let warn = |text| Problem::new("intruders", Level::Warn, text);
     let mut problems: Vec<Problem> = now
@@ -177,28 +194,34 @@ pub(super) fn intruders(now: &Snapshot) -> Vec<Problem> {
         .map(|intruder| {
             let text = |text: &str| printable(text);
             let node = match intruder.node.as_str() {
-                "" => "a node without a name".to_owned(),
+                "" => "a node of unknown name".to_owned(),
                 node => text(node),
             };
             let (topic, host) = (text(intruder.topic.as_str()), text(intruder.host.as_str()));
             let remedy = text(intruder.remedy.as_str());
-            warn(format!("{node} on {host} reads {topic} past the bridge: {remedy}"))
+            warn(format!("{node} on {host} bypasses the bridge, it subscribes to {topic}: {remedy}"))
         })
         .collect();
     let seen = now.control.intruders_seen;
     if now.intruders.len() == MAX_INTRUDERS && seen > MAX_INTRUDERS as u64 {
-        problems.push(warn(format!("{seen} remote readers were seen past the bridge; no more are listed")));
+        let text = format!(
+            "{seen} remote subscribers have bypassed the bridge since control started, {MAX_INTRUDERS} of them are \
+             listed; point all of them at noncritical outputs"
+        );
+        problems.push(warn(text));
     }
     problems
 }
 
-/// Messages on the probe topics that were not believed. Late responses are the link's and show as loss.
+/// Refused messages on the probe topics. Late responses are no problem here: they count as loss of the link.
 pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
+    let window = super::window_text(now, before);
     let refused = now.control.refused.since(&before.control.refused);
     let refused = refused.iter().filter(|(reason, _)| *reason != ProbeRefusal::Late);
     refused
         .map(|(reason, count)| {
-            let text = format!("{count} probe messages refused just now: {} ({reason})", reason.meaning());
+            let count = counted(count, "probe message");
+            let text = format!("refused {count} in the last {window}: {} ({reason})", reason.meaning());
             Problem::new("probes", Level::Warn, text)
         })
         .collect()
@@ -206,7 +229,7 @@ pub(super) fn refusals(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{after, sound};
+    use super::super::tests::{healthy, problems_after};
     use super::*;
     use crate::model::{
         FixedText, IntruderRecord, LaneMode, ProcessHealth, SubscriberRecord, SubscriberWarning,
@@ -222,11 +245,11 @@ mod tests {
             rtt_mean_us: 81_250,
             jitter_us: 30_000,
             state: SubscriberState::Critical as u8,
-            last_response_at: sound().at,
+            last_response_at: healthy().at,
             ..SubscriberRecord::default()
         };
         change(&mut record);
-        after(|now| now.subscribers = vec![SubscriberReading { lane: Some(1), record }])
+        problems_after(|now| now.subscribers = vec![SubscriberReading { lane: Some(1), record }])
     }
 
     fn control() -> ProcessReading {
@@ -240,77 +263,80 @@ mod tests {
     }
 
     #[test]
-    fn a_control_that_cannot_probe_is_an_error_while_it_is_there() {
-        let said = after(|now| {
+    fn control_without_a_secret_is_a_problem_while_it_runs() {
+        let found = problems_after(|now| {
             now.control.without_secret = 1;
             now.processes.push(control());
         });
-        assert_eq!(said.len(), 1);
-        assert!(said[0].starts_with("nobody is probed: the secret"), "{said:?}");
-        assert_eq!(after(|now| now.control.without_secret = 1), [""; 0]);
+        assert_eq!(found.len(), 1);
+        assert!(found[0].starts_with("no subscriber is probed: control has no secret"), "{found:?}");
+        assert_eq!(problems_after(|now| now.control.without_secret = 1), [""; 0]);
     }
 
     #[test]
-    fn control_is_missed_where_it_is_asked_for_and_never_ran() {
-        let said = after(|now| now.needs_control = true);
-        assert_eq!(said.len(), 1);
-        assert!(said[0].starts_with("control was never started: nobody is probed"), "{said:?}");
-        let said = after(|now| {
+    fn control_that_is_needed_and_never_ran_is_a_problem() {
+        let found = problems_after(|now| now.needs_control = true);
+        assert_eq!(found.len(), 1);
+        assert!(found[0].starts_with("control was never started: no subscriber is probed"), "{found:?}");
+        let found = problems_after(|now| {
             now.needs_control = true;
             now.processes.insert(1, control());
         });
-        assert_eq!(said, [""; 0]);
+        assert_eq!(found, [""; 0]);
     }
 
     #[test]
-    fn what_safety_takes_away_is_said_with_its_reason() {
-        let said = after(|now| {
+    fn a_safety_mode_is_a_problem_with_the_limited_lanes_and_the_cause() {
+        let found = problems_after(|now| {
             now.control.safety = SafetyMode::Degraded as u8;
             now.control.safety_reason = FixedText::new("lane critical lags by 120.0 ms");
             now.lanes[1].reason = ModeReason::Safety;
             now.lanes[1].mode = LaneMode::Suspended;
         });
-        let expected = "safety is degraded, lane noncritical is suspended: lane critical lags by 120.0 ms";
-        assert_eq!(said, [expected]);
-        let said = after(|now| now.control.safety = SafetyMode::Emergency as u8);
-        assert_eq!(said, ["safety is emergency, all forwarding is stopped"]);
+        let end = "it returns to normal by itself when the cause is removed";
+        let expected = format!(
+            "the safety mode is degraded, lane noncritical is suspended; cause: lane critical lags by 120.0 ms; {end}"
+        );
+        assert_eq!(found, [expected]);
+        let found = problems_after(|now| now.control.safety = SafetyMode::Emergency as u8);
+        assert_eq!(found, [format!("the safety mode is emergency, all forwarding is stopped; {end}")]);
     }
 
     #[test]
-    fn a_subscriber_is_named_for_what_is_wrong_with_its_link() {
+    fn a_subscriber_with_a_bad_link_is_a_problem() {
         assert_eq!(subscriber(|_| {}), [""; 0]);
-        let said = subscriber(|record| record.state = SubscriberState::Noncritical as u8);
-        assert_eq!(said, ["subscriber laptop on lane noncritical is NONCRITICAL: RTT 81.2 ms, loss 2.0 %"]);
+        let found = subscriber(|record| record.state = SubscriberState::Noncritical as u8);
+        let expected = "subscriber laptop on lane noncritical is NONCRITICAL because its link is bad: RTT 81.2 ms, \
+                        loss 2.0 %; check its link; it becomes CRITICAL when the link is good again";
+        assert_eq!(found, [expected]);
         let forced = |record: &mut SubscriberRecord| {
             record.state = SubscriberState::Noncritical as u8;
             record.forced = 1;
         };
         assert_eq!(subscriber(forced), [""; 0]);
         let warnings = SubscriberWarning::Rtt as u8 | SubscriberWarning::Jitter as u8;
-        let said = subscriber(|record| record.warnings = warnings);
-        let expected = "subscriber laptop on lane noncritical is above its warning threshold of rtt, jitter: \
-                        RTT 81.2 ms, loss 2.0 %, jitter 30.0 ms";
-        assert_eq!(said, [expected]);
+        let found = subscriber(|record| record.warnings = warnings);
+        let expected = "subscriber laptop on lane noncritical is above the warning threshold of rtt, jitter: \
+                        RTT 81.2 ms, loss 2.0 %, jitter 30.0 ms; check its link, or raise probes.*_threshold";
+        assert_eq!(found, [expected]);
     }
 
     #[test]
-    fn a_subscriber_that_does_not_answer_is_named_with_the_program_to_start() {
-        let said = subscriber(|record| record.lost = 50);
-        let program = "does `adaptive-bridge responder --id laptop` run there?";
-        assert_eq!(
-            said,
-            [format!("subscriber laptop on lane noncritical does not answer for 1 s; {program}")]
-        );
-        let said = subscriber(|record| {
+    fn a_subscriber_that_answers_no_probe_is_a_problem_with_the_program_to_start() {
+        let found = subscriber(|record| record.lost = 50);
+        let remedy = "check its link, and that `adaptive-bridge responder --id laptop` runs on its host";
+        let laptop = "subscriber laptop on lane noncritical";
+        assert_eq!(found, [format!("{laptop} has not answered a probe for 1 s; {remedy}")]);
+        let found = subscriber(|record| {
             record.lost = 50;
             record.last_response_at = crate::model::MonotonicNs(0);
         });
-        assert_eq!(said, [format!("subscriber laptop on lane noncritical has never answered; {program}")]);
+        assert_eq!(found, [format!("{laptop} has never answered a probe; {remedy}")]);
     }
 
     #[test]
-    fn an_intruder_is_named_with_its_remedy_and_steers_no_terminal() {
-        let said = after(|now| {
+    fn an_intruder_is_a_problem_with_its_remedy_and_without_control_characters() {
+        let found = problems_after(|now| {
             now.intruders = vec![IntruderRecord {
                 topic: FixedText::new("/scan"),
                 node: FixedText::new("/rviz\x1b[2J"),
@@ -320,14 +346,16 @@ mod tests {
             }];
         });
         assert_eq!(
-            said,
-            ["/rviz\u{fffd}[2J on 192.168.0.7 reads /scan past the bridge: subscribe to /n/scan"]
+            found,
+            [
+                "/rviz\u{fffd}[2J on 192.168.0.7 bypasses the bridge, it subscribes to /scan: subscribe to /n/scan"
+            ]
         );
     }
 
     #[test]
-    fn settings_that_differ_and_reloads_that_were_refused_are_named() {
-        let said = after(|now| {
+    fn different_settings_refused_reloads_and_errors_are_problems() {
+        let found = problems_after(|now| {
             for (process, fingerprint) in now.processes.iter_mut().zip([1, 2, 1]) {
                 process.health.settings_fingerprint = fingerprint;
             }
@@ -335,23 +363,23 @@ mod tests {
             now.processes[2].health.errors = 3;
         });
         assert_eq!(
-            said[0],
-            "the processes apply different settings: ingress and egress-noncritical other ones than \
-             egress-critical; reload or restart those that are behind"
+            found[0],
+            "the processes use different settings: ingress and egress-noncritical versus egress-critical; run \
+             `adaptive-bridge reload`, and restart a process that still differs"
         );
-        assert!(said[1].starts_with("egress-critical refused a reload just now"), "{said:?}");
-        assert_eq!(said[2], "egress-noncritical: 3 errors just now; its log names them");
-        assert_eq!(said.len(), 3);
+        assert!(found[1].starts_with("egress-critical refused a reload in the last 1.0 s"), "{found:?}");
+        assert_eq!(found[2], "egress-noncritical: 3 errors in the last 1.0 s; read its log");
+        assert_eq!(found.len(), 3);
     }
 
     #[test]
-    fn refused_probe_messages_are_named_but_for_late_ones() {
-        let said = after(|now| {
+    fn refused_probe_messages_are_problems_except_late_ones() {
+        let found = problems_after(|now| {
             for refusal in [ProbeRefusal::Late, ProbeRefusal::Replayed, ProbeRefusal::Replayed] {
                 now.control.refused.add(refusal);
             }
         });
-        assert_eq!(said.len(), 1);
-        assert!(said[0].starts_with("2 probe messages refused just now: seen before"), "{said:?}");
+        let replayed = ProbeRefusal::Replayed.meaning();
+        assert_eq!(found, [format!("refused 2 probe messages in the last 1.0 s: {replayed} (replayed)")]);
     }
 }

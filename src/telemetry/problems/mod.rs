@@ -1,34 +1,39 @@
-//! What is wrong with a bridge, in words.
+//! Finds what is wrong with a bridge in two snapshots, and describes it for users.
 
 mod control;
+mod processes;
 mod publishers;
 
 use super::liveness::ProcessState;
 use super::report::drops_since;
-use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
+use super::snapshot::{LaneReading, OutputReading, RouteReading, Snapshot};
+use super::text::counted;
 use crate::model::{DropReason, LaneCounters, LaneMode, TrafficClass};
 use crate::shm::ProcessRole;
 
-/// A lane writes the mode that it applies ten times a second; one that has not after so long does not look.
+/// A lane's process writes the mode that it applies ten times a second. After this time without it, the
+/// process does not read its policy.
 const APPLY_MS: u64 = 1_000;
 
-/// Fewer samples may be on their way at the moment of the reading.
+/// A critical lane that forwarded none of this many published samples is stuck. Fewer may be in transit at
+/// the moment of the snapshot.
 const SILENT_LANE_SAMPLES: u64 = 5;
 
-/// Fewer samples may be on their way to a reader that acknowledges at each HEARTBEAT.
+/// A reader that acknowledged none of this many offered samples is silent. Fewer may be in transit, because a
+/// reader acknowledges at each HEARTBEAT.
 const SILENT_READER_SAMPLES: u64 = 5;
 
-/// How grave something is: the levels of `diagnostic_msgs/DiagnosticStatus`, with their numbers.
+/// The severity of a problem: the levels of `diagnostic_msgs/DiagnosticStatus`, with their numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Level {
     /// Nothing is wrong.
     Ok = 0,
-    /// Something is wrong and the bridge does its work.
+    /// Something is wrong, but the bridge forwards samples.
     Warn = 1,
-    /// Something does not do its work.
+    /// A part of the bridge does not work.
     Error = 2,
-    /// Nothing is heard of it.
+    /// A part of the bridge, or a peer, sends no data.
     Stale = 3,
 }
 
@@ -43,7 +48,7 @@ impl Level {
         }
     }
 
-    /// The graver of two. An error is graver than silence, which is no more than a suspicion.
+    /// The more severe of two levels. `Error` is above `Stale`, because missing data only suggests a fault.
     pub const fn worse(self, other: Self) -> Self {
         const fn rank(level: Level) -> u8 {
             match level {
@@ -57,15 +62,15 @@ impl Level {
     }
 }
 
-/// Something that is wrong. Its JSON is the sentence.
+/// An entry of `problems` in the report. Its JSON is the text alone.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
     /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `network`, `intruders`,
     /// `lane NAME`, `route ID` or `subscriber ID`.
     pub about: String,
-    /// How grave.
+    /// The severity.
     pub level: Level,
-    /// A sentence for people.
+    /// A sentence for users: what is wrong, with which part or peer, and what to do next.
     pub text: String,
 }
 
@@ -81,13 +86,12 @@ impl serde::Serialize for Problem {
     }
 }
 
-/// What is wrong, the gravest first: processes, accounts that do not add up, safety, lanes that forward
-/// nothing, drops, what is away, subscribers, intruders, then what is only missing.
+/// All problems, the most severe first: processes, counts that do not add up, the safety mode, lanes that
+/// forward nothing, drops, absences, subscribers, intruders, publishers.
 pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     let mut problems = Vec::new();
     for process in &now.processes {
-        let former = before.processes.iter().find(|former| former.name == process.name);
-        problems.extend(process_problem(process, former, now));
+        problems.extend(processes::problem(process, now, before));
     }
     problems.extend(control::missing(now));
     problems.extend(control::without_secret(now));
@@ -97,15 +101,14 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems.extend(now.routes.iter().filter_map(unaccounted_by_ingress));
     problems.extend(control::safety(now));
     for (route, output) in outputs(now) {
-        problems.extend(silent(now, route, output, before.route(route)));
+        problems.extend(forwards_nothing(route, output, now, before));
     }
     problems.extend(now.lanes.iter().filter_map(|lane| not_applied(lane, now)));
     for route in &now.routes {
-        dropped(now, route, before.route(route), &mut problems);
+        dropped(route, now, before, &mut problems);
     }
     for (route, output) in outputs(now) {
-        let former = before.route(route).and_then(|former| former.output(output));
-        overrun(now, output, former, &mut problems);
+        slow_readers(route, output, now, before, &mut problems);
     }
     problems.extend(control::settings(now, before));
     problems.extend(control::absences(now));
@@ -122,72 +125,43 @@ fn outputs(snapshot: &Snapshot) -> impl Iterator<Item = (&RouteReading, &OutputR
     snapshot.routes.iter().flat_map(|route| route.outputs.iter().map(move |output| (route, output)))
 }
 
-fn process_problem(
-    process: &ProcessReading,
-    former: Option<&ProcessReading>,
-    now: &Snapshot,
-) -> Option<Problem> {
-    let (name, pid) = (&process.name, process.health.pid);
-    let consequence = match process.role {
-        ProcessRole::Ingress => "nothing is taken in".to_owned(),
-        ProcessRole::Control => "lanes keep their modes, then fall back to safe ones".to_owned(),
-        ProcessRole::Egress(lane) => match now.lanes.get(lane) {
-            Some(lane) => format!("lane {} forwards nothing", lane.name),
-            None => "its lane forwards nothing".to_owned(),
-        },
-    };
-    let about = match process.role {
-        ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), about_lane),
-        ProcessRole::Ingress | ProcessRole::Control => name.clone(),
-    };
-    let text = match process.state {
-        // Somebody wanted that; what follows is worth a word all the same.
-        ProcessState::Ended => {
-            return Some(Problem::new(about, Level::Warn, format!("{name} has ended: {consequence}")));
-        }
-        ProcessState::Dead => format!("{name} (pid {pid}) is dead: {consequence}"),
-        ProcessState::Stopped => {
-            format!("{name} (pid {pid}) is stopped: {consequence}; `kill -CONT {pid}` lets it go on")
-        }
-        ProcessState::Silent => {
-            let silent_s = now.at.since(process.health.alive_at) as f64 / 1e9;
-            format!("{name} (pid {pid}) has not turned for {silent_s:.1} s: {consequence}")
-        }
-        ProcessState::NotStarted => format!("{name} was never started: {consequence}"),
-        ProcessState::Running => {
-            let restarts = process.health.starts.checked_sub(former?.health.starts).filter(|&n| n > 0)?;
-            let times = if restarts == 1 { "once".to_owned() } else { format!("{restarts} times") };
-            return Some(Problem::new(about, Level::Warn, format!("{name} was restarted just now, {times}")));
-        }
-    };
-    Some(Problem::new(about, Level::Error, text))
+/// The time between the two snapshots, such as `1.0 s` or `50 ms`.
+fn window_text(now: &Snapshot, before: &Snapshot) -> String {
+    let window_ms = now.at.since(before.at) as f64 / 1e6;
+    if window_ms < 1_000.0 { format!("{window_ms:.0} ms") } else { format!("{:.1} s", window_ms / 1e3) }
 }
 
 fn about_lane(lane: &LaneReading) -> String {
     format!("lane {}", lane.name)
 }
 
+/// A lane's counts of an output that do not add up.
 fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<Problem> {
     let counters = &output.counters;
     (!counters.is_whole()).then(|| {
         let text = format!(
-            "lane {}, route {}: does not add up: {} received, {} forwarded, {} waiting, {} dropped",
+            "lane {}, route {}: the sample counts do not add up: {} received, but {} forwarded + {} waiting + {} \
+             dropped; unless egress-{} is stopped (SIGSTOP), this is a bug: report it with \
+             `adaptive-bridge status --json`",
             lane.name,
             route.id,
             counters.received(),
             counters.forwarded,
             counters.waiting,
-            counters.drops.total()
+            counters.drops.total(),
+            lane.name
         );
         Problem::new(about_lane(lane), Level::Error, text)
     })
 }
 
+/// Ingress's counts of a route that do not add up.
 fn unaccounted_by_ingress(route: &RouteReading) -> Option<Problem> {
     let counters = &route.counters;
     (!route.is_whole()).then(|| {
         let text = format!(
-            "ingress, route {}: does not add up: {} received, {} published, {} dropped",
+            "ingress, route {}: the sample counts do not add up: {} received, but {} published + {} dropped; this is \
+             a bug: report it with `adaptive-bridge status --json`",
             route.id,
             counters.received,
             counters.published,
@@ -197,18 +171,18 @@ fn unaccounted_by_ingress(route: &RouteReading) -> Option<Problem> {
     })
 }
 
-/// A critical lane that is there, and forwards nothing of what comes in.
-fn silent(
-    now: &Snapshot,
+/// A critical lane whose process runs but forwards none of the samples that ingress publishes.
+fn forwards_nothing(
     route: &RouteReading,
     output: &OutputReading,
-    former: Option<&RouteReading>,
+    now: &Snapshot,
+    before: &Snapshot,
 ) -> Option<Problem> {
     let lane = &now.lanes[output.lane];
     let process = now.processes.iter().find(|process| process.role == ProcessRole::Egress(output.lane))?;
-    let former = former?;
+    let former = before.route(route)?;
     let published = route.counters.published.checked_sub(former.counters.published)?;
-    // A sample that no reader was there for shows that the lane turns.
+    // A sample that was dropped because no reader was matched also shows that the lane makes turns.
     let written = |counters: &LaneCounters| counters.forwarded + counters.drops.get(DropReason::NoReader);
     let forwarded = written(&output.counters).checked_sub(written(&former.output(output)?.counters))?;
     let may_forward = lane.class == TrafficClass::Critical && lane.mode != LaneMode::Stopped;
@@ -218,8 +192,12 @@ fn silent(
         && forwarded == 0)
         .then(|| {
             let text = format!(
-                "lane {}, {}: {published} samples came in just now and none was forwarded",
-                lane.name, output.topic
+                "lane {}, {}: ingress published {published} samples in the last {} and the lane forwarded none; read \
+                 the log of {}",
+                lane.name,
+                output.topic,
+                window_text(now, before),
+                process.name
             );
             Problem::new(about_lane(lane), Level::Error, text)
         })
@@ -230,21 +208,28 @@ fn not_applied(lane: &LaneReading, now: &Snapshot) -> Option<Problem> {
     let applies = lane.health.policy_epoch == lane.policy.epoch;
     (lane.health.pid != 0 && waited && !applies && lane.policy.epoch != 0).then(|| {
         let text = format!(
-            "lane {}: mode {} was set and the lane's process has not applied it",
-            lane.name, lane.mode
+            "lane {0}: egress-{0} has not applied mode {1} within {2} s; read its log, and restart it if it hangs",
+            lane.name,
+            lane.mode,
+            APPLY_MS / 1_000
         );
         Problem::new(about_lane(lane), Level::Warn, text)
     })
 }
 
-/// What was dropped or lost on a route within the window.
-fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, problems: &mut Vec<Problem>) {
+/// Samples of a route that were dropped, or lost before ingress, within the window.
+fn dropped(route: &RouteReading, now: &Snapshot, before: &Snapshot, problems: &mut Vec<Problem>) {
+    let window = window_text(now, before);
+    let former = before.route(route);
     let about = format!("route {}", route.id);
     let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
     for (reason, count) in dropped.iter() {
-        let what = reason.meaning();
-        let text =
-            format!("ingress, route {}: {count} samples dropped just now: {what} ({reason})", route.id);
+        let text = format!(
+            "ingress, route {}: dropped {} in the last {window}: {} ({reason})",
+            route.id,
+            counted(count, "sample"),
+            reason.meaning()
+        );
         problems.push(Problem::new(about.clone(), Level::Error, text));
     }
     for output in &route.outputs {
@@ -257,9 +242,10 @@ fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, 
                 TrafficClass::Noncritical => Level::Warn,
             };
             let text = format!(
-                "lane {}, {}: {count} samples dropped just now: {} ({reason}){}",
+                "lane {}, {}: dropped {} in the last {window}: {} ({reason}){}",
                 lane.name,
                 output.topic,
+                counted(count, "sample"),
                 reason.meaning(),
                 matched_readers(reason, output)
             );
@@ -270,43 +256,52 @@ fn dropped(now: &Snapshot, route: &RouteReading, former: Option<&RouteReading>, 
         && let Some(lost @ 1..) = route.counters.lost_upstream.checked_sub(former.counters.lost_upstream)
     {
         let text = format!(
-            "route {}: {lost} samples lost just now on their way from the publisher to the bridge{}",
+            "route {}: {} lost in the last {window} between publisher and ingress{}; check the network to the \
+             publisher, and the receive buffers with `adaptive-bridge doctor`",
             route.id,
+            counted(lost, "sample"),
             publishers::lost_by_publisher(now, route, former)
         );
         problems.push(Problem::new(about, Level::Warn, text));
     }
 }
 
-/// Readers that missed samples within the window, or acknowledge nothing, by node.
-fn overrun(
-    now: &Snapshot,
+/// Matched readers that missed samples within the window, or acknowledge none.
+fn slow_readers(
+    route: &RouteReading,
     output: &OutputReading,
-    former: Option<&OutputReading>,
+    now: &Snapshot,
+    before: &Snapshot,
     problems: &mut Vec<Problem>,
 ) {
     let lane = &now.lanes[output.lane];
+    let former = before.route(route).and_then(|former| former.output(output));
     for record in output.readers.iter() {
-        let before = former.and_then(|former| {
+        let earlier = former.and_then(|former| {
             former.readers.iter().find(|earlier| earlier.reader == record.reader).copied()
         });
-        let Some(before) = before else { continue };
-        let missed = record.overrun.saturating_sub(before.overrun);
-        // It was offered samples and has acknowledged not one of them, nor of those that waited before.
-        let offered = record.offered.saturating_sub(before.offered);
+        let Some(earlier) = earlier else { continue };
+        let missed = record.overrun.saturating_sub(earlier.overrun);
+        // The lane offered samples within the window and the reader acknowledged none of them, nor any of
+        // the older unacknowledged ones.
+        let offered = record.offered.saturating_sub(earlier.offered);
         let is_silent = offered >= SILENT_READER_SAMPLES
-            && record.unacknowledged.saturating_sub(before.unacknowledged) == offered
-            && before.unacknowledged > 0;
+            && record.unacknowledged.saturating_sub(earlier.unacknowledged) == offered
+            && earlier.unacknowledged > 0;
         let reader = now.reader_name(record);
         let text = if missed > 0 {
             format!(
-                "lane {}, {}: {reader} missed {missed} samples just now: it does not keep up (reader_overrun); \
-                 the other subscribers have them",
-                lane.name, output.topic
+                "lane {}, {}: {reader} missed {} in the last {}: it acknowledges too slowly \
+                 (reader_overrun); the other subscribers have them; raise window_samples, or move it to a slower lane",
+                lane.name,
+                output.topic,
+                counted(missed, "sample"),
+                window_text(now, before)
             )
         } else if is_silent {
             format!(
-                "lane {}, {}: {reader} acknowledges nothing, {} samples so far: is it stopped, or its link down?",
+                "lane {}, {}: {reader} acknowledges no samples, {} so far; check that its process runs and \
+                 that its link is up",
                 lane.name, output.topic, record.unacknowledged
             )
         } else {
@@ -316,22 +311,22 @@ fn overrun(
     }
 }
 
-/// Who may be to blame for a write that failed: one of the matched readers, and not always a remote one.
+/// For a failed write, the number of matched readers: any of them, local or remote, may be the cause.
 fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
-    match (reason, output.counters.readers) {
-        (DropReason::WriteFailed, 1) => "; 1 reader is matched".to_owned(),
-        (DropReason::WriteFailed, readers) => format!("; {readers} readers are matched"),
-        _ => String::new(),
+    if reason != DropReason::WriteFailed {
+        return String::new();
     }
+    let readers = counted(output.counters.readers, "subscriber");
+    format!("; {readers} matched, see matched_readers in `adaptive-bridge status --json`")
 }
 
-/// Drops that are how a noncritical lane works. A critical lane has none of these.
+/// Drops that are part of a noncritical lane's normal work. A critical lane has none of these.
 const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
     match reason {
         DropReason::Superseded | DropReason::QueueFull | DropReason::Suspended => {
             matches!(class, TrafficClass::Noncritical)
         }
-        // The lane's mode says it, or the number of its readers, or that it was restarted just now.
+        // The report shows the cause elsewhere: the lane's mode, the number of its readers, or its restart.
         DropReason::Stopped | DropReason::NoReader => true,
         _ => false,
     }
@@ -339,15 +334,15 @@ const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::snapshot::ModeReason;
+    use super::super::snapshot::{ModeReason, ProcessReading};
     use super::*;
     use crate::model::{
         ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
         MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
     };
 
-    /// A bridge of one route and the two lanes on which 100 samples came through, and nothing is wrong.
-    pub(in crate::telemetry) fn sound() -> Snapshot {
+    /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.
+    pub(in crate::telemetry) fn healthy() -> Snapshot {
         let at = MonotonicNs(100_000_000_000);
         let health = ProcessHealth { pid: 7, alive_at: at, starts: 1, ..ProcessHealth::default() };
         let process = |name: &str, role| ProcessReading {
@@ -410,9 +405,9 @@ pub(super) mod tests {
         }
     }
 
-    /// What is said of a bridge that was sound and then changed.
-    pub(in crate::telemetry) fn after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
-        let before = sound();
+    /// The problems of a healthy bridge that changes within a window of 1 s.
+    pub(in crate::telemetry) fn problems_after(change: impl FnOnce(&mut Snapshot)) -> Vec<String> {
+        let before = healthy();
         let mut now = before.clone();
         now.at = now.at.plus_ms(1_000);
         change(&mut now);
@@ -426,70 +421,77 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn of_a_sound_bridge_nothing_is_said() {
-        assert_eq!(after(|_| {}), [""; 0]);
-        assert_eq!(after(|now| drop_on(now, 1, DropReason::Superseded, 90)), [""; 0]);
+    fn a_healthy_bridge_has_no_problems() {
+        assert_eq!(problems_after(|_| {}), [""; 0]);
+        assert_eq!(problems_after(|now| drop_on(now, 1, DropReason::Superseded, 90)), [""; 0]);
     }
 
     #[test]
-    fn a_process_that_hangs_or_was_restarted_is_named() {
-        let said = after(|now| {
+    fn a_process_that_hangs_is_dead_or_was_restarted_is_a_problem() {
+        let found = problems_after(|now| {
             now.processes[0].state = ProcessState::Silent;
             now.processes[1].health.starts = 3;
             now.processes[2].state = ProcessState::Dead;
         });
         assert_eq!(
-            said,
+            found,
             [
-                "ingress (pid 7) has not turned for 1.0 s: nothing is taken in",
-                "egress-critical was restarted just now, 2 times",
-                "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing",
+                "ingress (pid 7) hangs, its main loop made no turn for 1.0 s: the bridge receives no samples; check \
+                 the CPU load and its log, and restart it if it does not recover",
+                "egress-critical was restarted 2 times in the last 1.0 s; read its log for the cause",
+                "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing; read its log, and if it is not \
+                 restarted automatically, start its service or run `adaptive-bridge egress --lane noncritical`",
             ]
         );
     }
 
     #[test]
-    fn a_process_that_was_told_to_end_is_no_error() {
-        let mut now = sound();
+    fn a_process_that_ended_normally_is_a_warning() {
+        let mut now = healthy();
         now.processes[0].state = ProcessState::Ended;
-        let expected = Problem::new("ingress", Level::Warn, "ingress has ended: nothing is taken in".into());
-        assert_eq!(of(&now, &sound()), [expected]);
+        let expected = "ingress has ended: the bridge receives no samples; if it should run, start its service or run \
+                        `adaptive-bridge ingress`";
+        assert_eq!(of(&now, &healthy()), [Problem::new("ingress", Level::Warn, expected.into())]);
     }
 
     #[test]
-    fn an_account_that_does_not_add_up_is_shown() {
-        let said = after(|now| {
+    fn sample_counts_that_do_not_add_up_are_a_problem() {
+        let found = problems_after(|now| {
             now.routes[0].counters.received += 2;
             now.routes[0].outputs[1].counters.last_sequence += 1;
         });
         assert_eq!(
-            said,
+            found,
             [
-                "lane noncritical, route scan: does not add up: 101 received, 100 forwarded, 0 waiting, \
-             0 dropped",
-                "ingress, route scan: does not add up: 102 received, 100 published, 0 dropped",
+                "lane noncritical, route scan: the sample counts do not add up: 101 received, but 100 forwarded + 0 \
+                 waiting + 0 dropped; unless egress-noncritical is stopped (SIGSTOP), this is a bug: report it with \
+                 `adaptive-bridge status --json`",
+                "ingress, route scan: the sample counts do not add up: 102 received, but 100 published + 0 dropped; \
+                 this is a bug: report it with `adaptive-bridge status --json`",
             ]
         );
     }
 
     #[test]
-    fn a_critical_lane_that_lives_and_forwards_nothing_is_named() {
-        let come = |now: &mut Snapshot| {
+    fn a_critical_lane_that_runs_and_forwards_nothing_is_a_problem() {
+        let publish = |now: &mut Snapshot| {
             now.routes[0].counters.received += 50;
             now.routes[0].counters.published += 50;
         };
-        let said = after(come);
-        assert_eq!(said, ["lane critical, /c/scan: 50 samples came in just now and none was forwarded"]);
-        let said = after(|now| {
-            come(now);
+        let found = problems_after(publish);
+        let expected = "lane critical, /c/scan: ingress published 50 samples in the last 1.0 s and the lane forwarded \
+                        none; read the log of egress-critical";
+        assert_eq!(found, [expected]);
+        let found = problems_after(|now| {
+            publish(now);
             now.lanes[0].mode = LaneMode::Stopped;
         });
-        assert_eq!(said, [""; 0]);
+        assert_eq!(found, [""; 0]);
     }
 
     #[test]
-    fn drops_that_are_no_part_of_the_work_are_named_while_they_go_on() {
-        let said = after(|now| {
+    fn unexpected_drops_within_the_window_are_problems() {
+        let found = problems_after(|now| {
             now.routes[0].counters.received += 1;
             now.routes[0].counters.drops.add(DropReason::TooLarge, 1);
             now.routes[0].counters.lost_upstream += 4;
@@ -497,32 +499,39 @@ pub(super) mod tests {
             drop_on(now, 0, DropReason::WriteFailed, 3);
             drop_on(now, 0, DropReason::Superseded, 1);
         });
-        assert_eq!(said.len(), 4, "{said:?}");
+        assert_eq!(found.len(), 4, "{found:?}");
+        let too_large = DropReason::TooLarge.meaning();
+        let expected =
+            format!("ingress, route scan: dropped 1 sample in the last 1.0 s: {too_large} (too_large)");
+        assert_eq!(found[0], expected);
         assert!(
-            said[0].starts_with("ingress, route scan: 1 samples dropped just now: larger than"),
-            "{said:?}"
+            found[1].contains("lane critical, /c/scan: dropped 3 samples in the last 1.0 s"),
+            "{found:?}"
         );
-        assert!(said[1].contains("lane critical, /c/scan: 3 samples"), "{said:?}");
-        assert!(said[1].ends_with("(write_failed); 2 readers are matched"), "{said:?}");
-        assert!(said[2].ends_with("(superseded)"), "{said:?}");
-        assert!(said[3].contains("4 samples lost just now on their way"), "{said:?}");
-        let mut before = sound();
+        assert!(found[1].contains("(write_failed); 2 subscribers matched"), "{found:?}");
+        assert!(found[2].ends_with("(superseded)"), "{found:?}");
+        assert!(
+            found[3].contains("4 samples lost in the last 1.0 s between publisher and ingress"),
+            "{found:?}"
+        );
+        let mut before = healthy();
         drop_on(&mut before, 0, DropReason::WriteFailed, 3);
         assert_eq!(of(&before, &before), []);
     }
 
     #[test]
-    fn a_mode_that_is_not_applied_and_a_publisher_that_is_missing_are_named() {
-        let said = after(|now| {
+    fn a_mode_that_is_not_applied_and_a_missing_publisher_are_problems() {
+        let found = problems_after(|now| {
             now.lanes[1].policy = LanePolicy { epoch: 1, ..LanePolicy::default() };
             now.lanes[1].mode = LaneMode::Suspended;
             now.routes[0].counters.writers = 0;
         });
         assert_eq!(
-            said,
+            found,
             [
-                "lane noncritical: mode suspended was set and the lane's process has not applied it",
-                "route scan: the publisher of /scan is gone",
+                "lane noncritical: egress-noncritical has not applied mode suspended within 1 s; read its log, and \
+                 restart it if it hangs",
+                "route scan: lost the last publisher of /scan; check that its node runs and that its link is up",
             ]
         );
     }

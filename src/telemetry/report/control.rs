@@ -1,4 +1,4 @@
-//! What control found and decided, as the report has it.
+//! The parts of the report that come from control: safety, probes, subscribers, intruders, absences.
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
@@ -10,33 +10,33 @@ use crate::model::{
 use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
 
-/// The safety supervisor.
+/// The state of the safety supervisor.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct SafetyReport {
-    /// `normal`, `degraded` or `emergency`.
+    /// The safety mode: `normal`, `degraded` or `emergency`.
     pub mode: &'static str,
-    /// What brought the mode about; null in normal mode.
+    /// The cause of the mode; null in normal mode.
     pub reason: Option<String>,
-    /// For how long it has been in force; null when control never ran.
+    /// The time since the mode was entered; null when control never ran.
     pub since_s: Option<f64>,
-    /// Changes of the mode since control came up.
+    /// Changes of the mode since control started.
     pub transitions: u64,
 }
 
-/// The probes of all subscribers together.
+/// Probe counts, summed over all subscribers.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct ProbesReport {
-    /// Probes sent.
+    /// Probe requests sent.
     pub sent: u64,
-    /// Responses that were taken for what they claim to be.
+    /// Probe responses accepted.
     pub accepted: u64,
-    /// Messages refused, by reason.
+    /// Refused messages, by reason.
     pub refused: Refusals,
-    /// Of those, the ones within the window.
+    /// Refused messages within the window, by reason.
     pub refused_in_window: Refusals,
 }
 
-/// Refusals, by name; in JSON every reason is there.
+/// Refusal counts by reason. The JSON has every reason as a key.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Refusals(pub RefusalCounts);
 
@@ -50,30 +50,30 @@ impl Serialize for Refusals {
     }
 }
 
-/// One subscriber.
+/// The state and the link figures of one subscriber.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct SubscriberReport {
     /// The id of its responder.
     pub id: String,
-    /// Its lane; null when control named none that there is.
+    /// Its lane; null when it has none.
     pub lane: Option<String>,
     /// Whether the configuration lists it.
     pub listed: bool,
-    /// `UNKNOWN`, `CRITICAL` or `NONCRITICAL`.
+    /// Its state: `UNKNOWN`, `CRITICAL` or `NONCRITICAL`.
     pub state: &'static str,
     /// Whether the configuration forces the state.
     pub forced: bool,
-    /// Why it is in its state.
+    /// The reason of its state.
     pub reason: String,
-    /// For how long it has been.
+    /// The time since it entered its state.
     pub state_since_s: Option<f64>,
-    /// Changes of its state since control came up.
+    /// Changes of its state since control started.
     pub transitions: u64,
-    /// Probes of the sliding window whose fate is known.
+    /// Probes of the sliding window that were answered or timed out.
     pub settled: u64,
-    /// Of those, the ones without a response in time.
+    /// Settled probes without a response in time.
     pub lost: u64,
-    /// The share of those, 0 to 1.
+    /// The share of lost probes, 0 to 1.
     pub loss: Option<f64>,
     /// Mean round trip within the sliding window.
     pub rtt_mean_ms: Option<f64>,
@@ -81,35 +81,35 @@ pub struct SubscriberReport {
     pub rtt_p95_ms: Option<f64>,
     /// Jitter of the round trips.
     pub jitter_ms: Option<f64>,
-    /// How long ago its last response came.
+    /// The time since its last response.
     pub last_response_age_ms: Option<f64>,
     /// The figures above their warning threshold: `rtt`, `loss`, `jitter`.
     pub warnings: Vec<&'static str>,
 }
 
 impl SubscriberReport {
-    /// The figures in words, such as `RTT 81.2 ms, loss 2.0 %`.
+    /// The link figures as text, such as `RTT 81.2 ms, loss 2.0 %`.
     pub fn figures(&self) -> String {
         match (self.rtt_mean_ms, self.loss) {
             (Some(rtt_ms), Some(loss)) => format!("RTT {rtt_ms:.1} ms, loss {:.1} %", loss * 100.0),
             (None, Some(_)) => format!("none of {} probes answered", self.settled),
-            (_, None) => "no probe settled yet".to_owned(),
+            (_, None) => "no probe answered or timed out yet".to_owned(),
         }
     }
 }
 
-/// A remote reader that reaches past the bridge.
+/// A remote subscriber that bypasses the bridge.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct IntruderReport {
-    /// The topic that it reads.
+    /// The topic that it subscribes to.
     pub topic: String,
-    /// Its node; null when it has not said.
+    /// Its node; null when it is unknown.
     pub node: Option<String>,
     /// The addresses of its host.
     pub host: String,
-    /// What to do about it.
+    /// The remedy, as text for users.
     pub remedy: String,
-    /// For how long it has been known.
+    /// The time since it was first seen.
     pub since_s: Option<f64>,
 }
 
@@ -118,15 +118,15 @@ pub struct IntruderReport {
 pub struct AbsenceReport {
     /// `interface` or `peer`.
     pub kind: &'static str,
-    /// The interface, or the peer's node; null when it has none.
+    /// The interface, or the peer's node; null when the node is unknown.
     pub name: Option<String>,
-    /// The address of the interface, or of the peer's host; null when it is not known.
+    /// The address of the interface, or of the peer's host; null when it is unknown.
     pub host: Option<String>,
-    /// What the interface lacks; or what the peer subscribes to and publishes.
+    /// What the interface lacks, or the topics that the peer subscribes to and publishes.
     pub detail: String,
-    /// For how long it is or was away.
+    /// The time that it is or was away.
     pub away_s: f64,
-    /// For how long it has been back; null while it is away.
+    /// The time since it came back; null while it is away.
     pub back_s: Option<f64>,
 }
 
@@ -199,27 +199,28 @@ impl Snapshot {
         }
     }
 
-    /// Why a lane is in its mode, in a sentence.
+    /// The reason of a lane's mode, as text for users.
     pub(super) fn mode_detail(&self, number: usize, lane: &LaneReading) -> String {
         match lane.reason {
-            ModeReason::Default => "nobody has set a mode".to_owned(),
-            ModeReason::ByHand => "an operator has set it".to_owned(),
+            ModeReason::Default => "no mode was set".to_owned(),
+            ModeReason::ByHand => "an operator has set it with `adaptive-bridge mode`".to_owned(),
             ModeReason::Safety => match self.control.safety_reason.as_str() {
                 "" => format!("the safety mode is {}", self.control.safety()),
                 reason => format!("the safety mode is {}: {}", self.control.safety(), printable(reason)),
             },
             ModeReason::Control => self.control_detail(number, lane),
             ModeReason::Held => {
-                format!("control does not run; its last word holds: {}", self.control_detail(number, lane))
+                let detail = self.control_detail(number, lane);
+                format!("control does not run, its last decision holds for policy_hold_s: {detail}")
             }
-            ModeReason::Expired => "control is gone for longer than policy_hold_s".to_owned(),
+            ModeReason::Expired => "control has not run for longer than policy_hold_s".to_owned(),
         }
     }
 
-    /// What control went by: the worst subscriber of a noncritical lane, by name.
+    /// The basis of control's decision: the subscriber of a noncritical lane with the worst link.
     fn control_detail(&self, number: usize, lane: &LaneReading) -> String {
         if lane.class == TrafficClass::Critical {
-            return "a critical lane forwards every sample, whatever the links are like".to_owned();
+            return "a critical lane forwards every sample, even over bad links".to_owned();
         }
         if self.control.classifies == 0 {
             return "subscribers are not classified".to_owned();
@@ -238,8 +239,12 @@ impl Snapshot {
         let Some(worst) = of_lane.max_by_key(|subscriber| badness(subscriber)) else {
             return "the lane has no subscriber that answers probes".to_owned();
         };
-        let kept = lane.mode == LaneMode::Normal && worst.record.state() == SubscriberState::Noncritical;
-        let kept = if kept { "; safety.allow_noncritical_degrade forbids to degrade it" } else { "" };
+        let stays = lane.mode == LaneMode::Normal && worst.record.state() == SubscriberState::Noncritical;
+        let stays = if stays {
+            "; the lane stays normal because safety.allow_noncritical_degrade is false"
+        } else {
+            ""
+        };
         let worst = self.subscriber_report(worst);
         let forced = if worst.forced { ", forced" } else { "" };
         let of = if count == 1 {
@@ -247,7 +252,7 @@ impl Snapshot {
         } else {
             format!("the worst of {count} subscribers,")
         };
-        format!("{of} {} is {}{forced}: {}{kept}", worst.id, worst.state, worst.figures())
+        format!("{of} {} is {}{forced}: {}{stays}", worst.id, worst.state, worst.figures())
     }
 }
 
@@ -263,7 +268,7 @@ fn some_text(text: &str) -> Option<String> {
 mod tests {
     use super::*;
     use crate::model::{FixedText, SafetyMode, SubscriberRecord};
-    use crate::telemetry::problems::tests::sound;
+    use crate::telemetry::problems::tests::healthy;
 
     fn subscriber(id: &str, state: SubscriberState, lost: u64) -> SubscriberReading {
         let record = SubscriberRecord {
@@ -278,7 +283,7 @@ mod tests {
     }
 
     fn detail(reason: ModeReason, change: impl FnOnce(&mut Snapshot)) -> String {
-        let mut snapshot = sound();
+        let mut snapshot = healthy();
         snapshot.control.classifies = 1;
         snapshot.lanes[1].reason = reason;
         snapshot.lanes[1].mode = LaneMode::Degraded;
@@ -287,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_of_control_is_explained_by_the_worst_subscriber_of_the_lane() {
+    fn a_mode_set_by_control_is_explained_by_the_worst_subscriber_of_the_lane() {
         let none = detail(ModeReason::Control, |_| {});
         assert_eq!(none, "the lane has no subscriber that answers probes");
         let worst = detail(ModeReason::Control, |now| {
@@ -305,36 +310,36 @@ mod tests {
     }
 
     #[test]
-    fn a_lane_that_no_subscriber_degrades_says_why() {
+    fn a_lane_that_is_not_degraded_has_a_reason() {
         let noncritical = |now: &mut Snapshot| {
             now.subscribers = vec![subscriber("laptop", SubscriberState::Noncritical, 1)];
         };
-        let said = detail(ModeReason::Control, |now| {
+        let found = detail(ModeReason::Control, |now| {
             noncritical(now);
             now.lanes[1].mode = LaneMode::Normal;
         });
-        assert!(said.ends_with("; safety.allow_noncritical_degrade forbids to degrade it"), "{said}");
-        let said = detail(ModeReason::Control, |now| {
+        assert!(found.ends_with("because safety.allow_noncritical_degrade is false"), "{found}");
+        let found = detail(ModeReason::Control, |now| {
             noncritical(now);
             now.lanes[1].class = TrafficClass::Critical;
         });
-        assert_eq!(said, "a critical lane forwards every sample, whatever the links are like");
-        let said = detail(ModeReason::Control, |now| now.control.classifies = 0);
-        assert_eq!(said, "subscribers are not classified");
+        assert_eq!(found, "a critical lane forwards every sample, even over bad links");
+        let found = detail(ModeReason::Control, |now| now.control.classifies = 0);
+        assert_eq!(found, "subscribers are not classified");
     }
 
     #[test]
-    fn a_mode_of_safety_is_explained_by_the_fault() {
-        let said = detail(ModeReason::Safety, |now| {
+    fn a_mode_set_by_safety_is_explained_by_its_cause() {
+        let found = detail(ModeReason::Safety, |now| {
             now.control.safety = SafetyMode::Emergency as u8;
             now.control.safety_reason = FixedText::new("ingress is dead");
         });
-        assert_eq!(said, "the safety mode is emergency: ingress is dead");
+        assert_eq!(found, "the safety mode is emergency: ingress is dead");
     }
 
     #[test]
-    fn round_trips_are_unknown_where_no_probe_was_answered() {
-        let now = sound();
+    fn round_trips_are_unknown_when_no_probe_was_answered() {
+        let now = healthy();
         let report = now.subscriber_report(&subscriber("laptop", SubscriberState::Noncritical, 50));
         assert_eq!((report.rtt_mean_ms, report.loss), (None, Some(1.0)));
         assert_eq!(report.figures(), "none of 50 probes answered");

@@ -1,8 +1,9 @@
-//! Latencies, of the window and of all time.
+//! Latencies: of the window, and since the bridge started.
 
 use crate::model::LatencyHistogram;
 
-/// A latency within the window; at most 6.3 % too large, for it is the upper edge of a bucket.
+/// The latency of a stage within the window. Each value is the upper edge of a bucket: at most 6.3 % too
+/// large.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct Latency {
     /// Samples measured.
@@ -11,27 +12,28 @@ pub struct Latency {
     pub p50_us: Option<f64>,
     /// 99th percentile.
     pub p99_us: Option<f64>,
-    /// The largest.
+    /// Maximum.
     pub max_us: Option<f64>,
-    /// All that was ever measured, for the metrics page. No part of the JSON.
+    /// All latencies since the bridge started, for the metrics page; not part of the JSON.
     #[serde(skip)]
     pub total: LatencyTotal,
 }
 
-/// All latencies of a stage since the bridge came up, in buckets that double.
+/// All latencies of a stage since the bridge started, in buckets that double in width.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LatencyTotal {
-    /// For each of [`Self::EDGES_NS`], the latencies below it.
+    /// For each of [`Self::EDGES_NS`], the number of latencies below it.
     pub below: [u64; Self::EDGES_NS.len()],
-    /// All of them.
+    /// The number of all latencies.
     pub count: u64,
-    /// Their sum, each taken as the middle of its bucket: 3.2 % off at most within 1 µs to 137 s.
+    /// The sum, with each latency counted as the middle of its bucket: the error is at most 3.2 % from 1 µs
+    /// to 137 s.
     pub sum_ns: u128,
 }
 
 impl LatencyTotal {
-    /// 16 µs to 17 s, each twice the one before. They are edges of [`LatencyHistogram`]'s buckets, too, so
-    /// that the counts are exact.
+    /// The bucket edges: 16 µs to 17 s, each twice the one before. They are also bucket edges of
+    /// [`LatencyHistogram`], so the counts are exact.
     pub const EDGES_NS: [u64; 21] = {
         let mut edges = [1 << 14; 21];
         let mut at = 1;
@@ -51,7 +53,7 @@ impl LatencyTotal {
                 total.below[place] = total.count;
                 place += 1;
             }
-            // The counts are read from shared memory and may be any.
+            // The counts come from shared memory and may have any value.
             total.count = total.count.saturating_add(count);
             total.sum_ns += u128::from(count) * u128::from(u64::midpoint(lower_ns, upper_ns));
             lower_ns = upper_ns;
@@ -64,7 +66,7 @@ impl LatencyTotal {
 }
 
 impl Latency {
-    /// Of two readings of a histogram; without the former one there is no window.
+    /// The latency between two readings of a histogram; without an earlier reading it is empty.
     pub(super) fn of(now: &LatencyHistogram, before: Option<&LatencyHistogram>) -> Self {
         let window = before.map_or_else(LatencyHistogram::default, |before| now.since(before));
         let us = |quantile| window.quantile_ns(quantile).map(|ns| ns as f64 / 1e3);
@@ -83,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn latencies_are_those_of_the_window_also_the_largest() {
+    fn all_latencies_including_the_maximum_are_of_the_window() {
         let mut histogram = LatencyHistogram::default();
         histogram.record(90_000_000);
         let before = histogram;
@@ -99,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn the_total_counts_exactly_at_its_edges_and_knows_the_sum() {
+    fn the_total_has_exact_counts_at_its_edges_and_the_sum() {
         let mut histogram = LatencyHistogram::default();
         let mut sum_ns = 0.0;
         for (latency_ns, count) in

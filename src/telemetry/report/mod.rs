@@ -1,4 +1,4 @@
-//! What two readings of the boards say together: counts, and rates and latencies of the time between.
+//! The report made from two snapshots: counts, and the rates and latencies of the time between them.
 //!
 //! The types here are the JSON of `status --json`; `docs/status-json.md` documents every key.
 
@@ -19,16 +19,16 @@ use crate::model::{
     ReaderRecord,
 };
 
-/// The state of a bridge. Keys that end in a unit are in that unit; what cannot be told is null.
+/// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Report {
-    /// The bridge.
+    /// The name of the bridge's instance.
     pub instance: String,
-    /// When the boards were read, in milliseconds since the Unix epoch.
+    /// The time of the later snapshot, in milliseconds since the Unix epoch.
     pub time_unix_ms: u64,
-    /// The time between the two readings: rates, latencies and `drops_in_window` are of it.
+    /// The time between the two snapshots, to which rates, latencies and `drops_in_window` refer.
     pub window_ms: f64,
-    /// What is wrong, a sentence each, the gravest first.
+    /// The problems, the most severe first.
     pub problems: Vec<Problem>,
     /// The safety supervisor.
     pub safety: SafetyReport,
@@ -40,57 +40,57 @@ pub struct Report {
     pub routes: Vec<RouteReport>,
     /// The probes.
     pub probes: ProbesReport,
-    /// The subscribers that control follows.
+    /// The subscribers that control tracks.
     pub subscribers: Vec<SubscriberReport>,
-    /// The remote readers that reach past the bridge.
+    /// The remote subscribers that bypass the bridge.
     pub intruders: Vec<IntruderReport>,
-    /// Such readers ever seen since control came up, those not shown included.
+    /// Intruders seen since control started, including those not listed.
     pub intruders_seen: u64,
-    /// The network interfaces and peers that are away, and those that came back lately.
+    /// The network interfaces and peers that are away, or came back within the last 15 minutes.
     pub absences: Vec<AbsenceReport>,
 }
 
-/// One process.
+/// The state of one process.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct ProcessReport {
-    /// `ingress`, `control`, `egress-critical`, …
+    /// Its name: `ingress`, `control`, `egress-critical`, …
     pub name: String,
     /// Its process id; 0 when it never ran.
     pub pid: u64,
-    /// Whether it is there and turns.
+    /// Its state.
     pub state: ProcessState,
-    /// How long ago it came up.
+    /// The time since it started.
     pub uptime_s: Option<f64>,
-    /// How often it was started in this bridge, the first time included.
+    /// Starts of the process in this bridge, including the first one.
     pub starts: u64,
     /// Turns of its data path.
     pub turns: u64,
-    /// How long ago it turned last.
+    /// The time since its last turn.
     pub last_turn_age_ms: Option<f64>,
-    /// What failed in it, samples apart.
+    /// Errors of the process, except dropped samples.
     pub errors: u64,
-    /// Reloads that it refused because the file was bad.
+    /// Reloads that it refused because of errors in the configuration file.
     pub refused_reloads: u64,
-    /// Tells the settings that it applies from others, in hexadecimal; null when it has not said.
+    /// A hash of the settings that it applies, in hexadecimal, to compare processes; null until it is known.
     pub settings_fingerprint: Option<String>,
 }
 
-/// One lane.
+/// The mode of one lane.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct LaneReport {
     /// Its name.
     pub name: String,
-    /// `critical` or `noncritical`.
+    /// Its class: `critical` or `noncritical`.
     pub class: &'static str,
-    /// The mode that the policy board gives it.
+    /// The mode that results from the policy board.
     pub mode: &'static str,
-    /// Why: `default`, `by_hand`, `control`, `safety`, `held` or `expired`.
+    /// The reason of the mode: `default`, `by_hand`, `control`, `safety`, `held` or `expired`.
     pub mode_reason: &'static str,
-    /// The same in a sentence with what lies behind it. For people: wording may change.
+    /// The reason as text for users, with its cause. The wording may change.
     pub mode_detail: String,
-    /// When the policy ends, unless it is confirmed or set anew.
+    /// The time until the policy ends unless it is confirmed or set again.
     pub mode_ends_in_s: Option<f64>,
-    /// The epoch of the policy on the board; 0 when nobody has set one.
+    /// The epoch of the policy on the board; 0 when no policy was ever set.
     pub policy_epoch: u64,
     /// The mode that the lane's process applies.
     pub applied_mode: Option<&'static str>,
@@ -98,37 +98,37 @@ pub struct LaneReport {
     pub applied_policy_epoch: u64,
 }
 
-/// One route.
+/// The counts, rates and latencies of one route.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct RouteReport {
     /// Its id.
     pub id: String,
-    /// What ingress subscribes to.
+    /// The topic that ingress subscribes to.
     pub input_topic: String,
     /// The message type; null until it is known.
     pub message_type: Option<String>,
-    /// Publishers matched.
+    /// Matched publishers.
     pub writers: u64,
-    /// Samples taken in.
+    /// Samples that ingress received.
     pub received: u64,
-    /// Payload bytes of those.
+    /// Payload bytes of the received samples.
     pub received_bytes: u64,
     /// Samples published to the lanes.
     pub published: u64,
-    /// Of those, the ones that were put together in shared memory, and not copied there.
+    /// Published samples that the DDS library assembled in shared memory, so that they were not copied there.
     pub in_place: u64,
-    /// Samples that the publisher numbered and that never reached the bridge.
+    /// Samples lost before ingress, by gaps in the publishers' sequence numbers.
     pub lost_upstream: u64,
-    /// Samples that arrived after they or younger ones of their publisher had been taken, and were discarded;
-    /// not among the received.
+    /// Discarded samples that arrived again or after newer ones of their publisher; not included in
+    /// `received`.
     pub repeated: u64,
-    /// Of the received, those of publishers that have no account because there are too many.
+    /// Received samples of publishers without an account, because there are more publishers than accounts.
     pub unmarked: u64,
-    /// The publishers whose samples came.
+    /// The publishers that have sent samples.
     pub publishers: Vec<PublisherReport>,
-    /// Samples received and not published, by reason.
+    /// Samples received but not published, by reason.
     pub drops: Drops,
-    /// Of those, the ones within the window.
+    /// Drops within the window, by reason.
     pub drops_in_window: Drops,
     /// Whether `received = published + drops`.
     pub whole: bool,
@@ -136,71 +136,72 @@ pub struct RouteReport {
     pub rate_hz: Option<f64>,
     /// Payload bytes received per second.
     pub bytes_per_s: Option<f64>,
-    /// How long ago the last sample was received.
+    /// The time since the last received sample.
     pub last_received_age_ms: Option<f64>,
-    /// How far the clock of a publisher is ahead of this computer's; `null` while the clocks of all agree.
+    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `null` while all
+    /// agree.
     pub clock_offset_s: Option<f64>,
-    /// The GUID of that publisher's DDS writer.
+    /// The GUID of the DDS writer with that clock offset.
     pub clock_offset_writer: Option<String>,
-    /// From the publisher's source timestamp to ingress.
+    /// Latency from the publisher's source timestamp to ingress.
     pub dds_in: Latency,
-    /// The lanes that serve the route.
+    /// The outputs of the route, one for each lane that serves it.
     pub lanes: Vec<OutputReport>,
 }
 
-/// One publisher of a route, by the sequence numbers of its DDS writer.
+/// The account of one publisher of a route, from the sequence numbers of its DDS writer.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct PublisherReport {
-    /// Its DDS writer.
+    /// The GUID of its DDS writer.
     pub writer: String,
-    /// Its ROS 2 node; null while it is not known.
+    /// Its ROS 2 node; null while it is unknown.
     pub node: Option<String>,
-    /// The address of its host; null while it is not known.
+    /// The address of its host; null while it is unknown.
     pub host: Option<String>,
-    /// `RELIABLE` or `BEST_EFFORT`; null when the publisher is gone.
+    /// `RELIABLE` or `BEST_EFFORT`; null when the publisher has left.
     pub reliability: Option<&'static str>,
-    /// The number of the first sample taken.
+    /// The sequence number of its first received sample.
     pub first_sequence: i64,
-    /// The highest number taken.
+    /// The highest sequence number received.
     pub last_sequence: i64,
-    /// Samples taken.
+    /// Samples received.
     pub received: u64,
-    /// Numbers between the first and the last that never reached the bridge.
+    /// Sequence numbers between the first and the last that did not reach the bridge.
     pub lost_upstream: u64,
-    /// Samples that arrived again, or after younger ones, and were discarded.
+    /// Discarded samples that arrived again or after newer ones.
     pub repeated: u64,
-    /// How long ago the last sample was taken.
+    /// The time since the last received sample.
     pub last_received_age_ms: Option<f64>,
 }
 
-/// One route on one lane.
+/// The counts, rates and latencies of one output.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct OutputReport {
     /// The lane.
     pub lane: String,
-    /// What the lane publishes to.
+    /// The topic that the lane publishes to.
     pub topic: String,
-    /// Readers matched.
+    /// Matched readers.
     pub readers: u64,
-    /// Those readers, 32 at most.
+    /// The matched readers, 32 at most.
     pub matched_readers: Vec<ReaderReport>,
-    /// Samples that single readers missed because they did not keep up; the others have them.
+    /// Samples that left the history before single readers acknowledged them; the other readers have them.
     pub reader_overrun: u64,
-    /// Samples that the lane was offered since it began to account.
+    /// Samples offered to the lane since it first started.
     pub received: u64,
-    /// Samples given to the DDS writer.
+    /// Samples that the lane gave to its DDS writer.
     pub forwarded: u64,
-    /// Payload bytes of those.
+    /// Payload bytes of the forwarded samples.
     pub forwarded_bytes: u64,
-    /// Of the forwarded, those handed over by reference.
+    /// Forwarded samples that were handed over by reference, not copied.
     pub by_reference: u64,
-    /// Of the forwarded, those published while the lane was down.
+    /// Forwarded samples that were published while the lane was down.
     pub caught_up: u64,
     /// Samples waiting in the lane.
     pub waiting: u64,
     /// Samples not forwarded, by reason.
     pub drops: Drops,
-    /// Of those, the ones within the window.
+    /// Drops within the window, by reason.
     pub drops_in_window: Drops,
     /// Whether `received = forwarded + waiting + drops`.
     pub whole: bool,
@@ -210,13 +211,13 @@ pub struct OutputReport {
     pub rate_hz: Option<f64>,
     /// Payload bytes forwarded per second.
     pub bytes_per_s: Option<f64>,
-    /// How long ago the last sample was forwarded.
+    /// The time since the last forwarded sample.
     pub last_forwarded_age_ms: Option<f64>,
-    /// From ingress to the lane.
+    /// Latency from ingress to the lane.
     pub shm: Latency,
-    /// Within the lane, up to its DDS writer.
+    /// Latency within the lane, up to its DDS writer.
     pub dds_out: Latency,
-    /// From the source timestamp to the lane's DDS writer.
+    /// Age of the samples when the DDS writer gets them, by their source timestamp.
     pub age: Latency,
 }
 
@@ -225,21 +226,21 @@ pub struct OutputReport {
 pub struct ReaderReport {
     /// Its GUID, in hexadecimal.
     pub guid: String,
-    /// Its ROS 2 node; null while control does not know it.
+    /// Its ROS 2 node; null while it is unknown.
     pub node: Option<String>,
-    /// The address of its host; null while control does not know it.
+    /// The address of its host; null while it is unknown.
     pub host: Option<String>,
     /// `RELIABLE` or `BEST_EFFORT`.
     pub reliability: &'static str,
-    /// Samples written since it was matched, and the history that it was offered then.
+    /// Samples offered to it: the history when it was matched, and all samples written since.
     pub offered: u64,
-    /// Of those, samples that it has not acknowledged; 0 for a BEST_EFFORT reader.
+    /// Offered samples that it has not acknowledged; 0 for a BEST_EFFORT reader.
     pub unacknowledged: u64,
-    /// Of those, samples that left the lane's history before the reader had them.
+    /// Offered samples that left the lane's history before the reader acknowledged them.
     pub overrun: u64,
 }
 
-/// Drops, by name. In JSON every reason is there, so that a key that is missing is a mistake in its name.
+/// Drop counts by reason. The JSON has every reason as a key, so that a missing key means a misspelt name.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Drops(pub DropCounts);
 
@@ -254,7 +255,7 @@ impl Serialize for Drops {
 }
 
 impl Snapshot {
-    /// What this reading says, with rates and latencies since `earlier`. A bridge that was started anew in
+    /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in
     /// between has no rates yet.
     pub fn since(&self, earlier: &Self) -> Report {
         let window_ms = self.at.since(earlier.at) as f64 / 1e6;
@@ -284,7 +285,7 @@ impl Snapshot {
         }
     }
 
-    /// The same route in this reading.
+    /// The route with the same id in this snapshot.
     pub(super) fn route(&self, other: &RouteReading) -> Option<&RouteReading> {
         self.routes.iter().find(|route| route.id == other.id)
     }
@@ -411,7 +412,7 @@ impl Snapshot {
         }
     }
 
-    /// The ROS 2 node of an endpoint and the address of its host, as far as they are known.
+    /// The ROS 2 node of an endpoint and the address of its host, if they are known.
     fn node_and_host(&self, endpoint: Guid) -> (Option<String>, Option<String>) {
         let Some(named) = self.named_endpoints.iter().find(|named| named.endpoint == endpoint) else {
             return (None, None);
@@ -420,17 +421,17 @@ impl Snapshot {
         (text(&named.node), text(&named.host))
     }
 
-    /// A publisher by its node and host, as far as they are known, for people.
+    /// A name for a publisher: its node, or its GUID if the node is unknown, and its host if it is known.
     pub(super) fn publisher_name(&self, writer: Guid) -> String {
         let (node, host) = self.node_and_host(writer);
-        let node = node.unwrap_or_else(|| format!("the writer {writer}"));
+        let node = node.unwrap_or_else(|| format!("writer {writer}"));
         host.map_or_else(|| node.clone(), |host| format!("{node} on {host}"))
     }
 
-    /// A reader by its node and host, as far as they are known, for people.
+    /// A name for a reader: its node, or its GUID if the node is unknown, and its host if it is known.
     pub(super) fn reader_name(&self, record: &ReaderRecord) -> String {
         let report = self.reader_report(record);
-        let node = report.node.unwrap_or_else(|| format!("the reader {}", report.guid));
+        let node = report.node.unwrap_or_else(|| format!("reader {}", report.guid));
         match report.host {
             Some(host) => format!("{node} on {host}"),
             None => node,
@@ -439,18 +440,18 @@ impl Snapshot {
 }
 
 impl RouteReading {
-    /// Whether every sample received was published or dropped for a named reason.
+    /// Whether every received sample was published or dropped for a named reason.
     pub fn is_whole(&self) -> bool {
         self.counters.received == self.counters.published + self.counters.drops.total()
     }
 
-    /// The same lane's output in this reading.
+    /// The output with the same lane and topic in this reading.
     pub(super) fn output(&self, other: &OutputReading) -> Option<&OutputReading> {
         self.outputs.iter().find(|output| output.lane == other.lane && output.topic == other.topic)
     }
 }
 
-/// What was dropped since an earlier reading; nothing when there is none, or when it is of another bridge.
+/// Drops since an earlier reading; none without an earlier reading or after the bridge was restarted.
 pub(super) fn drops_since(now: &DropCounts, before: Option<DropCounts>) -> DropCounts {
     let mut drops = DropCounts::default();
     if let Some(before) = before {
@@ -478,17 +479,18 @@ fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
     }
 }
 
-/// `None` for an instant that never was.
-/// How far the clock of a publisher is ahead of ours; `None` while all agree.
+/// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all agree.
 pub(super) fn clock_offset_s(counters: &IngressCounters) -> Option<f64> {
     (counters.clock_offset_ns != 0).then(|| -(counters.clock_offset_ns as f64) / 1e9)
 }
 
+/// The time since `at`; `None` for 0, which means that the event never happened.
 fn age_ms(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
     (at.0 != 0).then(|| now.since(at) as f64 / 1e6)
 }
 
-/// `None` without an earlier reading, and when the count went back: then it is another bridge's.
+/// The rate of a count; `None` without an earlier reading, and when the count decreased because the bridge
+/// was restarted.
 fn per_s(now: u64, before: Option<u64>, window_ms: f64) -> Option<f64> {
     let grown = now.checked_sub(before?)?;
     (window_ms > 0.0).then(|| grown as f64 * 1e3 / window_ms)
@@ -499,20 +501,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rate_is_what_came_in_the_window() {
+    fn a_rate_is_the_growth_of_a_count_within_the_window() {
         assert_eq!(per_s(150, Some(100), 500.0), Some(100.0));
         assert_eq!(per_s(100, Some(100), 500.0), Some(0.0));
     }
 
     #[test]
-    fn there_is_no_rate_without_a_reading_before_of_the_same_bridge() {
+    fn without_an_earlier_reading_of_the_same_bridge_there_is_no_rate() {
         assert_eq!(per_s(150, None, 500.0), None);
         assert_eq!(per_s(99, Some(100), 500.0), None);
         assert_eq!(per_s(150, Some(100), 0.0), None);
     }
 
     #[test]
-    fn drops_of_another_bridge_are_not_news() {
+    fn drops_before_the_window_are_not_counted() {
         let mut now = DropCounts::default();
         now.add(DropReason::Stale, 3);
         assert_eq!(drops_since(&now, None).total(), 0);
@@ -522,10 +524,11 @@ mod tests {
         let since: Vec<_> = drops_since(&now, Some(before)).iter().collect();
         assert_eq!(since, [(DropReason::Stale, 2)]);
     }
-    /// The other keys are compared with what a real bridge prints (tests/cli.rs).
+
+    /// tests/cli.rs compares the other keys with the output of a running bridge.
     #[test]
     fn every_key_of_a_subscriber_an_intruder_and_a_publisher_is_documented() {
-        let report = serde_json::to_value(crate::telemetry::samples::wide()).unwrap();
+        let report = serde_json::to_value(crate::telemetry::test_report::wide_report()).unwrap();
         let page = include_str!("../../../docs/status-json.md");
         let publisher = &report["routes"][0]["publishers"][0];
         for (list, item) in [

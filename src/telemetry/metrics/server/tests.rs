@@ -1,7 +1,7 @@
-//! The server with real sockets and clients that behave badly.
+//! Tests of the server with real sockets and misbehaving clients.
 
 use super::*;
-use crate::telemetry::samples::wide;
+use crate::telemetry::test_report::wide_report;
 
 fn server(folder: &tempfile::TempDir) -> (MetricsServer, PathBuf) {
     let path = folder.path().join("metrics.sock");
@@ -14,17 +14,17 @@ fn client(path: &Path) -> UnixStream {
     client
 }
 
-/// The whole answer to a request.
-fn ask(path: &Path, request: &str) -> String {
+/// Sends a request and returns the whole response.
+fn request(path: &Path, text: &str) -> String {
     let mut client = client(path);
-    client.write_all(request.as_bytes()).unwrap();
-    let mut answer = String::new();
-    client.read_to_string(&mut answer).unwrap();
-    answer
+    client.write_all(text.as_bytes()).unwrap();
+    let mut response = String::new();
+    client.read_to_string(&mut response).unwrap();
+    response
 }
 
-fn status(answer: &str) -> &str {
-    answer.lines().next().unwrap()
+fn status(response: &str) -> &str {
+    response.lines().next().unwrap()
 }
 
 #[test]
@@ -32,45 +32,45 @@ fn the_page_is_that_of_the_latest_report() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
     let get = "GET /metrics HTTP/1.1\r\nHost: robot\r\n\r\n";
-    assert_eq!(status(&ask(&path, get)), "HTTP/1.1 503 Service Unavailable");
-    server.show(Arc::new(Report { instance: "old".into(), ..wide() }));
-    let report = wide();
+    assert_eq!(status(&request(&path, get)), "HTTP/1.1 503 Service Unavailable");
+    server.show(Arc::new(Report { instance: "old".into(), ..wide_report() }));
+    let report = wide_report();
     server.show(Arc::new(report.clone()));
-    let answer = ask(&path, get);
-    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+    let response = request(&path, get);
+    let (head, body) = response.split_once("\r\n\r\n").unwrap();
     assert_eq!(body, metrics_page(&report));
     assert_eq!(status(head), "HTTP/1.1 200 OK");
     assert!(head.contains(&format!("\r\nContent-Type: {CONTENT_TYPE}\r\n")), "{head}");
     assert!(head.contains(&format!("\r\nContent-Length: {}\r\n", body.len())), "{head}");
-    let head_only = ask(&path, "HEAD /metrics?x=1 HTTP/1.0\r\n\r\n");
+    let head_only = request(&path, "HEAD /metrics?x=1 HTTP/1.0\r\n\r\n");
     assert_eq!(head_only, format!("{head}\r\n\r\n"));
 }
 
 #[test]
-fn it_is_served_over_tcp_too() {
+fn the_page_is_also_served_over_tcp() {
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let server = MetricsServer::start(&MetricsListener::Tcp("127.0.0.1".parse().unwrap(), port)).unwrap();
-    server.show(Arc::new(wide()));
+    server.show(Arc::new(wide_report()));
     let mut client = TcpStream::connect(("127.0.0.1", port)).unwrap();
-    // In pieces, and with more than was asked for.
+    // The request is sent in pieces, followed by unneeded bytes.
     for piece in ["GET /met", "rics HTTP/1.1\r\n", "\r", "\nunasked"] {
         client.write_all(piece.as_bytes()).unwrap();
         client.flush().unwrap();
     }
-    let mut answer = String::new();
-    client.read_to_string(&mut answer).unwrap();
-    assert_eq!(status(&answer), "HTTP/1.1 200 OK");
-    assert!(answer.ends_with(&metrics_page(&wide())));
+    let mut response = String::new();
+    client.read_to_string(&mut response).unwrap();
+    assert_eq!(status(&response), "HTTP/1.1 200 OK");
+    assert!(response.ends_with(&metrics_page(&wide_report())));
     drop(server);
     assert_eq!(TcpStream::connect(("127.0.0.1", port)).unwrap_err().kind(), ErrorKind::ConnectionRefused);
 }
 
 #[test]
-fn what_is_no_request_for_the_page_is_refused() {
+fn bad_requests_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
-    server.show(Arc::new(wide()));
-    for (request, expected) in [
+    server.show(Arc::new(wide_report()));
+    for (bad, expected) in [
         ("POST /metrics HTTP/1.1\r\n\r\n", "405 Method Not Allowed"),
         ("GET / HTTP/1.1\r\n\r\n", "404 Not Found"),
         ("GET /metrics/x HTTP/1.1\r\n\r\n", "404 Not Found"),
@@ -81,30 +81,30 @@ fn what_is_no_request_for_the_page_is_refused() {
         (&"x".repeat(MAX_REQUEST_BYTES + 1), "431 Request Header Fields Too Large"),
         (&format!("GET /metrics HTTP/1.1\r\n{}\r\n\r\n", "x".repeat(100_000)), "431 Request"),
     ] {
-        let answer = ask(&path, request);
-        assert!(status(&answer).starts_with(&format!("HTTP/1.1 {expected}")), "{request:.40}: {answer}");
+        let response = request(&path, bad);
+        assert!(status(&response).starts_with(&format!("HTTP/1.1 {expected}")), "{bad:.40}: {response}");
     }
 }
 
 #[test]
-fn clients_that_say_nothing_hold_nobody_up_for_long() {
+fn silent_clients_delay_others_only_until_their_timeout() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
-    server.show(Arc::new(wide()));
-    // All places are taken: who comes later waits in the kernel's queue.
+    server.show(Arc::new(wide_report()));
+    // All places are taken: a later client waits in the kernel's queue.
     let silent: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| client(&path)).collect();
     let mut slow = client(&path);
     slow.write_all(b"GET /metrics").unwrap();
-    let answer = ask(&path, "GET /metrics HTTP/1.1\r\n\r\n");
-    assert_eq!(status(&answer), "HTTP/1.1 200 OK");
-    // Their time is over.
+    let response = request(&path, "GET /metrics HTTP/1.1\r\n\r\n");
+    assert_eq!(status(&response), "HTTP/1.1 200 OK");
+    // The silent clients have timed out.
     for mut client in silent {
         assert_eq!(client.read(&mut [0]).unwrap(), 0);
     }
 }
 
 #[test]
-fn the_file_of_the_socket_is_for_its_owner_and_goes_with_the_server() {
+fn the_socket_file_is_for_its_owner_and_is_removed_with_the_server() {
     let folder = tempfile::tempdir().unwrap();
     let (first, path) = server(&folder);
     let mode = fs::symlink_metadata(&path).unwrap().permissions().mode();
@@ -113,16 +113,16 @@ fn the_file_of_the_socket_is_for_its_owner_and_goes_with_the_server() {
     assert!(second.to_string().contains("metrics.sock (diagnostics.metrics)"), "{second}");
     drop(first);
     assert!(!path.exists());
-    // One that was killed leaves its file.
+    // A killed server leaves its file behind.
     drop(UnixListener::bind(&path).unwrap());
     assert!(path.exists());
     let (third, _) = server(&folder);
-    third.show(Arc::new(wide()));
-    assert_eq!(status(&ask(&path, "GET /metrics HTTP/1.1\r\n\r\n")), "HTTP/1.1 200 OK");
+    third.show(Arc::new(wide_report()));
+    assert_eq!(status(&request(&path, "GET /metrics HTTP/1.1\r\n\r\n")), "HTTP/1.1 200 OK");
     drop(third);
-    // What is no socket is somebody's own.
+    // A file that is not a socket is kept.
     fs::write(&path, "mine").unwrap();
     let refused = MetricsServer::start(&MetricsListener::Unix(path.clone())).unwrap_err();
-    assert!(refused.to_string().contains("there is a file of that name"), "{refused}");
+    assert!(refused.to_string().contains("exists and is not a socket"), "{refused}");
     assert_eq!(fs::read_to_string(&path).unwrap(), "mine");
 }

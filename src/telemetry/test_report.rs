@@ -1,4 +1,4 @@
-//! A report for the tests of what is made of one.
+//! A report for the tests of its output formats.
 
 use super::liveness::ProcessState;
 use super::problems::{Level, Problem};
@@ -17,8 +17,8 @@ fn drops(each: u64) -> Drops {
     Drops(counts)
 }
 
-/// Every list has an item, and figures and names are as long as they come.
-pub(super) fn wide() -> Report {
+/// A report in which every list has an item, and numbers and texts have their maximum length.
+pub(super) fn wide_report() -> Report {
     let latency = Latency {
         count: 1,
         p50_us: Some(99_940.0),
