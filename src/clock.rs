@@ -1,4 +1,4 @@
-//! The only reader of the operating system's clocks. Everything else is handed the time.
+//! Reads the operating system's clocks. No other module of the library does.
 
 use nix::time::{ClockId, clock_gettime};
 
@@ -14,8 +14,8 @@ pub fn wall() -> WallNs {
     WallNs(read(ClockId::CLOCK_REALTIME))
 }
 
-/// Linux has both clocks since 2.6, and neither reads below zero on a machine whose date is after 1970; a
-/// failure would read as instant 0.
+/// Reads a clock in nanoseconds. Linux has both clocks since 2.6, and neither is negative on a machine whose
+/// date is after 1970; a failure would return 0.
 fn read(clock: ClockId) -> u64 {
     match clock_gettime(clock) {
         Ok(time) => {

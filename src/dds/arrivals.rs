@@ -1,4 +1,4 @@
-//! Datagrams, seen as they come, by a thread that takes none of them.
+//! Detects arriving samples by peeking at datagrams before the DDS library receives them.
 
 use std::io;
 use std::net::UdpSocket;
@@ -11,41 +11,41 @@ use super::DdsError;
 use super::rustdds::sample_arriving;
 use crate::model::Guid;
 
-/// What is looked at of a datagram: the headers of RTPS and of the first submessages.
-const LOOKED_AT_BYTES: usize = 256;
+/// The part of a datagram that is peeked at: the RTPS header and the headers of the first submessages.
+const PEEKED_BYTES: usize = 256;
 
-/// What epoll says of the closer, beside the numbers of the sockets.
-const CLOSING: u64 = u64::MAX;
+/// The epoll data of the closer; that of a socket is its index.
+const CLOSER: u64 = u64::MAX;
 
-/// The sockets of a participant that samples come to.
+/// Waits for datagrams on the sockets on which a participant receives samples, without receiving them.
 ///
-/// The kernel wakes who waits here right after the thread that receives.
+/// The kernel wakes the waiting thread right after the thread that receives.
 pub struct Arrivals {
     epoll: Epoll,
     sockets: Vec<UdpSocket>,
-    closing: Arc<EventFd>,
+    close_event: Arc<EventFd>,
 }
 
-/// Ends the waiting, from any thread.
+/// Makes [`Arrivals::wait`] return, from any thread.
 pub struct ArrivalsCloser {
-    closing: Arc<EventFd>,
+    close_event: Arc<EventFd>,
 }
 
-/// What has come.
+/// The result of [`Arrivals::wait`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arrival {
-    /// A sample, or a part of one, as its datagram claims; nothing was checked.
+    /// A sample or a fragment of one, as the datagram claims; the claim is not checked.
     Sample {
-        /// Who wrote it.
+        /// The writer of the sample.
         writer: Guid,
-        /// Its number among those of the writer.
+        /// The writer's sequence number of the sample.
         sequence: i64,
-        /// Bytes of it that come after this datagram.
+        /// Bytes of the sample that are still missing after this datagram.
         left_bytes: usize,
     },
-    /// Something else, or what was received before it could be looked at.
+    /// Another datagram, or one that was received before it could be peeked at.
     Other,
-    /// Somebody called [`ArrivalsCloser::close`].
+    /// [`ArrivalsCloser::close`] was called.
     Closed,
 }
 
@@ -54,33 +54,33 @@ impl Arrivals {
         let open = || {
             let sockets = sockets?;
             let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
-            // Edge-triggered, for nothing is taken that would end a level. Exclusive, for then the kernel has
-            // it behind the event loop in the queue of those it wakes; otherwise it would be before it.
+            // Edge-triggered, because datagrams stay in the socket and a level would never end. Exclusive, so
+            // that the kernel wakes this thread after the library's event loop instead of before it.
             let flags = EpollFlags::EPOLLIN | EpollFlags::EPOLLET | EpollFlags::EPOLLEXCLUSIVE;
             for (number, socket) in (0..).zip(&sockets) {
                 epoll.add(socket, EpollEvent::new(flags, number))?;
             }
-            let closing = EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?;
-            epoll.add(&closing, EpollEvent::new(EpollFlags::EPOLLIN, CLOSING))?;
-            Ok(Self { epoll, sockets, closing: Arc::new(closing) })
+            let close_event = EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?;
+            epoll.add(&close_event, EpollEvent::new(EpollFlags::EPOLLIN, CLOSER))?;
+            Ok(Self { epoll, sockets, close_event: Arc::new(close_event) })
         };
         open().map_err(|error: io::Error| DdsError::library("a watch of its sockets".to_owned(), error))
     }
 
-    /// What ends the waiting.
+    /// Returns a handle that ends the waiting.
     pub fn closer(&self) -> ArrivalsCloser {
-        ArrivalsCloser { closing: self.closing.clone() }
+        ArrivalsCloser { close_event: self.close_event.clone() }
     }
 
-    /// Waits until something has come since the last call. Of several datagrams that wait to be received the
-    /// first one is looked at.
+    /// Waits for a datagram that has arrived since the last call. If several wait to be received on its
+    /// socket, the first of them is peeked at.
     pub fn wait(&self) -> Arrival {
         let mut events = [EpollEvent::empty()];
         match self.epoll.wait(&mut events, EpollTimeout::NONE) {
-            Ok(1) if events[0].data() == CLOSING => Arrival::Closed,
+            Ok(1) if events[0].data() == CLOSER => Arrival::Closed,
             Ok(1) => {
                 let socket = usize::try_from(events[0].data()).ok().and_then(|at| self.sockets.get(at));
-                socket.and_then(look_at).unwrap_or(Arrival::Other)
+                socket.and_then(peek_sample).unwrap_or(Arrival::Other)
             }
             _ => Arrival::Other,
         }
@@ -88,16 +88,19 @@ impl Arrivals {
 }
 
 impl ArrivalsCloser {
-    /// Lets [`Arrivals::wait`] return [`Arrival::Closed`], now and from now on.
+    /// Makes [`Arrivals::wait`] return [`Arrival::Closed`], in this call and in all later ones.
     pub fn close(&self) {
-        // A counter that is full has been written to before.
-        let _ = self.closing.write(1);
+        // A write fails only if the counter is full, that is, if this was called before.
+        let _ = self.close_event.write(1);
     }
 }
 
-fn look_at(socket: &UdpSocket) -> Option<Arrival> {
-    let mut datagram = [0; LOOKED_AT_BYTES];
-    // Does not block: the socket is one of the library's event loop, which may have received it by now.
+/// Reads the start of the first waiting datagram; `None` if it carries no sample or has been received
+/// already.
+fn peek_sample(socket: &UdpSocket) -> Option<Arrival> {
+    let mut datagram = [0; PEEKED_BYTES];
+    // Does not block, because the event loop's sockets are non-blocking. The event loop may have received
+    // the datagram already.
     let length = socket.peek(&mut datagram).ok()?;
     let (writer, sequence, left_bytes) = sample_arriving(datagram.get(..length)?)?;
     Some(Arrival::Sample { writer: Guid(writer.to_bytes()), sequence, left_bytes })

@@ -1,14 +1,14 @@
-//! What other participants have, as discovery reports it.
+//! Changes of remote readers, writers and participants, as discovery reports them.
 
 use super::qos::{durability_of, reliability_of};
 use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription, LostReason};
 use crate::model::{Durability, Guid, Reliability};
 use crate::policy::Location;
 
-/// Announced addresses of an endpoint that are looked at. A host has fewer.
+/// The most announced addresses of an endpoint that are kept. A host has fewer.
 const MAX_ADDRESSES: usize = 64;
 
-/// A reader or writer that discovery has seen.
+/// A remote reader or writer that was discovered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoint {
     /// Its GUID.
@@ -17,46 +17,48 @@ pub struct Endpoint {
     pub topic: String,
     /// DDS type, such as `sensor_msgs::msg::dds_::LaserScan_`.
     pub dds_type: String,
-    /// RELIABILITY that it offers or requests.
+    /// The RELIABILITY that it offers or requests.
     pub reliability: Reliability,
-    /// DURABILITY that it offers or requests.
+    /// The DURABILITY that it offers or requests.
     pub durability: Durability,
-    /// What is known of where it is.
+    /// The addresses from which its host is determined.
     pub location: Location,
 }
 
-/// A change in what other participants have.
+/// A change of a remote reader, writer or participant, or of its match with a local endpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Discovery {
-    /// A writer is there, or changed.
+    /// A writer was discovered, or has changed.
     Writer(Endpoint),
-    /// A writer is gone.
+    /// A writer was deleted.
     WriterGone(Guid),
-    /// A reader is there, or changed.
+    /// A reader was discovered, or has changed.
     Reader(Endpoint),
-    /// A reader is gone.
+    /// A reader was deleted.
     ReaderGone(Guid),
-    /// A participant is gone, and with it its readers and writers, of which nothing else is said.
+    /// A participant has left or its lease has expired. Its readers and writers are gone with it; no separate
+    /// change reports them.
     ParticipantGone {
-        /// The prefix that their GUIDs have in common.
+        /// The GUID prefix of the participant and of its endpoints.
         prefix: [u8; 12],
-        /// For how long nothing was heard of it, if its lease has ended; `None` if it said goodbye.
+        /// The time for which nothing was received from it, if its lease has expired; `None` if it announced
+        /// that it leaves.
         silent_ms: Option<u64>,
     },
-    /// A reader of ours asks for more than a writer offers, or a reader for more than ours offers.
+    /// A local and a remote endpoint do not match: the reader requests a stronger QoS than the writer offers.
     Incompatible {
-        /// The endpoint of ours.
+        /// The local endpoint.
         local: Guid,
-        /// The other one.
+        /// The remote endpoint.
         remote: Guid,
     },
 }
 
-/// The event in our terms; `None` for one that the bridge has no use for.
+/// Converts an event of RustDDS; `None` for one that the bridge does not use.
 pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery> {
     use DomainParticipantStatusEvent as Event;
     match event {
-        // DDS 1.4 table in clause 2.2.3: RELIABILITY defaults to RELIABLE for writers, BEST_EFFORT for
+        // DDS 1.4, table in clause 2.2.3: the default RELIABILITY is RELIABLE for writers and BEST_EFFORT for
         // readers.
         Event::WriterDetected { writer } => Some(Discovery::Writer(endpoint(writer, Reliability::Reliable))),
         Event::ReaderDetected { reader } => {

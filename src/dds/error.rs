@@ -1,16 +1,16 @@
-//! What can go wrong at the RTPS edge.
+//! Errors when DDS entities are created.
 
 use std::fmt;
 use std::io;
 
-/// Why a participant, reader or writer could not be made.
+/// Why a participant, reader or writer could not be created.
 #[derive(Debug)]
 pub enum DdsError {
     /// The host's interfaces could not be listed.
     Interfaces(io::Error),
-    /// The DDS library refused.
+    /// The DDS library returned an error.
     Library {
-        /// What was being made.
+        /// The entity that was to be created.
         what: String,
         /// The library's reason.
         reason: String,

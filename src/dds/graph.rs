@@ -1,28 +1,29 @@
-//! The ROS 2 graph: each process is one node, and says which endpoints belong to it.
+//! Encodes and decodes entries of the ROS 2 graph, which name the nodes of a participant and their endpoints.
 //!
 //! ROS 2 maps nodes to DDS participants by `rmw_dds_common/msg/ParticipantEntitiesInfo` on the DDS topic
-//! `ros_discovery_info`. ros2-client keeps such an entry only for endpoints that it made itself, and its
-//! readers and writers decode what they carry; so the entry for our raw endpoints is encoded here.
+//! `ros_discovery_info`. ros2-client publishes such an entry only for endpoints that it created itself, and
+//! its readers and writers decode payloads; so this module encodes the entry of the raw endpoints. Each
+//! process of the bridge is one node.
 
 use crate::model::{Encapsulation, Guid};
 
-/// Nodes of one participant that are read; one container of components has tens of them.
+/// The most nodes of one participant that are accepted; a component container has tens of them.
 const MAX_NODES: usize = 256;
-/// Readers and writers of one participant that are read. A node has about fifteen.
+/// The most readers and writers of one participant that are accepted. A node has about fifteen.
 const MAX_ENDPOINTS: usize = 8_192;
-/// Bytes of a namespace or of a node's name: the limit of ROS 2 (`rmw_validate_node_name`).
+/// The longest namespace or node name, as in ROS 2 (`rmw_validate_node_name`).
 const MAX_NAME_BYTES: usize = 255;
 
-/// Topic of the graph entries.
+/// The DDS topic of the graph entries.
 pub(super) const TOPIC: &str = "ros_discovery_info";
-/// Type of the graph entries.
+/// The DDS type of the graph entries.
 pub(super) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 
-/// The entry of a participant with one node, in plain little-endian CDR (RTPS 2.5 clause 10, without the
-/// encapsulation header).
+/// Encodes the entry of a participant with one node in plain little-endian CDR (RTPS 2.5 clause 10), without
+/// the encapsulation header.
 ///
-/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron. A GUID fills
-/// the first 16; the rest is zero.
+/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron. The GUID is
+/// in the first 16 bytes; the others are zero.
 pub fn encode_graph(
     participant: Guid,
     namespace: &str,
@@ -48,7 +49,7 @@ pub fn encode_graph(
 /// The encapsulation of [`encode_graph`]'s result.
 pub(super) const ENCAPSULATION: Encapsulation = Encapsulation::CDR_LE;
 
-/// A graph entry that was read.
+/// A decoded graph entry: the nodes of one participant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GraphEntry {
     /// The participant.
@@ -68,30 +69,31 @@ pub struct GraphNode {
     pub writers: Vec<Guid>,
 }
 
-/// Reads an entry in plain CDR of either byte order, with identifiers of 16 or 24 bytes; `None` for anything
-/// else, for an entry of more than 256 nodes or 8,192 endpoints, and for names that ROS 2 does not allow.
+/// Decodes an entry in plain CDR of either byte order, with identifiers of 16 or 24 bytes; `None` for
+/// anything else, for an entry of more than 256 nodes or 8,192 endpoints, and for names that ROS 2 does not
+/// allow.
 ///
-/// The entry itself says how long its identifiers are: an entry with a node can't be read in both ways, for
-/// where the shorter ones have the number of nodes the longer ones have zeros, and one without a node is too
-/// short to be read with the longer ones.
+/// Only one length of the identifiers fits an entry. An entry with a node has the number of nodes after 16
+/// bytes if its identifiers are short, and zeros there if they are long; an entry without a node is too short
+/// for long identifiers.
 pub fn decode_graph(cdr: &[u8], encapsulation: Encapsulation) -> Option<GraphEntry> {
     let big_endian = match encapsulation.representation() {
         [0, 0] => true,
         [0, 1] => false,
         _ => return None,
     };
-    [16, 24].into_iter().find_map(|gid_bytes| Cdr { cdr, at: 0, big_endian, gid_bytes }.entry())
+    [16, 24].into_iter().find_map(|gid_bytes| CdrReader { cdr, at: 0, big_endian, gid_bytes }.entry())
 }
 
-/// A reader of plain CDR.
-struct Cdr<'a> {
+/// Reads values from plain CDR.
+struct CdrReader<'a> {
     cdr: &'a [u8],
     at: usize,
     big_endian: bool,
     gid_bytes: usize,
 }
 
-impl Cdr<'_> {
+impl CdrReader<'_> {
     fn entry(&mut self) -> Option<GraphEntry> {
         let participant = self.gid()?;
         let count = self.count(MAX_NODES)?;
@@ -106,7 +108,7 @@ impl Cdr<'_> {
             endpoints += writers.len();
             nodes.push(GraphNode { name: full_name(namespace, name)?, readers, writers });
         }
-        // RTPS fills a payload up to a whole word.
+        // RTPS pads a payload to a multiple of 4 bytes.
         (self.cdr.len() - self.at < 4).then_some(GraphEntry { participant, nodes })
     }
 
@@ -134,7 +136,7 @@ impl Cdr<'_> {
     }
 
     fn gids(&mut self, max: usize) -> Option<Vec<Guid>> {
-        // Collected as they are read: the number claimed allocates nothing.
+        // Collects one by one, so that a false count cannot cause a large allocation.
         (0..self.count(max)?).map(|_| self.gid()).collect()
     }
 
@@ -145,8 +147,8 @@ impl Cdr<'_> {
     }
 }
 
-/// `/robot` and `rviz` are `/robot/rviz`. Names reach logs and terminals, so only those are read that ROS 2
-/// allows: tokens of A-Z, a-z, 0-9 and _.
+/// Joins namespace and name: `/robot` and `rviz` are `/robot/rviz`. Names are printed in logs and terminals,
+/// so only those that ROS 2 allows are accepted: tokens of A-Z, a-z, 0-9 and _.
 fn full_name(namespace: String, name: String) -> Option<String> {
     let is_token = |token: &str| {
         !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
@@ -169,7 +171,7 @@ fn put_u32(cdr: &mut Vec<u8>, value: u32) {
     cdr.extend_from_slice(&value.to_le_bytes());
 }
 
-/// A CDR string: its length with the terminating zero, its bytes, the zero.
+/// Writes a CDR string: its length with the terminating zero, its bytes, the zero.
 fn put_string(cdr: &mut Vec<u8>, text: &str) {
     put_u32(cdr, text.len() as u32 + 1);
     cdr.extend_from_slice(text.as_bytes());
@@ -181,7 +183,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_entry_is_laid_out_as_the_message_definition_says() {
+    fn an_entry_has_the_layout_of_the_message_definition() {
         let cdr = encode_graph(Guid([1; 16]), "/", "ab", &[Guid([2; 16])], &[], 16);
         let mut expected = vec![1; 16];
         expected.extend([1, 0, 0, 0]);
@@ -212,13 +214,13 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_says_how_long_its_identifiers_are() {
+    fn the_length_of_the_identifiers_is_detected() {
         for gid_bytes in [16, 24] {
             let cdr = encoded("/robot", "rviz", gid_bytes);
             assert_eq!(decoded(&cdr), Some(entry(&[("/robot/rviz", 2)])));
-            // Filled up to a word.
+            // Padded to a multiple of 4 bytes.
             assert_eq!(decoded(&[&cdr[..], &[0; 3]].concat()), Some(entry(&[("/robot/rviz", 2)])));
-            // Of no node, as of a participant that has just been made.
+            // Without a node, as from a participant that has just been created.
             let mut none = vec![1; 16];
             none.resize(gid_bytes + 4, 0);
             assert_eq!(decoded(&none), Some(entry(&[])));
@@ -227,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_of_several_nodes_and_of_the_other_byte_order_is_read() {
+    fn an_entry_of_several_nodes_and_of_the_other_byte_order_is_decoded() {
         let mut cdr = vec![1; 16];
         cdr.extend([0, 0, 0, 2]);
         for (name, id) in [(b'a', 2), (b'b', 5)] {
@@ -241,21 +243,22 @@ mod tests {
         }
         let read = decode_graph(&cdr, Encapsulation([0, 0, 0, 0]));
         assert_eq!(read, Some(entry(&[("/n/a", 2), ("/n/b", 5)])));
-        assert_eq!(decoded(&cdr), None, "of the wrong byte order");
+        assert_eq!(decoded(&cdr), None, "in the wrong byte order");
         assert_eq!(decode_graph(&cdr, Encapsulation([0, 7, 0, 0])), None, "in XCDR2");
     }
 
     #[test]
-    fn whatever_is_cut_off_or_claims_too_much_is_no_entry() {
+    fn a_truncated_entry_and_one_with_false_counts_are_rejected() {
         for gid_bytes in [16, 24] {
             let cdr = encoded("/robot", "rviz", gid_bytes);
             for length in 0..cdr.len() {
-                // A longer identifier cut off behind its first zeros is a shorter one without a node.
+                // A long identifier that is cut off after its first zeros is also an entry with a short
+                // identifier and no node.
                 let read = decoded(&cdr[..length]);
                 assert!(read.is_none_or(|entry| entry.nodes.is_empty()), "{length} of {} bytes", cdr.len());
             }
             assert_eq!(decoded(&[&cdr[..], &[0; 4]].concat()), None);
-            // Each word in turn claims as much as it can.
+            // Each word in turn has the largest value.
             for word in 0..cdr.len() / 4 {
                 let mut forged = cdr.clone();
                 forged[word * 4..][..4].fill(0xff);
@@ -268,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ros_does_not_allow_in_a_name_reaches_no_log() {
+    fn names_that_ros_does_not_allow_are_rejected() {
         for (namespace, name) in [
             ("/", ""),
             ("", "a"),
@@ -287,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn identifiers_of_older_distributions_are_longer() {
+    fn identifiers_of_humble_are_padded_to_24_bytes() {
         let cdr = encode_graph(Guid([1; 16]), "/", "ab", &[], &[], 24);
         assert_eq!(cdr[..24], [[1; 16].as_slice(), &[0; 8]].concat());
     }

@@ -1,4 +1,4 @@
-//! Which node of the ROS 2 graph an endpoint belongs to, as the other participants say.
+//! Finds the ROS 2 node of an endpoint in the graph entries of the other participants.
 
 use std::collections::HashMap;
 
@@ -6,15 +6,15 @@ use super::graph::{GraphNode, decode_graph};
 use super::reader::{RawReader, Take};
 use crate::model::Guid;
 
-/// Participants whose entries are kept.
+/// The most participants whose entries are kept.
 pub const MAX_PARTICIPANTS: usize = 256;
-/// Readers and writers that are kept, of all participants together: 1 MiB of GUIDs.
+/// The most readers and writers that are kept, of all participants together: 1 MiB of GUIDs.
 pub const MAX_GRAPH_ENDPOINTS: usize = 65_536;
 
-/// The graph entries of the other participants, made by [`Participant::watch_graph`].
+/// The graph entries of the other participants; created by [`Participant::watch_graph`].
 ///
-/// Its memory is bounded whatever the network says. Only who asks for nodes should have one: it takes in
-/// whatever any participant announces.
+/// Its memory is bounded whatever the network sends. Create one only where the names of nodes are needed,
+/// because it reads the entries of all participants.
 ///
 /// [`Participant::watch_graph`]: super::Participant::watch_graph
 pub struct GraphWatch {
@@ -22,10 +22,10 @@ pub struct GraphWatch {
     entries: Entries,
 }
 
-/// What did not become an entry.
+/// Counts the samples from which no entry was stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct GraphRefusals {
-    /// Samples that are no graph entry, or that speak of another participant than the one that sent them.
+    /// Samples that are no graph entry, or an entry for another participant than the sender.
     pub malformed: u64,
     /// Entries beyond [`MAX_PARTICIPANTS`] or [`MAX_GRAPH_ENDPOINTS`].
     pub too_many: u64,
@@ -36,7 +36,7 @@ impl GraphWatch {
         Self { reader, entries: Entries::default() }
     }
 
-    /// Takes in what has come since the last time.
+    /// Reads the entries that have arrived since the last call.
     pub fn poll(&mut self) {
         loop {
             let mut decoded = None;
@@ -44,10 +44,10 @@ impl GraphWatch {
                 self.reader.take(&mut |cdr, encapsulation| decoded = decode_graph(cdr, encapsulation));
             match taken {
                 Take::Sample(origin) => {
-                    let from_itself =
+                    let own_entry =
                         decoded.filter(|entry| entry.participant.prefix() == origin.writer.prefix());
-                    match from_itself {
-                        Some(entry) => self.entries.put(origin.writer.prefix(), entry.nodes),
+                    match own_entry {
+                        Some(entry) => self.entries.insert(origin.writer.prefix(), entry.nodes),
                         None => self.entries.refusals.malformed += 1,
                     }
                 }
@@ -57,62 +57,64 @@ impl GraphWatch {
         }
     }
 
-    /// The node that has this reader or writer, such as `/robot/rviz`; `None` until its participant has said
-    /// so.
+    /// The node that has this reader or writer, such as `/robot/rviz`; `None` until its participant has
+    /// published an entry for it.
     pub fn node_of(&self, endpoint: Guid) -> Option<&str> {
         self.entries.node_of(endpoint)
     }
 
-    /// Forgets a participant that is gone.
+    /// Removes the entry of a participant that has left or whose lease has expired.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
         self.entries.remove(prefix);
     }
 
-    /// Participants whose entries are kept.
+    /// The number of participants whose entries are kept.
     pub fn participants(&self) -> usize {
-        self.entries.of.len()
+        self.entries.nodes_by_participant.len()
     }
 
-    /// What did not become an entry, since the beginning.
+    /// The samples from which no entry was stored, since this was created.
     pub fn refusals(&self) -> GraphRefusals {
         self.entries.refusals
     }
 }
 
-/// The entries, by the prefix of the participant that sent them: nobody speaks for another.
+/// The entries by GUID prefix of the sender, so that no participant can name the endpoints of another one.
 #[derive(Default)]
 struct Entries {
-    of: HashMap<[u8; 12], Vec<GraphNode>>,
+    nodes_by_participant: HashMap<[u8; 12], Vec<GraphNode>>,
     endpoints: usize,
     refusals: GraphRefusals,
 }
 
 impl Entries {
-    fn put(&mut self, prefix: [u8; 12], nodes: Vec<GraphNode>) {
+    fn insert(&mut self, prefix: [u8; 12], nodes: Vec<GraphNode>) {
         self.remove(prefix);
-        let endpoints = endpoints_of(&nodes);
-        if self.of.len() == MAX_PARTICIPANTS || self.endpoints + endpoints > MAX_GRAPH_ENDPOINTS {
+        let endpoints = count_endpoints(&nodes);
+        if self.nodes_by_participant.len() == MAX_PARTICIPANTS
+            || self.endpoints + endpoints > MAX_GRAPH_ENDPOINTS
+        {
             self.refusals.too_many += 1;
             return;
         }
         self.endpoints += endpoints;
-        self.of.insert(prefix, nodes);
+        self.nodes_by_participant.insert(prefix, nodes);
     }
 
     fn remove(&mut self, prefix: [u8; 12]) {
-        if let Some(nodes) = self.of.remove(&prefix) {
-            self.endpoints -= endpoints_of(&nodes);
+        if let Some(nodes) = self.nodes_by_participant.remove(&prefix) {
+            self.endpoints -= count_endpoints(&nodes);
         }
     }
 
     fn node_of(&self, endpoint: Guid) -> Option<&str> {
-        let nodes = self.of.get(&endpoint.prefix())?;
+        let nodes = self.nodes_by_participant.get(&endpoint.prefix())?;
         let has = |node: &&GraphNode| node.readers.contains(&endpoint) || node.writers.contains(&endpoint);
         nodes.iter().find(has).map(|node| node.name.as_str())
     }
 }
 
-fn endpoints_of(nodes: &[GraphNode]) -> usize {
+fn count_endpoints(nodes: &[GraphNode]) -> usize {
     nodes.iter().map(|node| node.readers.len() + node.writers.len()).sum()
 }
 
@@ -139,15 +141,15 @@ mod tests {
     }
 
     #[test]
-    fn an_endpoint_is_that_of_its_own_participants_node() {
+    fn only_its_own_participant_can_name_the_node_of_an_endpoint() {
         let mut entries = Entries::default();
-        entries.put(prefix(1), vec![node("/a", 1, 2), node("/thief", 2, 5)]);
-        entries.put(prefix(2), vec![node("/b", 2, 2)]);
+        entries.insert(prefix(1), vec![node("/a", 1, 2), node("/thief", 2, 5)]);
+        entries.insert(prefix(2), vec![node("/b", 2, 2)]);
         assert_eq!(entries.node_of(guid(1, 1)), Some("/a"));
         assert_eq!(entries.node_of(guid(1, 1 << 20)), Some("/a"));
         assert_eq!(entries.node_of(guid(2, 1)), Some("/b"));
         assert_eq!(entries.node_of(guid(2, 4)), None, "another participant's claim");
-        entries.put(prefix(1), vec![node("/c", 1, 1)]);
+        entries.insert(prefix(1), vec![node("/c", 1, 1)]);
         assert_eq!(entries.node_of(guid(1, 0)), Some("/c"));
         assert_eq!(entries.node_of(guid(1, 1)), None);
         entries.remove(prefix(1));
@@ -155,20 +157,20 @@ mod tests {
     }
 
     #[test]
-    fn no_more_is_kept_than_the_limits_allow() {
+    fn entries_beyond_the_limits_are_refused() {
         let mut entries = Entries::default();
         for number in 0..MAX_PARTICIPANTS + 10 {
-            entries.put(prefix(number), vec![node("/a", number, 1)]);
+            entries.insert(prefix(number), vec![node("/a", number, 1)]);
         }
-        assert_eq!((entries.of.len(), entries.refusals.too_many), (MAX_PARTICIPANTS, 10));
-        entries.put(prefix(3), vec![node("/b", 3, 1)]);
-        assert_eq!(entries.node_of(guid(3, 0)), Some("/b"), "a known one is renewed");
+        assert_eq!((entries.nodes_by_participant.len(), entries.refusals.too_many), (MAX_PARTICIPANTS, 10));
+        entries.insert(prefix(3), vec![node("/b", 3, 1)]);
+        assert_eq!(entries.node_of(guid(3, 0)), Some("/b"), "an entry of a known participant is replaced");
 
         let mut entries = Entries::default();
         for number in 0..10 {
-            entries.put(prefix(number), vec![node("/a", number, 8_000)]);
+            entries.insert(prefix(number), vec![node("/a", number, 8_000)]);
         }
-        assert_eq!((entries.of.len(), entries.refusals.too_many), (8, 2));
+        assert_eq!((entries.nodes_by_participant.len(), entries.refusals.too_many), (8, 2));
         assert!(entries.endpoints <= MAX_GRAPH_ENDPOINTS);
         for number in 0..10 {
             entries.remove(prefix(number));

@@ -1,8 +1,8 @@
-//! The RTPS edge: a participant, a raw reader, a raw writer and discovery, on RustDDS.
+//! The DDS interface of the bridge: participant, raw reader, raw writer and discovery, on top of RustDDS.
 //!
-//! Payloads pass as the bytes that were on the wire, with their encapsulation header, and are never decoded;
-//! that is why any message type will do. No RustDDS type leaves this module, so that another DDS library
-//! could stand behind it.
+//! Payloads are forwarded as the bytes that were on the wire, with their encapsulation header, and are never
+//! decoded; so the bridge forwards any message type. The public interface has no RustDDS types, so that
+//! another DDS library could replace RustDDS.
 
 mod arrivals;
 mod discovery;
@@ -29,5 +29,5 @@ pub use qos::ReaderQos;
 pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};
 pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent, Written};
 
-/// RustDDS, in the version that ros2-client uses, so that there is one of it.
+/// RustDDS in the version that ros2-client uses, so that the program contains one version of it.
 use ros2_client::dds::rustdds;

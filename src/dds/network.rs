@@ -1,4 +1,4 @@
-//! From the interfaces that a user names to the addresses that the DDS library wants.
+//! Network interfaces: the configured ones, as the DDS library takes them, and those that the host has.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
@@ -12,7 +12,7 @@ use super::rustdds;
 use crate::config::NetworkSelector;
 use crate::policy::HostInterface;
 
-/// The interfaces asked for in the DDS library's terms.
+/// Converts the configured interfaces to selectors of RustDDS.
 pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustdds::NetworkSelector> {
     asked.iter().map(|selector| match selector {
         NetworkSelector::Name(name) => rustdds::NetworkSelector::Name(name.clone()),
@@ -25,7 +25,7 @@ pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustd
 pub struct AbsentInterface {
     /// Its name or address, as configured.
     pub asked: String,
-    /// What the host has, as `name address`.
+    /// The interfaces that the host has, as `name address`.
     pub present: Vec<String>,
 }
 
@@ -33,7 +33,7 @@ impl fmt::Display for AbsentInterface {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "network interface {} is not on this host or has no IPv4 address, and is used as soon as it has \
+            "network interface {} is not on this host or has no IPv4 address; it is used as soon as it has \
              one; the host has: {}",
             self.asked,
             self.present.join(", ")
@@ -41,10 +41,10 @@ impl fmt::Display for AbsentInterface {
     }
 }
 
-/// Those of the interfaces asked for that have no address at present.
+/// The configured interfaces that have no IPv4 address at present.
 ///
 /// # Errors
-/// The kernel does not list them.
+/// The kernel cannot list the interfaces.
 pub fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<AbsentInterface>, DdsError> {
     if asked.is_empty() {
         return Ok(Vec::new());
@@ -61,12 +61,12 @@ fn host_interfaces() -> Result<Vec<(String, Ipv4Addr)>, DdsError> {
         .collect())
 }
 
-/// The addresses of this host at present, of both families: what
-/// [`Location::whereabouts`](crate::policy::Location::whereabouts) compares with. They change when a network
-/// is joined or left.
+/// The IPv4 and IPv6 addresses of this host at present, with which
+/// [`Location::whereabouts`](crate::policy::Location::whereabouts) compares. They change when the host joins
+/// or leaves a network.
 ///
 /// # Errors
-/// The kernel does not list them.
+/// The kernel cannot list the interfaces.
 pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
     Ok(interface_addresses()?
         .filter_map(|interface| {
@@ -77,17 +77,18 @@ pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
         .collect())
 }
 
-/// The interfaces of this host at present, once for each IPv4 address, and those without one.
+/// The interfaces of this host at present: one entry for each IPv4 address, and one for each interface
+/// without an IPv4 address.
 ///
 /// # Errors
-/// The kernel does not list them.
+/// The kernel cannot list the interfaces.
 pub fn interfaces() -> Result<Vec<HostInterface>, DdsError> {
     let mut interfaces: Vec<HostInterface> = Vec::new();
     for listed in interface_addresses()? {
         let v4 = |address: Option<SockaddrStorage>| Some(address?.as_sockaddr_in()?.ip());
         let address = v4(listed.address).zip(v4(listed.netmask));
         let name = listed.interface_name;
-        // Listed once for each address of any family.
+        // The kernel lists an interface once for each of its addresses, of any family.
         let place = interfaces.iter().position(|known| known.name == name && known.address.is_none());
         match place {
             Some(place) if address.is_some() => interfaces[place].address = address,
@@ -132,14 +133,14 @@ mod tests {
     }
 
     #[test]
-    fn an_interface_is_found_by_name_and_by_address() {
+    fn an_interface_that_the_host_has_by_name_or_address_is_not_absent() {
         let asked =
             [NetworkSelector::Name("wlan0".into()), NetworkSelector::Address(Ipv4Addr::new(192, 168, 0, 7))];
         assert_eq!(absent(&asked, &host()), []);
     }
 
     #[test]
-    fn an_absent_interface_is_named_beside_the_present_ones() {
+    fn the_message_names_the_absent_interface_and_those_of_the_host() {
         let absent = absent(&[NetworkSelector::Name("eth9".into())], &host());
         assert_eq!(absent.len(), 1);
         let text = absent[0].to_string();

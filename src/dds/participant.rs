@@ -1,4 +1,4 @@
-//! One DDS participant, which is one ROS 2 node.
+//! A DDS participant that appears as one ROS 2 node.
 
 use std::time::Duration;
 
@@ -20,22 +20,23 @@ use super::writer::RawWriter;
 use crate::config::DdsNetwork;
 use crate::model::{Durability, Guid, History, QosProfile, Reliability, SourceTimestamp};
 
-/// What a participant is made of.
+/// The settings of a participant.
 #[derive(Clone, Debug)]
 pub struct ParticipantOptions<'a> {
-    /// Domain and interfaces.
+    /// The DDS domain and the network interfaces.
     pub network: &'a DdsNetwork,
     /// The ROS 2 namespace of the node, such as `/adaptive_bridge`.
     pub namespace: String,
-    /// The name under which ROS 2 shows the process.
+    /// The name of the node, under which ROS 2 shows the process.
     pub node_name: String,
-    /// Length of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
+    /// The bytes of an identifier in the ROS 2 graph: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
 }
 
 /// A DDS participant with its node's entry in the ROS 2 graph.
 pub struct Participant {
-    /// First, because fields are dropped in this order and the library wants its writers gone first.
+    /// First, because fields are dropped in this order and the library requires that writers are dropped
+    /// first.
     graph: RawWriter,
     listener: DomainParticipantStatusListener,
     publisher: Publisher,
@@ -48,7 +49,8 @@ pub struct Participant {
     writers: Vec<Guid>,
 }
 
-/// Each participant offers its graph entry as `rmw_dds_common` does: the last one, reliably, to late joiners.
+/// The QoS of the graph entries, as in `rmw_dds_common`: the last entry is delivered reliably, also to late
+/// joiners.
 const GRAPH_QOS: QosProfile = QosProfile {
     reliability: Reliability::Reliable,
     history: History::KeepLast { depth: 1 },
@@ -57,8 +59,8 @@ const GRAPH_QOS: QosProfile = QosProfile {
     deadline_ms: None,
 };
 
-/// Reads the last entry of each participant. The topic has no key, so the depth is that of all together; an
-/// entry that is pushed out by a burst comes again when its participant next changes.
+/// The QoS for reading the last entry of each participant. The topic has no key, so all participants share
+/// the depth. An entry that a burst evicts is replaced when its participant publishes the next one.
 const GRAPH_READER_QOS: ReaderQos = ReaderQos {
     reliability: Reliability::Reliable,
     durability: Durability::TransientLocal,
@@ -66,28 +68,28 @@ const GRAPH_READER_QOS: ReaderQos = ReaderQos {
     deadline_ms: None,
 };
 
-/// Graph entries that may be unacknowledged; one is written for each endpoint made or dropped.
+/// The most unacknowledged graph entries; one is written for each endpoint that is created or dropped.
 const GRAPH_WINDOW_SAMPLES: usize = 1024;
 
 impl Participant {
     /// Joins the domain and announces the node.
     ///
     /// # Errors
-    /// The DDS library cannot open its sockets. That an interface is absent is no error: it is used as soon
-    /// as it is there.
+    /// The DDS library cannot open its sockets. An absent interface is no error: it is used as soon as the
+    /// host has it.
     pub fn open(options: &ParticipantOptions) -> Result<Self, DdsError> {
         Self::build(options, |builder| builder)
     }
 
-    /// Like [`open`](Self::open), and lets the thread that receives call `on_received`: after each datagram,
-    /// before it is acknowledged, and when [`ring`](Self::ring) asks for it. A sample taken there has not
-    /// been handed to another thread first, which saves a wake-up. It calls `on_arriving` some microseconds
-    /// before, when it has a datagram with a sample or a part of one, with the writer, the sequence number,
-    /// and how many bytes of the sample are yet to come behind it, as the datagram claims.
+    /// Like [`open`](Self::open), but the thread that receives calls `on_received` after each datagram,
+    /// before it acknowledges it, and after [`ring`](Self::ring). Taking a sample there saves the wake-up of
+    /// another thread. Some microseconds earlier, for a datagram with a sample or a fragment of one, the
+    /// thread calls `on_arriving` with the writer, the sequence number, and the bytes of the sample that are
+    /// still missing after this datagram, as the datagram claims.
     ///
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
-    /// not panic, and may take from readers and arm them, but not call the participant. If `on_received` has
-    /// more to do than it does at once it returns true, and is called again soon.
+    /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
+    /// true if it has left work undone; it is then called again soon.
     ///
     /// # Errors
     /// As for [`open`](Self::open).
@@ -141,50 +143,53 @@ impl Participant {
             readers: Vec::new(),
             writers: Vec::new(),
         };
-        opened.announce();
+        opened.publish_graph_entry();
         Ok(opened)
     }
 
-    /// The participant's GUID.
+    /// Its GUID.
     pub fn guid(&self) -> Guid {
         Guid(self.participant.guid().to_bytes())
     }
 
-    /// Lets the thread that receives turn once, with a call of what [`open_receiving`](Self::open_receiving)
-    /// was given.
+    /// Makes the thread that receives call `on_received` of [`open_receiving`](Self::open_receiving) once.
     pub fn ring(&self) {
         self.participant.wake_event_loop();
     }
 
-    /// Where samples come in, for a thread that looks at them before they are received. To be dropped before
-    /// the participant, whose ports it has, too.
+    /// Returns a watch of the sockets on which samples arrive, for a thread that peeks at datagrams before
+    /// they are received. Drop it before the participant, because it keeps the participant's ports bound.
     ///
     /// # Errors
-    /// The process may have no more descriptors; it is not from [`open_receiving`](Self::open_receiving), or
-    /// this was called before.
+    /// The process has no file descriptor left, the participant is not from
+    /// [`open_receiving`](Self::open_receiving), or this was called before.
     pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
         Arrivals::new(self.participant.onlooker_sockets())
     }
 
-    /// Says goodbye for a participant that died and could not: the others forget its readers and writers at
-    /// once, instead of when its lease ends, 15 s later. Until then a RELIABLE, KEEP_ALL publisher waits for
-    /// the acknowledgements of a reader that is no more.
+    /// Announces that a participant whose process died has left. Remote participants then drop its readers
+    /// and writers at once, instead of when its lease expires, 15 s later. Until then a RELIABLE, KEEP_ALL
+    /// publisher waits for acknowledgements of a reader that no longer exists.
     pub fn say_goodbye_for(&self, dead: Guid) {
         if dead != Guid::default() && self.participant.dispose_participant(GUID::from_bytes(dead.0)).is_err()
         {
-            tracing::warn!(?dead, "goodbye for a dead participant not sent; its lease has to end");
+            tracing::warn!(
+                ?dead,
+                "cannot announce that the participant of a dead process has left; remote participants drop \
+                 it when its lease expires"
+            );
         }
     }
 
-    /// Whether an endpoint is one of this participant's own.
+    /// Whether an endpoint belongs to this participant.
     pub fn owns(&self, endpoint: Guid) -> bool {
         endpoint.prefix() == self.guid().prefix()
     }
 
-    /// A reader of `topic`, a DDS topic name, and its place in the node's graph entry.
+    /// Creates a reader of `topic`, a DDS topic name, and adds it to the node's graph entry.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create it.
     pub fn create_reader(
         &mut self,
         topic: &str,
@@ -192,17 +197,17 @@ impl Participant {
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.enlist(&reader);
-        discard_earlier(&reader);
+        self.add_to_graph(&reader);
+        discard_earlier_samples(&reader);
         Ok(reader)
     }
 
-    /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that goes on where another one has
-    /// ended, in this process or in an earlier one. Of each writer in `taken` it neither requests nor gives
-    /// samples up to and including that number. It gives all that arrives from the first instant on.
+    /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that continues after an earlier
+    /// one, of this process or of another. For each writer in `taken` it neither requests nor returns samples
+    /// up to and including that sequence number. It returns every sample that arrives after its creation.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create it.
     pub fn create_reader_after(
         &mut self,
         topic: &str,
@@ -211,22 +216,23 @@ impl Participant {
         taken: impl IntoIterator<Item = (Guid, i64)>,
     ) -> Result<RawReader, DdsError> {
         let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
-        // The library computes with the number after it.
-        let number = |taken: i64| SequenceNumber::from(taken.min(i64::MAX - 1));
-        let taken = taken.into_iter().map(|(writer, taken)| (GUID::from_bytes(writer.0), number(taken)));
+        // The library adds 1 to the number.
+        let last_taken = |number: i64| SequenceNumber::from(number.min(i64::MAX - 1));
+        let taken =
+            taken.into_iter().map(|(writer, number)| (GUID::from_bytes(writer.0), last_taken(number)));
         self.participant
             .begin_after(&made_topic, taken)
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.enlist(&reader);
+        self.add_to_graph(&reader);
         Ok(reader)
     }
 
     /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the
-    /// same topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from the beginning.
+    /// same topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from its creation on.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create it.
     pub fn create_reader_beside_reliable(
         &mut self,
         topic: &str,
@@ -235,22 +241,22 @@ impl Participant {
     ) -> Result<RawReader, DdsError> {
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         reader.ignore_reliable_writers();
-        self.enlist(&reader);
-        discard_earlier(&reader);
+        self.add_to_graph(&reader);
+        discard_earlier_samples(&reader);
         Ok(reader)
     }
 
     /// Adds the reader to the node's graph entry.
-    fn enlist(&mut self, reader: &RawReader) {
+    fn add_to_graph(&mut self, reader: &RawReader) {
         self.readers.push(reader.guid);
-        self.announce();
+        self.publish_graph_entry();
     }
 
-    /// Learns from now on which nodes the other participants have. As in ROS 2 itself, the reader for that is
-    /// in no node's graph entry.
+    /// Creates a [`GraphWatch`], which reads the graph entries of the other participants. As in ROS 2 itself,
+    /// its reader is not in the node's graph entry.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create the reader.
     pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
         self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS).map(GraphWatch::new)
     }
@@ -272,12 +278,12 @@ impl Participant {
         Ok(RawReader { inner, guid })
     }
 
-    /// A writer of `topic`, a DDS topic name, and its place in the node's graph entry. A RELIABLE writer
-    /// retains `window_samples` for readers that have not acknowledged them; beyond that, the oldest sample
-    /// goes, and a reader that lacks it misses it.
+    /// Creates a writer of `topic`, a DDS topic name, and adds it to the node's graph entry. A RELIABLE
+    /// writer retains `window_samples` that readers have not acknowledged. Beyond that it evicts the oldest
+    /// sample, which is an overrun for each reader that has not acknowledged it.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create it.
     pub fn create_writer(
         &mut self,
         topic: &str,
@@ -289,11 +295,11 @@ impl Participant {
     }
 
     /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
-    /// `max_blocking` for room in a full window, as ROS 2 publishers do (100 ms). For publishers: the bridge
-    /// itself never waits.
+    /// `max_blocking` for room in a full window, as ROS 2 publishers do (100 ms). For demo and tests: the
+    /// bridge itself never waits.
     ///
     /// # Errors
-    /// The DDS library refused.
+    /// The DDS library cannot create it.
     pub fn create_blocking_writer(
         &mut self,
         topic: &str,
@@ -314,18 +320,18 @@ impl Participant {
     ) -> Result<RawWriter, DdsError> {
         let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, policies)?;
         self.writers.push(writer.guid());
-        self.announce();
+        self.publish_graph_entry();
         Ok(writer)
     }
 
-    /// Takes a dropped reader or writer out of the node's graph entry.
+    /// Removes a dropped reader or writer from the node's graph entry.
     pub fn forget(&mut self, endpoint: Guid) {
         self.readers.retain(|guid| *guid != endpoint);
         self.writers.retain(|guid| *guid != endpoint);
-        self.announce();
+        self.publish_graph_entry();
     }
 
-    /// The next change in what other participants have, if there is one.
+    /// Returns the next change that discovery reports, if there is one.
     pub fn poll_discovery(&self) -> Option<Discovery> {
         loop {
             if let Some(change) = translate(self.listener.try_recv_status()?) {
@@ -334,7 +340,8 @@ impl Participant {
         }
     }
 
-    fn announce(&self) {
+    /// Publishes the node's graph entry.
+    fn publish_graph_entry(&self) {
         let entry = graph::encode_graph(
             self.guid(),
             &self.namespace,
@@ -343,18 +350,17 @@ impl Participant {
             &self.writers,
             self.graph_gid_bytes,
         );
-        // A full window means that 1024 entries are unacknowledged; the next entry says all that this one
-        // does.
+        // A full window means that 1024 entries are unacknowledged; the next entry lists all endpoints again.
         if let Err(error) = self.graph.write(Bytes::from(entry), graph::ENCAPSULATION, SourceTimestamp::NONE)
         {
-            tracing::warn!(node = self.node_name, %error, "ROS 2 graph entry not published");
+            tracing::warn!(node = self.node_name, %error, "cannot publish the node's ROS 2 graph entry");
         }
     }
 }
 
-/// Discards the samples that a new reader begins with: the library keeps them by topic, beyond the life of a
-/// reader, and what a former reader has taken would be taken once more.
-fn discard_earlier(reader: &RawReader) {
+/// Discards the samples that are already there for a new reader. The library keeps samples by topic, beyond
+/// the life of a reader, so the new reader would take samples again that an earlier one has taken.
+fn discard_earlier_samples(reader: &RawReader) {
     while reader.take(&mut |_, _| {}) != Take::Empty {}
 }
 

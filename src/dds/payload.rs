@@ -1,4 +1,4 @@
-//! How raw payloads pass through RustDDS' serialization interfaces.
+//! Passes raw payloads through RustDDS' serialization traits without encoding or decoding them.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -6,22 +6,22 @@ use std::convert::Infallible;
 
 use bytes::Bytes;
 
-use super::lent::{Lent, Payload};
+use super::lent::{LentMemoryAdapter, Payload};
 use super::rustdds::no_key::{Decode, DeserializerAdapter, SerializerAdapter};
 use super::rustdds::{LentMemory, RepresentationIdentifier};
 use crate::model::Encapsulation;
 
-/// A payload on its way out.
+/// A payload to be written, with its encapsulation.
 pub(super) struct RawPayload {
     pub bytes: Bytes,
     pub encapsulation: Encapsulation,
 }
 
-/// The adapter for both directions.
-pub(super) struct Raw;
+/// The (de)serializer that RustDDS' readers and writers of raw payloads use.
+pub(super) struct RawAdapter;
 
-/// Every encapsulation that RTPS and XTypes define (RTPS 2.5 table 10.3, XTypes 1.3 table 60). RustDDS turns
-/// away any other, which is counted as malformed.
+/// Every encapsulation that RTPS and XTypes define (RTPS 2.5 table 10.3, XTypes 1.3 table 60). RustDDS
+/// rejects any other, and the bridge counts such a sample as malformed.
 static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::CDR_LE,
     RepresentationIdentifier::CDR_BE,
@@ -42,14 +42,16 @@ static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::XML,
 ];
 
-/// What a payload and its encapsulation are handed to.
-pub(super) type Borrower<'a> = dyn FnMut(Payload<'_>, Encapsulation) + 'a;
+/// Receives a payload and its encapsulation.
+pub(super) type PayloadCallback<'a> = dyn FnMut(Payload<'_>, Encapsulation) + 'a;
 
-/// Hands the payload to a closure while it is still in the receive buffer, or with the memory it is in.
+/// Calls a closure with the payload, either in the receive buffer or in the memory that was lent for it.
 #[derive(Clone, Copy)]
-pub(super) struct Lend<'cell, 'closure>(pub &'cell RefCell<&'closure mut Borrower<'closure>>);
+pub(super) struct PayloadDecoder<'cell, 'closure>(
+    pub &'cell RefCell<&'closure mut PayloadCallback<'closure>>,
+);
 
-impl Decode<'_, ()> for Lend<'_, '_> {
+impl Decode<'_, ()> for PayloadDecoder<'_, '_> {
     type Error = Infallible;
 
     fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> Result<(), Infallible> {
@@ -74,12 +76,12 @@ impl Decode<'_, ()> for Lend<'_, '_> {
     ) -> Result<(), Infallible> {
         if let Some(memory) = memory.take() {
             let memory: Box<dyn Any> = memory;
-            match memory.downcast::<Lent>() {
+            match memory.downcast::<LentMemoryAdapter>() {
                 Ok(lent) => {
                     (self.0.borrow_mut())(Payload::Lent(lent.0), encapsulation(encoding, options));
                 }
-                // Every reader here gives the library memory of that type.
-                Err(_) => debug_assert!(false, "memory that nobody here lent"),
+                // `RawReader::lend_memory` lends the library memory of this type only.
+                Err(_) => debug_assert!(false, "the DDS library returned memory that no reader lent"),
             }
         }
         Ok(())
@@ -91,7 +93,7 @@ fn encapsulation(encoding: RepresentationIdentifier, options: [u8; 2]) -> Encaps
     Encapsulation([high, low, options[0], options[1]])
 }
 
-impl DeserializerAdapter<()> for Raw {
+impl DeserializerAdapter<()> for RawAdapter {
     type Error = Infallible;
     type Decoded = ();
 
@@ -102,7 +104,7 @@ impl DeserializerAdapter<()> for Raw {
     fn transform_decoded((): ()) {}
 }
 
-impl SerializerAdapter<RawPayload> for Raw {
+impl SerializerAdapter<RawPayload> for RawAdapter {
     type Error = Infallible;
 
     fn output_encoding() -> RepresentationIdentifier {
@@ -115,7 +117,7 @@ impl SerializerAdapter<RawPayload> for Raw {
 
     fn output_encapsulation(value: &RawPayload) -> (RepresentationIdentifier, [u8; 2]) {
         let representation = value.encapsulation.representation();
-        // Two bytes are all that the conversion reads, so it cannot fail; CDR_LE would be the least surprise.
+        // The conversion needs two bytes, so it cannot fail; CDR_LE is the most common encapsulation.
         let encoding =
             RepresentationIdentifier::from_bytes(&representation).unwrap_or(RepresentationIdentifier::CDR_LE);
         (encoding, value.encapsulation.options())

@@ -1,4 +1,4 @@
-//! Our QoS in RustDDS' terms, and back.
+//! Converts between the bridge's QoS and the QoS policies of RustDDS.
 
 use super::rustdds::policy;
 use super::rustdds::{Duration, QosPolicies, QosPolicyBuilder};
@@ -9,20 +9,21 @@ const XCDR1: i16 = 0;
 const XML: i16 = 1;
 const XCDR2: i16 = 2;
 
-/// What a reader asks for.
+/// The QoS that a reader requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReaderQos {
-    /// RELIABILITY.
+    /// The requested RELIABILITY.
     pub reliability: Reliability,
-    /// DURABILITY.
+    /// The requested DURABILITY.
     pub durability: Durability,
-    /// Samples that may wait between the DDS library and us; at least 1.
+    /// The most samples that the DDS library keeps until they are taken; at least 1.
     pub depth: u32,
-    /// DEADLINE in milliseconds; `None` is infinite.
+    /// The requested DEADLINE in milliseconds; `None` is infinite.
     pub deadline_ms: Option<u64>,
 }
 
-/// A reader's policies. It accepts every data representation, because we do not look inside.
+/// The policies of a reader. It accepts every data representation, because the bridge does not decode
+/// payloads.
 pub(super) fn of_reader(qos: &ReaderQos) -> QosPolicies {
     let depth = i32::try_from(qos.depth).unwrap_or(i32::MAX);
     let mut builder = QosPolicyBuilder::new()
@@ -39,9 +40,9 @@ pub(super) fn of_reader(qos: &ReaderQos) -> QosPolicies {
     builder.build().with_data_representation(policy::DataRepresentation { value: vec![XCDR1, XCDR2, XML] })
 }
 
-/// The policies of a writer that waits for no reader. It retains `window_samples` for repairs, also where the
-/// configuration says KEEP_ALL: HISTORY is not matched between writers and readers (DDS 1.4 clause 2.2.3.18),
-/// and a KEEP_ALL writer would refuse samples as soon as one reader does not acknowledge.
+/// The policies of a writer that waits for no reader. It retains `window_samples` for retransmission, also
+/// where KEEP_ALL is configured: HISTORY is not matched between writers and readers (DDS 1.4 clause
+/// 2.2.3.18), and a KEEP_ALL writer would refuse samples as soon as one reader does not acknowledge.
 pub(super) fn of_writer(qos: &QosProfile, window_samples: usize) -> QosPolicies {
     let depth = u32::try_from(window_samples).unwrap_or(u32::MAX);
     let history = match qos.history {
@@ -81,8 +82,8 @@ pub(super) fn of_blocking_writer(
     .build()
 }
 
-/// What an endpoint announced; a policy that is absent has its DDS default (DDS 1.4 clause 2.2.3), which for
-/// RELIABILITY differs between readers and writers.
+/// The RELIABILITY that an endpoint announced; `default` if it announced none, because the DDS default (DDS
+/// 1.4 clause 2.2.3) differs between readers and writers.
 pub(super) fn reliability_of(qos: &QosPolicies, default: Reliability) -> Reliability {
     match qos.reliability() {
         Some(policy::Reliability::BestEffort) => Reliability::BestEffort,
@@ -91,7 +92,7 @@ pub(super) fn reliability_of(qos: &QosPolicies, default: Reliability) -> Reliabi
     }
 }
 
-/// See [`reliability_of`].
+/// The DURABILITY that an endpoint announced; VOLATILE, the DDS default, if it announced none.
 pub(super) fn durability_of(qos: &QosPolicies) -> Durability {
     match qos.durability() {
         Some(policy::Durability::Volatile) | None => Durability::Volatile,

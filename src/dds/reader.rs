@@ -1,46 +1,46 @@
-//! A DDS reader that lends each payload while it is still in the receive buffer.
+//! A DDS reader of raw payloads that gives access to each payload in the receive buffer, without a copy.
 
 use std::cell::RefCell;
 use std::sync::Arc;
 use std::task::Waker;
 
-use super::lent::{Lender, Payload, SampleMemory};
-use super::payload::{Lend, Raw};
+use super::lent::{Payload, SampleMemory, SampleMemoryAdapter};
+use super::payload::{PayloadDecoder, RawAdapter};
 use super::rustdds::no_key::SimpleDataReader;
 use super::rustdds::{DataReaderStatus, StatusEvented};
 use crate::model::{Encapsulation, Guid, SourceTimestamp};
 
-/// Where a sample comes from.
+/// The writer of a sample, its sequence number there, and its source timestamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleOrigin {
-    /// When the publisher says it was written.
+    /// The time at which the publisher wrote the sample, by the publisher's clock.
     pub source_timestamp: SourceTimestamp,
     /// The publisher's writer.
     pub writer: Guid,
-    /// The sample's number with that writer.
+    /// The writer's sequence number of the sample.
     pub sequence: i64,
 }
 
-/// What [`RawReader::take`] found.
+/// The result of [`RawReader::take`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Take {
-    /// A sample, whose payload was lent.
+    /// A sample, whose payload was passed to the callback.
     Sample(SampleOrigin),
-    /// A sample whose encapsulation DDS does not define; nothing was lent, and it is gone.
+    /// A sample whose encapsulation DDS does not define; it was discarded without a call of the callback.
     Malformed,
-    /// Nothing there.
+    /// No sample was waiting.
     Empty,
 }
 
-/// A change of who a reader is matched with.
+/// A change of the writers that a reader is matched with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ReaderEvent {
-    /// Writers matched at present.
+    /// A writer was matched or unmatched.
     Matched {
-        /// How many.
+        /// The number of writers that are matched now.
         writers: u64,
     },
-    /// A writer offers less than the reader asks for.
+    /// A writer offers a weaker QoS than the reader requests.
     Incompatible {
         /// The writer.
         writer: Guid,
@@ -49,7 +49,7 @@ pub enum ReaderEvent {
 
 /// A DDS reader of raw payloads.
 pub struct RawReader {
-    pub(super) inner: SimpleDataReader<(), Raw>,
+    pub(super) inner: SimpleDataReader<(), RawAdapter>,
     pub(super) guid: Guid,
 }
 
@@ -59,40 +59,42 @@ impl RawReader {
         self.guid
     }
 
-    /// Arranges for `waker` to be woken once by the next arrival, and forgets arrivals signalled so far. Take
-    /// until [`Take::Empty`] after this and before sleeping, or an arrival in between is slept through.
+    /// Makes the next arrival wake `waker` once, and clears the arrivals that are signalled so far. After
+    /// this call take until [`Take::Empty`] before the thread sleeps; otherwise it sleeps although a sample
+    /// waits.
     pub fn arm(&self, waker: &Waker) {
         self.inner.set_waker(Some(waker.clone()));
         self.inner.drain_read_notifications();
     }
 
-    /// Leaves RELIABLE writers to the RELIABLE reader of the same topic in this participant from now on, each
-    /// one as soon as that reader receives from it; for a BEST_EFFORT reader.
+    /// Makes this BEST_EFFORT reader ignore each RELIABLE writer as soon as the RELIABLE reader of the same
+    /// topic in this participant receives from that writer.
     pub fn ignore_reliable_writers(&self) {
         self.inner.ignore_reliable_writers();
     }
 
-    /// From now on samples of the topic that arrive in fragments are put together in memory of `memory`, as
-    /// far as it lends any. Of two readers of a topic in one participant, one
-    /// [ignores](Self::ignore_reliable_writers) what the other takes.
+    /// Makes the DDS library assemble fragmented samples of the topic in memory that `memory` lends; when it
+    /// lends none, the library uses its own. The setting applies to the topic: of two readers of the topic in
+    /// one participant, one must [ignore](Self::ignore_reliable_writers) the samples that the other takes.
     pub fn lend_memory(&self, memory: Arc<dyn SampleMemory>) {
-        self.inner.set_sample_memory(Arc::new(Lender(memory)));
+        self.inner.set_sample_memory(Arc::new(SampleMemoryAdapter(memory)));
     }
 
-    /// Takes the next sample, lending its payload and encapsulation to `lend` exactly once if there is one.
+    /// Takes the next sample, if one waits, and calls `lend` once with its payload and encapsulation.
     ///
-    /// Samples of one RELIABLE writer come in order and without repetition. The library's lock on the topic
-    /// is held while `lend` runs: it must copy and return.
+    /// Samples of one RELIABLE writer are returned in order and once each. The library's lock on the topic is
+    /// held while `lend` runs: it must copy and return.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
         self.take_payload(&mut |payload, encapsulation| {
             payload.with_bytes(|bytes| lend(bytes, encapsulation));
         })
     }
 
-    /// Like [`take`](Self::take), for one who has [lent memory](Self::lend_memory) and wants it back.
+    /// Like [`take`](Self::take), but also returns the [lent memory](Self::lend_memory) that the payload is
+    /// in.
     pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
         let lend = RefCell::new(receive);
-        match self.inner.try_take_one_with(Lend(&lend)) {
+        match self.inner.try_take_one_with(PayloadDecoder(&lend)) {
             Ok(Some(change)) => Take::Sample(SampleOrigin {
                 source_timestamp: change
                     .write_options
@@ -106,7 +108,7 @@ impl RawReader {
         }
     }
 
-    /// The next change of matching, if there is one.
+    /// Returns the next change of the matched writers, if there is one.
     pub fn poll_event(&self) -> Option<ReaderEvent> {
         loop {
             match self.inner.try_recv_status()? {

@@ -1,11 +1,11 @@
-//! A DDS writer of raw payloads whose writes wait for no reader, unless it was made to wait.
+//! A DDS writer of raw payloads. A write does not wait for readers unless the writer was created as blocking.
 
 use std::fmt;
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::payload::{Raw, RawPayload};
+use super::payload::{RawAdapter, RawPayload};
 use super::rustdds::no_key::DataWriter;
 use super::rustdds::{
     DataWriterStatus, GUID, StatusEvented, Timestamp, WriteOptionsBuilder,
@@ -16,9 +16,9 @@ use crate::model::{Encapsulation, Guid, SourceTimestamp};
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WriteError {
-    /// A writer that was made to wait for acknowledgements has waited for its blocking time.
+    /// A blocking writer has waited for acknowledgements for its whole blocking time.
     WindowFull,
-    /// The DDS library refused for another reason.
+    /// The DDS library refused the sample for another reason.
     Refused,
 }
 
@@ -33,19 +33,19 @@ impl fmt::Display for WriteError {
 
 impl std::error::Error for WriteError {}
 
-/// A change of who a writer is matched with.
+/// A change of the readers that a writer is matched with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WriterEvent {
-    /// A reader came or went.
+    /// A reader was matched or unmatched.
     Matched {
         /// The reader.
         reader: Guid,
-        /// Whether it came.
+        /// Whether it was matched; otherwise it was unmatched.
         joined: bool,
-        /// Readers matched at present.
+        /// The number of readers that are matched now.
         readers: u64,
     },
-    /// A reader asks for more than the writer offers.
+    /// A reader requests a stronger QoS than the writer offers.
     Incompatible {
         /// The reader.
         reader: Guid,
@@ -61,24 +61,24 @@ pub struct Written {
     pub sequence: i64,
 }
 
-/// A matched reader: what it was offered, has acknowledged and missed.
+/// A matched reader, with the samples that it was offered, has acknowledged and has missed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MatchedReader {
     /// The reader.
     pub guid: Guid,
     /// Whether it requested RELIABLE.
     pub reliable: bool,
-    /// Samples written since it was matched, and the history that it was offered then.
+    /// Samples written since it was matched, plus the history that it was offered then.
     pub offered: u64,
     /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
     pub unacknowledged: u64,
-    /// Of those, samples that left the writer's history before the reader had them.
+    /// Of those, samples evicted from the writer's history before the reader acknowledged them.
     pub overrun: u64,
 }
 
 /// A DDS writer of raw payloads.
 pub struct RawWriter {
-    pub(super) inner: DataWriter<RawPayload, Raw>,
+    pub(super) inner: DataWriter<RawPayload, RawAdapter>,
     pub(super) guid: Guid,
 }
 
@@ -88,12 +88,12 @@ impl RawWriter {
         self.guid
     }
 
-    /// Hands a sample to the DDS library: at once, or, of a writer that was made to wait, within its blocking
-    /// time. The library keeps `payload` until every matched RELIABLE reader has acknowledged it, or until newer
-    /// samples take its place. [`sent_through`](Self::sent_through) tells when it was sent.
+    /// Writes a sample. Returns at once; a blocking writer returns within its blocking time. The DDS library keeps
+    /// `payload` until every matched RELIABLE reader has acknowledged it, or until newer samples evict it from the
+    /// history. [`sent_through`](Self::sent_through) tells when it was sent.
     ///
     /// # Errors
-    /// The library did not take the sample, and `payload` is dropped.
+    /// The library did not accept the sample, and `payload` is dropped.
     pub fn write(
         &self,
         payload: Bytes,
@@ -103,8 +103,8 @@ impl RawWriter {
         self.write_with(payload, encapsulation, timestamp, None)
     }
 
-    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer,
-    /// whom the DDS protocol has no way to give the history.
+    /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, to
+    /// which the DDS protocol does not deliver the history.
     ///
     /// # Errors
     /// As for [`write`](Self::write).
@@ -118,13 +118,13 @@ impl RawWriter {
         self.write_with(payload, encapsulation, timestamp, Some(reader)).map(|_| ())
     }
 
-    /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. What the
-    /// library can't send on the thread that writes it waits for the library's own thread.
+    /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. A sample
+    /// that the thread that writes it can't send waits for the library's own thread.
     pub fn sent_through(&self) -> i64 {
         self.inner.sent_through().into()
     }
 
-    /// Every matched reader.
+    /// Lists the matched readers.
     pub fn matched_readers(&self) -> impl Iterator<Item = MatchedReader> {
         self.inner.matched_readers().into_iter().map(|reader| MatchedReader {
             guid: Guid(reader.guid.to_bytes()),
@@ -135,10 +135,10 @@ impl RawWriter {
         })
     }
 
-    /// Waits until every matched RELIABLE reader has acknowledged everything written, for `patience` at most;
-    /// whether they have.
-    pub fn wait_acknowledged(&self, patience: Duration) -> bool {
-        self.inner.wait_for_acknowledgments(patience).unwrap_or(false)
+    /// Waits for `timeout` at most until every matched RELIABLE reader has acknowledged all samples, and
+    /// returns whether they have.
+    pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
+        self.inner.wait_for_acknowledgments(timeout).unwrap_or(false)
     }
 
     fn write_with(
@@ -162,7 +162,7 @@ impl RawWriter {
         }
     }
 
-    /// The next change of matching, if there is one.
+    /// Returns the next change of the matched readers, if there is one.
     pub fn poll_event(&self) -> Option<WriterEvent> {
         loop {
             match self.inner.try_recv_status()? {

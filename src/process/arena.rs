@@ -1,18 +1,18 @@
-//! Where small payloads are copied for the DDS writer, without an allocation for each.
+//! Memory for copies of small payloads that are handed to the DDS writer, without an allocation for each.
 
 use std::collections::VecDeque;
 
 use bytes::{Bytes, BytesMut};
 
-/// 256 KiB: some 90 samples of a typical laser scan (2,948 bytes), and within what allocators serve without a
-/// system call of its own for each.
+/// Size of a chunk. 256 KiB hold some 90 samples of a typical laser scan (2,948 bytes), and allocators serve
+/// that size without a system call for each allocation.
 const CHUNK_BYTES: usize = 256 * 1024;
 
-/// Copies payloads into chunks that are used again when the DDS writer has let go of all payloads in them.
+/// Copies payloads into chunks, and reuses a chunk when the DDS writer has dropped all payloads in it.
 #[derive(Debug)]
 pub(super) struct CopyArena {
     current: BytesMut,
-    /// Chunks that were filled, oldest first; the writer may still hold payloads in them.
+    /// Full chunks, oldest first; the writer may still hold payloads in them.
     filled: VecDeque<BytesMut>,
 }
 
@@ -21,7 +21,7 @@ impl CopyArena {
         Self { current: BytesMut::with_capacity(CHUNK_BYTES), filled: VecDeque::with_capacity(64) }
     }
 
-    /// A copy of `payload`.
+    /// Copies `payload`; one that is larger than a chunk gets an allocation of its own.
     pub fn copy(&mut self, payload: &[u8]) -> Bytes {
         if payload.len() > CHUNK_BYTES {
             return Bytes::copy_from_slice(payload);
@@ -33,7 +33,8 @@ impl CopyArena {
         self.current.split().freeze()
     }
 
-    /// Goes on with the chunk that was filled first, if the writer is done with it, else with a new one.
+    /// Continues with the oldest full chunk if the writer has dropped all payloads in it, else with a new
+    /// one.
     fn next_chunk(&mut self) {
         let next = match self.filled.pop_front() {
             Some(mut oldest) => {
@@ -46,8 +47,8 @@ impl CopyArena {
             }
             None => BytesMut::with_capacity(CHUNK_BYTES),
         };
-        let spent = std::mem::replace(&mut self.current, next);
-        self.filled.push_back(spent);
+        let full = std::mem::replace(&mut self.current, next);
+        self.filled.push_back(full);
     }
 }
 
@@ -67,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn chunks_are_used_again_once_nobody_holds_what_is_in_them() {
+    fn chunks_are_reused_when_no_payload_in_them_is_held() {
         let mut arena = CopyArena::new();
         let payload = [9; 3_000];
         let mut held = VecDeque::new();

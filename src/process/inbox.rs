@@ -1,4 +1,4 @@
-//! DDS readers that wake their role.
+//! The DDS readers of one topic, with a flag that the DDS library raises when a sample arrives.
 
 use std::cell::Cell;
 use std::sync::Arc;
@@ -9,15 +9,15 @@ use std::thread::Thread;
 use crate::dds::{Payload, RawReader, Take};
 use crate::model::{Encapsulation, Guid};
 
-/// Rung by the DDS library when a sample has arrived.
+/// A flag that the DDS library raises (rings) when a sample has arrived, and the thread to wake then.
 pub(super) struct Bell {
     rung: AtomicBool,
-    /// To be woken; none where the library's own thread looks.
+    /// The thread to unpark; `None` where the DDS library's own thread checks the flag.
     thread: Option<Thread>,
 }
 
 impl Bell {
-    /// One that wakes nobody.
+    /// Creates a flag that wakes no thread.
     pub fn silent() -> Self {
         Self { rung: AtomicBool::new(false), thread: None }
     }
@@ -48,14 +48,14 @@ impl Wake for Bell {
     }
 }
 
-/// A share of one in so many samples is taken from the last reader first, so that a flood at the first one
-/// cannot hold up the last.
-const TURN_OF_THE_LAST: u64 = 32;
+/// One take in so many tries the last reader first, so that a flood of samples at the first reader cannot
+/// block it.
+const LAST_READER_FIRST_EVERY: u64 = 32;
 
-/// The one or two readers of a topic with a bell, so that looking costs next to nothing while nothing has
-/// come.
+/// The one or two readers of a topic, and the flag that makes a poll nearly free while no sample has
+/// arrived.
 pub(super) struct Inbox {
-    /// In the order in which they are read.
+    /// In the order in which samples are taken from them.
     readers: Vec<RawReader>,
     bell: Arc<Bell>,
     waker: Waker,
@@ -63,7 +63,7 @@ pub(super) struct Inbox {
 }
 
 impl Inbox {
-    /// With one reader, for the thread that calls this, which is the one that is woken.
+    /// Creates an inbox with one reader; arrivals wake the calling thread.
     pub fn new(reader: RawReader) -> Self {
         let thread = Some(std::thread::current());
         let mut inbox = Self::with_bell(Arc::new(Bell { rung: AtomicBool::new(false), thread }));
@@ -71,19 +71,19 @@ impl Inbox {
         inbox
     }
 
-    /// Without a reader yet, for threads that look at that bell.
+    /// Creates an inbox without readers; arrivals ring `bell`, which the caller checks.
     pub fn with_bell(bell: Arc<Bell>) -> Self {
         Self { readers: Vec::new(), waker: Waker::from(Arc::clone(&bell)), bell, takes: Cell::new(0) }
     }
 
-    /// Adds a reader, which is read after the others.
+    /// Adds a reader, from which samples are taken after the others.
     pub fn add(&mut self, reader: RawReader) {
         self.readers.push(reader);
-        // A new reader rings nobody yet: it is looked at first.
+        // A new reader is not armed yet, so the next take must poll it.
         self.bell.ring();
     }
 
-    /// Takes a reader out.
+    /// Removes a reader and returns it.
     pub fn remove(&mut self, reader: Guid) -> Option<RawReader> {
         let place = self.readers.iter().position(|known| known.guid() == reader)?;
         Some(self.readers.remove(place))
@@ -94,13 +94,13 @@ impl Inbox {
         &self.readers
     }
 
-    /// As [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: an arrival after this look keeps
-    /// it from sleeping.
+    /// Takes the next sample, like [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: a later
+    /// arrival unparks it.
     pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
         self.take_with(|reader| reader.take(lend))
     }
 
-    /// The same for [`RawReader::take_payload`].
+    /// Takes the next sample, like [`RawReader::take_payload`].
     pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
         self.take_with(|reader| reader.take_payload(receive))
     }
@@ -113,7 +113,7 @@ impl Inbox {
         if take != Take::Empty {
             return take;
         }
-        // Nothing there, so ask to be rung, and look again in case something came in between.
+        // Arm the readers, then poll once more for a sample that arrived before they were armed.
         self.bell.silence();
         for reader in &self.readers {
             reader.arm(&self.waker);
@@ -132,7 +132,7 @@ impl Inbox {
         };
         let takes = self.takes.get().wrapping_add(1);
         self.takes.set(takes);
-        let order = if takes.is_multiple_of(TURN_OF_THE_LAST) { [last, first] } else { [first, last] };
+        let order = if takes.is_multiple_of(LAST_READER_FIRST_EVERY) { [last, first] } else { [first, last] };
         order.into_iter().map(take_one).find(|take| *take != Take::Empty).unwrap_or(Take::Empty)
     }
 }
