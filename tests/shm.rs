@@ -490,7 +490,7 @@ fn a_folder_that_others_could_tamper_with_is_refused() {
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).unwrap();
     let error = open(&root).unwrap_err();
     assert!(matches!(error, ShmError::RootNotOurs { .. }), "{error}");
-    assert!(error.to_string().contains("others may write"), "{error}");
+    assert!(error.to_string().contains("other users may write"), "{error}");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o755)).unwrap();
     open(&root).unwrap();
 

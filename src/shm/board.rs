@@ -1,9 +1,10 @@
-//! Latest values in shared memory, which readers poll without waiting.
+//! Boards: latest values in shared memory, which readers poll without waiting.
 //!
-//! All boards of an instance are one segment, which the first process creates and which belongs to none: it
-//! stays until the last process of the instance has left, so a process that died finds its counters again.
+//! All boards of an instance are in one segment. The first process creates it and the last process that
+//! leaves the instance removes it, so a process that is restarted continues with the counters of its
+//! predecessor.
 //!
-//! Each value is a [`Cell`]; the counts of a histogram are single words, and are counted in place.
+//! Each value is a [`Cell`]. A histogram is not: its counts are single words, which are incremented in place.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,12 +25,12 @@ use crate::model::{
     RouteInfo, SubscriberRecord, fnv1a,
 };
 
-/// What the boards must have room for. All processes of an instance must agree on it.
+/// The lanes and routes for which the boards have room. It must be the same in all processes of an instance.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BridgeShape {
-    /// The lanes; a lane's number is its place here.
+    /// The lanes; the number of a lane is its index.
     pub lanes: Vec<LaneName>,
-    /// The routes; a route's number is its place here.
+    /// The routes; the number of a route is its index.
     pub routes: Vec<RouteId>,
 }
 
@@ -42,7 +43,7 @@ impl BridgeShape {
         }
     }
 
-    /// A number that differs when lanes, routes or the layout of a value differ.
+    /// A hash of the lanes, the routes and the layout, by which processes detect that theirs differ.
     fn fingerprint(&self) -> u64 {
         let mut text = format!("{LAYOUT_VERSION} {}", Layout::of(self).words);
         for lane in &self.lanes {
@@ -55,37 +56,37 @@ impl BridgeShape {
     }
 }
 
-/// A process that shows its health.
+/// A process that publishes its health on a board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ProcessRole {
     /// Ingress.
     Ingress,
     /// Control.
     Control,
-    /// The egress of the lane of that number.
+    /// Egress of the lane with that number.
     Egress(usize),
 }
 
-/// A stage of a sample's way whose latency is measured.
+/// A stage of a sample's path through the bridge whose latency is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
     /// From the publisher's source timestamp to ingress; recorded by ingress.
     DdsIn,
-    /// From ingress to the lane of that number; recorded by the lane.
+    /// From ingress to the lane with that number; recorded by the lane.
     Shm(usize),
-    /// Within the lane of that number, up to its DDS writer.
+    /// Within the lane with that number, up to its DDS writer.
     DdsOut(usize),
-    /// From the source timestamp to the DDS writer of the lane of that number.
+    /// From the source timestamp to the DDS writer of the lane with that number.
     Age(usize),
 }
 
-/// Counts up when the meaning of a word changes.
+/// Incremented whenever the meaning of a word in the segment changes.
 const LAYOUT_VERSION: u32 = 5;
-/// "ABboards", so that a foreign file is not taken for boards.
+/// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
 
-/// Where everything is, in words.
+/// The offset of each board in the segment, in words.
 #[derive(Clone, Copy, Debug)]
 struct Layout {
     lanes: usize,
@@ -147,12 +148,12 @@ impl Layout {
     }
 
     fn health(&self, role: ProcessRole) -> Cell<ProcessHealth> {
-        let place = match role {
+        let index = match role {
             ProcessRole::Ingress => 0,
             ProcessRole::Control => 1,
             ProcessRole::Egress(lane) => 2 + self.check_lane(lane),
         };
-        Cell::at(self.health + place * Cell::<ProcessHealth>::WORDS)
+        Cell::at(self.health + index * Cell::<ProcessHealth>::WORDS)
     }
 
     fn policy(&self, lane: usize) -> Cell<LanePolicy> {
@@ -163,29 +164,29 @@ impl Layout {
         Cell::at(self.control)
     }
 
-    fn subscriber(&self, place: usize) -> Cell<SubscriberRecord> {
-        assert!(place < MAX_SUBSCRIBERS, "subscriber {place} of {MAX_SUBSCRIBERS}");
-        Cell::at(self.subscribers + place * Cell::<SubscriberRecord>::WORDS)
+    fn subscriber(&self, index: usize) -> Cell<SubscriberRecord> {
+        assert!(index < MAX_SUBSCRIBERS, "subscriber {index} of {MAX_SUBSCRIBERS}");
+        Cell::at(self.subscribers + index * Cell::<SubscriberRecord>::WORDS)
     }
 
-    fn intruder(&self, place: usize) -> Cell<IntruderRecord> {
-        assert!(place < MAX_INTRUDERS, "intruder {place} of {MAX_INTRUDERS}");
-        Cell::at(self.intruders + place * Cell::<IntruderRecord>::WORDS)
+    fn intruder(&self, index: usize) -> Cell<IntruderRecord> {
+        assert!(index < MAX_INTRUDERS, "intruder {index} of {MAX_INTRUDERS}");
+        Cell::at(self.intruders + index * Cell::<IntruderRecord>::WORDS)
     }
 
-    fn named_endpoint(&self, place: usize) -> Cell<NamedEndpoint> {
-        assert!(place < MAX_NAMED_ENDPOINTS, "named endpoint {place} of {MAX_NAMED_ENDPOINTS}");
-        Cell::at(self.named_endpoints + place * Cell::<NamedEndpoint>::WORDS)
+    fn named_endpoint(&self, index: usize) -> Cell<NamedEndpoint> {
+        assert!(index < MAX_NAMED_ENDPOINTS, "named endpoint {index} of {MAX_NAMED_ENDPOINTS}");
+        Cell::at(self.named_endpoints + index * Cell::<NamedEndpoint>::WORDS)
     }
 
-    fn absence(&self, place: usize) -> Cell<AbsenceRecord> {
-        assert!(place < MAX_ABSENCES, "absence {place} of {MAX_ABSENCES}");
-        Cell::at(self.absences + place * Cell::<AbsenceRecord>::WORDS)
+    fn absence(&self, index: usize) -> Cell<AbsenceRecord> {
+        assert!(index < MAX_ABSENCES, "absence {index} of {MAX_ABSENCES}");
+        Cell::at(self.absences + index * Cell::<AbsenceRecord>::WORDS)
     }
 
     fn output_readers(&self, lane: usize, route: usize) -> Cell<OutputReaders> {
-        let place = self.check_lane(lane) * self.routes + self.check_route(route);
-        Cell::at(self.output_readers + place * Cell::<OutputReaders>::WORDS)
+        let index = self.check_lane(lane) * self.routes + self.check_route(route);
+        Cell::at(self.output_readers + index * Cell::<OutputReaders>::WORDS)
     }
 
     fn route_info(&self, route: usize) -> Cell<RouteInfo> {
@@ -196,26 +197,26 @@ impl Layout {
         Cell::at(self.ingress + self.check_route(route) * Cell::<IngressCounters>::WORDS)
     }
 
-    fn publisher(&self, route: usize, place: usize) -> Cell<PublisherAccount> {
-        assert!(place < MAX_PUBLISHERS, "publisher {place} of {MAX_PUBLISHERS}");
-        let index = self.check_route(route) * MAX_PUBLISHERS + place;
-        Cell::at(self.publishers + index * Cell::<PublisherAccount>::WORDS)
+    fn publisher(&self, route: usize, index: usize) -> Cell<PublisherAccount> {
+        assert!(index < MAX_PUBLISHERS, "publisher {index} of {MAX_PUBLISHERS}");
+        let cell = self.check_route(route) * MAX_PUBLISHERS + index;
+        Cell::at(self.publishers + cell * Cell::<PublisherAccount>::WORDS)
     }
 
     fn lane(&self, lane: usize, route: usize) -> Cell<LaneCounters> {
-        let place = self.check_lane(lane) * self.routes + self.check_route(route);
-        Cell::at(self.lane + place * Cell::<LaneCounters>::WORDS)
+        let index = self.check_lane(lane) * self.routes + self.check_route(route);
+        Cell::at(self.lane + index * Cell::<LaneCounters>::WORDS)
     }
 
     fn histogram(&self, stage: Stage, route: usize) -> usize {
         let of_lane = |lane: usize, stage: usize| 1 + 3 * self.check_lane(lane) + stage;
-        let place = match stage {
+        let stage_index = match stage {
             Stage::DdsIn => 0,
             Stage::Shm(lane) => of_lane(lane, 0),
             Stage::DdsOut(lane) => of_lane(lane, 1),
             Stage::Age(lane) => of_lane(lane, 2),
         };
-        let index = place * self.routes + self.check_route(route);
+        let index = stage_index * self.routes + self.check_route(route);
         self.histograms + index * HISTOGRAM_WORDS.next_multiple_of(LINE)
     }
 
@@ -223,7 +224,8 @@ impl Layout {
         self.wake + self.check_lane(lane) * LINE
     }
 
-    /// Numbers come from the configuration that the shape was made of; another one is a defect of the caller.
+    /// Panics for a number that the shape does not have: a defect of the caller, because numbers come from
+    /// the configuration that the shape was made from.
     fn check_lane(&self, lane: usize) -> usize {
         assert!(lane < self.lanes, "lane {lane} of {}", self.lanes);
         lane
@@ -238,8 +240,8 @@ impl Layout {
 /// All boards of an instance.
 ///
 /// # Panics
-/// All methods, when the number of a lane or route is not one of the [`BridgeShape`], or a place in a table
-/// is not below its size.
+/// All methods panic if the [`BridgeShape`] has no lane or route with the given number, or if the index in a
+/// table is not below its size.
 #[derive(Clone, Debug)]
 pub struct Boards {
     segment: Arc<Segment>,
@@ -248,8 +250,8 @@ pub struct Boards {
 }
 
 impl Boards {
-    /// The boards of an instance that runs, or did until its last process was killed; for processes that look
-    /// only, such as `status`. `None` when there are none.
+    /// Opens the boards of an instance, for commands that only read them, such as `status`; `None` when there
+    /// are none. Boards also exist after the last process of the instance was killed.
     pub fn find(root: &Path, instance: &InstanceName, shape: &BridgeShape) -> Result<Option<Self>, ShmError> {
         let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(None) };
         let layout = Layout::of(shape);
@@ -280,105 +282,104 @@ impl Boards {
         let first = [0, 1].map(|at| segment.word(at).load(Ordering::Relaxed));
         if first != [MAGIC, shape.fingerprint()] {
             return Err(ShmError::Incompatible {
-                what: "the boards were set up with other lanes, other routes, or by another version"
-                    .to_owned(),
+                what: "the boards were created with other lanes or routes, or by another version".to_owned(),
                 path: dir.path.clone(),
             });
         }
         Ok(Self { segment: Arc::new(segment), layout, policy_lock: dir.path.join("policy.lock") })
     }
 
-    /// What a process shows of itself; zeroes while it never ran. `None` when the writer changes it faster
-    /// than it can be read, which only a runaway writer does; so for all readings.
+    /// The health of a process; zeroes if it has never run. As for all boards, `None` when the writer changes
+    /// the value faster than it can be read, which only a runaway writer does.
     pub fn health(&self, role: ProcessRole) -> Option<ProcessHealth> {
         self.layout.health(role).read(&self.segment)
     }
 
-    /// Writes what a process shows of itself, beginning with what its predecessor wrote. One writer at a
-    /// time: the holder of the role's lock.
+    /// Writes the health of a process, beginning with what its predecessor wrote. One writer at a time: the
+    /// holder of the role's lock.
     pub fn health_writer(&self, role: ProcessRole) -> BoardWriter<ProcessHealth> {
         self.writer(self.layout.health(role))
     }
 
-    /// What ingress has counted on a route.
+    /// The counters of ingress for a route.
     pub fn ingress(&self, route: usize) -> Option<IngressCounters> {
         self.layout.ingress(route).read(&self.segment)
     }
 
-    /// Counts for ingress on a route, beginning where its predecessor ended.
+    /// Writes the counters of ingress for a route, beginning with those of its predecessor.
     pub fn ingress_writer(&self, route: usize) -> BoardWriter<IngressCounters> {
         self.writer(self.layout.ingress(route))
     }
 
-    /// The account of the publisher at a place below [`MAX_PUBLISHERS`] of a route.
-    pub fn publisher(&self, route: usize, place: usize) -> Option<PublisherAccount> {
-        self.layout.publisher(route, place).read(&self.segment)
+    /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
+    pub fn publisher(&self, route: usize, index: usize) -> Option<PublisherAccount> {
+        self.layout.publisher(route, index).read(&self.segment)
     }
 
-    /// Writes the account of the publisher at a place below [`MAX_PUBLISHERS`] of a route, beginning with
+    /// Writes the account of the publisher of a route at an index below [`MAX_PUBLISHERS`], beginning with
     /// what its predecessor wrote.
-    pub fn publisher_writer(&self, route: usize, place: usize) -> BoardWriter<PublisherAccount> {
-        self.writer(self.layout.publisher(route, place))
+    pub fn publisher_writer(&self, route: usize, index: usize) -> BoardWriter<PublisherAccount> {
+        self.writer(self.layout.publisher(route, index))
     }
 
-    /// What a lane has counted on a route.
+    /// The counters of a lane for a route.
     pub fn lane(&self, lane: usize, route: usize) -> Option<LaneCounters> {
         self.layout.lane(lane, route).read(&self.segment)
     }
 
-    /// Counts for a lane on a route, beginning where its predecessor ended.
+    /// Writes the counters of a lane for a route, beginning with those of its predecessor.
     pub fn lane_writer(&self, lane: usize, route: usize) -> BoardWriter<LaneCounters> {
         self.writer(self.layout.lane(lane, route))
     }
 
-    /// What control found and decided for the bridge as a whole.
+    /// The state and decisions of control that concern the whole bridge.
     pub fn control(&self) -> Option<ControlRecord> {
         self.layout.control().read(&self.segment)
     }
 
-    /// Writes what control found and decided; one writer at a time, as for the health.
+    /// Writes the record of control. One writer at a time, as for the health.
     pub fn control_writer(&self) -> BoardWriter<ControlRecord> {
         self.writer(self.layout.control())
     }
 
-    /// What control knows of the subscriber at a place below [`MAX_SUBSCRIBERS`].
-    pub fn subscriber(&self, place: usize) -> Option<SubscriberRecord> {
-        self.layout.subscriber(place).read(&self.segment)
+    /// The record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
+    pub fn subscriber(&self, index: usize) -> Option<SubscriberRecord> {
+        self.layout.subscriber(index).read(&self.segment)
     }
 
-    /// Writes what control knows of the subscriber at a place below [`MAX_SUBSCRIBERS`].
-    pub fn subscriber_writer(&self, place: usize) -> BoardWriter<SubscriberRecord> {
-        self.writer(self.layout.subscriber(place))
+    /// Writes the record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
+    pub fn subscriber_writer(&self, index: usize) -> BoardWriter<SubscriberRecord> {
+        self.writer(self.layout.subscriber(index))
     }
 
-    /// The intruder at a place below [`MAX_INTRUDERS`].
-    pub fn intruder(&self, place: usize) -> Option<IntruderRecord> {
-        self.layout.intruder(place).read(&self.segment)
+    /// The intruder at an index below [`MAX_INTRUDERS`].
+    pub fn intruder(&self, index: usize) -> Option<IntruderRecord> {
+        self.layout.intruder(index).read(&self.segment)
     }
 
-    /// Writes the intruder at a place below [`MAX_INTRUDERS`].
-    pub fn intruder_writer(&self, place: usize) -> BoardWriter<IntruderRecord> {
-        self.writer(self.layout.intruder(place))
+    /// Writes the intruder at an index below [`MAX_INTRUDERS`].
+    pub fn intruder_writer(&self, index: usize) -> BoardWriter<IntruderRecord> {
+        self.writer(self.layout.intruder(index))
     }
 
-    /// The endpoint that control names at a place below [`MAX_NAMED_ENDPOINTS`].
-    pub fn named_endpoint(&self, place: usize) -> Option<NamedEndpoint> {
-        self.layout.named_endpoint(place).read(&self.segment)
+    /// The named endpoint at an index below [`MAX_NAMED_ENDPOINTS`]: a GUID and its ROS 2 node.
+    pub fn named_endpoint(&self, index: usize) -> Option<NamedEndpoint> {
+        self.layout.named_endpoint(index).read(&self.segment)
     }
 
-    /// Writes the endpoint that control names at a place below [`MAX_NAMED_ENDPOINTS`].
-    pub fn named_endpoint_writer(&self, place: usize) -> BoardWriter<NamedEndpoint> {
-        self.writer(self.layout.named_endpoint(place))
+    /// Writes the named endpoint at an index below [`MAX_NAMED_ENDPOINTS`].
+    pub fn named_endpoint_writer(&self, index: usize) -> BoardWriter<NamedEndpoint> {
+        self.writer(self.layout.named_endpoint(index))
     }
 
-    /// The interface or peer at a place below [`MAX_ABSENCES`] that is or was away.
-    pub fn absence(&self, place: usize) -> Option<AbsenceRecord> {
-        self.layout.absence(place).read(&self.segment)
+    /// The absence (of an interface or peer) at an index below [`MAX_ABSENCES`].
+    pub fn absence(&self, index: usize) -> Option<AbsenceRecord> {
+        self.layout.absence(index).read(&self.segment)
     }
 
-    /// Writes the interface or peer at a place below [`MAX_ABSENCES`].
-    pub fn absence_writer(&self, place: usize) -> BoardWriter<AbsenceRecord> {
-        self.writer(self.layout.absence(place))
+    /// Writes the absence at an index below [`MAX_ABSENCES`].
+    pub fn absence_writer(&self, index: usize) -> BoardWriter<AbsenceRecord> {
+        self.writer(self.layout.absence(index))
     }
 
     /// The readers that are matched with a lane's output of a route.
@@ -386,22 +387,22 @@ impl Boards {
         self.layout.output_readers(lane, route).read(&self.segment)
     }
 
-    /// Records the readers of a lane's output of a route, beginning with what its predecessor recorded.
+    /// Writes the readers of a lane's output of a route, beginning with what its predecessor wrote.
     pub fn output_readers_writer(&self, lane: usize, route: usize) -> BoardWriter<OutputReaders> {
         self.writer(self.layout.output_readers(lane, route))
     }
 
-    /// What ingress found out about a route.
+    /// What ingress has discovered about a route.
     pub fn route_info(&self, route: usize) -> Option<RouteInfo> {
         self.layout.route_info(route).read(&self.segment)
     }
 
-    /// Writes what ingress found out about a route.
+    /// Writes what ingress has discovered about a route.
     pub fn route_info_writer(&self, route: usize) -> BoardWriter<RouteInfo> {
         self.writer(self.layout.route_info(route))
     }
 
-    /// The latencies of a stage on a route. Counts that are being recorded meanwhile may be in or not.
+    /// The latencies of a stage on a route. Latencies that are recorded during the call may be missing.
     pub fn histogram(&self, stage: Stage, route: usize) -> LatencyHistogram {
         load(&self.segment, self.layout.histogram(stage, route))
     }
@@ -416,24 +417,24 @@ impl Boards {
         }
     }
 
-    /// The policy of a lane; epoch 0 when nobody has set one.
+    /// The policy of a lane; epoch 0 if none has been set.
     pub fn policy(&self, lane: usize) -> Option<LanePolicy> {
         self.layout.policy(lane).read(&self.segment)
     }
 
-    /// The policies of all lanes, to change them; any process may, one after the other. Others that want to
-    /// wait until this is dropped.
+    /// Locks the policies of all lanes for changes. Any process may change them, one at a time: another
+    /// caller waits until this is dropped.
     pub fn policies(&self) -> Result<Policies<'_>, ShmError> {
-        let one_at_a_time = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
-        Ok(Policies { boards: self, _one_at_a_time: one_at_a_time })
+        let lock = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
+        Ok(Policies { boards: self, _lock: lock })
     }
 
-    /// Wakes a lane.
+    /// The waker of a lane, for ingress.
     pub fn waker(&self, lane: usize) -> LaneWaker {
         LaneWaker::new(self.segment.clone(), self.layout.wake(lane))
     }
 
-    /// Sleeps for a lane; one at a time.
+    /// The sleeper of a lane, for its egress process. One at a time.
     pub fn sleeper(&self, lane: usize) -> LaneSleeper {
         LaneSleeper::new(self.segment.clone(), self.layout.wake(lane))
     }
@@ -444,16 +445,17 @@ impl Boards {
     }
 }
 
-/// The only one who changes policies.
+/// The exclusive right to change the policies of the lanes.
 #[derive(Debug)]
 pub struct Policies<'a> {
     boards: &'a Boards,
-    _one_at_a_time: FileLock,
+    _lock: FileLock,
 }
 
 impl Policies<'_> {
-    /// Changes the policy of a lane. `change` gets the present policy and gives the new one; the epoch is
-    /// counted here, up by one unless only `written_at` differs. Returns what was written.
+    /// Changes the policy of a lane. `change` gets the present policy and returns the new one. This method
+    /// sets the epoch: it increments it unless only `written_at` differs. Returns the policy that was
+    /// written.
     pub fn set(
         &self,
         lane: usize,
@@ -466,7 +468,8 @@ impl Policies<'_> {
         (after.epoch, after.changed_at) = (before.epoch, before.changed_at);
         let only_time_differs = LanePolicy { written_at: before.written_at, ..after } == before;
         if before.epoch == 0 || !only_time_differs {
-            // Only a foreign process can have written the last number. 0 still means that none has set one.
+            // Only a foreign process can have written the largest number. 0 means that no policy has been
+            // set.
             after.epoch = after.epoch.checked_add(1).unwrap_or(1);
             after.changed_at = now;
         }
@@ -475,7 +478,7 @@ impl Policies<'_> {
     }
 }
 
-/// The one writer of one value on a board. Dropping it leaves the value where it is.
+/// The only writer of a value on a board. The value stays on the board after the writer is dropped.
 #[derive(Debug)]
 pub struct BoardWriter<T> {
     segment: Arc<Segment>,
@@ -485,12 +488,12 @@ pub struct BoardWriter<T> {
 
 #[expect(private_bounds, reason = "only the types of the boards are written")]
 impl<T: Plain> BoardWriter<T> {
-    /// The value as last written.
+    /// The value that was last written.
     pub fn get(&self) -> &T {
         &self.value
     }
 
-    /// Changes the value and shows it. A process that dies within leaves the value as it was before.
+    /// Changes the value and publishes it. If the process dies during the call, the previous value stays.
     pub fn update<R>(&mut self, change: impl FnOnce(&mut T) -> R) -> R {
         let result = change(&mut self.value);
         self.cell.write(&self.segment, &self.value);
@@ -498,7 +501,7 @@ impl<T: Plain> BoardWriter<T> {
     }
 }
 
-/// The one writer of one histogram.
+/// The only writer of a histogram.
 #[derive(Debug)]
 pub struct HistogramWriter {
     segment: Arc<Segment>,
@@ -514,7 +517,7 @@ impl HistogramWriter {
         let bucket = above.min(HISTOGRAM_WORDS - 2);
         let count = self.segment.word(self.at + bucket);
         count.store(count.load(Ordering::Relaxed).wrapping_add(1), Ordering::Relaxed);
-        // The maximum stands behind the counts.
+        // The maximum is the word after the counts.
         let max_ns = self.segment.word(self.at + HISTOGRAM_WORDS - 1);
         if latency_ns > max_ns.load(Ordering::Relaxed) {
             max_ns.store(latency_ns, Ordering::Relaxed);

@@ -1,9 +1,9 @@
-//! One value in shared memory that its one writer changes and any process reads without waiting.
+//! A value in shared memory with one writer, which any process reads without waiting.
 //!
-//! A value is kept in several copies. The writer fills the next copy, then shows it by counting up the
-//! version. A writer that dies within an update therefore leaves the former value, whole. A reader takes the
-//! copy that is shown, and reads again if the writer has begun to fill that copy meanwhile: it never waits
-//! and never sees half a value.
+//! A value is kept in several copies. The writer fills the next copy, then publishes it by incrementing the
+//! version. If a writer dies during an update, the previous value therefore stays complete. A reader reads
+//! the published copy, and reads again if the writer has begun to overwrite that copy during the read: it
+//! never waits and never returns a partly written value.
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -16,20 +16,21 @@ use crate::model::{
     SubscriberRecord,
 };
 
-/// Words of a cache line, on which every value begins, so that two writers never share one.
+/// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
 pub(super) const LINE: usize = 8;
-/// Copies of a value. A reader, which takes some 100 ns when the writer is on another CPU, starts again only
-/// if more than `COPIES - 2` updates came meanwhile.
+/// Copies of a value. A read, which takes some 100 ns when the writer is on another CPU, is repeated only if
+/// more than `COPIES - 2` updates happened during it.
 const COPIES: u64 = 4;
-/// Attempts of a reader, so that a writer that changes the value without pause cannot hold it.
+/// The most attempts of one read, so that a writer that updates without pause cannot block a reader.
 const READ_ATTEMPTS: usize = 1_000;
 
-/// A type that may be copied through shared memory word by word.
+/// A type that can be copied to and from shared memory word by word.
 ///
 /// # Safety
-/// `repr(C)`, without padding, of a size that is a multiple of 8 bytes, and every bit pattern is a value.
+/// The type is `repr(C)`, has no padding and a size that is a multiple of 8 bytes, and every bit pattern is a
+/// valid value.
 pub(super) unsafe trait Plain: Copy + Default {
-    /// Its size in words.
+    /// The size of the type in words.
     const WORDS: usize = {
         assert!(size_of::<Self>().is_multiple_of(8));
         size_of::<Self>() / 8
@@ -46,11 +47,11 @@ unsafe impl Plain for PublisherAccount {}
 unsafe impl Plain for LaneCounters {}
 // SAFETY: `repr(C)`; records of a GUID of 16 bytes and four 64-bit integers.
 unsafe impl Plain for OutputReaders {}
-// SAFETY: `repr(C)`; a GUID of 16 bytes, then twice 128 bytes of text, which is checked when it is read.
+// SAFETY: `repr(C)`; a GUID of 16 bytes, then twice 128 bytes of text, which its reader validates.
 unsafe impl Plain for NamedEndpoint {}
 // SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
 unsafe impl Plain for LanePolicy {}
-// SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which is checked when it is looked at.
+// SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which its reader validates.
 unsafe impl Plain for ControlRecord {}
 // SAFETY: `repr(C)`; 128 bytes of text, nine words, 8 single bytes, 128 bytes of text.
 unsafe impl Plain for SubscriberRecord {}
@@ -58,7 +59,7 @@ unsafe impl Plain for SubscriberRecord {}
 unsafe impl Plain for IntruderRecord {}
 // SAFETY: `repr(C)`; three words, then three times 128 bytes of text.
 unsafe impl Plain for AbsenceRecord {}
-// SAFETY: `repr(C)`, 128 bytes of text, which is checked when it is looked at.
+// SAFETY: `repr(C)`, 128 bytes of text, which its reader validates.
 unsafe impl Plain for RouteInfo {}
 // SAFETY: `repr(C)`, 64-bit integers only.
 unsafe impl Plain for LatencyHistogram {}
@@ -75,7 +76,8 @@ const _: () = {
     assert!(size_of::<RouteInfo>() == 16 * 8);
 };
 
-/// A value in its copies: a line for the version, then the copies, each on lines of its own.
+/// The location of a value in a segment: a cache line for the version, then the copies, each on its own
+/// lines.
 #[derive(Debug)]
 pub(super) struct Cell<T> {
     at: usize,
@@ -91,11 +93,11 @@ impl<T> Clone for Cell<T> {
 impl<T> Copy for Cell<T> {}
 
 impl<T: Plain> Cell<T> {
-    /// Words that it takes, copies and version.
+    /// The size in words, with version and copies.
     pub(super) const WORDS: usize = LINE + COPIES as usize * Self::COPY_WORDS;
     const COPY_WORDS: usize = T::WORDS.next_multiple_of(LINE);
 
-    /// The value at a word of a segment, a multiple of [`LINE`].
+    /// The value at a word offset of a segment, which must be a multiple of [`LINE`].
     pub(super) fn at(at: usize) -> Self {
         Self { at, _type: PhantomData }
     }
@@ -104,14 +106,14 @@ impl<T: Plain> Cell<T> {
         self.at + LINE + (version % COPIES) as usize * Self::COPY_WORDS
     }
 
-    /// The value; `None` when its writer changes it faster than it can be read.
+    /// Reads the value; `None` when its writer changes it faster than it can be read.
     pub(super) fn read(self, segment: &Segment) -> Option<T> {
         for _ in 0..READ_ATTEMPTS {
             let version = segment.word(self.at).load(Ordering::Acquire);
             let value = load(segment, self.copy_at(version));
-            // The writer begins to fill this copy again, as version `version + COPIES`, only after it has
-            // shown the one before that. If we have read a word of it, this fence makes us see that it was
-            // shown.
+            // The writer begins to overwrite this copy, with version `version + COPIES`, only after it has
+            // published the version before that. If `load` has read a word of the new version, this fence
+            // makes the load below see that earlier version number.
             fence(Ordering::Acquire);
             let now = segment.word(self.at).load(Ordering::Relaxed);
             if now.wrapping_sub(version) < COPIES - 1 {
@@ -121,14 +123,15 @@ impl<T: Plain> Cell<T> {
         None
     }
 
-    /// Shows another value. One writer at a time.
+    /// Publishes a new value. One writer at a time.
     pub(super) fn write(self, segment: &Segment, value: &T) {
         let version = segment.word(self.at).load(Ordering::Relaxed).wrapping_add(1);
-        // Whoever reads a word of what follows also sees that the version was counted up before.
+        // A reader that reads one of the words stored below also sees the version number of the previous
+        // update.
         fence(Ordering::Release);
         let to = self.copy_at(version);
         for word in 0..T::WORDS {
-            // SAFETY: `T` has `WORDS` words, all of them initialised, as `Plain` promises.
+            // SAFETY: `T` has `WORDS` words, all of them initialised, as `Plain` requires.
             let word_value = unsafe { (&raw const *value).cast::<u64>().add(word).read_unaligned() };
             segment.word(to + word).store(word_value, Ordering::Relaxed);
         }
@@ -136,13 +139,14 @@ impl<T: Plain> Cell<T> {
     }
 }
 
+/// Copies a value out of a segment, word by word.
 pub(super) fn load<T: Plain>(segment: &Segment, at: usize) -> T {
     let mut value = MaybeUninit::<T>::uninit();
     for word in 0..T::WORDS {
         let word_value = segment.word(at + word).load(Ordering::Relaxed);
-        // SAFETY: `T` has `WORDS` words.
+        // SAFETY: `value` has room for `WORDS` words.
         unsafe { value.as_mut_ptr().cast::<u64>().add(word).write_unaligned(word_value) };
     }
-    // SAFETY: all words are written, and every bit pattern is a value, as `Plain` promises.
+    // SAFETY: all words are written, and every bit pattern is a valid value, as `Plain` requires.
     unsafe { value.assume_init() }
 }

@@ -1,4 +1,4 @@
-//! The samples of one route: one publisher, the lanes, and taps, over a pool of fixed size.
+//! The channel of a route: one publisher (ingress), the lanes and taps as subscribers, a pool of fixed size.
 
 use std::fmt;
 use std::ptr::NonNull;
@@ -25,56 +25,57 @@ use super::node::{NodeShared, ShmNode, StartLock, failed};
 use super::root::RoleLock;
 use super::sample_error::{LoanError, TakeError};
 use super::service::Service;
-use super::slot::{LENT_SLOTS, LentPlace, LentSlot, Slot};
+use super::slot::{LENT_SLOTS, LentPermit, LentSlot, Slot};
 use crate::config::{Lane, Settings};
 use crate::model::{RouteId, SampleHeader, fnv1a};
 
-/// Slots that ingress may hold at once before they are published: the one that it copies into, and those that
-/// it has the DDS library put samples together in.
+/// The most slots that ingress holds before it publishes them: one that it copies into, and those in which
+/// the DDS library assembles samples.
 const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
-/// The share of one tap.
+/// The queue of a tap.
 const TAP: LaneQueue = LaneQueue { queue_depth: 4, max_borrowed: 2 };
-/// Ingress, and the standby that may come beside it one day.
+/// The most publishers of a route: ingress, and one for a future standby.
 const PUBLISHERS: usize = 2;
-/// Attempts to open a service whose creator died, or that its last user removes just now, and the pause.
+/// Attempts to open a service whose creator has died or whose last user is removing it, and the pause between
+/// them.
 const OPEN_ATTEMPTS: usize = 20;
 const OPEN_PAUSE: Duration = Duration::from_millis(25);
 
-/// What one lane may hold of a route.
+/// The most samples of a route that a lane may hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LaneQueue {
-    /// Samples that wait for the lane.
+    /// Samples that wait in the queue of the lane.
     pub queue_depth: usize,
     /// Samples that the lane holds while DDS sends them.
     pub max_borrowed: usize,
 }
 
 impl LaneQueue {
-    /// The share of a configured lane.
+    /// The limits of a configured lane.
     pub fn of(lane: &Lane) -> Self {
         Self { queue_depth: lane.queue_depth, max_borrowed: lane.max_borrowed_in_all() }
     }
 }
 
-/// The fixed parameters of the samples of one route. All processes of an instance must agree on them.
+/// The fixed parameters of the channel of a route. They must be the same in all processes of an instance.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RouteChannel {
     /// The route.
     pub route: RouteId,
-    /// The largest payload.
+    /// The largest payload that the route allows.
     pub max_sample_bytes: usize,
-    /// Each lane that serves the route.
+    /// The queues of the lanes that serve the route.
     pub lanes: Vec<LaneQueue>,
-    /// Local programs that may tap the route at once.
+    /// The most taps of the route at the same time.
     pub max_taps: usize,
-    /// Samples kept for subscribers that come later.
+    /// Samples that are retained for subscribers that join later.
     pub retained_samples: usize,
 }
 
-/// What the pool of a route takes.
+/// The size of the pool of a route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PoolSize {
-    /// Slots.
+    /// The number of slots.
     pub slots: usize,
     /// Bytes of one slot, headers included.
     pub slot_bytes: usize,
@@ -83,10 +84,10 @@ pub struct PoolSize {
 }
 
 impl RouteChannel {
-    /// The channel of a configured route; one queue for each lane that serves it.
+    /// The channel of a configured route, with one queue for each lane that serves it.
     ///
     /// # Panics
-    /// When there is no route of that number.
+    /// If there is no route with that number.
     pub fn of(settings: &Settings, route: usize) -> Self {
         let serves = |lane: &&Lane| lane.outputs.iter().any(|output| output.route == route);
         let configured = &settings.routes[route];
@@ -99,34 +100,37 @@ impl RouteChannel {
         }
     }
 
-    /// What the pool takes; ingress allocates it at its start, all of it.
+    /// The size of the pool. Ingress allocates the whole pool when it starts.
     ///
-    /// Every slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress; so as
-    /// many as all of those together suffice, whatever the lanes do.
+    /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. So
+    /// the sum of these limits is enough, whatever the lanes do.
     pub fn pool_size(&self) -> PoolSize {
         let share = |queue: LaneQueue| self.depth(queue) + queue.max_borrowed.max(1);
         let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
         let slots = lanes + self.max_taps * share(TAP) + self.retained_samples + LOANED_SLOTS;
-        // As iceoryx2 lays it out: its header, ours, the payload, each aligned, all aligned to the largest.
+        // The layout of iceoryx2: its header, the bridge's header, the payload, each aligned, and the slot
+        // aligned to the largest of them.
         let align = align_of::<IceoryxHeader>().max(align_of::<WireHeader>());
         let headers =
             size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>()) + size_of::<WireHeader>();
         let slot_bytes = (headers + self.max_sample_bytes).next_multiple_of(align);
-        // Beside the slots there is a free list of 4 bytes for each, and what describes the segment.
+        // In addition, a free list of 4 bytes for each slot, and the description of the segment.
         let bytes = (slots * (slot_bytes + 4) + 1024).next_multiple_of(4096) as u64;
         PoolSize { slots, slot_bytes, bytes }
     }
 
-    /// A queue that is given what is retained must have room for it.
+    /// The depth of a queue; it must have room for the retained samples, which a new subscriber receives
+    /// first.
     fn depth(&self, queue: LaneQueue) -> usize {
         queue.queue_depth.max(self.retained_samples).max(1)
     }
 
-    fn everybody(&self) -> impl Iterator<Item = LaneQueue> + '_ {
+    /// The queues of all lanes, and one of a tap if taps are allowed.
+    fn queues(&self) -> impl Iterator<Item = LaneQueue> + '_ {
         self.lanes.iter().copied().chain((self.max_taps > 0).then_some(TAP))
     }
 
-    /// All parameters as text: iceoryx2 lets only processes meet that agree on it.
+    /// All parameters as text. iceoryx2 refuses to open the service with another text.
     fn parameters(&self) -> String {
         let mut text = format!(
             "bytes={} taps={} retained={}",
@@ -138,13 +142,13 @@ impl RouteChannel {
         text
     }
 
-    /// Opens the route's service, or creates it: whoever comes first.
+    /// Opens the route's service; the first process creates it.
     fn open(&self, shared: &NodeShared, start: &StartLock) -> Result<Factory, ShmError> {
         let what = format!("to open route {}", self.route);
-        let say = |error: &dyn fmt::Display| failed(shared.dir(), &what, error);
+        let failure = |error: &dyn fmt::Display| failed(shared.dir(), &what, error);
         let name = format!("ab1/samples/{}", self.route);
-        let name = name.as_str().try_into().map_err(|error| say(&error))?;
-        // An attribute has at most 255 bytes, which many lanes exceed.
+        let name = name.as_str().try_into().map_err(|error| failure(&error))?;
+        // A hash, because an attribute has at most 255 bytes and the text of many lanes is longer.
         let parameters = format!("{:016x}", fnv1a(self.parameters().as_bytes()));
         let key = "ab1".try_into().map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;
         let value = parameters.as_str().try_into();
@@ -167,17 +171,17 @@ impl RouteChannel {
                 .max_subscribers(subscribers)
                 .max_nodes(subscribers + PUBLISHERS)
                 .history_size(self.retained_samples)
-                .subscriber_max_buffer_size(self.everybody().map(|q| self.depth(q)).max().unwrap_or(1))
+                .subscriber_max_buffer_size(self.queues().map(|q| self.depth(q)).max().unwrap_or(1))
                 .subscriber_max_borrowed_samples(
-                    self.everybody().map(|queue| queue.max_borrowed).max().unwrap_or(1).max(1),
+                    self.queues().map(|queue| queue.max_borrowed).max().unwrap_or(1).max(1),
                 )
                 .open_or_create_with_attributes(&verifier);
             let error = match opened {
                 Ok(factory) => return Ok(factory),
                 Err(error) => error,
             };
-            if attempt < OPEN_ATTEMPTS && is_passing(error) {
-                // Its creator may have died within, or the last user removes it at this moment.
+            if attempt < OPEN_ATTEMPTS && is_transient(error) {
+                // Its creator may have died during the creation, or its last user is removing it.
                 shared.clean_up(start);
                 thread::sleep(OPEN_PAUSE);
                 continue;
@@ -204,19 +208,19 @@ impl RouteChannel {
                     | OpenError::DoesNotSupportRequestedMinSubscriberBorrowedSamples,
                 ) => ShmError::Incompatible {
                     what: format!(
-                        "route {} is in use with other sizes, or by another version ({error})",
+                        "route {} is in use with other sizes or by another version ({error})",
                         self.route
                     ),
                     path: shared.dir().path.clone(),
                 },
-                other => say(&other),
+                other => failure(&other),
             });
         }
     }
 }
 
 /// Whether the same call may succeed a little later.
-fn is_passing(error: OpenOrCreateError) -> bool {
+fn is_transient(error: OpenOrCreateError) -> bool {
     match error {
         OpenOrCreateError::SystemInFlux => true,
         OpenOrCreateError::PublishSubscribeOpenError(error) => matches!(
@@ -245,10 +249,10 @@ fn is_passing(error: OpenOrCreateError) -> bool {
 
 type Factory = PortFactory<Service, [u8], WireHeader>;
 
-/// The one publisher of a route: ingress.
+/// The publisher of a route's channel, which ingress holds.
 #[derive(Debug)]
 pub struct SamplePublisher {
-    // The port goes before the membership that it lives in.
+    // Declared first, so that the port is dropped before the membership that it needs.
     port: Publisher<Service, [u8], WireHeader>,
     max_sample_bytes: usize,
     lent: Arc<AtomicUsize>,
@@ -256,7 +260,7 @@ pub struct SamplePublisher {
 }
 
 impl SamplePublisher {
-    /// Allocates the pool, all of it at once, and connects to the subscribers that are there.
+    /// Allocates the whole pool and connects to the present subscribers.
     pub fn create(node: &ShmNode, channel: &RouteChannel) -> Result<Self, ShmError> {
         let shared = node.shared();
         let pool = channel.pool_size();
@@ -271,12 +275,12 @@ impl SamplePublisher {
                 .allocation_strategy(AllocationStrategy::Static)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
                 .max_loaned_samples(LOANED_SLOTS)
-                // iceoryx2 would reserve the largest queue for every subscriber.
+                // By default iceoryx2 reserves the largest queue for every subscriber.
                 .override_sample_preallocation(move |_| pool.slots)
                 .create()
         };
         let port = match create() {
-            // A dead predecessor takes the place until it is cleaned up.
+            // A dead predecessor counts until it is cleaned up.
             Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
                 shared.clean_up(&start);
                 create()
@@ -301,7 +305,7 @@ impl SamplePublisher {
         })
     }
 
-    /// Copies a payload into a free slot: the one copy on the way in. No allocation, no waiting.
+    /// Copies a payload into a free slot, which is the only copy in ingress. Neither allocates nor waits.
     pub fn copy_in(&self, payload: &[u8]) -> Result<Slot, LoanError> {
         let too_large = LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes };
         if payload.len() > self.max_sample_bytes {
@@ -312,49 +316,53 @@ impl SamplePublisher {
             Err(IceoryxLoanError::OutOfMemory) => Err(LoanError::PoolExhausted),
             Err(IceoryxLoanError::ExceedsMaxLoanSize) => Err(too_large),
             Err(IceoryxLoanError::ExceedsMaxLoans) => {
-                Err(LoanError::Failed("too many slots held unpublished"))
+                Err(LoanError::Failed("ingress holds too many unpublished slots"))
             }
-            Err(IceoryxLoanError::InternalFailure) => Err(LoanError::Failed("iceoryx2: internal failure")),
+            Err(IceoryxLoanError::InternalFailure) => Err(LoanError::Failed("internal failure of iceoryx2")),
         }
     }
 
-    /// A free slot for a payload of `len` bytes that is yet to be written, if so many may be had. On any
-    /// thread: waits for no process, but for a thread of this one that is in [`attend`](Self::attend), for
-    /// iceoryx2 takes a lock. What is in it is what an older sample left.
+    /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot is free,
+    /// too many are lent, or the route does not allow that length. The slot contains bytes of an older
+    /// sample.
+    ///
+    /// May be called on any thread. It waits for no other process, but iceoryx2 takes a lock, so it waits for
+    /// a thread of this process that is in [`attend`](Self::attend).
     pub fn lend(&self, len: usize) -> Option<LentSlot> {
         if len > self.max_sample_bytes {
             return None;
         }
-        let place = LentPlace::take(&self.lent)?;
+        let permit = LentPermit::take(&self.lent)?;
         let slot = self.port.loan_slice_uninit(len).ok()?;
-        // SAFETY: any byte is a valid `u8`, and those of the pool, a mapped file whose pages are all there,
-        // are initialised: by the kernel with zeros, or by an older sample.
+        // SAFETY: any byte is a valid `u8`, and the bytes of the pool, a mapped file with all its pages, are
+        // initialised: by the kernel with zeros, or by an older sample.
         let sample = unsafe { slot.assume_init() };
-        Some(LentSlot::new(sample, place, self.node.clone()))
+        Some(LentSlot::new(sample, permit, self.node.clone()))
     }
 
-    /// Connects to subscribers that came since, gives them what is retained, and takes back the slots of
-    /// those that are gone. Publishing does so too; where nothing is published for long, call it now and then
-    /// (10 times a second, say). Cheap when nothing has changed.
+    /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
+    /// subscribers that have left. Publishing does the same; on a route where nothing is published, call this
+    /// periodically, for example 10 times a second. Cheap when nothing has changed.
     pub fn attend(&self) {
-        // A subscriber that cannot be reached is logged by iceoryx2; the others are connected all the same.
+        // iceoryx2 logs a failed connection to a subscriber, and still connects to the others.
         let _ = self.port.update_connections();
     }
 }
 
-/// As what a subscriber comes.
+/// The kind of a subscriber, which determines its queue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SubscriberRole {
-    /// A lane, with its share of the pool.
+    /// A lane, with its queue and borrow limit.
     Lane(LaneQueue),
-    /// A tap: a queue of 4, 2 borrowed.
+    /// A tap: a queue of 4 samples, at most 2 borrowed.
     Tap,
 }
 
-/// One subscriber of a route: a lane or a tap.
+/// A subscriber of a route's channel: a lane or a tap.
 #[derive(Debug)]
 pub struct SampleSubscriber {
-    // The port goes before the membership that it lives in, which `borrowed` holds.
+    // Declared first, so that the port is dropped before the membership that it needs, which `borrowed`
+    // holds.
     port: Subscriber<Service, [u8], WireHeader>,
     max_borrowed: usize,
     max_sample_bytes: usize,
@@ -362,14 +370,14 @@ pub struct SampleSubscriber {
     _tap: Option<RoleLock>,
 }
 
-/// How many samples of a subscriber are out, and the membership that they need.
+/// The number of samples that a subscriber has borrowed, and the membership that they need.
 #[derive(Debug)]
 struct Borrowed {
     count: AtomicUsize,
     _node: Arc<NodeShared>,
 }
 
-/// One of a subscriber's borrows; given back when dropped.
+/// One borrowed sample in [`Borrowed`]; dropping it decrements the count.
 #[derive(Debug)]
 struct Borrow(Arc<Borrowed>);
 
@@ -380,7 +388,8 @@ impl Drop for Borrow {
 }
 
 impl SampleSubscriber {
-    /// Subscribes; with `history`, what is retained comes first. There need not be a publisher yet.
+    /// Subscribes to a route. With `history`, the retained samples are delivered first. The publisher may
+    /// come later.
     pub fn open(
         node: &ShmNode,
         channel: &RouteChannel,
@@ -390,7 +399,7 @@ impl SampleSubscriber {
         let shared = node.shared();
         let (queue, tap) = match role {
             SubscriberRole::Lane(queue) => (queue, None),
-            SubscriberRole::Tap => (TAP, Some(take_tap_place(shared, channel)?)),
+            SubscriberRole::Tap => (TAP, Some(acquire_tap_lock(shared, channel)?)),
         };
         let start = StartLock::take(shared.dir())?;
         let factory = channel.open(shared, &start)?;
@@ -404,7 +413,7 @@ impl SampleSubscriber {
                 .create()
         };
         let port = match create() {
-            // A dead predecessor takes the place until it is cleaned up.
+            // A dead predecessor counts until it is cleaned up.
             Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                 shared.clean_up(&start);
                 create()
@@ -428,7 +437,7 @@ impl SampleSubscriber {
         })
     }
 
-    /// Takes the oldest sample that waits, if any. No allocation.
+    /// Takes the oldest waiting sample, if there is one. Does not allocate.
     pub fn take(&self) -> Result<Option<ShmSample>, TakeError> {
         if self.borrowed.count.fetch_add(1, Ordering::Acquire) >= self.max_borrowed {
             self.borrowed.count.fetch_sub(1, Ordering::Relaxed);
@@ -445,53 +454,53 @@ impl SampleSubscriber {
         }
     }
 
-    /// Samples taken and not dropped yet.
+    /// The number of samples that were taken and are not dropped yet.
     pub fn borrowed(&self) -> usize {
         self.borrowed.count.load(Ordering::Acquire)
     }
 
-    /// Samples that may be borrowed at once.
+    /// The most samples that may be borrowed at the same time.
     pub fn max_borrowed(&self) -> usize {
         self.max_borrowed
     }
 }
 
-/// Lanes have their places by their role; taps have to share a fixed number, so that none takes a lane's
-/// place.
-fn take_tap_place(shared: &NodeShared, channel: &RouteChannel) -> Result<RoleLock, ShmError> {
-    for place in 0..channel.max_taps {
-        let name = format!("tap-{}-{place}", channel.route);
+/// Takes one of the `max_taps` tap locks of a route, so that taps cannot use up the connections of lanes. A
+/// lane needs no such lock, because its role lock admits one process.
+fn acquire_tap_lock(shared: &NodeShared, channel: &RouteChannel) -> Result<RoleLock, ShmError> {
+    for number in 0..channel.max_taps {
+        let name = format!("tap-{}-{number}", channel.route);
         match RoleLock::try_acquire(shared.dir(), &name) {
             Ok(Some(lock)) => return Ok(lock),
             Ok(None) => {}
-            Err(error) => return Err(failed(shared.dir(), "to take a tap's place", &error)),
+            Err(error) => return Err(failed(shared.dir(), "to take a tap's lock", &error)),
         }
     }
     Err(ShmError::TooManySubscribers { route: channel.route.clone(), max: channel.max_taps })
 }
 
-/// A sample in shared memory. Its slot is free again when it is dropped, on whatever thread.
+/// A sample in shared memory. Dropping it, on any thread, frees its slot.
 #[derive(Debug)]
 pub struct ShmSample {
     header: SampleHeader,
     payload: NonNull<u8>,
     length: usize,
-    // The slot is given back before it is no longer counted.
+    // Declared before `_borrow`, so that the slot is returned before the count is decremented.
     _slot: Sample<Service, [u8], WireHeader>,
     _borrow: Borrow,
 }
 
 // SAFETY: a shared reference gives access to the header, which is a copy, and to the bytes of the payload,
-// which nobody writes while they are borrowed. `_slot`, which is what is not `Sync`, is reached by nobody
+// which no process writes while they are borrowed. `_slot`, the field that is not `Sync`, is not accessed
 // until it is dropped, and may be dropped on any thread: `Sample` of a thread-safe service is `Send`. The
 // bytes are in a mapping that `_slot` keeps, not in memory of a thread.
 unsafe impl Sync for ShmSample {}
-// SAFETY: as above; the pointer is the one field that is not `Send` by itself.
+// SAFETY: as above; the pointer is the only field that is not `Send` by itself.
 unsafe impl Send for ShmSample {}
 
 impl ShmSample {
-    /// Checks what another process wrote, and remembers where the payload is, so that looking at it later
-    /// takes no lock and reads no length that might have changed.
+    /// Validates what another process wrote, and stores the address and length of the payload, so that a
+    /// later access takes no lock and reads no length that may have changed.
     fn new(
         slot: Sample<Service, [u8], WireHeader>,
         max_bytes: usize,
@@ -504,14 +513,14 @@ impl ShmSample {
             return Err(TakeError::Malformed(HeaderError::PayloadTooLong));
         }
         header::check(&header).map_err(TakeError::Malformed)?;
-        // A reference is never null; of an empty payload it is only an address.
+        // A reference is never null; for an empty payload it is a dangling address.
         let Some(payload) = NonNull::new(payload.cast_mut().cast()) else {
             return Err(TakeError::Failed("a payload at address 0"));
         };
         Ok(Self { header, payload, length, _slot: slot, _borrow: borrow })
     }
 
-    /// The header, checked.
+    /// The header, which has been validated.
     pub fn header(&self) -> &SampleHeader {
         &self.header
     }
@@ -519,7 +528,7 @@ impl ShmSample {
     /// The payload.
     pub fn payload(&self) -> &[u8] {
         // SAFETY: `length` bytes of the slot, which is mapped as long as `_slot` lives, and which ingress
-        // does not write before it is given back.
+        // does not write before the slot is returned.
         unsafe { std::slice::from_raw_parts(self.payload.as_ptr(), self.length) }
     }
 }
@@ -536,7 +545,7 @@ mod tests {
     use crate::model::InstanceName;
 
     #[test]
-    fn a_payload_longer_than_its_route_allows_is_refused() {
+    fn a_payload_longer_than_the_route_allows_is_refused() {
         let root = tempfile::tempdir().unwrap();
         let instance = InstanceName::try_from("unit").unwrap();
         let node = ShmNode::open(root.path(), &instance, "test").unwrap();
@@ -552,7 +561,8 @@ mod tests {
         let publisher = SamplePublisher::create(&node, &channel).unwrap();
         let mut subscriber =
             SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(lane), false).unwrap();
-        // Processes that say different sizes do not meet; one that lies does.
+        // Processes with different sizes cannot open the same service. A faulty publisher is simulated by a
+        // smaller limit at the subscriber.
         subscriber.max_sample_bytes = 50;
         let mut header = WireHeader::default().0;
         header.sequence = 1;

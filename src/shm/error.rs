@@ -1,66 +1,66 @@
-//! What can go wrong at start-up, in the words of someone who has to mend it.
+//! Errors when shared memory is set up.
 
 use std::fmt;
 use std::path::PathBuf;
 
 use crate::model::{InstanceName, RouteId};
 
-/// Why shared memory could not be set up. `Display` says what failed, where, and what to do about it.
+/// Why shared memory could not be set up. `Display` names what failed, where, and what to do next.
 #[derive(Debug)]
 pub enum ShmError {
-    /// The folder could not be created, or not be made private.
+    /// The folder could not be created or made private.
     CannotCreateRoot {
         /// The folder.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// The folder belongs to another user, or others may write to it.
+    /// The folder belongs to another user, or other users may write to it.
     RootNotOurs {
         /// The folder.
         path: PathBuf,
-        /// Why it is refused.
+        /// Why the folder is refused.
         reason: String,
     },
-    /// The folder's path is too long for the files that live below it.
+    /// The folder's path is too long for the files below it.
     PathTooLong {
         /// The folder.
         path: PathBuf,
         /// Its length in bytes.
         length: usize,
-        /// The longest that works.
+        /// The longest length that is allowed.
         max: usize,
     },
-    /// Another process serves the role already.
+    /// Another process already serves the role.
     AlreadyServed {
         /// The role.
         role: String,
-        /// The process that serves it; 0 when it has not said yet.
+        /// The process that serves it; 0 when it has not written its process id yet.
         pid: u32,
     },
-    /// The bridge is to be started as a whole, and processes of its instance run.
+    /// The whole bridge is to be started, but processes of its instance are running.
     AlreadyRuns {
         /// The instance.
         instance: InstanceName,
-        /// One of the processes: that of `up` if there is one; 0 when it has not said yet.
+        /// One of these processes, preferably `up`; 0 when it has not written its process id yet.
         pid: u32,
     },
-    /// Shared memory has less room than the bridge needs.
+    /// Shared memory has less free space than the bridge needs.
     NoRoom {
-        /// What it is for.
+        /// What the memory is for.
         what: String,
         /// The bytes that are needed.
         needed_bytes: u64,
-        /// The bytes that are free, where the file system tells.
+        /// The bytes that are free; 0 when the file system does not report them.
         free_bytes: u64,
         /// The file system.
         path: PathBuf,
     },
-    /// Access was refused.
+    /// The operating system refused access.
     Permission {
-        /// What was to be done.
+        /// The operation, as `to` and a verb.
         what: String,
-        /// Where.
+        /// The file or folder.
         path: PathBuf,
     },
     /// Running processes of this instance use another version or another configuration.
@@ -70,27 +70,27 @@ pub enum ShmError {
         /// The folder of the instance.
         path: PathBuf,
     },
-    /// All places for taps, or for a lane, on a route are taken.
+    /// A route has as many taps or lanes as it allows.
     TooManySubscribers {
         /// The route.
         route: RouteId,
-        /// Places that there are.
+        /// The most that the route allows.
         max: usize,
     },
-    /// Another process holds a lock for longer than a start-up takes: it is stopped, perhaps.
+    /// Another process has held a lock for longer than a start takes; it may be stopped.
     Busy {
         /// The lock file.
         path: PathBuf,
-        /// The process that holds it; 0 when unknown.
+        /// The process that holds it; 0 if unknown.
         pid: u32,
     },
-    /// An operation of iceoryx2 or of the operating system failed for a reason of its own.
+    /// An operation of iceoryx2 or of the operating system failed for another reason.
     Failed {
-        /// What was to be done.
+        /// The operation, as `to` and a verb.
         what: String,
-        /// Where.
+        /// The file or folder.
         path: PathBuf,
-        /// What was said.
+        /// The error that was reported.
         reason: String,
     },
 }
@@ -111,7 +111,7 @@ impl fmt::Display for ShmError {
             ),
             Self::PathTooLong { path, length, max } => write!(
                 f,
-                "the path {} has {length} bytes, at most {max} work; choose a shorter \
+                "the path {} has {length} bytes, at most {max} are allowed; choose a shorter \
                  shared_memory.root_path",
                 path.display()
             ),
@@ -123,14 +123,14 @@ impl fmt::Display for ShmError {
             }
             Self::NoRoom { what, needed_bytes, free_bytes, path } => write!(
                 f,
-                "{what} needs {needed_bytes} bytes of shared memory, {} has {free_bytes} free; enlarge it \
-                 (mount -o remount,size=… {0}; docker run --shm-size=…), or lower max_sample_bytes, \
+                "{what} needs {needed_bytes} bytes of shared memory, but {} has {free_bytes} free; enlarge \
+                 it (mount -o remount,size=… {0}; docker run --shm-size=…), or lower max_sample_bytes, \
                  queue_depth or max_taps",
                 path.display()
             ),
             Self::Permission { what, path } => write!(
                 f,
-                "not permitted: {what} ({}); all processes of a bridge must run as the same user",
+                "not permitted {what} ({}); all processes of a bridge must run as the same user",
                 path.display()
             ),
             Self::Incompatible { what, path } => write!(
@@ -144,11 +144,11 @@ impl fmt::Display for ShmError {
             ),
             Self::Busy { path, pid } => write!(
                 f,
-                "the lock {} is held by process {pid} for longer than a start takes; if that process is \
+                "process {pid} has held the lock {} for longer than a start takes; if that process is \
                  stopped, continue or kill it",
                 path.display()
             ),
-            Self::Failed { what, path, reason } => write!(f, "{what} failed ({}): {reason}", path.display()),
+            Self::Failed { what, path, reason } => write!(f, "failed {what} ({}): {reason}", path.display()),
         }
     }
 }

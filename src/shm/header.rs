@@ -1,4 +1,4 @@
-//! The sample header as shared memory carries it, and the check of what was read there.
+//! The sample header in shared memory, and its validation after reading.
 
 use std::fmt;
 
@@ -9,12 +9,12 @@ use crate::model::{AgeBasis, Encapsulation, Guid, MonotonicNs, SampleHeader, Sou
 /// The size of a [`SampleHeader`] in shared memory.
 pub const HEADER_BYTES: usize = size_of::<SampleHeader>();
 
-/// What is wrong with a header that was read from shared memory.
+/// Why a sample header that was read from shared memory is invalid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HeaderError {
-    /// Not [`HEADER_BYTES`] long.
+    /// The header is not [`HEADER_BYTES`] long.
     WrongLength,
-    /// Sequences begin at 1.
+    /// The sequence number is 0; sequence numbers begin at 1.
     SequenceZero,
     /// The payload is longer than the route allows.
     PayloadTooLong,
@@ -24,16 +24,17 @@ impl fmt::Display for HeaderError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::WrongLength => "a sample header of the wrong length",
-            Self::SequenceZero => "a sample header with sequence 0",
-            Self::PayloadTooLong => "a sample longer than its route allows",
+            Self::SequenceZero => "a sample header with sequence number 0",
+            Self::PayloadTooLong => "a sample larger than its route allows",
         })
     }
 }
 
 impl std::error::Error for HeaderError {}
 
-/// Reads a header from bytes that any process may have written. Every encapsulation and every timestamp is
-/// let through: they are forwarded as they came. So is every age basis, each of which means something.
+/// Decodes and validates a header from bytes that any process may have written. Every encapsulation and
+/// timestamp is accepted, because they are forwarded unchanged, and every age basis, because all its values
+/// are valid.
 pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
     let bytes: &[u8; HEADER_BYTES] = bytes.try_into().map_err(|_| HeaderError::WrongLength)?;
     let word = |at: usize| {
@@ -57,6 +58,7 @@ pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
     Ok(header)
 }
 
+/// Validates a header.
 pub(super) fn check(header: &SampleHeader) -> Result<(), HeaderError> {
     if header.sequence == 0 { Err(HeaderError::SequenceZero) } else { Ok(()) }
 }
@@ -66,12 +68,12 @@ pub(super) fn check(header: &SampleHeader) -> Result<(), HeaderError> {
 #[repr(transparent)]
 pub(super) struct WireHeader(pub(super) SampleHeader);
 
-/// No byte of the header is padding, so that none is left unwritten.
+/// The header has no padding, so that every byte in shared memory is written.
 const _: () = assert!(HEADER_BYTES == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 && align_of::<SampleHeader>() == 8);
 
 // SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle
-// of a process, no destructor, every bit pattern valid. The name stands for exactly this layout, and the
-// service's name carries the version.
+// of a process, no destructor, every bit pattern valid. The type name denotes exactly this layout, and the
+// name of the service contains the version.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "ab1::SampleHeader"

@@ -1,4 +1,4 @@
-//! Which processes serve the roles of an instance.
+//! Finds the processes that serve the roles of an instance, and the files of an instance.
 
 use std::fs;
 use std::io;
@@ -9,31 +9,31 @@ use super::error::ShmError;
 use super::root::{InstanceDir, LOCK_SUFFIX, ROLE_PREFIX, read_pid};
 use crate::model::InstanceName;
 
-/// Where Linux lists the locks that are held (proc_locks(5)).
+/// The file in which Linux lists held locks (proc_locks(5)).
 const LOCKS: &str = "/proc/locks";
 
 /// A process that serves a role of an instance.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RoleHolder {
-    /// `ingress`, `control`, `egress-critical`, …
+    /// The role: `ingress`, `control`, `egress-critical`, …
     pub role: String,
-    /// Its process id. The kernel says that this process holds the role's lock, so it is none that got the
-    /// number of a dead one.
+    /// Its process id. The kernel reports that this process holds the role's lock, so it is not another
+    /// process that got the id of a dead one.
     pub pid: u32,
-    /// Where it leaves what it has to say about its last reload.
+    /// The path of the file in which it reports the result of its last reload.
     pub note: PathBuf,
 }
 
 impl RoleHolder {
-    /// All processes that serve a role of the instance now, by the names of the roles; none when the bridge
-    /// does not run. Takes no lock, so that no start of a role is in its way.
+    /// Lists the processes that serve a role of the instance now, sorted by role; empty when the bridge is
+    /// not running. Takes no lock, so that it never makes the start of a role fail.
     ///
     /// # Errors
-    /// The folder of the instance belongs to somebody else, or the list of locks cannot be read.
+    /// The folder of the instance belongs to another user, or the list of locks cannot be read.
     pub fn all(root: &Path, instance: &InstanceName) -> Result<Vec<Self>, ShmError> {
         let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(Vec::new()) };
         let failed = |path: &Path, error: io::Error| ShmError::Failed {
-            what: "to find out who serves the roles".to_owned(),
+            what: "to find the processes of the bridge".to_owned(),
             path: path.to_owned(),
             reason: error.to_string(),
         };
@@ -44,7 +44,7 @@ impl RoleHolder {
             .filter_map(|entry| {
                 let name = entry.file_name().into_string().ok()?;
                 let role = name.strip_prefix(ROLE_PREFIX)?.strip_suffix(LOCK_SUFFIX)?;
-                // A tap has a lock, too; it is no process of the bridge.
+                // A tap also has a lock, but is not a process of the bridge.
                 let is_process = matches!(role, "ingress" | "control") || role.starts_with("egress-");
                 let (path, inode) = (entry.path(), entry.metadata().ok()?.ino());
                 let pid = read_pid(&path);
@@ -60,12 +60,12 @@ impl RoleHolder {
     }
 }
 
-/// Whether the process holds a lock on the file of that inode.
+/// Whether the process holds a lock on the file with that inode number.
 pub(super) fn is_locked_by(pid: u32, inode: u64) -> bool {
     fs::read_to_string(LOCKS).is_ok_and(|locks| holds(&locks, pid, inode))
 }
 
-/// The files of an instance in the shared-memory file system, whoever made them.
+/// Lists the files of an instance in the shared-memory file system.
 pub fn instance_files(root: &Path, instance: &InstanceName) -> Vec<PathBuf> {
     match InstanceDir::find(root, instance) {
         Ok(Some(dir)) => dir.shm_files(),
@@ -73,9 +73,9 @@ pub fn instance_files(root: &Path, instance: &InstanceName) -> Vec<PathBuf> {
     }
 }
 
-/// Whether the process holds a lock on the file of that inode: a line of the list such as
-/// `1: FLOCK  ADVISORY  WRITE 708 00:1a:2389 0 EOF`. The device is not compared: some file systems show
-/// another one there than `stat` does.
+/// Whether the list of locks has an exclusive one of that process on the file with that inode number: a line
+/// such as `1: FLOCK  ADVISORY  WRITE 708 00:1a:2389 0 EOF`. The device is not compared, because on some file
+/// systems it differs from that of `stat`.
 fn holds(locks: &str, pid: u32, inode: u64) -> bool {
     pid != 0
         && locks.lines().any(|line| {
@@ -93,7 +93,7 @@ mod tests {
     use crate::shm::RoleLock;
 
     #[test]
-    fn only_the_holder_of_a_lock_has_the_role() {
+    fn only_a_process_with_an_exclusive_flock_holds_a_role() {
         let locks = "1: POSIX  ADVISORY  WRITE 7 00:1a:23 0 EOF\n\
                      2: FLOCK  ADVISORY  WRITE 708 fe:00:2389 0 EOF\n\
                      2: -> FLOCK  ADVISORY  WRITE 709 fe:00:2389 0 EOF\n\
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn who_serves_a_role_is_found_and_who_died_or_taps_is_not() {
+    fn only_living_processes_with_a_role_are_listed() {
         let root = tempfile::tempdir().unwrap();
         let instance = InstanceName::try_from("holders").unwrap();
         let all = || RoleHolder::all(root.path(), &instance).unwrap();
@@ -114,7 +114,7 @@ mod tests {
         let _ingress = RoleLock::acquire(root.path(), &instance, "ingress").unwrap();
         let _lane = RoleLock::acquire(root.path(), &instance, "egress-rviz").unwrap();
         let _tap = RoleLock::acquire(root.path(), &instance, "tap-scan-0").unwrap();
-        // What a process that was killed leaves: a file that names it, and no lock.
+        // A process that was killed leaves a file with a process id that is not locked.
         let folder = root.path().join("holders");
         fs::write(folder.join("role-egress-dead.lock"), std::process::id().to_string()).unwrap();
         let found = all();

@@ -1,8 +1,8 @@
-//! The file that keeps the configuration in force of an instance, and the lock that says whether it counts.
+//! The file with the configuration in force of an instance, and the lock that shows whether it is valid.
 //!
 //! Every process of a running bridge holds the lock shared; a tap does not. The process that gets it
-//! exclusively is the first one: it writes the file anew. A file whose lock no process holds is left from a
-//! bridge that was killed, and is overwritten. What the bytes mean is for the caller.
+//! exclusively is the first one, and writes the file. A file whose lock no process holds was left by a killed
+//! bridge, and is overwritten. The caller encodes and decodes the content.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -23,14 +23,14 @@ use crate::model::{InstanceName, fnv1a};
 const LOCK: &str = "in-force.lock";
 const FILE: &str = "in-force.json";
 
-/// The largest file that is read. A configuration file has 1 MiB at most.
+/// The most bytes that are read of a file. A configuration file has 1 MiB at most.
 const MAX_BYTES: u64 = 8 << 20;
 
 /// How long a start waits for the first process to write the file, which takes a few milliseconds.
-const PATIENCE_MS: u64 = 5_000;
+const JOIN_TIMEOUT_MS: u64 = 5_000;
 
-/// The share of one process in the configuration in force, which lasts as long as any process of the
-/// instance has a share.
+/// The share of a process in the configuration in force, which exists as long as any process of the instance
+/// has a share.
 #[derive(Debug)]
 pub struct InForceShare {
     lock: Option<FileLock>,
@@ -38,7 +38,7 @@ pub struct InForceShare {
 }
 
 impl InForceShare {
-    /// Joins the processes of a running bridge; yields what they have in force. `None` when none runs.
+    /// Joins a running bridge and returns its configuration in force; `None` when no process is running.
     ///
     /// # Errors
     /// The folder of the instance belongs to another user, or a file in it cannot be read.
@@ -46,44 +46,49 @@ impl InForceShare {
         let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(None) };
         match Self::attempt(&dir, None) {
             Ok(Attempt::Joined { share, bytes, .. }) => Ok(Some((share, bytes))),
-            Ok(Attempt::Alone) => Ok(None),
+            Ok(Attempt::NoneRunning) => Ok(None),
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
             Err(error) => Err(failed("to join the running bridge", &dir.path, &error)),
         }
     }
 
-    /// Joins the processes of a running bridge, or puts `first` in force when none runs. Yields what is in
-    /// force, which is `first` in the second case.
+    /// Joins a running bridge, or puts `first` in force when no process is running. Returns the configuration
+    /// in force, which is `first` in the second case.
     ///
     /// # Errors
     /// As for [`join_running`](Self::join_running), or the file cannot be written.
     pub fn join(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<(Self, Vec<u8>), ShmError> {
-        let (share, bytes, _) = Self::enter(root, instance, first)?;
+        let (share, bytes, _) = Self::join_or_begin(root, instance, first)?;
         Ok((share, bytes))
     }
 
     /// Puts `first` in force as the first process of the instance.
     ///
     /// # Errors
-    /// [`ShmError::AlreadyRuns`] when a process of the instance runs; else as for [`join`](Self::join).
+    /// [`ShmError::AlreadyRuns`] if a process of the instance is running; otherwise as for
+    /// [`join`](Self::join).
     pub fn begin(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<Self, ShmError> {
-        let (share, _, is_first) = Self::enter(root, instance, first)?;
+        let (share, _, is_first) = Self::join_or_begin(root, instance, first)?;
         if is_first {
             return Ok(share);
         }
-        // The first process may have no role yet; it has left its number in the lock.
+        // The first process may have no role yet, but it has written its process id to the lock file.
         let pid = running_pid(root, instance).unwrap_or_else(|| read_pid(&share.dir.join(LOCK)));
         Err(ShmError::AlreadyRuns { instance: instance.clone(), pid })
     }
 
-    /// Yields also whether this is the first process.
-    fn enter(root: &Path, instance: &InstanceName, first: &[u8]) -> Result<(Self, Vec<u8>, bool), ShmError> {
-        // The last process that leaves removes the folder: then it is made again.
+    /// Like [`join`](Self::join), and also returns whether this is the first process.
+    fn join_or_begin(
+        root: &Path,
+        instance: &InstanceName,
+        first: &[u8],
+    ) -> Result<(Self, Vec<u8>, bool), ShmError> {
+        // A process that leaves as the last one may remove the folder at the same time; then retry.
         for _ in 0..100 {
             let dir = InstanceDir::prepare(root, instance)?;
             match Self::attempt(&dir, Some(first)) {
                 Ok(Attempt::Joined { share, bytes, is_first }) => return Ok((share, bytes, is_first)),
-                Ok(Attempt::Alone) => {}
+                Ok(Attempt::NoneRunning) => {}
                 Err(error) if error.kind() == ErrorKind::NotFound => {}
                 Err(error) => return Err(failed("to put a configuration in force", &dir.path, &error)),
             }
@@ -91,16 +96,16 @@ impl InForceShare {
         Err(ShmError::Failed {
             what: "to put a configuration in force".to_owned(),
             path: root.to_owned(),
-            reason: "the folder is removed again and again".to_owned(),
+            reason: "other processes removed the folder in 100 attempts".to_owned(),
         })
     }
 
-    /// The file, for the process to put another configuration in force.
+    /// The file, for putting another configuration in force.
     pub fn file(&self) -> InForceFile {
         InForceFile { dir: self.dir.clone() }
     }
 
-    /// `first` is `None` where a bridge that does not run is not to be begun.
+    /// Joins once. `first` is `None` if the caller does not start a bridge.
     fn attempt(dir: &InstanceDir, first: Option<&[u8]>) -> io::Result<Attempt> {
         let path = dir.path.join(LOCK);
         let file = InForceFile { dir: dir.path.clone() };
@@ -108,18 +113,18 @@ impl InForceShare {
             let share = Self { lock: Some(lock), dir: dir.path.clone() };
             Ok(Attempt::Joined { share, bytes, is_first })
         };
-        let give_up_at = clock::monotonic().plus_ms(PATIENCE_MS);
+        let give_up_at = clock::monotonic().plus_ms(JOIN_TIMEOUT_MS);
         loop {
             if let Some(mut lock) = FileLock::take(&path, FlockArg::LockExclusiveNonblock)? {
                 let Some(first) = first else {
                     file.remove();
                     lock.remove();
-                    return Ok(Attempt::Alone);
+                    return Ok(Attempt::NoneRunning);
                 };
                 file.write(first)?;
                 lock.write_pid()?;
-                // The kernel may give the lock to another process while it is changed: that one is the first
-                // then, and has removed or overwritten the file.
+                // The kernel may give the lock to another process during the change from exclusive to shared.
+                // That process is then the first one, and has removed or overwritten the file.
                 if lock.relock(FlockArg::LockSharedNonblock).is_ok()
                     && lock_is_current(&lock)
                     && let Some(bytes) = file.read()?
@@ -133,7 +138,7 @@ impl InForceShare {
             }
             if clock::monotonic() > give_up_at {
                 return Err(io::Error::other(format!(
-                    "process {} holds it for longer than a start takes",
+                    "process {} has held the lock for longer than a start takes",
                     read_pid(&path)
                 )));
             }
@@ -142,14 +147,15 @@ impl InForceShare {
     }
 }
 
+/// The result of [`InForceShare::attempt`].
 enum Attempt {
     Joined {
         share: InForceShare,
         bytes: Vec<u8>,
         is_first: bool,
     },
-    /// No process runs, and none is to begin.
-    Alone,
+    /// No process is running, and the caller does not start a bridge.
+    NoneRunning,
 }
 
 fn failed(what: &str, path: &Path, error: &io::Error) -> ShmError {
@@ -171,7 +177,7 @@ impl Drop for InForceShare {
     }
 }
 
-/// Removes the file if no process has a share in it; for the clean-up of an instance.
+/// Removes the file and its lock if no process has a share, for the clean-up of an instance.
 pub(super) fn sweep(dir: &Path) {
     if let Ok(Some(lock)) = FileLock::take(&dir.join(LOCK), FlockArg::LockExclusiveNonblock) {
         InForceFile { dir: dir.to_owned() }.remove();
@@ -179,25 +185,25 @@ pub(super) fn sweep(dir: &Path) {
     }
 }
 
-/// Whether a file of that name belongs to this module, which sees to its removal.
+/// Whether this module creates, and removes, the file with that name.
 pub(super) fn owns(name: &[u8]) -> bool {
     name == LOCK.as_bytes() || name == FILE.as_bytes()
 }
 
-/// A process of the instance that runs, `up` before all others.
+/// The id of a running process of the instance, preferably `up`.
 fn running_pid(root: &Path, instance: &InstanceName) -> Option<u32> {
     let up = RoleLock::holder(root, instance, "up");
     up.or_else(|| RoleHolder::all(root, instance).ok()?.first().map(|holder| holder.pid))
 }
 
-/// The file that keeps the configuration in force.
+/// The file with the configuration in force.
 #[derive(Clone, Debug)]
 pub struct InForceFile {
     dir: PathBuf,
 }
 
 impl InForceFile {
-    /// That of an instance, whether or not a process runs; for commands that look only. Takes no lock.
+    /// Finds the file of an instance, running or not, for commands that only read. Takes no lock.
     ///
     /// # Errors
     /// The folder of the instance belongs to another user.
@@ -205,10 +211,10 @@ impl InForceFile {
         Ok(InstanceDir::find(root, instance)?.map(|dir| Self { dir: dir.path }))
     }
 
-    /// Its content; `None` when there is none.
+    /// Reads the content; `None` when there is no file.
     ///
     /// # Errors
-    /// The operating system refused.
+    /// The operating system cannot read the file.
     pub fn read(&self) -> io::Result<Option<Vec<u8>>> {
         let file = match File::open(self.dir.join(FILE)) {
             Ok(file) => file,
@@ -220,10 +226,11 @@ impl InForceFile {
         Ok(Some(bytes))
     }
 
-    /// Replaces its content in one step, readable by its owner only: it may hold a secret.
+    /// Replaces the content atomically. Only the owner may read the file, because it may contain a secret.
     ///
     /// # Errors
-    /// The operating system refused. `NotFound` when the folder is gone because the bridge ends.
+    /// The operating system cannot write the file; `NotFound` if the bridge is ending and has removed the
+    /// folder.
     pub fn write(&self, bytes: &[u8]) -> io::Result<()> {
         write_privately(&self.dir.join(FILE), bytes)
     }
@@ -233,9 +240,10 @@ impl InForceFile {
     }
 }
 
+/// Replaces a file atomically by one of mode 0600.
 fn write_privately(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let draft = path.with_extension(format!("draft{}", std::process::id()));
-    // A draft that a dead process with this number left may have other rights.
+    // A draft that a dead process with the same id left may have another mode.
     let _ = fs::remove_file(&draft);
     let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&draft)?;
     file.write_all(bytes)?;
@@ -243,8 +251,9 @@ fn write_privately(path: &Path, bytes: &[u8]) -> io::Result<()> {
     fs::rename(&draft, path)
 }
 
-/// Where the bridge runs that was started with a certain configuration file. It is found by the path of the
-/// file, so that a process finds its bridge while the file is broken, missing, or names another instance.
+/// The root and instance of the bridge that was started with a configuration file. It is stored under the
+/// path of that file, so that a process finds its bridge even if the file is invalid, missing, or names
+/// another instance.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BridgeAddress {
     /// The configuration file, as an absolute path.
@@ -253,16 +262,16 @@ pub struct BridgeAddress {
     instance: InstanceName,
 }
 
-/// The folder of the addresses in the default root. No instance has a name that begins with a dot.
+/// The folder of the addresses in the default root. Names of instances cannot begin with a dot.
 const ADDRESSES: &str = ".addresses";
 
 impl BridgeAddress {
-    /// The address of the instance in `root`, started with `file`.
+    /// Creates the address of the instance in `root` that was started with `file`.
     pub fn new(file: &Path, root: &Path, instance: &InstanceName) -> Self {
         Self { file: file.to_owned(), root: root.to_owned(), instance: instance.clone() }
     }
 
-    /// The folder of the bridge's shared files.
+    /// The root, the folder that contains the folder of the instance.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -272,10 +281,10 @@ impl BridgeAddress {
         &self.instance
     }
 
-    /// Writes the address below `default_root`, and removes those of bridges whose folders are gone.
+    /// Writes the address below `default_root`, and removes addresses of bridges whose folders are gone.
     ///
     /// # Errors
-    /// The folder cannot be made or belongs to another user, or the operating system refused.
+    /// The folder cannot be created or belongs to another user, or the file cannot be written.
     pub fn write(&self, default_root: &Path) -> Result<(), ShmError> {
         let folder = default_root.join(ADDRESSES);
         make_private(&folder)?;
@@ -293,8 +302,8 @@ impl BridgeAddress {
         write_privately(&address_path(default_root, &self.file), &bytes).map_err(failed)
     }
 
-    /// The address of the bridge that was started with `file`; `None` when there is none. The bridge may have
-    /// ended since.
+    /// Finds the address of the bridge that was started with `file`; `None` when there is none. The bridge
+    /// may have ended.
     pub fn find(default_root: &Path, file: &Path) -> Option<Self> {
         let found = read_address(&address_path(default_root, file))?;
         (found.file == file).then_some(found)
@@ -323,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_first_process_puts_in_force_lasts_until_the_last_one_has_left() {
+    fn the_first_configuration_stays_in_force_until_the_last_process_has_left() {
         let root = tempfile::tempdir().unwrap();
         let join = |first: &[u8]| InForceShare::join(root.path(), &instance(), first).unwrap();
         let running = || InForceShare::join_running(root.path(), &instance()).unwrap();
@@ -344,18 +353,18 @@ mod tests {
     }
 
     #[test]
-    fn what_a_killed_bridge_left_is_not_in_force() {
+    fn the_file_of_a_killed_bridge_is_not_in_force() {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("kept");
         let (mut share, _) = InForceShare::join(root.path(), &instance(), b"old").unwrap();
-        // A process that dies leaves its files and no lock.
+        // A process that dies leaves its files, and the kernel releases its lock.
         drop(share.lock.take());
         assert!(folder.join(FILE).exists());
         assert_eq!(InForceShare::join(root.path(), &instance(), b"new").unwrap().1, b"new");
     }
 
     #[test]
-    fn a_second_beginning_is_refused() {
+    fn a_second_first_process_is_refused() {
         let root = tempfile::tempdir().unwrap();
         let _first = InForceShare::begin(root.path(), &instance(), b"one").unwrap();
         match InForceShare::begin(root.path(), &instance(), b"two") {
@@ -365,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_is_found_by_its_file_until_the_folder_of_the_bridge_is_gone() {
+    fn an_address_is_found_by_the_configuration_file_until_the_bridge_folder_is_removed() {
         let root = tempfile::tempdir().unwrap();
         let other = tempfile::tempdir().unwrap();
         let find = |file: &str| BridgeAddress::find(root.path(), Path::new(file));

@@ -1,16 +1,15 @@
-//! The shared-memory edge: how samples, wake-ups, counters and policies cross between the processes of one
-//! bridge.
+//! Shared memory: passes samples, wake-ups, counters and policies between the processes of one bridge.
 //!
-//! - [`ShmNode`]: the membership of one process in one bridge instance; cleans up after dead processes.
+//! - [`ShmNode`]: the membership of a process in a bridge instance; cleans up after dead processes.
 //! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of
 //!   fixed size (iceoryx2 publish-subscribe).
-//! - [`LaneWaker`], [`LaneSleeper`]: how ingress wakes a lane.
+//! - [`LaneWaker`], [`LaneSleeper`]: ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
-//! - [`RoleLock`]: at most one process for each role; [`RoleHolder`]: which one.
-//! - [`InForceShare`]: the configuration in force, which lasts as long as any process of the bridge runs.
+//! - [`RoleLock`]: lets at most one process serve a role; [`RoleHolder`]: names that process.
+//! - [`InForceShare`]: the configuration in force, which exists as long as any process of the bridge runs.
 //!
-//! No type of iceoryx2 leaves this module. What may be killed, stopped or restarted at any moment is every
-//! process; `docs/decisions/0004-shared-memory.md` says how each primitive bears it.
+//! The public interface has no types of iceoryx2. Any process may be killed, stopped or restarted at any
+//! moment; `docs/decisions/0004-shared-memory.md` describes how each primitive tolerates that.
 
 mod board;
 mod cell;

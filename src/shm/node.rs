@@ -1,4 +1,4 @@
-//! The membership of one process in one bridge instance.
+//! The membership of a process in a bridge instance, and the clean-up after dead processes.
 
 use std::collections::HashSet;
 use std::fs;
@@ -20,29 +20,29 @@ use super::segment::{commit_files, require_free};
 use super::service::Service;
 use crate::model::InstanceName;
 
-/// What a service, a connection or the boards of a small bridge take beside the pool.
+/// The bytes that a service, a connection or the boards of a small bridge need in addition to the pool.
 const SMALL_BYTES: u64 = 512 * 1024;
 
-/// What a process found and removed of dead ones.
+/// The result of a clean-up after dead processes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CleanUp {
     /// Dead processes whose ports, queues and pools were removed.
     pub dead_processes: usize,
-    /// Dead processes that could not be cleaned up now; the next clean-up tries again.
+    /// Dead processes whose clean-up failed; the next clean-up retries.
     pub failed: usize,
-    /// Files removed that belonged to nobody: half made ones, and all of them when no process was alive.
+    /// Removed files that belonged to no process: incomplete ones, and all files when no process was alive.
     pub stray_files: usize,
 }
 
-/// The membership of this process in one bridge instance; one for each process.
+/// The membership of this process in a bridge instance. A process has one.
 #[derive(Clone, Debug)]
 pub struct ShmNode {
     shared: Arc<NodeShared>,
     cleaned_up: CleanUp,
 }
 
-/// What every port and every sample keeps alive. The fields are dropped in this order: the node's own files
-/// go first, then the membership.
+/// The part of [`ShmNode`] that every port and every sample keeps alive. The fields are dropped in this
+/// order: first the node with its files, then the membership.
 #[derive(Debug)]
 pub(super) struct NodeShared {
     node: Node<Service>,
@@ -50,19 +50,19 @@ pub(super) struct NodeShared {
 }
 
 impl ShmNode {
-    /// Joins the instance in `root`, and first cleans up what dead processes of the instance left behind.
+    /// Cleans up after dead processes of the instance in `root`, then joins the instance.
     ///
-    /// Nothing but the arguments configures iceoryx2: no `iceoryx2.toml` of the working folder, of the user
-    /// or of the system is read. It installs no signal handler.
+    /// Only the arguments configure iceoryx2: no `iceoryx2.toml` of the working folder, of the user or of the
+    /// system is read. iceoryx2 installs no signal handler.
     pub fn open(root: &Path, instance: &InstanceName, process: &str) -> Result<Self, ShmError> {
-        quieten();
+        limit_iceoryx_log();
         let (membership, stray_files) = Membership::join(root, instance)?;
         let dir = membership.dir();
         require_free(SMALL_BYTES, "joining the bridge")?;
         let start = StartLock::take(dir)?;
         for folder in ["nodes", "services"] {
-            // iceoryx2 would create them with mode 0755.
-            private_folder(&dir.path.join(folder))?;
+            // Created here because iceoryx2 creates them with mode 0755.
+            create_private_folder(&dir.path.join(folder))?;
         }
         let config = config_of(dir)?;
         let mut cleaned_up = clean_up_dead(dir, &config, &start);
@@ -74,20 +74,20 @@ impl ShmNode {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
             .map_err(|error| failed(dir, "to join the bridge", &error))?;
-        // iceoryx2 lets everybody read and write its count of nodes.
+        // iceoryx2 creates its count of nodes with mode 0666.
         make_private(&dir.shm_files());
         drop(start);
         Ok(Self { shared: Arc::new(NodeShared { node, membership }), cleaned_up })
     }
 
-    /// What `open` cleaned up.
+    /// The result of the clean-up in [`open`](Self::open).
     pub fn cleaned_up(&self) -> CleanUp {
         self.cleaned_up
     }
 
-    /// Cleans up after processes that died since; for processes that run for long, once a second, say. Never
-    /// waits: while another process starts or cleans up it does nothing. It reads folders, which takes some
-    /// 0.5 ms, so it is not for the thread that handles samples.
+    /// Cleans up after processes that have died since the last clean-up. Long-running processes call it about
+    /// once a second. Never waits: while another process starts or cleans up, it does nothing. It reads
+    /// folders, which takes some 0.5 ms, so do not call it on the thread that handles samples.
     pub fn clean_up(&self) -> CleanUp {
         match StartLock::try_take(self.shared.dir()) {
             Some(start) => self.shared.clean_up(&start),
@@ -95,7 +95,7 @@ impl ShmNode {
         }
     }
 
-    /// The boards of the instance; the first process creates them, the others find them.
+    /// Opens the boards of the instance; the first process creates them.
     pub fn boards(&self, shape: &BridgeShape) -> Result<Boards, ShmError> {
         let _start = StartLock::take(self.shared.dir())?;
         Boards::open_or_create(self.shared.dir(), shape)
@@ -119,24 +119,25 @@ impl NodeShared {
         &self.node
     }
 
-    /// Gives everything that iceoryx2 set up in shared memory its pages.
+    /// Allocates all pages of the instance's files in shared memory.
     pub(super) fn commit(&self, what: &str) -> Result<(), ShmError> {
         commit_files(&self.dir().shm_files(), what)
     }
 
-    /// Fails when shared memory has no room for that many bytes and what comes with every port.
+    /// Returns an error if shared memory has no room for that many bytes and the overhead of a port.
     pub(super) fn require_free(&self, bytes: u64, what: &str) -> Result<(), ShmError> {
         require_free(bytes + SMALL_BYTES, what)
     }
 }
 
-/// The log of iceoryx2 goes to `tracing`. It reports every operation that fails, also those that are expected
-/// to, so it is warnings only, unless somebody asks for more under the name of its crate.
-fn quieten() {
+/// Limits iceoryx2's log, which goes to `tracing`, to warnings, because iceoryx2 also logs failures that are
+/// expected. A log filter that enables debug messages of `iceoryx2_bb_loggers::tracing` lifts this limit.
+fn limit_iceoryx_log() {
     let debug = tracing::enabled!(target: "iceoryx2_bb_loggers::tracing", tracing::Level::DEBUG);
     set_log_level(if debug { LogLevel::Debug } else { LogLevel::Warn });
 }
 
+/// The configuration of iceoryx2 for an instance.
 fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
     let path = iceoryx2::prelude::Path::new(dir.path.as_os_str().as_encoded_bytes())
         .map_err(|error| failed(dir, "to use the folder's path", &format!("{error:?}")))?;
@@ -145,19 +146,19 @@ fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
-    // All cleaning up is done by `clean_up_dead`.
+    // `clean_up_dead` does all clean-ups.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
 }
 
-/// Held by whoever sets something up in shared memory: one process at a time.
+/// The lock that a process must hold to create anything in shared memory.
 ///
 /// iceoryx2 0.10 waits for ever for a segment whose creator was killed before it set its length, and refuses
-/// for ever a service whose creator was killed before it wrote its description. Nobody but the holder of this
-/// lock creates either, so that whatever its holder finds half made belongs to a process that is dead.
-/// Nothing on the way of a sample takes it.
+/// for ever a service whose creator was killed before it wrote its description. Only the holder of this lock
+/// creates either, so an incomplete one that the holder finds belongs to a dead process. The code that
+/// forwards samples never takes this lock.
 pub(super) struct StartLock {
     _lock: FileLock,
 }
@@ -169,7 +170,7 @@ impl StartLock {
 
     pub(super) fn take(dir: &InstanceDir) -> Result<Self, ShmError> {
         let mut lock = FileLock::take_soon(&Self::path(dir), FlockArg::LockExclusiveNonblock)?;
-        // For the message of those who wait in vain; not worth failing for.
+        // For the error message of processes that wait for the lock, so a failure is ignored.
         let _ = lock.write_pid();
         Ok(Self { _lock: lock })
     }
@@ -180,14 +181,13 @@ impl StartLock {
     }
 }
 
-/// Removes what dead processes left: their ports with queues and pools, and services that nobody uses any
-/// more.
+/// Removes the ports of dead processes, with queues and pools, and services that no process uses any more.
 ///
-/// This is done here and not by iceoryx2 itself because, for a process that died after its details were
-/// removed or before they were written, iceoryx2 falls back to the configuration file of the working folder.
+/// The clean-up of iceoryx2 itself is not used: for a process that died after its details were removed or
+/// before they were written, it falls back to the configuration file of the working folder.
 fn clean_up_dead(dir: &InstanceDir, config: &Config, _start: &StartLock) -> CleanUp {
     let mut result = CleanUp::default();
-    result.stray_files += remove_half_made(dir);
+    result.stray_files += remove_incomplete(dir);
     let mut known = HashSet::new();
     let listed = Node::<Service>::list(config, |state| {
         let id = state.node_id().value().to_string();
@@ -212,24 +212,25 @@ fn clean_up_dead(dir: &InstanceDir, config: &Config, _start: &StartLock) -> Clea
     result
 }
 
-/// Removes what its creator, dead now, did not finish.
-fn remove_half_made(dir: &InstanceDir) -> usize {
+/// Removes segments and service descriptions that a process, dead now, did not complete.
+fn remove_incomplete(dir: &InstanceDir) -> usize {
     let segment = |metadata: &fs::Metadata| metadata.len() == 0 || metadata.mode() & 0o400 == 0;
-    // iceoryx2 takes away the right to write when the description is complete.
+    // iceoryx2 removes the write permission when the description is complete.
     let description = |metadata: &fs::Metadata| metadata.mode() & 0o200 != 0;
     let services = fs::read_dir(dir.path.join("services")).into_iter().flatten().flatten();
     let segments = dir.shm_files().into_iter().map(|path| (path, segment as fn(&_) -> _));
     let files = segments.chain(services.map(|entry| (entry.path(), description as fn(&_) -> _)));
     files
-        .filter(|(path, is_half_made)| {
-            let half_made = fs::symlink_metadata(path).is_ok_and(|metadata| is_half_made(&metadata));
-            half_made && fs::remove_file(path).is_ok()
+        .filter(|(path, is_incomplete)| {
+            let incomplete = fs::symlink_metadata(path).is_ok_and(|metadata| is_incomplete(&metadata));
+            incomplete && fs::remove_file(path).is_ok()
         })
         .count()
 }
 
-/// Removes the files of processes that died while they joined, or while they were cleaned up after: those
-/// that iceoryx2 does not know as alive or dead. All their ports are gone by then, or were never there.
+/// Removes the files of nodes that iceoryx2 lists neither as alive nor as dead, which means that the process
+/// died while it joined or that its clean-up was interrupted. Such a node has no ports any more, or never
+/// had.
 fn remove_unknown_nodes(dir: &InstanceDir, known: &HashSet<String>) -> usize {
     let entries = fs::read_dir(dir.path.join("nodes")).into_iter().flatten().flatten();
     entries
@@ -248,10 +249,10 @@ fn remove_unknown_nodes(dir: &InstanceDir, known: &HashSet<String>) -> usize {
         .count()
 }
 
-/// Takes away what other users may do with files in shared memory.
+/// Removes the permissions of other users on files in shared memory.
 fn make_private(files: &[PathBuf]) {
     for path in files {
-        // A file that is gone belongs to a process that ends just now.
+        // A missing file belonged to a process that is ending.
         if let Ok(metadata) = fs::symlink_metadata(path)
             && metadata.permissions().mode() & 0o077 != 0
         {
@@ -260,7 +261,7 @@ fn make_private(files: &[PathBuf]) {
     }
 }
 
-fn private_folder(path: &Path) -> Result<(), ShmError> {
+fn create_private_folder(path: &Path) -> Result<(), ShmError> {
     match fs::DirBuilder::new().recursive(true).mode(0o700).create(path) {
         Ok(()) => Ok(()),
         Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),

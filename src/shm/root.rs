@@ -1,4 +1,4 @@
-//! The folder of an instance, and the locks in it.
+//! The folder of an instance, and the locks in it: of the instance, and of each role.
 
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, File, OpenOptions};
@@ -17,20 +17,22 @@ use super::{holders, in_force};
 use crate::clock;
 use crate::model::{InstanceName, fnv1a};
 
-/// Where Linux keeps POSIX shared memory.
+/// The folder of POSIX shared memory on Linux.
 pub(super) const SHM_DIR: &str = "/dev/shm";
 
-/// iceoryx2 keeps a path in 255 bytes and panics on a longer one. Its longest file name behind our prefix is
-/// that of a connection: a type hash (28), `_`, two port ids joined by `_` (79), and `.connection` (11).
+/// The longest path of iceoryx2, which panics on a longer one. Its longest file name after the bridge's
+/// prefix is that of a connection: a type hash (28), `_`, two port ids joined by `_` (79), and `.connection`
+/// (11).
 const ICEORYX_PATH_MAX: usize = 255;
 const ICEORYX_NAME_MAX: usize = 28 + 1 + 79 + 11;
 
-/// How long a start waits for another start of the same instance to finish, which takes a few milliseconds.
-const START_PATIENCE_MS: u64 = 5_000;
+/// How long a start waits for another start of the same instance, which takes a few milliseconds.
+const START_TIMEOUT_MS: u64 = 5_000;
 
-/// The folder under which instances live: the configured one, else the first entry of `$RUNTIME_DIRECTORY`
-/// (systemd), else `/run/adaptive-bridge` where that is ours, else `$XDG_RUNTIME_DIR/adaptive-bridge`, else
-/// `/tmp/adaptive-bridge-UID`. `env` looks up environment variables.
+/// Returns the root, the folder that contains the folders of the instances: the configured one, else the
+/// first entry of `$RUNTIME_DIRECTORY` (systemd), else `/run/adaptive-bridge` if this user owns it and may
+/// write to it, else `$XDG_RUNTIME_DIR/adaptive-bridge`, else `/tmp/adaptive-bridge-UID`. `env` looks up
+/// environment variables.
 pub fn default_root(configured: Option<&Path>, env: impl Fn(&str) -> Option<OsString>) -> PathBuf {
     if let Some(path) = configured {
         return path.to_owned();
@@ -58,13 +60,13 @@ pub fn default_root(configured: Option<&Path>, env: impl Fn(&str) -> Option<OsSt
 #[derive(Clone, Debug)]
 pub(super) struct InstanceDir {
     pub(super) path: PathBuf,
-    /// With what the names of this instance's files begin, in [`SHM_DIR`] above all, which all instances of
-    /// all users share: the version of what is in them, the instance, and a hash of the folder.
+    /// The prefix of the names of this instance's files. It keeps them apart in [`SHM_DIR`], which the
+    /// instances of all users share: the version of the layout, the instance, and a hash of the folder.
     pub(super) prefix: String,
 }
 
 impl InstanceDir {
-    /// Creates the folder where it is missing, and refuses one that another user could tamper with.
+    /// Creates the folder if it is missing, and refuses one to which another user may write.
     pub(super) fn prepare(root: &Path, instance: &InstanceName) -> Result<Self, ShmError> {
         if !root.is_absolute() {
             return Err(ShmError::RootNotOurs {
@@ -77,13 +79,13 @@ impl InstanceDir {
             .map_err(|source| ShmError::CannotCreateRoot { path: root.to_owned(), source })?;
         let found = Self::at(&real, instance)?;
         make_private(&found.path)?;
-        // Of the root others may know that it is there; the instance's folder is nobody else's business.
+        // Other users may list the root, but not the instance's folder.
         fs::set_permissions(&found.path, fs::Permissions::from_mode(0o700))
             .map_err(|source| ShmError::CannotCreateRoot { path: found.path.clone(), source })?;
         Ok(found)
     }
 
-    /// The folder, if it is there.
+    /// Finds the folder; `None` if it does not exist.
     pub(super) fn find(root: &Path, instance: &InstanceName) -> Result<Option<Self>, ShmError> {
         match fs::canonicalize(root) {
             Ok(real) => {
@@ -123,8 +125,8 @@ impl InstanceDir {
             .collect()
     }
 
-    /// Removes every file of the instance but locks that are held, and says how many. Only while the
-    /// instance's lock is held exclusively: then no process of the instance is alive.
+    /// Removes every file of the instance except held locks, and returns the number of removed files. Call it
+    /// only while the instance's lock is held exclusively: then no process of the instance is alive.
     pub(super) fn sweep(&self) -> usize {
         let mut removed = 0;
         in_force::sweep(&self.path);
@@ -164,7 +166,7 @@ fn count_files(folder: &Path) -> usize {
         .sum()
 }
 
-/// Creates a folder of mode 0700, with its parents, or checks the one that is there.
+/// Creates a folder with mode 0700, and its parents, or checks the owner and mode of an existing one.
 pub(super) fn make_private(path: &Path) -> Result<(), ShmError> {
     match DirBuilder::new().recursive(true).mode(0o700).create(path) {
         Ok(()) => check_owner(path),
@@ -183,9 +185,9 @@ fn check_owner(path: &Path) -> Result<(), ShmError> {
     if !metadata.is_dir() {
         refuse("it is not a folder".to_owned())
     } else if metadata.uid() != ours {
-        refuse(format!("it belongs to user {}, this process runs as user {ours}", metadata.uid()))
+        refuse(format!("it belongs to user {}, but this process runs as user {ours}", metadata.uid()))
     } else if metadata.mode() & 0o022 != 0 {
-        refuse(format!("others may write to it (mode {:o})", metadata.mode() & 0o7777))
+        refuse(format!("other users may write to it (mode {:o})", metadata.mode() & 0o7777))
     } else {
         Ok(())
     }
@@ -195,7 +197,7 @@ pub(super) const LOCK_SUFFIX: &str = ".lock";
 pub(super) const ROLE_PREFIX: &str = "role-";
 const INSTANCE_LOCK: &str = "instance.lock";
 
-/// A file that is locked with `flock`. The kernel releases the lock when the process dies, however it dies.
+/// A file that is locked with `flock`. The kernel releases the lock when the process ends, in any way.
 #[derive(Debug)]
 pub(super) struct FileLock {
     lock: Flock<File>,
@@ -203,10 +205,10 @@ pub(super) struct FileLock {
 }
 
 impl FileLock {
-    /// Takes a lock; `None` when another process has it.
+    /// Takes a lock; `None` when another process holds it.
     ///
-    /// A file that was removed while we waited for its lock guards nothing, so the file is compared with what
-    /// the path names once the lock is ours.
+    /// Another process may remove the file before the lock is taken, and the lock of a removed file protects
+    /// nothing. So the locked file is compared with the file at the path.
     pub(super) fn take(path: &Path, how: FlockArg) -> io::Result<Option<Self>> {
         loop {
             let file = OpenOptions::new()
@@ -234,7 +236,7 @@ impl FileLock {
         }
     }
 
-    /// Takes a lock that others hold for milliseconds only.
+    /// Waits for a lock that other processes hold for milliseconds only, and takes it.
     pub(super) fn take_soon(path: &Path, how: FlockArg) -> Result<Self, ShmError> {
         let start = clock::monotonic();
         loop {
@@ -243,17 +245,19 @@ impl FileLock {
                 Ok(None) => {}
                 Err(error) => return Err(lock_failed(path, &error)),
             }
-            if clock::monotonic() > start.plus_ms(START_PATIENCE_MS) {
+            if clock::monotonic() > start.plus_ms(START_TIMEOUT_MS) {
                 return Err(ShmError::Busy { path: path.to_owned(), pid: read_pid(path) });
             }
             thread::sleep(Duration::from_millis(2));
         }
     }
 
+    /// Changes the lock between shared and exclusive.
     pub(super) fn relock(&self, how: FlockArg) -> Result<(), Errno> {
         self.lock.relock(how)
     }
 
+    /// Writes the id of this process to the file, for messages of other processes.
     pub(super) fn write_pid(&mut self) -> io::Result<()> {
         let mut file: &File = &self.lock;
         file.set_len(0)?;
@@ -261,9 +265,9 @@ impl FileLock {
         writeln!(file, "{}", std::process::id())
     }
 
-    /// Removes the file and releases the lock. Only while the lock is exclusive.
+    /// Removes the file and releases the lock, which must be exclusive.
     pub(super) fn remove(self) {
-        // The next process creates a file anew; one that waits for this one sees that it is gone.
+        // The next process creates a new file; one that waits for this lock detects that the file is removed.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -279,14 +283,15 @@ fn lock_failed(path: &Path, error: &io::Error) -> ShmError {
     }
 }
 
+/// The process id in a lock file; 0 if there is none.
 pub(super) fn read_pid(path: &Path) -> u32 {
     let mut text = String::new();
     let read = File::open(path).and_then(|file| file.take(16).read_to_string(&mut text));
     read.ok().and_then(|_| text.trim().parse().ok()).unwrap_or(0)
 }
 
-/// That this process belongs to the instance: a shared lock, so that whoever gets it exclusively knows that
-/// nobody else is alive, and that all files of the instance are garbage.
+/// The shared lock by which a process belongs to an instance. A process that gets it exclusively knows that
+/// no other process of the instance is alive, and that all its files are left over.
 #[derive(Debug)]
 pub(super) struct Membership {
     dir: InstanceDir,
@@ -294,18 +299,18 @@ pub(super) struct Membership {
 }
 
 impl Membership {
-    /// Joins; the first one sweeps. Returns how many files that removed.
+    /// Joins the instance. The first process removes left-over files, and their number is returned.
     pub(super) fn join(root: &Path, instance: &InstanceName) -> Result<(Self, usize), ShmError> {
-        // The last one that leaves removes the folder: then it has to be made again.
+        // A process that leaves as the last one may remove the folder at the same time; then retry.
         for _ in 0..100 {
             let dir = InstanceDir::prepare(root, instance)?;
             let path = dir.path.join(INSTANCE_LOCK);
-            let alone = FileLock::take(&path, FlockArg::LockExclusiveNonblock);
-            let (lock, swept) = match alone {
+            let exclusive = FileLock::take(&path, FlockArg::LockExclusiveNonblock);
+            let (lock, swept) = match exclusive {
                 Ok(Some(lock)) => {
                     let swept = dir.sweep();
-                    // This may let go of the lock for an instant, and then another one sweeps: we have no
-                    // files yet.
+                    // This may release the lock for an instant, in which another process may remove all
+                    // files; this process has none yet.
                     match lock.relock(FlockArg::LockSharedNonblock) {
                         Ok(()) => (lock, swept),
                         Err(_) => {
@@ -325,7 +330,7 @@ impl Membership {
         Err(ShmError::Failed {
             what: "to join the instance".to_owned(),
             path: root.to_owned(),
-            reason: "its folder is removed again and again".to_owned(),
+            reason: "other processes removed its folder in 100 attempts".to_owned(),
         })
     }
 
@@ -334,7 +339,8 @@ impl Membership {
     }
 }
 
-/// Whether the path still names the locked file, which another one may have removed while a lock was changed.
+/// Whether the path still names the locked file, which another process may have removed while the lock
+/// changed.
 pub(super) fn lock_is_current(lock: &FileLock) -> bool {
     match (lock.lock.metadata(), fs::symlink_metadata(&lock.path)) {
         (Ok(locked), Ok(named)) => locked.ino() == named.ino() && locked.dev() == named.dev(),
@@ -343,7 +349,7 @@ pub(super) fn lock_is_current(lock: &FileLock) -> bool {
 }
 
 impl Drop for Membership {
-    /// The last one that leaves takes everything along.
+    /// The last process that leaves removes all files of the instance.
     fn drop(&mut self) {
         if let Some(lock) = self.lock.take()
             && lock.relock(FlockArg::LockExclusiveNonblock).is_ok()
@@ -351,21 +357,21 @@ impl Drop for Membership {
         {
             self.dir.sweep();
             lock.remove();
-            // Fails while a role is still held there, whose release tries again.
+            // Fails while a role lock is held there; its release retries.
             let _ = fs::remove_dir(&self.dir.path);
         }
     }
 }
 
-/// The right to serve a role of an instance: `ingress`, `egress-critical`, … Held until dropped; the
-/// operating system releases it when the process dies, however it dies.
+/// The right to serve a role of an instance, such as `ingress` or `egress-critical`. Held until it is
+/// dropped; the kernel releases it when the process ends, in any way.
 #[derive(Debug)]
 pub struct RoleLock {
     lock: Option<FileLock>,
 }
 
 impl RoleLock {
-    /// Takes the role, or says which process has it.
+    /// Takes the role; if another process has it, the error names that process.
     pub fn acquire(root: &Path, instance: &InstanceName, role: &str) -> Result<Self, ShmError> {
         for _ in 0..100 {
             let dir = InstanceDir::prepare(root, instance)?;
@@ -382,17 +388,17 @@ impl RoleLock {
         Err(ShmError::Failed {
             what: format!("to lock the role {role}"),
             path: root.to_owned(),
-            reason: "the folder is removed again and again".to_owned(),
+            reason: "other processes removed the folder in 100 attempts".to_owned(),
         })
     }
 
-    /// A file beside the lock, in which the holder may leave a note for whoever looks
-    /// ([`RoleHolder`](super::RoleHolder)). It is removed with the instance.
+    /// The path of a file beside the lock, in which the holder reports the result of its last reload
+    /// ([`RoleHolder`](super::RoleHolder)). The file is removed with the instance.
     pub fn note_path(&self) -> Option<PathBuf> {
         self.lock.as_ref().map(|lock| note_path(&lock.path))
     }
 
-    /// The process that holds the role; `None` when none does. Takes no lock.
+    /// The id of the process that holds the role; `None` when no process does. Takes no lock.
     pub(super) fn holder(root: &Path, instance: &InstanceName, role: &str) -> Option<u32> {
         let path = Self::path(&InstanceDir::find(root, instance).ok()??, role);
         let inode = fs::metadata(&path).ok()?.ino();
@@ -400,6 +406,7 @@ impl RoleLock {
         holders::is_locked_by(pid, inode).then_some(pid)
     }
 
+    /// Takes the role; `None` when another process has it.
     pub(super) fn try_acquire(dir: &InstanceDir, role: &str) -> io::Result<Option<Self>> {
         let taken = FileLock::take(&Self::path(dir, role), FlockArg::LockExclusiveNonblock)?;
         taken
@@ -417,7 +424,7 @@ impl RoleLock {
     }
 }
 
-/// The note that belongs to the lock of a role.
+/// The path of the reload note beside the lock of a role.
 pub(super) fn note_path(lock: &Path) -> PathBuf {
     lock.with_extension("reload")
 }
@@ -428,7 +435,7 @@ impl Drop for RoleLock {
             let folder = lock.path.parent().map(Path::to_owned);
             lock.remove();
             if let Some(folder) = folder {
-                // Only the last one of the instance succeeds.
+                // Succeeds only for the last process of the instance.
                 let _ = fs::remove_dir(folder);
             }
         }
@@ -444,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn the_root_is_what_is_configured_or_the_nearest_runtime_folder() {
+    fn the_root_is_the_configured_one_or_the_first_runtime_folder_that_is_set() {
         let systemd = &[("RUNTIME_DIRECTORY", "/run/ab:/run/other"), ("XDG_RUNTIME_DIR", "/run/user/7")];
         assert_eq!(default_root(Some(Path::new("/x")), env(systemd)), Path::new("/x"));
         assert_eq!(default_root(None, env(systemd)), Path::new("/run/ab"));

@@ -1,4 +1,4 @@
-//! What can go wrong with one sample.
+//! Errors when a sample is copied in, published or taken.
 
 use std::fmt;
 
@@ -9,12 +9,12 @@ use super::header::HeaderError;
 pub enum LoanError {
     /// The payload is larger than the route allows.
     TooLarge {
-        /// Its bytes.
+        /// The size of the payload in bytes.
         len: usize,
-        /// Bytes allowed.
+        /// The largest size that the route allows.
         max: usize,
     },
-    /// No slot is free: someone holds more than its share.
+    /// No slot is free: a process holds more slots than its limit.
     PoolExhausted,
     /// iceoryx2 failed.
     Failed(&'static str),
@@ -23,16 +23,17 @@ pub enum LoanError {
 /// Why a sample could not be published.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PublishError {
-    /// iceoryx2 failed; the sample reached some subscribers at most.
+    /// iceoryx2 failed; the sample was delivered to some of the subscribers or to none.
     Failed(&'static str),
 }
 
 /// Why no sample could be taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TakeError {
-    /// The subscriber holds as many samples as it may. Nothing is lost: drop one and take again.
+    /// The subscriber has borrowed as many samples as it may. The sample stays in the queue: drop a borrowed
+    /// one and take again.
     BorrowLimit,
-    /// The header or the length of a sample makes no sense; the sample is gone.
+    /// The header or the length of a sample is invalid; the sample is dropped.
     Malformed(HeaderError),
     /// iceoryx2 failed.
     Failed(&'static str),
@@ -41,9 +42,9 @@ pub enum TakeError {
 impl fmt::Display for LoanError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::TooLarge { len, max } => write!(f, "a sample of {len} bytes, at most {max} are allowed"),
+            Self::TooLarge { len, max } => write!(f, "the sample has {len} bytes, at most {max} are allowed"),
             Self::PoolExhausted => f.write_str("no free slot in the route's pool"),
-            Self::Failed(reason) => write!(f, "no slot: {reason}"),
+            Self::Failed(reason) => write!(f, "cannot get a slot: {reason}"),
         }
     }
 }
@@ -51,16 +52,16 @@ impl fmt::Display for LoanError {
 impl fmt::Display for PublishError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self::Failed(reason) = self;
-        write!(f, "not published to everybody: {reason}")
+        write!(f, "not published to all subscribers: {reason}")
     }
 }
 
 impl fmt::Display for TakeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::BorrowLimit => f.write_str("as many samples are held as may be"),
+            Self::BorrowLimit => f.write_str("the subscriber holds as many samples as it may borrow"),
             Self::Malformed(error) => write!(f, "{error}"),
-            Self::Failed(reason) => write!(f, "nothing taken: {reason}"),
+            Self::Failed(reason) => write!(f, "cannot take a sample: {reason}"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! A piece of shared memory of 64-bit words, which outlives every process that maps it.
+//! A segment of shared memory, made of 64-bit words, which outlives the processes that map it.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::ErrorKind;
@@ -16,28 +16,29 @@ use nix::sys::statvfs::statvfs;
 use super::error::ShmError;
 use super::root::SHM_DIR;
 
-/// Shared memory, mapped. All access is by atomics, so that what another process writes meanwhile is a value
-/// like any other.
+/// A mapped segment of shared memory. All access is atomic, so that concurrent writes of other processes are
+/// not undefined behaviour.
 #[derive(Debug)]
 pub(super) struct Segment {
     start: NonNull<u64>,
     words: usize,
 }
 
-// SAFETY: the mapping belongs to the process, not to a thread, and is reached by atomics only.
+// SAFETY: the mapping belongs to the process, not to a thread, and is accessed by atomics only.
 unsafe impl Send for Segment {}
 // SAFETY: as above.
 unsafe impl Sync for Segment {}
 
 impl Segment {
-    /// Opens the segment of that path, which has to have that many words; `None` when there is none.
+    /// Opens the segment at `path`, which must have `words` words; `None` when there is none.
     pub(super) fn open(path: &Path, words: usize) -> Result<Option<Self>, ShmError> {
         let file = match OpenOptions::new().read(true).write(true).open(path) {
             Ok(file) => file,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(failed("to open shared memory", path, &error)),
         };
-        let metadata = file.metadata().map_err(|error| failed("to look at shared memory", path, &error))?;
+        let metadata =
+            file.metadata().map_err(|error| failed("to get the size of shared memory", path, &error))?;
         if metadata.len() != words as u64 * 8 {
             return Err(ShmError::Incompatible {
                 what: format!("the boards have {} bytes, not {}", metadata.len(), words * 8),
@@ -47,8 +48,8 @@ impl Segment {
         Self::map(&file, path, words).map(Some)
     }
 
-    /// Creates the segment, all zeroes but for the first words, or opens the one that another process created
-    /// first. It appears under its name when it is complete, so nobody ever sees half of it.
+    /// Creates the segment, with the words of `first` followed by zeroes, or opens the one that another
+    /// process created first. It gets its name when it is complete, so no process opens an incomplete one.
     pub(super) fn create(path: &Path, words: usize, first: &[u64]) -> Result<Self, ShmError> {
         let draft = path.with_extension(format!("draft{}", std::process::id()));
         let made =
@@ -63,7 +64,7 @@ impl Segment {
             None => Self::open(path, words)?.ok_or_else(|| ShmError::Failed {
                 what: "to open shared memory".to_owned(),
                 path: path.to_owned(),
-                reason: "it is there and not there".to_owned(),
+                reason: "another process removed it at the same time".to_owned(),
             }),
         }
     }
@@ -98,26 +99,26 @@ impl Segment {
         Ok(Self { start: start.cast(), words })
     }
 
-    /// The word at that place. The places are computed from the layout, once; one outside is a defect of
-    /// ours.
+    /// The word at that offset. Panics for an offset outside, which is a defect, because offsets are computed
+    /// from the layout.
     pub(super) fn word(&self, at: usize) -> &AtomicU64 {
         assert!(at < self.words, "word {at} of {}", self.words);
-        // SAFETY: within the mapping, which lives as long as `self`; mappings are aligned to a page, so each
-        // word to 8 bytes; and every access, in every process, is atomic.
+        // SAFETY: the word is within the mapping, which lives as long as `self`; mappings are aligned to a
+        // page, so each word to 8 bytes; and every access, in every process, is atomic.
         unsafe { AtomicU64::from_ptr(self.start.add(at).as_ptr()) }
     }
 
-    /// The lower-addressed half of the word at that place.
+    /// The lower-addressed half of the word at that offset.
     pub(super) fn half(&self, at: usize) -> &AtomicU32 {
         assert!(at < self.words, "word {at} of {}", self.words);
-        // SAFETY: as for `word`; such a word is only ever used by halves.
+        // SAFETY: as for `word`; a word that is used by halves is never accessed as a whole.
         unsafe { AtomicU32::from_ptr(self.start.add(at).as_ptr().cast()) }
     }
 }
 
 impl Drop for Segment {
     fn drop(&mut self) {
-        // SAFETY: `map` mapped exactly this, and all references into it borrow `self`.
+        // SAFETY: `map` mapped exactly this range, and all references into it borrow `self`.
         let _ = unsafe { munmap(self.start.cast(), self.words * 8) };
     }
 }
@@ -129,13 +130,13 @@ fn failed(what: &str, path: &Path, error: &std::io::Error) -> ShmError {
     }
 }
 
-/// The bytes that are free in [`SHM_DIR`].
+/// The free bytes in [`SHM_DIR`]; 0 when the file system does not report them.
 pub(super) fn free_bytes() -> u64 {
     statvfs(SHM_DIR).map_or(0, |stat| stat.blocks_available() * stat.fragment_size())
 }
 
-/// Says so when shared memory has not that many bytes free: what finds none at its first touch dies of
-/// SIGBUS.
+/// Returns an error if shared memory has fewer free bytes: a process that touches a page for which there is
+/// no memory is killed by SIGBUS.
 pub(super) fn require_free(needed_bytes: u64, what: &str) -> Result<(), ShmError> {
     let free_bytes = free_bytes();
     if free_bytes < needed_bytes {
@@ -149,7 +150,7 @@ pub(super) fn require_free(needed_bytes: u64, what: &str) -> Result<(), ShmError
     Ok(())
 }
 
-/// Gives a file in shared memory all its pages now.
+/// Allocates all pages of a file in shared memory.
 fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
     loop {
         return match posix_fallocate(file, 0, bytes.cast_signed()) {
@@ -166,11 +167,11 @@ fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
     }
 }
 
-/// Gives files in shared memory all their pages now. iceoryx2 only sets the length of its segments; a page
-/// that is first touched when the file system is full is a SIGBUS in the middle of a sample.
+/// Allocates all pages of files in shared memory. iceoryx2 only sets the length of its segments; if the file
+/// system is full when a page is first touched, SIGBUS kills the process while it handles a sample.
 pub(super) fn commit_files(files: &[std::path::PathBuf], what: &str) -> Result<(), ShmError> {
     for path in files {
-        // A file that is gone or not readable yet belongs to a process that starts or ends just now.
+        // A file that is missing or not readable yet belongs to a process that is starting or ending.
         let Ok(file) = OpenOptions::new().read(true).write(true).open(path) else { continue };
         let Ok(metadata) = file.metadata() else { continue };
         if metadata.len() > 0 && metadata.blocks() * 512 < metadata.len() {

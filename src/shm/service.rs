@@ -1,8 +1,8 @@
-//! The variant of iceoryx2's services that the bridge uses: its thread-safe inter-process one, but that
-//! loaning a sample allocates nothing.
+//! The service variant of iceoryx2 that the bridge uses: thread-safe and inter-process, but loaning a sample
+//! does not allocate.
 //!
-//! iceoryx2 0.10 keeps what belongs to one loaned sample behind an `Arc` with a mutex of its own, and so
-//! calls the allocator for each sample. Here the memory of such an `Arc` is kept and used for the next one.
+//! iceoryx2 0.10 keeps the state of each loaned sample in an `Arc` with a mutex, and so allocates for each
+//! sample. This variant keeps the memory of such an `Arc` and reuses it for the next sample.
 
 use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
 use std::fmt::{self, Debug};
@@ -20,7 +20,7 @@ use iceoryx2_cal::arc_sync_policy::{ArcSyncPolicy, ArcSyncPolicyCreationError, L
 use iceoryx2_cal::shm_allocator::{bump_allocator::BumpAllocator, pool_allocator::PoolAllocator};
 use iceoryx2_cal::*;
 
-/// As `iceoryx2::service::ipc_threadsafe::Service`, but for the memory of loans.
+/// Like `iceoryx2::service::ipc_threadsafe::Service`, but reuses the memory of loans.
 #[derive(Clone, Debug)]
 pub(super) struct Service;
 
@@ -48,18 +48,18 @@ impl iceoryx2::service::Service for Service {
 
 impl ServiceInternal<Service> for Service {}
 
-/// The memory that is kept: what a loan needs fits into it.
+/// The layout of the memory blocks that are kept. The state of a loan fits into one.
 const BLOCK: Layout = match Layout::from_size_align(256, 16) {
     Ok(layout) => layout,
-    Err(_) => panic!("256 and 16 are a layout"),
+    Err(_) => panic!("256 and 16 are a valid layout"),
 };
-/// Blocks that are kept; ingress holds two loans of a route at once, at most.
+/// The most blocks that are kept. Ingress holds at most 3 loans of a route at the same time.
 const KEPT_BLOCKS: usize = 64;
 
-/// Blocks of layout [`BLOCK`] that nobody uses.
+/// Unused blocks with layout [`BLOCK`].
 struct Blocks(Vec<NonNull<u8>>);
 
-// SAFETY: plain memory that belongs to nobody else.
+// SAFETY: the pointers are the only ones to unused memory.
 unsafe impl Send for Blocks {}
 
 static BLOCKS: StdMutex<Blocks> = StdMutex::new(Blocks(Vec::new()));
@@ -68,13 +68,14 @@ fn fits_block(layout: Layout) -> bool {
     layout.size() <= BLOCK.size() && layout.align() <= BLOCK.align()
 }
 
+/// Returns memory for `layout`: a kept block if it fits, else newly allocated memory.
 fn take_memory(layout: Layout) -> NonNull<u8> {
     let layout = if fits_block(layout) {
         let mut blocks = BLOCKS.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(block) = blocks.0.pop() {
             return block;
         }
-        // So that giving back, which may happen on a hot path, allocates nothing.
+        // Reserved here, because a block may be returned on a hot path, which must not allocate.
         if blocks.0.capacity() == 0 {
             blocks.0.reserve_exact(KEPT_BLOCKS);
         }
@@ -86,9 +87,11 @@ fn take_memory(layout: Layout) -> NonNull<u8> {
     NonNull::new(unsafe { alloc(layout) }).unwrap_or_else(|| handle_alloc_error(layout))
 }
 
+/// Keeps the memory as a block, or frees it.
+///
 /// # Safety
-/// `memory` is of `take_memory` with the same layout, and nobody uses it any more.
-unsafe fn give_memory_back(memory: NonNull<u8>, layout: Layout) {
+/// `memory` comes from `take_memory` with the same layout, and is not used any more.
+unsafe fn return_memory(memory: NonNull<u8>, layout: Layout) {
     let layout = if fits_block(layout) {
         let mut blocks = BLOCKS.lock().unwrap_or_else(PoisonError::into_inner);
         if blocks.0.len() < KEPT_BLOCKS {
@@ -103,27 +106,27 @@ unsafe fn give_memory_back(memory: NonNull<u8>, layout: Layout) {
     unsafe { dealloc(memory.as_ptr(), layout) };
 }
 
-/// What all handles of one [`RecycledArc`] share.
+/// The memory that all handles of a [`RecycledArc`] share.
 struct Shared<T: Debug> {
     handles: AtomicUsize,
     /// A recursive mutex, as in iceoryx2's own variant.
     mutex: MutexHandle<T>,
 }
 
-/// A value that threads share behind a mutex, like `Arc<Mutex<T>>`.
+/// A value behind a mutex that threads share, like `Arc<Mutex<T>>`, in reused memory.
 pub(super) struct RecycledArc<T: Send + Debug + Abandonable> {
     shared: NonNull<Shared<T>>,
 }
 
-// SAFETY: as for `Arc<Mutex<T>>`: the count is atomic, and the value is reached under the mutex only.
+// SAFETY: as for `Arc<Mutex<T>>`: the count is atomic, and the value is accessed under the mutex only.
 unsafe impl<T: Send + Debug + Abandonable> Send for RecycledArc<T> {}
 // SAFETY: as above.
 unsafe impl<T: Send + Debug + Abandonable> Sync for RecycledArc<T> {}
 
 impl<T: Send + Debug + Abandonable> RecycledArc<T> {
     fn shared(&self) -> &Shared<T> {
-        // SAFETY: initialised by `new`, and there until the last handle, which is not before this one, is
-        // dropped. Only shared references are ever made of it.
+        // SAFETY: initialised by `new`, and valid until the last handle is dropped; this handle is not
+        // dropped yet. Only shared references to it are created.
         unsafe { self.shared.as_ref() }
     }
 
@@ -151,21 +154,21 @@ impl<T: Send + Debug + Abandonable> Drop for RecycledArc<T> {
         if self.shared().handles.fetch_sub(1, Ordering::Release) != 1 {
             return;
         }
-        // What other threads did with the value before they dropped their handles comes before its end.
+        // Accesses of other threads before they dropped their handles happen before the value is dropped.
         fence(Ordering::Acquire);
-        // SAFETY: this was the last handle, so nobody else has a reference; the value and the mutex were
-        // initialised in place by `new`.
+        // SAFETY: this was the last handle, so there is no other reference; `new` initialised the value and
+        // the mutex in place.
         unsafe { self.shared.drop_in_place() };
-        // SAFETY: of `take_memory` with this layout, and nobody has it any more.
-        unsafe { give_memory_back(self.shared.cast(), Layout::new::<Shared<T>>()) };
+        // SAFETY: the memory comes from `take_memory` with this layout, and is not used any more.
+        unsafe { return_memory(self.shared.cast(), Layout::new::<Shared<T>>()) };
     }
 }
 
 impl<T: Send + Debug + Abandonable> Abandonable for RecycledArc<T> {
-    /// As iceoryx2's own variant: the last handle abandons the value and leaks the memory, another one is
-    /// dropped. Only iceoryx2's tests do so.
+    /// Like iceoryx2's own variant: the last handle abandons the value and leaks the memory, any other handle
+    /// is dropped. Only iceoryx2's tests call this.
     unsafe fn abandon_in_place(mut this: NonNull<Self>) {
-        // SAFETY: the caller gives a valid handle, and does not use or drop it afterwards.
+        // SAFETY: the caller passes a valid handle, and does not use or drop it afterwards.
         let handle = unsafe { this.as_mut() };
         if handle.shared().handles.load(Ordering::Acquire) == 1 {
             if let Ok(mut value) = handle.mutex().lock() {
@@ -173,13 +176,13 @@ impl<T: Send + Debug + Abandonable> Abandonable for RecycledArc<T> {
                 unsafe { T::abandon_in_place(NonNull::from(&mut *value)) };
             }
         } else {
-            // SAFETY: not used afterwards, as the caller promises.
+            // SAFETY: not used afterwards, as the caller guarantees.
             unsafe { this.drop_in_place() };
         }
     }
 }
 
-/// The value, locked.
+/// The lock guard of a [`RecycledArc`], which gives access to the value.
 pub(super) struct Guard<'parent, T: Send + Debug>(MutexGuard<'parent, T>);
 
 impl<T: Send + Debug> Deref for Guard<'_, T> {
@@ -217,9 +220,9 @@ impl<T: Send + Debug + Abandonable> ArcSyncPolicy<T> for RecycledArc<T> {
     fn lock(&self) -> Guard<'_, T> {
         match self.mutex().lock() {
             Ok(guard) => Guard(guard),
-            // A recursive mutex of this process fails only when one thread has locked it 2^32 times, or when
-            // its memory is corrupted; there is no way on.
-            Err(error) => panic!("a mutex of this process cannot be locked: {error:?}"),
+            // Locking a recursive mutex of this process fails only when one thread has locked it 2^32 times
+            // or when its memory is corrupted; neither can be recovered from.
+            Err(error) => panic!("cannot lock a mutex of this process: {error:?}"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Slots of a route's pool that ingress holds: it writes a payload and then publishes it.
+//! Slots of a route's pool that ingress has loaned: it writes a payload, then publishes the slot.
 
 use std::ptr::NonNull;
 use std::sync::Arc;
@@ -12,74 +12,74 @@ use super::sample_error::PublishError;
 use super::service::Service;
 use crate::model::SampleHeader;
 
-/// Samples that are put together in the pool at the same time; any others are copied into it when they are
-/// complete. One publisher's fragments come one sample after the other; two, for one more publisher, or for a
-/// sample that waits for a fragment to be sent again.
+/// The most samples that the DDS library assembles in the pool at the same time; others are copied into it
+/// when they are complete. A publisher sends all fragments of a sample before those of the next one; the
+/// second slot is for another publisher, or for a sample that waits for a retransmitted fragment.
 pub(super) const LENT_SLOTS: usize = 2;
 
-/// A payload in shared memory that is not published yet; dropping it frees the slot.
+/// A slot with a complete payload that is not published yet. Dropping it frees the slot.
 #[derive(Debug)]
 pub struct Slot {
     pub(super) sample: SampleMut<Service, [u8], WireHeader>,
 }
 
 impl Slot {
-    /// Publishes the payload to all subscribers, and says how many got it. Never waits: in a full queue the
-    /// oldest sample gives way.
+    /// Publishes the payload and returns the number of subscribers that received it. Never waits: a full
+    /// queue drops its oldest sample.
     pub fn publish(mut self, header: SampleHeader) -> Result<usize, PublishError> {
         *self.sample.user_header_mut() = WireHeader(header);
         self.sample.send().map_err(|_| PublishError::Failed("a connection of iceoryx2 is broken"))
     }
 }
 
-/// A slot that is lent to who writes its payload; dropping it frees the slot.
+/// A slot that is lent to the DDS library, which writes its payload. Dropping it frees the slot.
 #[derive(Debug)]
 pub struct LentSlot {
     payload: NonNull<u8>,
     length: usize,
     slot: Slot,
-    // After the slot: who is let in by this finds a slot free.
-    _place: LentPlace,
-    // The slot may outlive the publisher.
+    // Declared after `slot`, so that the slot is free before the permit is returned.
+    _permit: LentPermit,
+    // Keeps the membership, because the slot may outlive the publisher.
     _node: Arc<NodeShared>,
 }
 
-// SAFETY: the pointer is the one field that is not `Send` by itself; the bytes are in a mapping that `slot`
-// keeps, not in memory of a thread, and nobody but the owner reaches them.
+// SAFETY: the pointer is the only field that is not `Send` by itself; the bytes are in a mapping that `slot`
+// keeps, not in memory of a thread, and only the owner accesses them.
 unsafe impl Send for LentSlot {}
 
 impl LentSlot {
-    /// Remembers where the payload is: iceoryx2 takes a lock each time that it is asked.
+    /// Stores the address of the payload, because iceoryx2 takes a lock for each access to it.
     pub(super) fn new(
         mut sample: SampleMut<Service, [u8], WireHeader>,
-        place: LentPlace,
+        permit: LentPermit,
         node: Arc<NodeShared>,
     ) -> Self {
         let payload = sample.payload_mut();
         let length = payload.len();
-        // Of an empty payload it is only an address.
+        // For an empty payload this is a dangling address.
         let payload = NonNull::from(payload).cast();
-        Self { payload, length, slot: Slot { sample }, _place: place, _node: node }
+        Self { payload, length, slot: Slot { sample }, _permit: permit, _node: node }
     }
 
-    /// The payload, to be written.
+    /// The payload, for writing.
     pub fn payload_mut(&mut self) -> &mut [u8] {
-        // SAFETY: `length` bytes of the slot, which is mapped as long as `slot` lives, and which nobody else
-        // reads or writes before it is published, for which `self` is used up.
+        // SAFETY: `length` bytes of the slot, which is mapped as long as `slot` lives, and which no other
+        // code accesses before it is published, which consumes `self`.
         unsafe { std::slice::from_raw_parts_mut(self.payload.as_ptr(), self.length) }
     }
 
-    /// The slot, with its payload.
+    /// Returns the slot, with its payload, for publishing.
     pub fn into_slot(self) -> Slot {
         self.slot
     }
 }
 
-/// One of the [`LENT_SLOTS`]; given back when dropped.
+/// The permission to lend one of the [`LENT_SLOTS`]; returned when dropped.
 #[derive(Debug)]
-pub(super) struct LentPlace(Arc<AtomicUsize>);
+pub(super) struct LentPermit(Arc<AtomicUsize>);
 
-impl LentPlace {
+impl LentPermit {
     pub(super) fn take(lent: &Arc<AtomicUsize>) -> Option<Self> {
         if lent.fetch_add(1, Ordering::Acquire) >= LENT_SLOTS {
             lent.fetch_sub(1, Ordering::Relaxed);
@@ -89,7 +89,7 @@ impl LentPlace {
     }
 }
 
-impl Drop for LentPlace {
+impl Drop for LentPermit {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Release);
     }

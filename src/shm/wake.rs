@@ -1,13 +1,13 @@
-//! How ingress wakes a lane: a futex in the boards' memory.
+//! Wakes a lane by a futex in the memory of the boards.
 //!
-//! A count of wakes, and a flag that says whether the lane sleeps. A wake counts, and calls the kernel only
-//! if the flag is up; a lane puts the flag up, looks at the count once more, and sleeps only if nothing came.
-//! Both sides write before they read, sequentially consistent, so one of them sees the other: no wake is
-//! lost. No descriptor and no buffer is involved that could fill up while a lane is stopped.
-//! `docs/decisions/0004-shared-memory.md` has the measurements.
+//! A lane has a count of wakes, and a flag that is set while it sleeps. A waker increments the count, and
+//! calls the kernel only if the flag is set. The lane sets the flag, reads the count again, and sleeps only
+//! if the count has not changed. Both sides write before they read, sequentially consistent, so at least one
+//! of them sees the write of the other: no wake is lost. There is no descriptor and no buffer that could fill
+//! up while a lane is stopped. `docs/decisions/0004-shared-memory.md` has the measurements.
 //!
-//! A lane that sleeps on another CPU than ingress runs on can be told a moment ahead, and gets up while the
-//! sample is still being received: `docs/decisions/0006-hand-overs.md`, `docs/decisions/0013-lookout.md`.
+//! Ingress can announce a wake to a lane that sleeps on another CPU: the lane then leaves its sleep while the
+//! sample is still being received (`docs/decisions/0006-hand-overs.md`, `docs/decisions/0013-lookout.md`).
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -21,36 +21,36 @@ use super::segment::Segment;
 use crate::clock;
 use crate::model::MonotonicNs;
 
-/// How long a lane stays up for a wake that was announced: the first at least, about what a sleep and getting
-/// up again take, and the second at most. What it waits for is one copy of the sample, the last 64 KiB of a
-/// large one, or the receiving thread's getting up: far less than the second, as a rule. A sample that takes
-/// longer wakes the lane as if nothing had been announced.
-const ANNOUNCED_NS: [u64; 2] = [50_000, 200_000];
+/// The shortest and the longest time for which a lane spins until an announced wake. The shortest is about
+/// the time that a sleep and a wake-up take. The lane waits for one copy of the sample, for the last 64 KiB
+/// of a large one, or for the wake-up of the receiving thread, which normally take far less than the longest
+/// time. A later wake is like one that was not announced.
+const SPIN_LIMITS_NS: [u64; 2] = [50_000, 200_000];
 
-/// Between these it stays up for one part in so many of the time that it slept before. At 1 kHz what it waits
-/// for is 37 µs away in the median, so most wakes come within 56 and the long waits are left out.
-const SLEPT_SHARE: u64 = 16;
+/// Between these limits a lane spins for the time that it slept before, divided by this number. At 1 kHz that
+/// is 56 µs, within which most wakes happen: the median is 37 µs after the announcement.
+const SLEEP_PER_SPIN: u64 = 16;
 
-/// How long a lane that slept for so long stays up for a wake that was announced.
-fn stays_up_ns(slept_ns: u64) -> u64 {
-    let [at_least, at_most] = ANNOUNCED_NS;
-    (slept_ns / SLEPT_SHARE).clamp(at_least, at_most)
+/// The time for which a lane spins until an announced wake, after a sleep of `slept_ns`.
+fn spin_ns(slept_ns: u64) -> u64 {
+    let [at_least, at_most] = SPIN_LIMITS_NS;
+    (slept_ns / SLEEP_PER_SPIN).clamp(at_least, at_most)
 }
 
-/// Why a [`LaneSleeper`] returned.
+/// Why [`LaneSleeper::sleep`] returned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Woken {
-    /// There was a wake since the last return, or a signal came.
+    /// There was a wake since the last return, or a signal interrupted the sleep.
     Woken,
-    /// A wake was announced, and the next sleep stays up for it. Who goes through its work meanwhile, though
-    /// there is none, has the code and the data at hand when there is. A wake that the lane has seen before
-    /// the kernel was called for it looks like this, too.
+    /// A wake was announced; the next sleep spins until the wake. A lane that runs one turn in between,
+    /// although it has no work, has code and data in the CPU's caches when the sample arrives. Also returned
+    /// after a wake that the lane had already seen when the waker called the kernel.
     Announced,
-    /// The time is over and nobody woke the lane.
+    /// The sleep timed out without a wake.
     TimedOut,
 }
 
-/// The two words of a lane, on a cache line of their own.
+/// The wake count and the sleep flag of a lane, on their own cache line.
 #[derive(Clone, Debug)]
 struct WakeWords {
     segment: Arc<Segment>,
@@ -58,17 +58,18 @@ struct WakeWords {
 }
 
 impl WakeWords {
-    fn wakes(&self) -> &AtomicU32 {
+    /// The number of wakes so far; the futex.
+    fn wake_count(&self) -> &AtomicU32 {
         self.segment.half(self.at)
     }
 
-    /// 0 while the lane is up, else one more than the number of the CPU that it sleeps on.
-    fn asleep(&self) -> &AtomicU32 {
+    /// 0 while the lane is awake, else one more than the number of the CPU on which it sleeps.
+    fn sleeping_cpu(&self) -> &AtomicU32 {
         self.segment.half(self.at + 1)
     }
 }
 
-/// Wakes one lane; any process or thread may hold any number of them.
+/// Wakes one lane. Any process or thread may hold any number of wakers.
 #[derive(Clone, Debug)]
 pub struct LaneWaker {
     words: WakeWords,
@@ -79,55 +80,58 @@ impl LaneWaker {
         Self { words: WakeWords { segment, at } }
     }
 
-    /// Says that a wake is about to come from `cpu`, as [`this_cpu`] has it, so that a lane that sleeps on
-    /// another one gets up meanwhile. On that CPU it could only get in the way. Nothing has to follow.
+    /// Announces that a wake will follow from `cpu`, a number from [`this_cpu`], so that a lane that sleeps
+    /// on another CPU leaves its sleep early. A lane on the same CPU is not affected, because it would only
+    /// delay the wake. A wake need not follow.
     pub fn announce(&self, cpu: u32) {
-        let sleeps_on = self.words.asleep().load(Ordering::Relaxed);
-        if sleeps_on != 0 && sleeps_on != cpu {
-            futex_wake(self.words.wakes());
+        let sleeping_cpu = self.words.sleeping_cpu().load(Ordering::Relaxed);
+        if sleeping_cpu != 0 && sleeping_cpu != cpu {
+            futex_wake(self.words.wake_count());
         }
     }
 
-    /// Wakes the lane. Never blocks, also while the lane is stopped; several wakes before the lane looks are
-    /// one. Calls the kernel only if the lane sleeps.
+    /// Wakes the lane. Never blocks, even while the lane's process is stopped. Several wakes before the lane
+    /// checks for them are one. Calls the kernel only if the lane sleeps.
     pub fn wake(&self) {
-        self.words.wakes().fetch_add(1, Ordering::SeqCst);
-        if self.words.asleep().load(Ordering::SeqCst) != 0 {
-            futex_wake(self.words.wakes());
+        self.words.wake_count().fetch_add(1, Ordering::SeqCst);
+        if self.words.sleeping_cpu().load(Ordering::SeqCst) != 0 {
+            futex_wake(self.words.wake_count());
         }
     }
 }
 
-/// Sleeps until its lane is woken; one for each lane.
+/// Sleeps until its lane is woken. Each lane has one.
 #[derive(Debug)]
 pub struct LaneSleeper {
     words: WakeWords,
-    seen: u32,
-    /// Whether the last announcement was followed by a wake in time. After one that was not, the lane stays
-    /// up for no other until a wake has come: a flood of samples that come to nothing does not keep it busy.
-    trusts: bool,
-    /// Until when the lane stays up for a wake that was announced.
-    up_until: Option<MonotonicNs>,
+    /// The wake count at the last check.
+    seen_count: u32,
+    /// Whether the last announcement was followed by a wake in time. After one that was not, the lane ignores
+    /// announcements until the next wake, so that samples that are announced but never forwarded do not keep
+    /// it busy.
+    trusts_announcements: bool,
+    /// The time until which the next sleep spins for an announced wake.
+    spin_until: Option<MonotonicNs>,
 }
 
 impl LaneSleeper {
     pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
         let words = WakeWords { segment, at };
-        // What came before is unknown, so the first sleep ends at once.
-        let seen = words.wakes().load(Ordering::SeqCst).wrapping_sub(1);
-        Self { words, seen, trusts: true, up_until: None }
+        // There may have been wakes for an earlier process, so the first sleep returns at once.
+        let seen_count = words.wake_count().load(Ordering::SeqCst).wrapping_sub(1);
+        Self { words, seen_count, trusts_announcements: true, spin_until: None }
     }
 
-    /// Sleeps until a wake, or for `timeout` at most. A wake that came since the last return ends it at once;
-    /// so does the first sleep of a new lane process, and a signal.
+    /// Sleeps until a wake, or for `timeout` at most. Returns at once if there was a wake since the last
+    /// return, and at the first call in a lane process. A signal also ends the sleep.
     pub fn sleep(&mut self, timeout: Duration) -> Woken {
         let timeout_ns = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
         let began = clock::monotonic();
         let deadline = began.plus_ns(timeout_ns);
-        let woken = self.look() || self.stay_up(deadline);
-        self.up_until = None;
+        let woken = self.take_wake() || self.spin(deadline);
+        self.spin_until = None;
         if woken {
-            self.trusts = true;
+            self.trusts_announcements = true;
             return Woken::Woken;
         }
         let woken = loop {
@@ -135,33 +139,33 @@ impl LaneSleeper {
             if left_ns == 0 {
                 break Woken::TimedOut;
             }
-            self.words.asleep().store(this_cpu(), Ordering::SeqCst);
-            if self.look() {
+            self.words.sleeping_cpu().store(this_cpu(), Ordering::SeqCst);
+            if self.take_wake() {
                 break Woken::Woken;
             }
-            // The kernel looks at the count once more, and sleeps only if it is still the one that we saw.
-            let outcome = futex_wait(self.words.wakes(), self.seen, left_ns);
-            if self.look() || outcome == Err(Errno::EINTR) {
+            // The kernel compares the count again, and sleeps only if it is still `seen_count`.
+            let outcome = futex_wait(self.words.wake_count(), self.seen_count, left_ns);
+            if self.take_wake() || outcome == Err(Errno::EINTR) {
                 break Woken::Woken;
             }
-            if outcome.is_ok() && std::mem::take(&mut self.trusts) {
+            if outcome.is_ok() && std::mem::take(&mut self.trusts_announcements) {
                 let now = clock::monotonic();
-                self.up_until = Some(now.plus_ns(stays_up_ns(now.since(began))));
+                self.spin_until = Some(now.plus_ns(spin_ns(now.since(began))));
                 break Woken::Announced;
             }
         };
-        self.words.asleep().store(0, Ordering::Relaxed);
-        self.trusts |= woken == Woken::Woken;
+        self.words.sleeping_cpu().store(0, Ordering::Relaxed);
+        self.trusts_announcements |= woken == Woken::Woken;
         woken
     }
 
-    /// Stays up for a wake that was announced, until `deadline` at most; whether it came.
-    fn stay_up(&mut self, deadline: MonotonicNs) -> bool {
-        let Some(up_until) = self.up_until else {
+    /// Spins for an announced wake, until `deadline` at most, and returns whether there was one.
+    fn spin(&mut self, deadline: MonotonicNs) -> bool {
+        let Some(spin_until) = self.spin_until else {
             return false;
         };
-        while clock::monotonic() < up_until.min(deadline) {
-            if self.look() {
+        while clock::monotonic() < spin_until.min(deadline) {
+            if self.take_wake() {
                 return true;
             }
             std::hint::spin_loop();
@@ -169,11 +173,11 @@ impl LaneSleeper {
         false
     }
 
-    /// Whether there was a wake since the last look.
-    fn look(&mut self) -> bool {
-        let wakes = self.words.wakes().load(Ordering::SeqCst);
-        let woken = wakes != self.seen;
-        self.seen = wakes;
+    /// Returns whether there was a wake since the last call.
+    fn take_wake(&mut self) -> bool {
+        let count = self.words.wake_count().load(Ordering::SeqCst);
+        let woken = count != self.seen_count;
+        self.seen_count = count;
         woken
     }
 }
@@ -181,12 +185,12 @@ impl LaneSleeper {
 /// One more than the number of the CPU that this thread runs on.
 pub fn this_cpu() -> u32 {
     let cpu = sched_getcpu().ok().and_then(|cpu| u32::try_from(cpu).ok());
-    // Without an answer all CPUs count as one, and nothing is announced.
+    // If the number is unknown, all CPUs count as the same one, and announcements have no effect.
     cpu.map_or(1, |cpu| cpu.saturating_add(1))
 }
 
 fn futex_wait(word: &AtomicU32, expected: u32, timeout_ns: u64) -> Result<(), Errno> {
-    // A futex that other processes use, so without FUTEX_PRIVATE_FLAG; a relative timeout runs on
+    // Without FUTEX_PRIVATE_FLAG, because other processes use the futex. A relative timeout is measured by
     // CLOCK_MONOTONIC.
     let timeout = libc::timespec {
         tv_sec: i64::try_from(timeout_ns / 1_000_000_000).unwrap_or(i64::MAX),
@@ -200,7 +204,7 @@ fn futex_wait(word: &AtomicU32, expected: u32, timeout_ns: u64) -> Result<(), Er
 }
 
 fn futex_wake(word: &AtomicU32) {
-    // SAFETY: the kernel uses the address of the word only. It cannot fail on a word that is mapped.
+    // SAFETY: the kernel uses only the address of the word. The call cannot fail for a mapped word.
     unsafe { libc::syscall(libc::SYS_futex, word.as_ptr(), libc::FUTEX_WAKE, 1) };
 }
 
@@ -209,11 +213,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lane_waits_for_no_longer_than_pays() {
-        assert_eq!(stays_up_ns(0), 50_000);
-        assert_eq!(stays_up_ns(200_000), 50_000, "at 5 kHz");
-        assert_eq!(stays_up_ns(900_000), 56_250, "at 1 kHz");
-        assert_eq!(stays_up_ns(10_000_000), 200_000, "at 100 Hz");
-        assert_eq!(stays_up_ns(u64::MAX), 200_000);
+    fn the_spin_time_is_a_sixteenth_of_the_sleep_within_limits() {
+        assert_eq!(spin_ns(0), 50_000);
+        assert_eq!(spin_ns(200_000), 50_000, "at 5 kHz");
+        assert_eq!(spin_ns(900_000), 56_250, "at 1 kHz");
+        assert_eq!(spin_ns(10_000_000), 200_000, "at 100 Hz");
+        assert_eq!(spin_ns(u64::MAX), 200_000);
     }
 }
