@@ -1,18 +1,19 @@
 //! Adaptive Bridge: a proxy between a robot's publishers and its subscribers.
 //!
-//! The layers, in the order in which they may use each other: a module uses those above it and none below.
-//! `tests/tidy.rs` enforces it.
+//! The modules are layers: each may use those listed above it and none of those below. `tests/tidy.rs` checks
+//! this.
 //!
-//! - [`model`]: vocabulary: time, names, QoS, sample header, modes, drop reasons.
-//! - [`policy`]: pure decisions; time is an argument.
-//! - [`config`]: YAML to validated settings.
-//! - [`clock`]: the only reader of the operating system's clocks.
-//! - [`dds`]: the RTPS edge, on RustDDS.
-//! - [`shm`]: the shared-memory edge, on iceoryx2.
-//! - [`telemetry`]: what the processes show: readings of the boards, logs.
-//! - [`process`]: the roles; the only place where the edges meet policy.
-//! - [`cli`]: one file for each subcommand.
-//! - [`eval`]: with the feature of that name, the evaluation harness.
+//! - [`model`]: plain data types: time, names, QoS, sample header, modes, drop reasons.
+//! - [`policy`]: decisions without side effects; the time is an argument.
+//! - [`config`]: reads YAML into validated settings.
+//! - [`clock`]: the only module that reads the operating system's clocks.
+//! - [`dds`]: DDS readers, writers and discovery, on RustDDS.
+//! - [`shm`]: channels, boards and pools in shared memory, on iceoryx2.
+//! - [`telemetry`]: snapshots of the boards, status, metrics, diagnostics, logs.
+//! - [`process`]: ingress, egress, control, responder and supervisor; the only module that combines DDS, shared
+//!   memory and policy.
+//! - [`cli`]: the subcommands.
+//! - [`eval`]: the evaluation harness (feature `eval`).
 
 #![warn(missing_docs)]
 #![cfg_attr(not(feature = "eval"), allow(rustdoc::broken_intra_doc_links))]

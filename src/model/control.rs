@@ -1,4 +1,4 @@
-//! What the control process shows of itself: plain records of fixed size, as in [`health`](super::health).
+//! Records that the control process writes to its board, of fixed size as in [`health`](super::health).
 
 use super::health::FixedText;
 use super::modes::{SafetyMode, SubscriberState};
@@ -6,66 +6,67 @@ use super::probe::RefusalCounts;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 
-/// Subscribers that are followed at once: listed ones first, then those that answer without being listed.
+/// The most subscribers that control follows at once: those that the configuration lists first, then others
+/// that respond to probes.
 pub const MAX_SUBSCRIBERS: usize = 64;
 
-/// Intruders that are shown at once; further ones are counted only.
+/// The most intruders on the board at once; further ones are only counted.
 pub const MAX_INTRUDERS: usize = 32;
 
-/// What control has found and decided for the bridge as a whole.
+/// The state of the control process and its decisions for the whole bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct ControlRecord {
-    /// When the safety mode was entered; 0 while control never ran.
+    /// When the safety mode was entered; 0 when control has never run.
     pub safety_since: MonotonicNs,
-    /// Changes of the safety mode since control came up.
+    /// Changes of the safety mode since control started.
     pub safety_transitions: u64,
-    /// Places taken in the table of subscribers, from the first on.
+    /// Records in use at the start of the subscriber table.
     pub subscribers: u64,
-    /// Places taken in the table of intruders, from the first on.
+    /// Records in use at the start of the intruder table.
     pub intruders: u64,
-    /// Intruders ever seen since control came up, those not shown included.
+    /// Intruders seen since control started, including those not on the board.
     pub intruders_seen: u64,
     /// Probes sent.
     pub probes_sent: u64,
-    /// Responses that were taken for what they claim to be.
+    /// Probe responses accepted.
     pub responses_accepted: u64,
-    /// Responses that were not, by reason.
+    /// Probe responses refused, by reason.
     pub refused: RefusalCounts,
     /// The safety mode, as [`SafetyMode`]'s number.
     pub safety: u8,
     /// 1 while subscribers are classified.
     pub classifies: u8,
-    /// 1 while nobody is probed because the secret of the probes cannot be had.
+    /// 1 while control sends no probes because it cannot read their secret.
     pub without_secret: u8,
     /// Always 0.
     pub reserved: [u8; 5],
-    /// What brought the safety mode about; empty in normal mode.
+    /// Why the bridge is in its safety mode; empty in normal mode.
     pub safety_reason: FixedText,
 }
 
 impl ControlRecord {
-    /// The safety mode; a number that is none reads as normal.
+    /// The safety mode; an undefined number counts as normal.
     pub fn safety(&self) -> SafetyMode {
         SafetyMode::from_u8(self.safety).unwrap_or_default()
     }
 }
 
-/// What control knows of one subscriber.
+/// The state and the probe figures of one subscriber.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct SubscriberRecord {
-    /// Its id; empty for a place that is free.
+    /// Its id; empty for a free record.
     pub id: FixedText,
     /// The number of its lane.
     pub lane: u64,
     /// When its state was entered.
     pub state_since: MonotonicNs,
-    /// Changes of its state since control came up.
+    /// Changes of its state since control started.
     pub transitions: u64,
-    /// Probes in the window whose fate is known.
+    /// Probes in the window that were answered in time or lost.
     pub settled: u64,
-    /// Of those, the ones without a response in time.
+    /// Of those, the lost ones: without a response in time.
     pub lost: u64,
     /// Mean round trip within the window, in microseconds.
     pub rtt_mean_us: u64,
@@ -73,7 +74,7 @@ pub struct SubscriberRecord {
     pub rtt_p95_us: u64,
     /// Jitter within the window, in microseconds.
     pub jitter_us: u64,
-    /// When its last response came; 0 for never.
+    /// When its last response arrived; 0 for never.
     pub last_response_at: MonotonicNs,
     /// Its state, as [`SubscriberState`]'s number.
     pub state: u8,
@@ -81,7 +82,7 @@ pub struct SubscriberRecord {
     pub forced: u8,
     /// 1 when the configuration lists the subscriber.
     pub listed: u8,
-    /// The figures that are above their warning threshold, as [`SubscriberWarning`]'s bits.
+    /// The figures above their warning threshold, as [`SubscriberWarning`]'s bits.
     pub warnings: u8,
     /// Always 0.
     pub reserved: [u8; 4],
@@ -90,12 +91,12 @@ pub struct SubscriberRecord {
 }
 
 impl SubscriberRecord {
-    /// Its state; a number that is none reads as unknown.
+    /// Its state; an undefined number counts as unknown.
     pub fn state(&self) -> SubscriberState {
         SubscriberState::from_u8(self.state).unwrap_or_default()
     }
 
-    /// The figures that are above their warning threshold.
+    /// The figures above their warning threshold.
     pub fn warnings(&self) -> impl Iterator<Item = SubscriberWarning> {
         let bits = self.warnings;
         SubscriberWarning::ALL.into_iter().filter(move |&warning| bits & warning as u8 != 0)
@@ -107,8 +108,8 @@ impl SubscriberRecord {
     }
 }
 
-/// A figure of a subscriber that may be above the warning threshold which the configuration sets for it
-/// (`probes.*_threshold`). A warning decides nothing.
+/// A figure of a subscriber above its configured warning threshold (`probes.*_threshold`). A warning has no
+/// influence on any mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum SubscriberWarning {
@@ -134,26 +135,27 @@ impl SubscriberWarning {
     }
 }
 
-/// A remote reader that reaches past the bridge.
+/// A remote subscriber that bypasses the bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct IntruderRecord {
     /// The ROS 2 topic that it reads.
     pub topic: FixedText,
-    /// Its ROS 2 node; empty when it has not said.
+    /// Its ROS 2 node; empty when the node has not announced itself.
     pub node: FixedText,
     /// The addresses of its host.
     pub host: FixedText,
-    /// What to do about it.
+    /// What the user can do about it.
     pub remedy: FixedText,
     /// When it was first seen.
     pub since: MonotonicNs,
 }
 
-/// Interfaces and peers that are shown as away, or as back, at once; those that are away come first.
+/// The most absences on the board at once, of interfaces and peers that are away or back; those that are away
+/// come first.
 pub const MAX_ABSENCES: usize = 32;
 
-/// What is or was away.
+/// What an absence is of: a network interface or a peer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum AbsenceKind {
@@ -174,40 +176,40 @@ impl AbsenceKind {
     }
 }
 
-/// A network interface of this host, or a peer on another one, that was there and is or was away.
+/// The absence of a network interface of this host or of a peer on another host, current or past.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct AbsenceRecord {
-    /// Since when it is away; 0 for a place that is free.
+    /// When the absence began; 0 for a free record.
     pub since: MonotonicNs,
-    /// When it came back; 0 while it is away.
+    /// When the interface or peer came back; 0 while it is away.
     pub back_at: MonotonicNs,
-    /// What it is, as [`AbsenceKind`]'s number.
+    /// Whether it is an interface or a peer, as [`AbsenceKind`]'s number.
     pub kind: u64,
-    /// The interface as configured; or the peer's node, empty where it has none.
+    /// The interface as configured, or the peer's node; empty for a peer without one.
     pub name: FixedText,
-    /// The address of the interface, or of the peer's host; empty where it is not known.
+    /// The address of the interface or of the peer's host; empty when it is not known.
     pub host: FixedText,
-    /// What the interface lacks; or what the peer subscribes to and publishes.
+    /// What the interface lacks, or what the peer subscribes to and publishes.
     pub detail: FixedText,
 }
 
 impl AbsenceRecord {
-    /// What it is; a number that is none reads as a peer.
+    /// Whether it is an interface or a peer; an undefined number counts as a peer.
     pub fn kind(&self) -> AbsenceKind {
         if self.kind == AbsenceKind::Interface as u64 { AbsenceKind::Interface } else { AbsenceKind::Peer }
     }
 
-    /// Whether it is away.
+    /// Whether the interface or peer is away at present.
     pub fn is_away(&self) -> bool {
         self.since.0 != 0 && self.back_at.0 == 0
     }
 }
 
-/// Publishers of input topics and readers of outputs whose nodes control names.
+/// The most publishers of input topics and readers of outputs whose nodes control records.
 pub const MAX_NAMED_ENDPOINTS: usize = 128;
 
-/// The ROS 2 node that has a writer of an input topic or a reader of an output.
+/// The ROS 2 node of one writer of an input topic or one reader of an output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct NamedEndpoint {
@@ -224,7 +226,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn loss_is_a_share_whatever_the_board_says() {
+    fn loss_is_at_most_1_even_for_inconsistent_counts() {
         let mut subscriber = SubscriberRecord::default();
         assert_eq!(subscriber.loss(), None);
         (subscriber.settled, subscriber.lost) = (50, 1);

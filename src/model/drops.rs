@@ -1,10 +1,10 @@
-//! Why a sample was not forwarded: a closed list, so that every sample taken in can be accounted for.
+//! Drop reasons: a closed list, so that every sample that ingress takes is accounted for.
 
 use std::fmt;
 
 macro_rules! drop_reasons {
     ($($(#[doc = $doc:literal])+ $variant:ident = $label:literal,)+) => {
-        /// Why a sample was dropped. The list is closed: a new way to lose a sample needs a new name here.
+        /// Why a sample was dropped. Code that drops samples for a new reason adds that reason here.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[repr(u8)]
         pub enum DropReason {
@@ -18,7 +18,7 @@ macro_rules! drop_reasons {
             /// The number of reasons.
             pub const COUNT: usize = Self::ALL.len();
 
-            /// The name under which logs, `status` and metrics show it.
+            /// The label in logs, `status` and metrics.
             pub const fn label(self) -> &'static str {
                 match self {
                     $(Self::$variant => $label,)+
@@ -35,14 +35,14 @@ drop_reasons! {
     PoolExhausted = "pool_exhausted",
     /// Ingress: an encapsulation that DDS does not define, or a payload the DDS library could not decode.
     Malformed = "malformed",
-    /// Lane: a hole in the route's sequence, left by an ingress process that died between numbering a
+    /// Lane: a gap in the route's sequence numbers, left by an ingress process that died between numbering a
     /// sample and publishing it.
     IngressDied = "ingress_died",
     /// Lane: overwritten in the lane's shared-memory queue before the lane took it.
     QueueOverflow = "queue_overflow",
-    /// Lane: published while no process served the lane, or held by one that was killed.
+    /// Lane: published while no process served the lane, or held by a process that was killed.
     LaneDown = "lane_down",
-    /// Lane: the message type of the route is not known yet, so that there is no writer.
+    /// Lane: there is no DDS writer because the message type of the route is not known yet.
     NoWriter = "no_writer",
     /// Lane: written while no reader was matched, or, after a restart of the lane, while a reader that had
     /// been matched before was not matched again.
@@ -51,7 +51,7 @@ drop_reasons! {
     WriteFailed = "write_failed",
     /// Noncritical lane: older than the stale threshold.
     Stale = "stale",
-    /// Noncritical lane: a fresher sample was there when the token came.
+    /// Noncritical lane: a newer sample was waiting when the rate allowed the next one.
     Superseded = "superseded",
     /// Noncritical lane: the lane's queue was full.
     QueueFull = "queue_full",
@@ -59,25 +59,25 @@ drop_reasons! {
     Suspended = "suspended",
     /// Any lane: forwarding is stopped (emergency).
     Stopped = "stopped",
-    /// Any lane: still waiting when the process was told to shut down.
+    /// Any lane: still waiting when the process shut down.
     Shutdown = "shutdown",
 }
 
 impl DropReason {
-    /// What has happened to the samples, and what to do about it, for people.
+    /// A text for users: why the samples were dropped and, where there is one, the remedy.
     pub const fn meaning(self) -> &'static str {
         match self {
             Self::TooLarge => "larger than the route's max_sample_bytes; raise it",
             Self::PoolExhausted => "no free slot in shared memory; raise queue_depth",
-            Self::Malformed => "an encapsulation that DDS does not know",
-            Self::IngressDied => "an ingress process died while it had them",
+            Self::Malformed => "an encapsulation that DDS does not define, or a payload that cannot be decoded",
+            Self::IngressDied => "an ingress process died before it published them",
             Self::QueueOverflow => "the lane took them too slowly; raise its queue_depth",
-            Self::LaneDown => "no process served the lane when they came, or it was killed while it had them",
+            Self::LaneDown => "published while no process served the lane, or held by a process that was killed",
             Self::NoWriter => "the message type is not known yet",
             Self::NoReader => "no subscriber was matched, or not again yet after a restart of the lane",
             Self::WriteFailed => "the DDS library refused them",
-            Self::Stale => "older than stale_threshold_ms; are the clocks in step?",
-            Self::Superseded => "a fresher one was there",
+            Self::Stale => "older than stale_threshold_ms; are the clocks synchronized?",
+            Self::Superseded => "a newer one replaced them",
             Self::QueueFull => "the lane's queue was full",
             Self::Suspended => "the lane is suspended",
             Self::Stopped => "forwarding is stopped",
@@ -92,8 +92,8 @@ impl fmt::Display for DropReason {
     }
 }
 
-/// How many samples were dropped, for each reason. They are read from shared memory, where any process of the
-/// user's could have written anything: no sum of them overflows.
+/// Counts of dropped samples by reason. Sums saturate: the counts come from shared memory, where any process
+/// of the same user could have written any number.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct DropCounts([u64; DropReason::COUNT]);
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_add_up() {
+    fn counts_are_summed_by_reason() {
         let mut counts = DropCounts::default();
         counts.add(DropReason::Stale, 2);
         counts.add(DropReason::TooLarge, 1);

@@ -1,6 +1,6 @@
 //! A hash that is the same in every process.
 
-/// FNV-1a, 64 bits: no secret, only a name that differs.
+/// The FNV-1a hash, 64 bits. It distinguishes values; it is not cryptographic.
 pub fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)

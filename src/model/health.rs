@@ -1,49 +1,50 @@
-//! What every process shows of itself in shared memory: plain records of fixed size, so that a reader needs
-//! nothing of the process that wrote them, not even that it is still alive.
+//! Records that the processes write to their boards: plain data of fixed size, which a reader can use even
+//! after the process that wrote them has died.
 
 use super::drops::DropCounts;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 
-/// Publishers of one route whose samples are numbered in an account of their own.
+/// The most publishers of one route that have an account each.
 pub const MAX_PUBLISHERS: usize = 64;
 
-/// How far ingress has taken the samples of one publisher, by the sequence numbers of its DDS writer.
+/// The account of one publisher: which of its samples ingress has taken, by the sequence numbers of its DDS
+/// writer.
 ///
 /// `last_sequence - first_sequence + 1 = received + lost_upstream`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct PublisherAccount {
-    /// The DDS writer; all zero where no publisher has this place.
+    /// The DDS writer; all zero for a free account.
     pub writer: Guid,
-    /// The number of the first sample taken. What has lower numbers was written before ingress first read
-    /// the writer.
+    /// The sequence number of the first sample taken. Samples with lower numbers were written before ingress
+    /// first read from the writer.
     pub first_sequence: i64,
-    /// The highest number taken: its high-water mark. No sample with this number or a lower one is published
-    /// again.
+    /// The highest sequence number taken, which is the high-water mark: ingress discards samples with this
+    /// number or a lower one.
     pub last_sequence: i64,
     /// Samples taken.
     pub received: u64,
-    /// Numbers between the first and the last that were not taken.
+    /// Sequence numbers between the first and the last that were not taken.
     pub lost_upstream: u64,
-    /// Samples that arrived with a number at or below the mark, and were discarded.
+    /// Samples discarded because their sequence number was at or below the high-water mark.
     pub repeated: u64,
     /// When the last sample was taken.
     pub last_at: MonotonicNs,
-    /// What the writer offers, as discovery knows it at present: one of `OFFER_UNKNOWN`,
-    /// `OFFERS_BEST_EFFORT` and `OFFERS_RELIABLE`.
+    /// The reliability that the writer offers according to discovery: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT` or
+    /// `OFFERS_RELIABLE`.
     pub offered_reliability: u64,
 }
 
 impl PublisherAccount {
-    /// Discovery does not know the writer, or no more.
+    /// The writer is not discovered, or not any more.
     pub const OFFER_UNKNOWN: u64 = 0;
-    /// Samples that the network loses are not repaired.
+    /// The writer does not resend samples that the network loses.
     pub const OFFERS_BEST_EFFORT: u64 = 1;
-    /// Samples that the network loses are repaired.
+    /// The writer resends samples that the network loses.
     pub const OFFERS_RELIABLE: u64 = 2;
 
-    /// The account of a writer whose first sample has this number, before that sample is taken.
+    /// The account of a writer before its first sample, which has this sequence number, is taken.
     pub const fn new(writer: Guid, first_sequence: i64) -> Self {
         Self {
             writer,
@@ -57,24 +58,25 @@ impl PublisherAccount {
         }
     }
 
-    /// Whether no publisher has this place.
+    /// Whether no publisher has this account.
     pub fn is_vacant(&self) -> bool {
         self.writer == Guid::default()
     }
 
-    /// Takes the sample with that number, which is above the mark; yields how many numbers were skipped.
+    /// Counts a sample whose sequence number is above the high-water mark, and returns the number of sequence
+    /// numbers skipped before it.
     pub fn take(&mut self, sequence: i64, now: MonotonicNs) -> u64 {
         let skipped = sequence.saturating_sub(self.last_sequence).saturating_sub(1).max(0).unsigned_abs();
         self.last_sequence = sequence;
         self.received += 1;
-        // What the numbers of the writer claim; a hostile one may jump as far as it likes.
+        // The number comes from the network: a hostile writer can skip any number of sequence numbers.
         self.lost_upstream = self.lost_upstream.saturating_add(skipped);
         self.last_at = now;
         skipped
     }
 }
 
-/// What ingress has done on one route. `received = published + drops`, always.
+/// The counters of ingress for one route. `received = published + drops`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct IngressCounters {
@@ -82,90 +84,87 @@ pub struct IngressCounters {
     pub received: u64,
     /// Payload bytes of those.
     pub received_bytes: u64,
-    /// Samples published to the lanes; also the sequence of the last one, because ingress numbers without
-    /// gaps.
+    /// Samples published to the lanes; also the sequence number of the last one, because ingress numbers
+    /// without gaps.
     pub published: u64,
-    /// Of the published, those that the DDS library put together in the pool itself, so that they were not
-    /// copied there.
+    /// Of the published, those that the DDS library assembled in the pool, without a copy.
     pub in_place: u64,
     /// Samples received and not published.
     pub drops: DropCounts,
-    /// Samples that the publisher numbered and the DDS reader never gave us: lost before the bridge.
+    /// Samples lost before ingress: their publisher numbered them, and the DDS reader never returned them.
     pub lost_upstream: u64,
-    /// Samples that arrived with a number at or below the high-water mark of their publisher, and were
-    /// discarded; not among the received.
+    /// Samples discarded because their sequence number was at or below the high-water mark of their publisher;
+    /// not among the received.
     pub repeated: u64,
     /// Of the received, those of publishers beyond [`MAX_PUBLISHERS`], which have no high-water mark.
     pub unmarked: u64,
-    /// The place of the account that changed last.
+    /// The index of the account that changed last.
     pub changed_place: u64,
-    /// That account as it was left. It is written here in the same step as the counts, and then in its place:
-    /// a successor of a process that died in between finds it here.
+    /// That account after the change. Ingress writes it here in one step with the counters and then into the
+    /// table: if ingress dies in between, its successor reads it here.
     pub changed_account: PublisherAccount,
     /// Writers matched at present.
     pub writers: u64,
     /// When the last sample was taken.
     pub last_received_at: MonotonicNs,
-    /// How far the clock of `clock_writer` is behind ours in nanoseconds, negative when it is ahead; 0 while
-    /// the clocks of all publishers agree with ours.
+    /// How far the clock of `clock_writer` is behind this host's, in nanoseconds, negative when it is ahead; 0
+    /// while the clocks of all publishers agree with this host's.
     pub clock_offset_ns: i64,
-    /// The writer whose clock is off furthest; all zero for none.
+    /// The writer whose clock differs most; all zero for none.
     pub clock_writer: Guid,
 }
 
-/// What one lane has done on one route.
+/// The counters of one lane for one route.
 ///
-/// `last_sequence - first_sequence = forwarded + drops` whenever no sample waits in the lane; while some
-/// wait, the difference is `waiting`.
+/// `last_sequence - first_sequence = forwarded + drops + waiting`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct LaneCounters {
-    /// The route's sequence when the lane began to account for it.
+    /// The last sequence number before the first one that the lane accounts for.
     pub first_sequence: u64,
-    /// The highest sequence that the lane has accounted for or holds.
+    /// The highest sequence number that the lane has accounted for or holds.
     pub last_sequence: u64,
-    /// Samples given to the DDS writer.
+    /// Samples written to DDS.
     pub forwarded: u64,
     /// Payload bytes of those.
     pub forwarded_bytes: u64,
-    /// Of the forwarded, those handed over by reference.
+    /// Of the forwarded, those passed to DDS by reference.
     pub by_reference: u64,
-    /// Of the forwarded, those published while the lane was down and caught up with afterwards.
+    /// Of the forwarded, those published while the lane was down, which it caught up with afterwards.
     pub caught_up: u64,
-    /// Samples taken or missed and not forwarded.
+    /// Samples taken or missing, and not forwarded.
     pub drops: DropCounts,
     /// Samples waiting in the lane at present.
     pub waiting: u64,
-    /// The sequence of the last forwarded sample.
+    /// The sequence number of the last forwarded sample.
     pub last_forwarded_sequence: u64,
-    /// When it was given to the DDS writer.
+    /// When that sample was written to DDS.
     pub last_forwarded_at: MonotonicNs,
-    /// The publisher's writer of the last forwarded sample, and its number there: what a standby resumes
-    /// from.
+    /// The publisher's DDS writer of the last forwarded sample, from which a standby can resume.
     pub last_writer_guid: Guid,
-    /// See `last_writer_guid`.
+    /// The sequence number that this writer gave the sample.
     pub last_writer_sequence: i64,
     /// Readers matched at present.
     pub readers: u64,
-    /// Samples that single readers missed because they did not keep up, summed over all readers ever matched.
-    /// The lane forwarded these samples; the other readers have them.
+    /// Overruns summed over all readers ever matched: samples that left the writer's history before one reader
+    /// acknowledged them. The lane forwarded these samples, and other readers may have received them.
     pub reader_overrun: u64,
 }
 
-/// Readers of one output that are recorded by name; further ones are only counted.
+/// The most readers of one output that have a record each; further ones are only counted.
 pub const MAX_OUTPUT_READERS: usize = 32;
 
-/// One reader that is matched with an output.
+/// The record of one reader that is matched with an output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct ReaderRecord {
     /// The reader; all zero for none.
     pub reader: Guid,
-    /// Samples written since it was matched, and the history that it was offered then.
+    /// Samples written since it was matched, plus the history that it was offered then.
     pub offered: u64,
     /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
     pub unacknowledged: u64,
-    /// Of those, samples that left the writer's history before the reader had them.
+    /// Of those, samples that left the writer's history before the reader received them.
     pub overrun: u64,
     /// 1 for a RELIABLE reader, 0 for a BEST_EFFORT one.
     pub reliable: u64,
@@ -175,79 +174,81 @@ pub struct ReaderRecord {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct OutputReaders {
-    /// The readers, from the first place on.
+    /// The records, those in use first.
     pub records: [ReaderRecord; MAX_OUTPUT_READERS],
 }
 
 impl OutputReaders {
-    /// The recorded readers.
+    /// The records in use.
     pub fn iter(&self) -> impl Iterator<Item = &ReaderRecord> {
         self.records.iter().filter(|record| record.reader != Guid::default())
     }
 }
 
 impl LaneCounters {
-    /// Samples that the lane was offered since it began to account.
+    /// Samples of the route since the lane began to account for them.
     pub fn received(&self) -> u64 {
         self.last_sequence.saturating_sub(self.first_sequence)
     }
 
-    /// Whether every sample offered is forwarded, waiting, or dropped for a named reason.
+    /// Whether every sample is accounted for: forwarded, waiting, or dropped for a named reason.
     pub fn is_whole(&self) -> bool {
         let counted = self.forwarded.saturating_add(self.drops.total()).saturating_add(self.waiting);
         self.received() == counted
     }
 }
 
-/// What a process is and that it turns.
+/// The health of a process: its id, its turns, its starts and the policy that it applies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct ProcessHealth {
     /// Process id.
     pub pid: u64,
-    /// When it came up.
+    /// When the process started.
     pub started_at: MonotonicNs,
-    /// When its data path last turned: a sample handled, or an idle turn that tested the wake-up source.
+    /// When its main loop last completed a turn: one that handled samples, or an idle one that checked its
+    /// wake-up source.
     pub alive_at: MonotonicNs,
-    /// Turns of the data path.
+    /// Turns of its main loop.
     pub turns: u64,
-    /// How often a process of this role was started in this bridge, this one included.
+    /// Starts of processes with this role in this bridge, including this one.
     pub starts: u64,
     /// The mode that the process applies, as [`LaneMode`](super::modes::LaneMode)'s number.
     pub mode: u8,
-    /// 1 when it ended as it was told to. A process that died could not say so.
+    /// 1 when the process shut down in order; it stays 0 when the process dies.
     pub ended: u8,
     /// Always 0.
     pub reserved: [u8; 6],
     /// The epoch of the policy that the process applies.
     pub policy_epoch: u64,
-    /// The process' DDS participant, for its successor to say goodbye for it should it be killed.
+    /// The process' DDS participant. If the process is killed, its successor announces to remote participants
+    /// that this one has left.
     pub participant: Guid,
-    /// What failed in the process, samples apart: housekeeping, a board, a policy that could not be written.
+    /// Failures in the process other than of samples: housekeeping, a board, a policy that it could not write.
     pub errors: u64,
-    /// Tells the settings that the process applies from others.
+    /// The fingerprint of the configuration that the process applies.
     pub settings_fingerprint: u64,
     /// Reloads that the process refused because the file was bad.
     pub refused_reloads: u64,
 }
 
-/// What the policy board says to one lane: what control decided, what safety demands at least, and what an
-/// operator has set. Each part has its own writer, and none takes away what another has said.
+/// The policy of one lane on the policy board: control's decision, the floor of the safety supervisor and an
+/// operator's override. Each part has its own writer, which leaves the other parts unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct LanePolicy {
-    /// Grows by one with each change; 0 means that nobody has set a policy yet.
+    /// Increases by one with each change; 0 before the first.
     pub epoch: u64,
-    /// When control last wrote or confirmed its part; 0 means that control never did.
+    /// When control last wrote or confirmed its part; 0 for never.
     pub written_at: MonotonicNs,
-    /// When the override by hand ends; 0 never.
+    /// When the override by hand ends; 0 for never.
     pub expires_at: MonotonicNs,
-    /// When the epoch last grew.
+    /// When the epoch last increased.
     pub changed_at: MonotonicNs,
-    /// The mode that control decided on, as [`LaneMode`](super::modes::LaneMode)'s number.
+    /// Control's mode, as [`LaneMode`](super::modes::LaneMode)'s number.
     pub mode: u8,
     /// The mildest mode that the safety supervisor allows, as [`LaneMode`](super::modes::LaneMode)'s number.
-    /// It holds against an override, too.
+    /// An override cannot go below it.
     pub safety_floor: u8,
     /// 1 while there is an override by hand.
     pub by_hand: u8,
@@ -269,7 +270,7 @@ impl LanePolicy {
     }
 }
 
-/// Text of at most 127 bytes that can live in shared memory.
+/// A text of at most 127 bytes in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct FixedText {
@@ -278,7 +279,7 @@ pub struct FixedText {
 }
 
 impl FixedText {
-    /// The text, cut at 127 bytes.
+    /// Copies the text, cut to at most 127 bytes at a character boundary.
     pub fn new(text: &str) -> Self {
         let mut cut = text.len().min(127);
         while !text.is_char_boundary(cut) {
@@ -289,7 +290,7 @@ impl FixedText {
         Self { length: cut as u8, bytes }
     }
 
-    /// The text; empty when the bytes are not UTF-8, which only a foreign writer could bring about.
+    /// The text; empty when the bytes are not UTF-8, which happens only if a foreign program wrote them.
     pub fn as_str(&self) -> &str {
         let length = usize::from(self.length).min(self.bytes.len());
         std::str::from_utf8(&self.bytes[..length]).unwrap_or("")
@@ -302,7 +303,7 @@ impl Default for FixedText {
     }
 }
 
-/// What ingress has found out about a route, for lanes that cannot discover the publisher themselves.
+/// The message type that ingress has discovered for a route, for lanes that cannot discover the publisher.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct RouteInfo {
@@ -310,15 +311,15 @@ pub struct RouteInfo {
     pub dds_type: FixedText,
 }
 
-/// Sub-buckets of each octave; the relative width of a bucket is 1/16, so that a quantile is at most 6.3 %
-/// off.
+/// Buckets of each octave. The relative width of a bucket is at most 1/16, so that a quantile is at most 6.3 %
+/// too large.
 const SUB_BUCKETS: usize = 16;
-/// Octaves from 2^10 ns (1 µs) up to 2^37 ns (137 s).
+/// Octaves, from 2^10 ns (1 µs) to 2^37 ns (137 s).
 const OCTAVES: usize = 27;
 const LOWEST_BIT: u32 = 10;
 
-/// Latencies in log-linear buckets: 1 µs to 137 s, a relative width of 1/16. Counts only grow; a reader that
-/// wants a window subtracts two readings.
+/// A histogram of latencies with log-linear buckets from 1 µs to 137 s, of a relative width of at most 1/16.
+/// Counts only increase; a reader subtracts two readings for the latencies of a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct LatencyHistogram {
@@ -334,7 +335,7 @@ impl Default for LatencyHistogram {
 }
 
 impl LatencyHistogram {
-    /// Counts one latency. Values outside the range count in the first or last bucket.
+    /// Counts one latency; one outside the range counts in the first or last bucket.
     pub fn record(&mut self, latency_ns: u64) {
         self.counts[Self::bucket(latency_ns)] += 1;
         self.max_ns = self.max_ns.max(latency_ns);
@@ -342,12 +343,12 @@ impl LatencyHistogram {
 
     /// Latencies counted.
     pub fn count(&self) -> u64 {
-        // As in `DropCounts`, the counts may be any.
+        // As in `DropCounts`, the counts may be any number.
         self.counts.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
-    /// The latency below or at which a share of `quantile` (0 to 1) of all counted ones lies, in nanoseconds,
-    /// as the upper edge of its bucket; `None` when nothing was counted.
+    /// The latency at or below which the share `quantile` (0 to 1) of all counted latencies lies, as the upper
+    /// edge of its bucket in nanoseconds; `None` when none was counted.
     pub fn quantile_ns(&self, quantile: f64) -> Option<u64> {
         let total = self.count();
         if total == 0 {
@@ -364,8 +365,8 @@ impl LatencyHistogram {
         Some(self.max_ns)
     }
 
-    /// What was counted since `earlier`, a former reading of the same histogram. The maximum stays that of
-    /// all.
+    /// The latencies counted since `earlier`, an earlier reading of the same histogram. The maximum remains
+    /// that of all latencies.
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
         for (count, before) in difference.counts.iter_mut().zip(earlier.counts.iter()) {
@@ -399,22 +400,22 @@ mod tests {
     use crate::model::DropReason;
 
     #[test]
-    fn quantiles_are_within_a_bucket_of_the_truth() {
+    fn quantiles_are_within_one_bucket_of_the_exact_value() {
         let mut histogram = LatencyHistogram::default();
         assert_eq!(histogram.quantile_ns(0.5), None);
         for value in 1..=10_000u64 {
             histogram.record(value * 1_000);
         }
         for quantile in [0.01, 0.5, 0.9, 0.99, 0.999] {
-            let truth = quantile * 10_000.0 * 1_000.0;
+            let exact = quantile * 10_000.0 * 1_000.0;
             let found = histogram.quantile_ns(quantile).unwrap() as f64;
-            assert!(found >= truth && found <= truth * 1.0626, "{quantile}: {found} for {truth}");
+            assert!(found >= exact && found <= exact * 1.0626, "{quantile}: {found} for {exact}");
         }
         assert_eq!(histogram.quantile_ns(1.0), Some(10_000_000));
     }
 
     #[test]
-    fn values_out_of_range_are_counted_all_the_same() {
+    fn values_out_of_range_are_counted() {
         let mut histogram = LatencyHistogram::default();
         histogram.record(0);
         histogram.record(u64::MAX);
@@ -424,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lane_is_whole_when_every_sample_is_somewhere() {
+    fn a_lane_is_whole_when_every_sample_is_accounted_for() {
         let mut counters =
             LaneCounters { first_sequence: 10, last_sequence: 20, forwarded: 7, ..Default::default() };
         assert!(!counters.is_whole());

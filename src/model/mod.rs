@@ -1,7 +1,7 @@
-//! The vocabulary of the project: plain values with names and units, shared by every other layer.
+//! Plain data types with names and units, shared by all other layers.
 //!
-//! Nothing here does anything but hold, check and convert itself. The terms are those of DDS, RTPS, ROS 2 and
-//! teletraffic engineering; each is defined at the type that carries its name.
+//! The types hold, check and convert values and do nothing else. The terms are those of DDS, RTPS, ROS 2 and
+//! teletraffic engineering; each is defined at the type of that name.
 
 mod control;
 mod drops;

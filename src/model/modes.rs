@@ -1,10 +1,10 @@
-//! Modes and states: what a lane does, what a subscriber is, how the bridge as a whole is.
+//! The class and mode of a lane, the state of a subscriber and the safety mode of the bridge.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// What a lane is for. It decides how a lane treats a sample, not how it is scheduled.
+/// The class of a lane: which samples it forwards, and when. It does not set how the process is scheduled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum TrafficClass {
     /// Every sample, at the publisher's rate, RELIABLE by default.
@@ -29,16 +29,16 @@ impl fmt::Display for TrafficClass {
     }
 }
 
-/// What a lane is told to do at present.
+/// The mode of a lane: how much it forwards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum LaneMode {
     /// The configured rate; 10 Hz by default on a noncritical lane.
     #[default]
     Normal = 0,
-    /// The reduced rate; 3 Hz by default. A critical lane makes no difference between this and normal.
+    /// The reduced rate; 3 Hz by default. A critical lane behaves as in normal mode.
     Degraded = 1,
-    /// A noncritical lane forwards nothing; a critical one goes on.
+    /// A noncritical lane forwards nothing; a critical one behaves as in normal mode.
     Suspended = 2,
     /// Nothing is forwarded on any lane (emergency).
     Stopped = 3,
@@ -58,7 +58,7 @@ impl LaneMode {
         }
     }
 
-    /// The mode of that numeric value, as shared memory carries it.
+    /// The mode with that number in shared memory; `None` for an undefined number.
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Normal),
@@ -76,7 +76,7 @@ impl fmt::Display for LaneMode {
     }
 }
 
-/// What the classifier makes of one subscriber.
+/// The classifier's state of one subscriber.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum SubscriberState {
@@ -101,7 +101,7 @@ impl SubscriberState {
 }
 
 impl SubscriberState {
-    /// The state of that numeric value, as shared memory carries it.
+    /// The state with that number in shared memory; `None` for an undefined number.
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Unknown),
@@ -118,7 +118,7 @@ impl fmt::Display for SubscriberState {
     }
 }
 
-/// How the bridge as a whole is.
+/// The safety supervisor's mode of the whole bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum SafetyMode {
@@ -143,7 +143,7 @@ impl SafetyMode {
 }
 
 impl SafetyMode {
-    /// The mode of that numeric value, as shared memory carries it.
+    /// The mode with that number in shared memory; `None` for an undefined number.
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Normal),
@@ -165,7 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lane_mode_survives_shared_memory() {
+    fn a_lane_mode_converts_to_its_number_and_back() {
         for mode in LaneMode::ALL {
             assert_eq!(LaneMode::from_u8(mode as u8), Some(mode));
         }

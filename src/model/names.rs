@@ -1,13 +1,13 @@
-//! Names that have been checked once and cannot be wrong afterwards.
+//! Names that are checked on construction: a value of these types is always valid.
 
 use std::fmt;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Why a string is not a name of the kind asked for.
+/// The error for a string that is not a valid name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NameError {
-    /// What the string was to be.
+    /// The kind of name, such as `lane name`.
     pub kind: &'static str,
     /// What is allowed, as a phrase that completes "must be …".
     pub allowed: &'static str,
@@ -21,7 +21,7 @@ impl fmt::Display for NameError {
 
 impl std::error::Error for NameError {}
 
-/// A type that is serialized as its text, and checked again when it is read.
+/// Serializes a type as its text, and checks the text when it deserializes it.
 macro_rules! text_in_serde {
     ($name:ident) => {
         impl Serialize for $name {
@@ -78,12 +78,12 @@ macro_rules! checked_name {
 }
 
 checked_name! {
-    /// A lane: `critical`, `noncritical`, `rviz`, … It becomes part of file names, unit names and node names.
+    /// The name of a lane: `critical`, `noncritical`, `rviz`, … It is part of file, unit and node names.
     LaneName, "lane name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", is_short_name
 }
 
 checked_name! {
-    /// One bridge among several on a host; the namespace of its shared memory.
+    /// The name of one bridge among several on a host; the namespace of its shared memory.
     InstanceName, "instance name",
     "1 to 24 characters of a-z, 0-9 and _, beginning with a letter",
     is_short_name
@@ -108,14 +108,14 @@ impl LaneName {
         Self("critical".to_owned())
     }
 
-    /// The name of the lane that noncritical subscribers are on unless the user says otherwise.
+    /// The name of the lane that noncritical subscribers are on unless the configuration names another.
     pub fn noncritical() -> Self {
         Self("noncritical".to_owned())
     }
 }
 
 impl TopicName {
-    /// The DDS topic that a ROS 2 topic is (REP 2009 prefix `rt`): `/scan` is `rt/scan`.
+    /// The DDS topic of a ROS 2 topic, with the prefix `rt` of REP 2009: `rt/scan` for `/scan`.
     pub fn to_dds(&self) -> String {
         format!("rt{}", self.0)
     }
@@ -132,12 +132,12 @@ impl TypeName {
     /// What is allowed, as a phrase that completes "must be …".
     pub const ALLOWED: &'static str = "package/msg/Name or package/Name, such as sensor_msgs/msg/LaserScan";
 
-    /// The type as DDS names it: `sensor_msgs::msg::dds_::LaserScan_`.
+    /// The DDS type name: `sensor_msgs::msg::dds_::LaserScan_`.
     pub fn to_dds(&self) -> String {
         format!("{}::msg::dds_::{}_", self.package, self.name)
     }
 
-    /// The ROS 2 type that a DDS type name stands for; `None` when it is not that of a ROS 2 message.
+    /// The ROS 2 type of a DDS type name; `None` when it is not that of a ROS 2 message.
     pub fn from_dds(dds: &str) -> Option<Self> {
         let (package, name) = dds.split_once("::msg::dds_::")?;
         Self::try_from(format!("{package}/msg/{}", name.strip_suffix('_')?).as_str()).ok()
@@ -185,7 +185,7 @@ fn is_token(text: &str) -> bool {
         && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// DDS limits a topic name to 255 characters; 246 leaves room for every prefix ROS 2 knows.
+/// DDS limits a topic name to 255 characters; 246 leaves room for every prefix that ROS 2 uses.
 fn is_topic_name(text: &str) -> bool {
     text.len() <= 246 && text.strip_prefix('/').is_some_and(|rest| rest.split('/').all(is_token))
 }
@@ -195,7 +195,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn topic_names_become_dds_names() {
+    fn topic_names_are_checked_and_converted_to_dds_names() {
         let topic = TopicName::try_from("/robot_1/scan").unwrap();
         assert_eq!(topic.to_dds(), "rt/robot_1/scan");
         for wrong in ["", "/", "scan", "/scan/", "//scan", "/2d", "/a b", "/~", "/{x}"] {
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn both_spellings_of_a_type_are_the_same_type() {
+    fn type_names_with_and_without_msg_are_equal() {
         let long = TypeName::try_from("sensor_msgs/msg/LaserScan").unwrap();
         assert_eq!(long, TypeName::try_from("sensor_msgs/LaserScan").unwrap());
         assert_eq!(long.to_dds(), "sensor_msgs::msg::dds_::LaserScan_");
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn lane_names_fit_into_file_names() {
+    fn lane_names_are_valid_in_file_names() {
         assert_eq!(LaneName::try_from("rviz_2").unwrap().as_str(), "rviz_2");
         for wrong in ["", "2d", "Rviz", "a-b", "a/b", "a_name_that_is_too_long_for_us"] {
             assert!(LaneName::try_from(wrong).is_err(), "{wrong:?}");

@@ -1,4 +1,4 @@
-//! Probes in words: what their ids may be, and why a probe message is refused.
+//! Valid ids in probe messages, and the reasons for which a probe message is refused.
 
 use std::fmt;
 
@@ -13,7 +13,8 @@ pub fn is_probe_id(text: &str) -> bool {
 
 macro_rules! probe_refusals {
     ($($(#[doc = $doc:literal])+ $variant:ident = $label:literal, $meaning:literal,)+) => {
-        /// Why a probe request or a response was refused. A refused message changes nothing but its count.
+        /// Why a probe request or a probe response was refused. A refused message is counted and has no other
+        /// effect.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[repr(u8)]
         pub enum ProbeRefusal {
@@ -27,14 +28,14 @@ macro_rules! probe_refusals {
             /// The number of reasons.
             pub const COUNT: usize = Self::ALL.len();
 
-            /// The name under which logs, `status` and metrics show it.
+            /// The label in logs, `status` and metrics.
             pub const fn label(self) -> &'static str {
                 match self {
                     $(Self::$variant => $label,)+
                 }
             }
 
-            /// What was wrong, and what to do about it, for people.
+            /// A text for users: what was wrong and, where there is one, the remedy.
             pub const fn meaning(self) -> &'static str {
                 match self {
                     $(Self::$variant => $meaning,)+
@@ -45,30 +46,30 @@ macro_rules! probe_refusals {
 }
 
 probe_refusals! {
-    /// Not a `std_msgs/String` of the JSON that the protocol asks for.
+    /// Not a `std_msgs/String` with the JSON that the protocol defines.
     Malformed = "malformed", "not a probe message; something else publishes on the topic",
     /// Larger than a probe message may be.
     Oversized = "oversized", "larger than 4 KiB; something else publishes on the topic",
     /// Of another version of the protocol.
     UnsupportedVersion = "unsupported_version", "not version 1 of the protocol; update the older side",
-    /// Without a signature where one is asked for.
+    /// Without a signature where one is required.
     Unsigned = "unsigned", "carries no nonce and hmac; give its sender the secret (security.enable_probe_hmac)",
     /// The signature is not that of the shared secret.
-    BadSignature = "bad_signature", "signed with another secret, or changed on its way",
-    /// Signed, and sent too long ago or too far ahead.
-    Expired = "expired", "its time is off by more than replay_window_ms; are the clocks in step?",
-    /// Signed, and seen before.
-    Replayed = "replayed", "seen before; somebody repeats recorded messages",
-    /// A response to no probe of ours.
+    BadSignature = "bad_signature", "signed with another secret, or changed in transit",
+    /// Signed, and its time is too far in the past or in the future.
+    Expired = "expired", "its time is off by more than replay_window_ms; are the clocks synchronized?",
+    /// Signed, and received before.
+    Replayed = "replayed", "received before; a program on the network repeats recorded messages",
+    /// A response to a probe that this bridge did not send.
     Unsolicited = "unsolicited", "answers no probe of this bridge",
-    /// A response to a probe that was given up already.
-    Late = "late", "came after timeout_ms, when its probe had been counted as lost",
-    /// More of one sender than `max_probe_rate_hz`, or more senders than are served.
+    /// A response to a probe that timed out.
+    Late = "late", "arrived after timeout_ms, when its probe had been counted as lost",
+    /// More messages of one sender than `max_probe_rate_hz`, or more senders than the process tracks.
     RateLimited = "rate_limited", "more than max_probe_rate_hz of one sender, or too many senders",
-    /// A response of one responder too many.
-    TooManySubscribers = "too_many_subscribers", "more responders than are followed",
-    /// A response of another responder than `classifier.subscriber_id`.
-    NotTheSubscriber = "not_the_subscriber", "not the one that classifier.subscriber_id names",
+    /// A response of a responder beyond the largest number that control follows.
+    TooManySubscribers = "too_many_subscribers", "more responders than the bridge follows",
+    /// A response of a responder other than `classifier.subscriber_id`.
+    NotTheSubscriber = "not_the_subscriber", "not the responder that classifier.subscriber_id names",
 }
 
 impl fmt::Display for ProbeRefusal {
@@ -77,8 +78,8 @@ impl fmt::Display for ProbeRefusal {
     }
 }
 
-/// How many messages were refused, for each reason. They may be read from shared memory, where any process of
-/// the user's could have written anything: no sum of them overflows.
+/// Counts of refused probe messages by reason. Sums saturate: the counts may come from shared memory, where
+/// any process of the same user could have written any number.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct RefusalCounts([u64; ProbeRefusal::COUNT]);
@@ -95,7 +96,7 @@ impl RefusalCounts {
         self.0[reason as usize]
     }
 
-    /// Counts all of `other` as well.
+    /// Adds the counts of `other`.
     pub fn merge(&mut self, other: &Self) {
         for (count, more) in self.0.iter_mut().zip(other.0) {
             *count = count.saturating_add(more);
@@ -107,7 +108,7 @@ impl RefusalCounts {
         self.0.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
-    /// What was counted since `earlier`, a former reading of the same counts.
+    /// The refusals since `earlier`, an earlier reading of the same counts.
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
         for (count, before) in difference.0.iter_mut().zip(earlier.0.iter()) {
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_add_up_and_never_overflow() {
+    fn counts_are_summed_by_reason_and_never_overflow() {
         let mut counts = RefusalCounts::default();
         counts.add(ProbeRefusal::Late);
         counts.add(ProbeRefusal::Malformed);

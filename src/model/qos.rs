@@ -1,4 +1,4 @@
-//! The DDS Quality of Service policies that a route can be given (DDS 1.4 clause 2.2.3).
+//! The DDS Quality of Service policies that the configuration can set for a route (DDS 1.4 clause 2.2.3).
 
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 pub enum Reliability {
     /// A lost sample stays lost.
     BestEffort,
-    /// A lost sample is repaired while the writer has it.
+    /// A lost sample is sent again while it is in the writer's history.
     Reliable,
 }
 
@@ -26,9 +26,9 @@ pub enum History {
 /// DURABILITY.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Durability {
-    /// A late joiner gets what is published from then on.
+    /// A late joiner receives what is published from then on.
     Volatile,
-    /// A late joiner also gets the writer's history.
+    /// A late joiner also receives the writer's history.
     TransientLocal,
 }
 

@@ -1,4 +1,4 @@
-//! How much of a route a noncritical lane forwards, and what gives way.
+//! The rate policy of a noncritical lane: how much of a route it forwards, and which samples it drops.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,7 +24,7 @@ impl LaneRates {
     }
 }
 
-/// The rate policy of a noncritical lane in one mode. It applies to each route of the lane by itself, but for
+/// The rate policy of a noncritical lane in one mode. It applies to each route of the lane separately, except
 /// `max_bytes_per_s`, which all routes of the lane share.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RatePolicy {
@@ -33,27 +33,27 @@ pub struct RatePolicy {
     pub max_rate_hz: f64,
     /// Payload bytes per second over all routes of the lane; `None` is unlimited.
     pub max_bytes_per_s: Option<u64>,
-    /// A sample older than this by its source timestamp is dropped; 0 never.
+    /// A sample whose age exceeds this is dropped as stale; 0 turns that off.
     pub stale_threshold_ms: u64,
-    /// What gives way when more samples wait than tokens come.
+    /// Which samples are dropped when more wait than the rate allows.
     pub drop_policy: DropPolicy,
-    /// Samples that may wait in the lane, for each route; at least 1.
+    /// The most samples of each route that wait in the lane; at least 1.
     pub queue_samples: usize,
 }
 
-/// What gives way when more samples wait than tokens come (`noncritical_drop_policy`).
+/// Which samples a noncritical lane drops when more wait than the rate allows (`noncritical_drop_policy`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum DropPolicy {
-    /// The freshest sample is sent; older ones that wait are superseded.
+    /// The newest sample is sent; older ones that wait are dropped as superseded.
     DropOldest,
-    /// The oldest sample is sent; a new one that finds the queue full is dropped.
+    /// The oldest sample is sent; a new one is dropped when the queue is full.
     DropLatest,
-    /// Stale samples are dropped, then the oldest fresh one is sent; the oldest gives way when the queue is
-    /// full.
+    /// Stale samples are dropped, then the oldest of the others is sent; when the queue is full, the oldest
+    /// one is dropped.
     DropStale,
 }
 
-/// A rate as text: that of a critical lane is infinite, which JSON has no number for.
+/// Serializes a rate as text: that of a critical lane is infinite, and JSON has no number for infinity.
 mod rate_as_text {
     use serde::de::Error;
     use serde::{Deserialize, Deserializer, Serializer};

@@ -1,4 +1,4 @@
-//! What travels beside a serialized sample from ingress to the lanes.
+//! The header that ingress passes to the lanes with each serialized sample.
 
 use std::fmt;
 
@@ -6,13 +6,13 @@ use super::time::{MonotonicNs, SourceTimestamp};
 
 /// The RTPS encapsulation header of a serialized payload (RTPS 2.5 clause 10.2): two bytes of representation
 /// identifier (CDR_LE, PL_CDR2_BE, …) and two bytes of options, whose two lowest bits count the padding bytes
-/// at the end (XTypes 1.3 clause 7.6.3.1.2). Forwarded as it came.
+/// at the end (XTypes 1.3 clause 7.6.3.1.2). Forwarded unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(transparent)]
 pub struct Encapsulation(pub [u8; 4]);
 
 impl Encapsulation {
-    /// Plain CDR, little endian, no options: what nearly all ROS 2 publishers send.
+    /// Plain CDR, little endian, no options: that of nearly all ROS 2 publishers.
     pub const CDR_LE: Self = Self([0, 1, 0, 0]);
 
     /// The representation identifier.
@@ -49,12 +49,12 @@ impl fmt::Display for Guid {
     }
 }
 
-/// The fixed header of one sample in shared memory.
+/// The header of one sample in shared memory, of fixed size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct SampleHeader {
-    /// The sample's number on its route, given by ingress: 1, 2, 3, … without a gap, also across restarts of
-    /// ingress. A gap that a lane sees is therefore a number of samples that the lane did not get.
+    /// The sample's number in its route. Ingress assigns 1, 2, 3, … without gaps, also across its restarts, so
+    /// that a gap which a lane finds is the number of samples that the lane did not receive.
     pub sequence: u64,
     /// The publisher's DDS source timestamp.
     pub source_timestamp: SourceTimestamp,
@@ -68,12 +68,12 @@ pub struct SampleHeader {
     pub writer_guid: Guid,
     /// How the payload is encoded.
     pub encapsulation: Encapsulation,
-    /// From when its age runs.
+    /// The instant from which its age is measured.
     pub age_basis: AgeBasis,
 }
 
 impl SampleHeader {
-    /// The source timestamp, if the age of the sample runs from it.
+    /// The source timestamp if the sample's age is measured from it, otherwise [`SourceTimestamp::NONE`].
     pub const fn age_source(&self) -> SourceTimestamp {
         match self.age_basis.late_ns() {
             Some(_) => SourceTimestamp::NONE,
@@ -81,7 +81,7 @@ impl SampleHeader {
         }
     }
 
-    /// The instant from which the age of the sample runs where it does not run from a source timestamp.
+    /// The instant from which the sample's age is measured when it is not measured from a source timestamp.
     pub const fn age_from(&self) -> MonotonicNs {
         match self.age_basis.late_ns() {
             Some(late_ns) => MonotonicNs(self.taken_at.0.saturating_sub(late_ns)),
@@ -90,8 +90,8 @@ impl SampleHeader {
     }
 }
 
-/// From when the age of a sample runs: from its source timestamp, or, where the publisher's clock disagrees
-/// with ours, from its arrival less the time by which it was later than the publisher's promptest samples.
+/// The instant from which a sample's age is measured: its source timestamp; or, when the publisher's clock
+/// disagrees with this host's, its arrival less its delay beyond the publisher's fastest samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(transparent)]
 pub struct AgeBasis(u32);
@@ -106,7 +106,7 @@ impl AgeBasis {
         Self(if late_us >= u32::MAX as u64 { u32::MAX } else { late_us as u32 + 1 })
     }
 
-    /// How late the sample was on its arrival; `None` when its age runs from the source timestamp.
+    /// The age of the sample on its arrival; `None` when its age is measured from the source timestamp.
     pub const fn late_ns(self) -> Option<u64> {
         match self.0 {
             0 => None,
@@ -114,12 +114,12 @@ impl AgeBasis {
         }
     }
 
-    /// As shared memory carries it.
+    /// The encoding in shared memory.
     pub const fn bits(self) -> u32 {
         self.0
     }
 
-    /// The basis as shared memory carries it.
+    /// The basis with this encoding in shared memory.
     pub const fn from_bits(bits: u32) -> Self {
         Self(bits)
     }

@@ -1,26 +1,27 @@
-//! What the control plane's decisions go by: thresholds and counts, as the configuration has them.
+//! Configured thresholds and counts for the decisions of the control process.
 
 use serde::{Deserialize, Serialize};
 
-/// The two sets of thresholds of the classifier (paper, section III-C), with a gap between them.
+/// The thresholds of the classifier (paper, section III-C): one set for demotion and one for promotion, with a
+/// gap between them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClassifierThresholds {
-    /// Loss, 0 to 1, above which a reading speaks for demotion.
+    /// Loss, 0 to 1, above which a reading calls for demotion.
     pub demote_loss: f64,
-    /// Loss, 0 to 1, below which a reading speaks for promotion.
+    /// Loss, 0 to 1, below which a reading calls for promotion.
     pub promote_loss: f64,
-    /// Mean RTT above which a reading speaks for demotion.
+    /// Mean RTT above which a reading calls for demotion.
     pub demote_rtt_ms: f64,
-    /// Mean RTT below which a reading speaks for promotion.
+    /// Mean RTT below which a reading calls for promotion.
     pub promote_rtt_ms: f64,
-    /// Consecutive readings that it takes; 0 counts as 1.
+    /// Consecutive readings required for a change; 0 counts as 1.
     pub hysteresis_count: u32,
-    /// Whether UNKNOWN is a state of its own; otherwise it is shown and treated as CRITICAL.
+    /// Whether UNKNOWN is a separate state; otherwise it is shown and treated as CRITICAL.
     pub allow_unknown_state: bool,
 }
 
 impl Default for ClassifierThresholds {
-    /// Those of the paper.
+    /// The values of the paper.
     fn default() -> Self {
         Self {
             demote_loss: 0.015,
@@ -33,38 +34,38 @@ impl Default for ClassifierThresholds {
     }
 }
 
-/// What the safety supervisor goes by (paper, section III-E). The paper gives no numbers: the defaults are
-/// ours, and `policy::SafetySupervisor` says why.
+/// The thresholds and counts of the safety supervisor (paper, section III-E). The paper gives no numbers;
+/// `policy::SafetySupervisor` explains these defaults.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SafetyRules {
-    /// Whether the critical path is preserved in DEGRADED; otherwise it stops there too, unless the trouble
-    /// is of noncritical lanes alone.
+    /// Whether critical lanes forward in DEGRADED; otherwise DEGRADED stops them too, unless only noncritical
+    /// lanes have trouble.
     pub preserve_critical_path: bool,
-    /// Whether noncritical lanes may be degraded or suspended at all; EMERGENCY stops them all the same.
+    /// Whether noncritical lanes may be degraded or suspended; EMERGENCY stops them in any case.
     pub allow_noncritical_degrade: bool,
-    /// More samples than these waiting in a noncritical lane count as an overflowing queue.
+    /// More samples than this waiting in a noncritical lane count as an overflowing queue.
     pub max_noncritical_queue: usize,
-    /// Whether overload takes the noncritical lanes first: EMERGENCY is then entered from DEGRADED only.
+    /// Whether overload stops the noncritical lanes first: EMERGENCY is then entered from DEGRADED only.
     pub overload_drop_noncritical_first: bool,
-    /// p99 lag at which a reading speaks for DEGRADED.
+    /// p99 lag from which a reading calls for DEGRADED.
     pub degraded_lag_ms: f64,
-    /// p99 lag at which a reading speaks for EMERGENCY.
+    /// p99 lag from which a reading calls for EMERGENCY.
     pub emergency_lag_ms: f64,
-    /// Share of a critical lane's queue, 0 to 1, at which a reading speaks for DEGRADED.
+    /// Occupancy of a critical lane's queue, 0 to 1, from which a reading calls for DEGRADED.
     pub degraded_queue_occupancy: f64,
-    /// Share of a critical lane's queue, 0 to 1, at which a reading speaks for EMERGENCY.
+    /// Occupancy of a critical lane's queue, 0 to 1, from which a reading calls for EMERGENCY.
     pub emergency_queue_occupancy: f64,
-    /// Errors per second of one process at which a reading speaks for DEGRADED.
+    /// Errors per second of one process from which a reading calls for DEGRADED.
     pub degraded_errors_per_s: f64,
-    /// Errors per second of one process at which a reading speaks for EMERGENCY.
+    /// Errors per second of one process from which a reading calls for EMERGENCY.
     pub emergency_errors_per_s: f64,
-    /// A process that has not turned for so long is silent.
+    /// Time without a turn from which a process counts as silent.
     pub silent_ms: u64,
-    /// Silence of a process on the critical path that speaks for EMERGENCY; 0 never does.
+    /// Silence of a process on the critical path that calls for EMERGENCY; 0 turns that off.
     pub emergency_silent_ms: u64,
-    /// Consecutive readings that the way up takes; 0 counts as 1.
+    /// Consecutive readings required to enter DEGRADED, and again to enter EMERGENCY; 0 counts as 1.
     pub hysteresis_count: u32,
-    /// Consecutive readings that each step of the way back takes; 0 counts as 1.
+    /// Consecutive readings required for each step back to NORMAL; 0 counts as 1.
     pub recovery_count: u32,
 }
 

@@ -1,9 +1,9 @@
-//! Instants. Three clocks are in play and none may be mistaken for another, so each has a type.
+//! Instants, with one type for each of the three clocks, so that they cannot be confused.
 
 /// An instant of `CLOCK_MONOTONIC`, in nanoseconds.
 ///
-/// It can cross shared memory, be written as a literal in a test and be replayed, unlike
-/// [`std::time::Instant`]. It is comparable between the processes of one host, and of one boot, only.
+/// Unlike [`std::time::Instant`] it can be stored in shared memory and written as a literal in a test. It is
+/// comparable only between processes of one host since one boot.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(transparent)]
 pub struct MonotonicNs(pub u64);
@@ -40,13 +40,13 @@ impl WallNs {
 /// A DDS source timestamp exactly as RTPS carries it (`Time_t`, RTPS 2.5 clause 9.3.2.1): whole seconds of
 /// the Unix epoch in the upper 32 bits and 2⁻³² fractions of a second in the lower ones.
 ///
-/// Kept in this form and not in nanoseconds so that what leaves is bit for bit what came in.
+/// Kept in this form and not in nanoseconds, so that the timestamp is forwarded bit for bit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(transparent)]
 pub struct SourceTimestamp(pub u64);
 
 impl SourceTimestamp {
-    /// The sample came without a source timestamp (`TIME_INVALID` or no `INFO_TS` submessage).
+    /// No source timestamp (`TIME_INVALID` or no `INFO_TS` submessage).
     pub const NONE: Self = Self(0);
 
     /// The instant as nanoseconds since the Unix epoch, rounded down; `None` for [`Self::NONE`].
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_timestamp_survives_the_round_trip_through_nanoseconds() {
+    fn a_source_timestamp_converts_to_nanoseconds_and_back_exactly() {
         for nanos in [0, 1, 2, 499_999_999, 500_000_000, 999_999_998, 999_999_999] {
             let wall = WallNs(1_763_000_000_000_000_000 + nanos);
             assert_eq!(SourceTimestamp::from_wall(wall).to_wall(), Some(wall));
