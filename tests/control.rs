@@ -518,9 +518,9 @@ fn remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once() {
     // They stay for a while, and announce themselves again and again.
     std::thread::sleep(Duration::from_secs(5));
     for (who, topic) in [
-        ("a reader of no known node", "/scan itself"),
-        ("node /fleet/rviz", "/scan itself"),
-        ("a reader of no known node", "/adaptive_bridge/critical/scan"),
+        ("a reader without a known node", "/scan directly"),
+        ("node /fleet/rviz", "/scan directly"),
+        ("a reader without a known node", "/adaptive_bridge/critical/scan"),
     ] {
         let text = format!("{who} on host {address} subscribes to {topic}");
         let said = scene.said(&text);

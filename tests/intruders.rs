@@ -232,7 +232,7 @@ fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
         let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
         told += 1;
         assert_eq!(intruder.node, None);
-        assert!(intruder.to_string().contains("a reader of no known node"), "{intruder}");
+        assert!(intruder.to_string().contains("a reader without a known node"), "{intruder}");
         peer.signal(Signal::SIGKILL);
         peer.wait();
         assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == intruder.reader));

@@ -1,4 +1,4 @@
-//! Network interfaces and peers on other hosts that are away: which, since when, and when they came back.
+//! Detects network interfaces and peers on other hosts that are away, and records when they come back.
 
 // Addresses only: `core::net` has no sockets.
 use core::net::{IpAddr, Ipv4Addr};
@@ -6,27 +6,27 @@ use std::collections::VecDeque;
 
 use crate::model::{AbsenceKind, Guid, MonotonicNs};
 
-/// An absence is remembered for so long: after its end, and from its beginning where nothing says that the
-/// interface or peer is still wanted. Longer than a robot drives through a gap in its Wi-Fi.
+/// How long an absence is kept after its end; or, unless the interface is configured, after its beginning.
+/// Longer than a robot takes to cross a gap in its Wi-Fi.
 pub const REMEMBER_ABSENCE_MS: u64 = 900_000;
 
-/// Participants on other hosts that are watched; of further ones nothing is said.
+/// The most participants on other hosts that are watched; further ones are ignored.
 pub const MAX_WATCHED_PEERS: usize = 128;
 
-/// Readers and writers of one participant that are remembered.
+/// The most readers and writers of one participant that are recorded.
 const MAX_PEER_ENDPOINTS: usize = 32;
 
-/// Interfaces that are watched beside the configured ones.
+/// The most interfaces that are watched in addition to the configured ones.
 const MAX_FOUND_INTERFACES: usize = 16;
 
-/// An IPv4 address of a network interface of this host, or an interface that has none.
+/// A network interface of this host with one of its IPv4 addresses, or without any.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HostInterface {
     /// Its name, such as `wlan0`.
     pub name: String,
     /// The address and its network mask.
     pub address: Option<(Ipv4Addr, Ipv4Addr)>,
-    /// Whether it is up and has a carrier, or is associated.
+    /// Whether it is up and has a carrier, or is associated with an access point.
     pub has_link: bool,
 }
 
@@ -37,29 +37,29 @@ impl HostInterface {
     }
 }
 
-/// An interface or a peer that is or was away.
+/// The absence of an interface or a peer, current or past.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Absence {
-    /// Which of the two.
+    /// Whether it is an interface or a peer.
     pub kind: AbsenceKind,
-    /// The interface as configured; or the node, empty where it is not known.
+    /// The interface as configured, or the peer's node; empty when the node is not known.
     pub name: String,
-    /// The address that the interface had; or that of the peer's host.
+    /// The last address of the interface, or that of the peer's host.
     pub host: Option<IpAddr>,
-    /// What is wrong with the interface; or what the peer subscribes to and publishes.
+    /// What the interface lacks, or what the peer subscribes to and publishes.
     pub detail: String,
-    /// Since when it is away.
+    /// When the absence began.
     pub since: MonotonicNs,
-    /// When it came back.
+    /// When the interface or peer came back; `None` while it is away.
     pub back_at: Option<MonotonicNs>,
 }
 
-/// A change that the log should have.
+/// A change to log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum AbsenceEvent {
-    /// It is away.
+    /// The interface or peer is away.
     Away(Absence),
-    /// It came back.
+    /// The interface or peer came back.
     Back(Absence),
 }
 
@@ -71,7 +71,7 @@ enum Presence {
 }
 
 impl Presence {
-    /// When it was away, and when it came back.
+    /// When the absence began, and when it ended.
     fn absence(self) -> Option<(MonotonicNs, Option<MonotonicNs>)> {
         match self {
             Self::Present => None,
@@ -87,7 +87,7 @@ impl Presence {
 
 #[derive(Clone, Debug)]
 struct Interface {
-    /// Its name, or an address where one is configured.
+    /// Its name, or its address if the configuration has that.
     name: String,
     is_configured: bool,
     address: Option<Ipv4Addr>,
@@ -129,11 +129,11 @@ struct Peer {
 impl Peer {
     fn absence(&self) -> Option<Absence> {
         let (since, back_at) = self.presence.absence()?;
-        let of = |publishes: bool| {
+        let topics = |publishes: bool| {
             let topics = self.endpoints.iter().filter(move |endpoint| endpoint.publishes == publishes);
             topics.map(|endpoint| endpoint.topic.as_str()).collect::<Vec<_>>().join(", ")
         };
-        let parts = [("subscribes to ", of(false)), ("publishes ", of(true))];
+        let parts = [("subscribes to ", topics(false)), ("publishes ", topics(true))];
         let parts = parts.iter().filter(|(_, topics)| !topics.is_empty());
         let detail: Vec<String> = parts.map(|(verb, topics)| format!("{verb}{topics}")).collect();
         Some(Absence {
@@ -147,8 +147,8 @@ impl Peer {
     }
 }
 
-/// Watches the interfaces that are configured, those by which peers were reached, and the peers. Memory is
-/// bounded whatever the network says.
+/// Watches the configured interfaces, the interfaces by which peers were reached, and the peers. Memory is
+/// bounded, whatever the network announces.
 #[derive(Clone, Debug, Default)]
 pub struct AbsenceWatch {
     interfaces: Vec<Interface>,
@@ -157,7 +157,7 @@ pub struct AbsenceWatch {
 }
 
 impl AbsenceWatch {
-    /// Watches these interfaces, by name or address, and those by which peers are reached.
+    /// Watches the configured interfaces, given by name or address, and those by which peers are reached.
     pub fn new(configured: impl IntoIterator<Item = String>) -> Self {
         let mut watch = Self::default();
         for name in configured {
@@ -174,31 +174,30 @@ impl AbsenceWatch {
         watch
     }
 
-    /// Takes in the interfaces that this host has now, and forgets what is long past.
+    /// Compares with the interfaces that this host has now, and removes expired absences.
     pub fn look(&mut self, present: &[HostInterface], now: MonotonicNs) {
-        let is_past = |presence: Presence, is_wanted: bool| match presence {
+        let is_expired = |presence: Presence, is_configured: bool| match presence {
             Presence::Present => false,
-            Presence::Away { since } => !is_wanted && now >= since.plus_ms(REMEMBER_ABSENCE_MS),
+            Presence::Away { since } => !is_configured && now >= since.plus_ms(REMEMBER_ABSENCE_MS),
             Presence::Back { at, .. } => now >= at.plus_ms(REMEMBER_ABSENCE_MS),
         };
         self.interfaces.retain(|interface| {
-            interface.is_configured || !is_past(interface.presence, interface.is_configured)
+            interface.is_configured || !is_expired(interface.presence, interface.is_configured)
         });
         for interface in &mut self.interfaces {
-            if is_past(interface.presence, interface.is_configured) {
+            if is_expired(interface.presence, interface.is_configured) {
                 interface.presence = Presence::Present;
             }
         }
-        self.peers.retain(|peer| !(peer.presence.is_away() && is_past(peer.presence, false)));
+        self.peers.retain(|peer| !(peer.presence.is_away() && is_expired(peer.presence, false)));
         for peer in &mut self.peers {
-            if is_past(peer.presence, false) {
+            if is_expired(peer.presence, false) {
                 peer.presence = Presence::Present;
             }
         }
         self.find_interfaces(present);
         for interface in &mut self.interfaces {
-            let trouble = trouble(&interface.name, present);
-            match (trouble, interface.presence) {
+            match (usable_address(&interface.name, present), interface.presence) {
                 (Ok(address), presence) => {
                     interface.address = Some(address);
                     if let Presence::Away { since } = presence {
@@ -216,7 +215,7 @@ impl AbsenceWatch {
         }
     }
 
-    /// Watches interfaces by which a peer is reached. Others come and go with containers and tunnels.
+    /// Adds the interfaces by which a peer is reached. Others appear and disappear with containers and tunnels.
     fn find_interfaces(&mut self, present: &[HostInterface]) {
         for found in present.iter().filter(|found| found.has_link) {
             let Some((address, _)) = found.address else { continue };
@@ -240,8 +239,8 @@ impl AbsenceWatch {
         }
     }
 
-    /// Discovery sees a reader or writer, new or changed, of a participant on another host, in the network of
-    /// that number.
+    /// Records a reader or writer, new or changed, that discovery found on another host in network number
+    /// `network`.
     pub fn found(
         &mut self,
         network: usize,
@@ -252,11 +251,11 @@ impl AbsenceWatch {
         now: MonotonicNs,
     ) {
         let prefix = guid.prefix();
-        let is_it = |peer: &Peer| peer.network == network && peer.prefix == prefix;
-        let place = match self.peers.iter().position(is_it) {
-            Some(place) => place,
+        let is_same = |peer: &Peer| peer.network == network && peer.prefix == prefix;
+        let index = match self.peers.iter().position(is_same) {
+            Some(index) => index,
             None => {
-                // A program that was started again in the place of one that is away.
+                // A restarted program replaces a peer that is away if one of its topics is the same.
                 let is_replaced = |peer: &Peer| {
                     let has =
                         |endpoint: &Endpoint| endpoint.topic == topic && endpoint.publishes == publishes;
@@ -266,11 +265,11 @@ impl AbsenceWatch {
                         && peer.endpoints.iter().any(has)
                 };
                 match self.peers.iter().position(is_replaced) {
-                    Some(place) => {
-                        let peer = &mut self.peers[place];
+                    Some(index) => {
+                        let peer = &mut self.peers[index];
                         peer.prefix = prefix;
                         peer.endpoints.clear();
-                        place
+                        index
                     }
                     None if self.peers.len() == MAX_WATCHED_PEERS => return,
                     None => {
@@ -287,7 +286,7 @@ impl AbsenceWatch {
                 }
             }
         };
-        let peer = &mut self.peers[place];
+        let peer = &mut self.peers[index];
         peer.host = host;
         if !peer.endpoints.iter().any(|endpoint| endpoint.guid == guid)
             && peer.endpoints.len() < MAX_PEER_ENDPOINTS
@@ -300,7 +299,7 @@ impl AbsenceWatch {
         }
     }
 
-    /// A reader or writer said goodbye.
+    /// Removes a reader or writer that was deleted in order.
     pub fn gone(&mut self, guid: Guid) {
         for peer in &mut self.peers {
             peer.endpoints.retain(|endpoint| endpoint.guid != guid);
@@ -308,7 +307,7 @@ impl AbsenceWatch {
         self.peers.retain(|peer| !peer.endpoints.is_empty());
     }
 
-    /// A participant said goodbye, or has been silent for so long that its lease has ended.
+    /// Removes a participant that left in order, or marks one as away whose lease expired after `silent_ms`.
     pub fn participant_gone(
         &mut self,
         network: usize,
@@ -316,9 +315,9 @@ impl AbsenceWatch {
         silent_ms: Option<u64>,
         now: MonotonicNs,
     ) {
-        let is_it = |peer: &Peer| peer.network == network && peer.prefix == prefix;
-        let Some(silent_ms) = silent_ms else { return self.peers.retain(|peer| !is_it(peer)) };
-        if let Some(peer) = self.peers.iter_mut().find(|peer| is_it(peer))
+        let is_same = |peer: &Peer| peer.network == network && peer.prefix == prefix;
+        let Some(silent_ms) = silent_ms else { return self.peers.retain(|peer| !is_same(peer)) };
+        if let Some(peer) = self.peers.iter_mut().find(|peer| is_same(peer))
             && !peer.presence.is_away()
         {
             let silent_ns = silent_ms.saturating_mul(1_000_000);
@@ -327,7 +326,7 @@ impl AbsenceWatch {
         }
     }
 
-    /// Asks for the nodes of peers in that network.
+    /// Updates the nodes of the peers in a network; `node_of` returns the node of a reader or writer.
     pub fn name_nodes<'graph>(&mut self, network: usize, node_of: impl Fn(Guid) -> Option<&'graph str>) {
         let peers = self.peers.iter_mut().filter(|peer| peer.network == network && !peer.presence.is_away());
         for peer in peers {
@@ -343,7 +342,7 @@ impl AbsenceWatch {
         self.events.pop_front()
     }
 
-    /// What is away, interfaces first, then what has come back.
+    /// All absences: current ones first, then past ones, each with interfaces before peers.
     pub fn absences(&self) -> Vec<Absence> {
         let interfaces = self.interfaces.iter().filter_map(Interface::absence);
         let mut all: Vec<Absence> = interfaces.chain(self.peers.iter().filter_map(Peer::absence)).collect();
@@ -352,16 +351,16 @@ impl AbsenceWatch {
     }
 }
 
-/// The address of the interface, or what keeps it from being used.
-fn trouble(name: &str, present: &[HostInterface]) -> Result<Ipv4Addr, &'static str> {
+/// The address of an interface, given by name or address, or why it cannot be used.
+fn usable_address(name: &str, present: &[HostInterface]) -> Result<Ipv4Addr, &'static str> {
     let by_address: Option<Ipv4Addr> = name.parse().ok();
-    let is_it = |found: &&HostInterface| match by_address {
+    let is_same = |found: &&HostInterface| match by_address {
         Some(address) => found.address.is_some_and(|(own, _)| own == address),
         None => found.name == name,
     };
     let mut detail =
         if by_address.is_some() { "is the address of no interface" } else { "is not on this host" };
-    for found in present.iter().filter(is_it) {
+    for found in present.iter().filter(is_same) {
         match found.address {
             Some((address, _)) if found.has_link => return Ok(address),
             Some(_) => detail = "has no link",
@@ -395,8 +394,8 @@ mod tests {
 
     const LAPTOP: IpAddr = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 4));
 
-    /// What is away, and what came back.
-    fn said(watch: &AbsenceWatch) -> Vec<String> {
+    /// All absences as text.
+    fn absences(watch: &AbsenceWatch) -> Vec<String> {
         let line = |absence: Absence| {
             let state = if absence.back_at.is_some() { "back" } else { "away" };
             format!("{state} {} {}", absence.name, absence.detail)
@@ -410,29 +409,29 @@ mod tests {
         let lo = interface("lo", Some([127, 0, 0, 1]), true);
         watch.look(std::slice::from_ref(&lo), at(0));
         assert_eq!(
-            said(&watch),
+            absences(&watch),
             ["away wlan0 is not on this host", "away 10.0.0.9 is the address of no interface"]
         );
         assert!(matches!(watch.poll(), Some(AbsenceEvent::Away(absence)) if absence.name == "wlan0"));
         let other = interface("eth0", Some([10, 0, 0, 9]), true);
         watch.look(&[lo.clone(), other.clone(), interface("wlan0", None, true)], at(1_000));
         assert_eq!(
-            said(&watch),
+            absences(&watch),
             ["away wlan0 has no IPv4 address", "back 10.0.0.9 is the address of no interface"]
         );
         let wlan = |has_link| interface("wlan0", Some([10, 0, 1, 2]), has_link);
         watch.look(&[lo.clone(), other.clone(), wlan(false)], at(2_000));
-        assert_eq!(said(&watch)[0], "away wlan0 has no link");
+        assert_eq!(absences(&watch)[0], "away wlan0 has no link");
         watch.look(&[lo.clone(), other.clone(), wlan(true)], at(3_000));
         let back = &watch.absences()[0];
         assert_eq!((back.since, back.back_at), (at(0), Some(at(3_000))));
         assert_eq!(back.host, Some(IpAddr::V4(Ipv4Addr::new(10, 0, 1, 2))));
         watch.look(&[lo, other, wlan(true)], at(3_000 + REMEMBER_ABSENCE_MS));
-        assert_eq!(said(&watch), [""; 0], "forgotten");
+        assert_eq!(absences(&watch), [""; 0], "expired");
     }
 
     #[test]
-    fn without_configured_interfaces_those_with_peers_behind_them_count() {
+    fn without_configured_interfaces_those_that_reach_peers_are_watched() {
         let mut watch = AbsenceWatch::new([]);
         let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);
         let docker = |has_link| interface("docker0", Some([172, 17, 0, 1]), has_link);
@@ -440,13 +439,13 @@ mod tests {
         watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
         watch.look(&[eth(true), docker(true)], at(1_000));
         watch.look(&[eth(false), docker(false)], at(2_000));
-        assert_eq!(said(&watch), ["away eth0 has no link"]);
+        assert_eq!(absences(&watch), ["away eth0 has no link"]);
         watch.look(&[], at(2_000 + REMEMBER_ABSENCE_MS));
-        assert_eq!(said(&watch), [""; 0], "an interface that is not configured is forgotten");
+        assert_eq!(absences(&watch), [""; 0], "an interface that is not configured expires");
     }
 
     #[test]
-    fn a_peer_is_away_when_it_is_silent_and_not_when_it_said_goodbye() {
+    fn a_peer_is_away_when_its_lease_expires_and_not_when_it_leaves_in_order() {
         let mut watch = AbsenceWatch::new([]);
         watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
         watch.found(0, guid(1, 3), "/odom", true, LAPTOP, at(0));
@@ -457,18 +456,18 @@ mod tests {
         watch.gone(guid(3, 4));
         watch.participant_gone(0, [3; 12], Some(10_000), at(20_000));
         watch.participant_gone(1, [1; 12], Some(10_000), at(20_000));
-        assert_eq!(said(&watch), [""; 0]);
+        assert_eq!(absences(&watch), [""; 0]);
         watch.participant_gone(0, [1; 12], Some(10_000), at(20_000));
-        assert_eq!(said(&watch), ["away /rviz subscribes to /scan and publishes /odom"]);
+        assert_eq!(absences(&watch), ["away /rviz subscribes to /scan and publishes /odom"]);
         assert_eq!(watch.absences()[0].since, at(10_000));
         watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(25_000));
-        assert_eq!(said(&watch), ["back /rviz subscribes to /scan and publishes /odom"]);
+        assert_eq!(absences(&watch), ["back /rviz subscribes to /scan and publishes /odom"]);
         let events: Vec<_> = std::iter::from_fn(|| watch.poll()).collect();
         assert!(matches!(&events[..], [AbsenceEvent::Away(_), AbsenceEvent::Back(_)]), "{events:?}");
     }
 
     #[test]
-    fn a_program_that_is_started_again_is_back_and_one_that_is_not_is_forgotten() {
+    fn a_restarted_program_is_back_and_one_that_is_not_restarted_expires() {
         let mut watch = AbsenceWatch::new([]);
         for participant in [1, 2] {
             watch.found(0, guid(participant, 4), "/scan", false, LAPTOP, at(0));
@@ -477,9 +476,9 @@ mod tests {
             watch.participant_gone(0, [participant; 12], Some(10_000), at(20_000));
         }
         watch.found(0, guid(3, 4), "/scan", false, LAPTOP, at(30_000));
-        assert_eq!(said(&watch), ["away  subscribes to /scan", "back  subscribes to /scan"]);
+        assert_eq!(absences(&watch), ["away  subscribes to /scan", "back  subscribes to /scan"]);
         watch.look(&[], at(20_000 + REMEMBER_ABSENCE_MS));
-        assert_eq!(said(&watch), ["back  subscribes to /scan"]);
+        assert_eq!(absences(&watch), ["back  subscribes to /scan"]);
     }
 
     #[test]

@@ -1,25 +1,24 @@
-//! The state of one subscriber: two sets of thresholds, and hysteresis (paper, section III-C).
+//! The classifier of one subscriber: two sets of thresholds, and hysteresis (paper, section III-C).
 
 use super::probe_window::LinkReading;
 use crate::model::{ClassifierThresholds, MonotonicNs, SubscriberState};
 
-/// Settled probes below which a reading says too little: 2 s of probes at 5 Hz. The loss thresholds are far
-/// below what so few can resolve, but the paper's bias is to react to a single loss; what the minimum keeps
-/// out are the first moments, when one slow answer is the whole mean. A window that holds fewer is enough
-/// when it is full.
+/// The settled probes that a reading needs: 2 s of probes at 5 Hz. So few probes cannot resolve the loss
+/// thresholds, but the paper's policy is to react to a single loss; the minimum excludes the first moments,
+/// when a single slow response is the whole mean. A window of fewer probes is sufficient when it is full.
 pub const MIN_SETTLED: usize = 10;
 
-/// A subscriber that the configuration doesn't list is forgotten after so long a silence: a laptop that was
-/// closed should not keep its lane degraded. A minute is longer than any fade or restart that it comes back
-/// from, and until then silence is loss. A listed one stays, silent or not.
+/// The silence after which control removes a subscriber that the configuration does not list, so that a laptop
+/// that was closed does not keep its lane degraded. A minute is longer than a fade of the link or a restart of
+/// the subscriber takes; until then, unanswered probes count as lost. A listed subscriber is never removed.
 pub const FORGET_UNLISTED_MS: u64 = 60_000;
 
-/// Why a subscriber changed its state.
+/// Why the state of a subscriber changed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TransitionReason {
-    /// Forced by hand.
+    /// The configuration forces the state.
     Override,
-    /// So many consecutive readings beyond a threshold of demotion; this is the last.
+    /// `hysteresis_count` consecutive readings were beyond a threshold of demotion.
     Demoted {
         /// The last of the readings.
         reading: LinkReading,
@@ -28,12 +27,12 @@ pub enum TransitionReason {
         /// Whether its mean RTT is beyond the threshold.
         by_rtt: bool,
     },
-    /// So many consecutive readings within both thresholds of promotion; this is the last.
+    /// `hysteresis_count` consecutive readings were within both thresholds of promotion.
     Promoted {
         /// The last of the readings.
         reading: LinkReading,
     },
-    /// Subscribers are not classified any more.
+    /// The classifier was turned off.
     Unclassified,
 }
 
@@ -51,18 +50,18 @@ impl TransitionReason {
     }
 }
 
-/// A change of state, as it is shown.
+/// A change of a subscriber's state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// The former state.
     pub from: SubscriberState,
     /// The new one.
     pub to: SubscriberState,
-    /// What decided.
+    /// Why it changed.
     pub reason: TransitionReason,
 }
 
-/// What one reading speaks for.
+/// The change that one reading calls for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Verdict {
     Demotion {
@@ -70,21 +69,22 @@ enum Verdict {
         by_rtt: bool,
     },
     Promotion,
-    /// Between the thresholds, or too little data.
+    /// The reading is between the thresholds, or has too little data.
     Neither,
 }
 
 /// The classifier of one subscriber.
 ///
-/// - UNKNOWN until there is enough data; the same crossings then lead to CRITICAL or to NONCRITICAL. A
-///   subscriber never heard has no data and stays UNKNOWN, which lane modes count as healthy.
-/// - A change takes `hysteresis_count` consecutive readings that cross; one in between resets the count.
-/// - A state forced by hand goes before everything and applies at once. When it ends, the classifier goes on
-///   from that state.
-/// - Where UNKNOWN is not allowed it is shown, and counts, as CRITICAL.
+/// - The state is UNKNOWN until there is enough data; then the same thresholds lead to CRITICAL or NONCRITICAL.
+///   A subscriber that never responded has no data and stays UNKNOWN, which lane modes count as healthy.
+/// - A change requires `hysteresis_count` consecutive readings beyond the thresholds; any other reading resets
+///   the count.
+/// - A forced state takes precedence over readings and applies immediately. When it ends, the classifier
+///   continues from that state.
+/// - Where UNKNOWN is not allowed, it is shown and treated as CRITICAL.
 ///
-/// One call of [`evaluate`](Self::evaluate) is one evaluation. A caller that was stopped doesn't make up for
-/// the evaluations that it missed: they would all see the same reading.
+/// One call of [`evaluate`](Self::evaluate) is one evaluation. A caller that was stopped does not repeat missed
+/// evaluations: they would all use the same reading.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SubscriberClassifier {
     state: SubscriberState,
@@ -95,12 +95,12 @@ pub struct SubscriberClassifier {
 }
 
 impl SubscriberClassifier {
-    /// A new subscriber: UNKNOWN.
+    /// The classifier of a new subscriber, in state UNKNOWN.
     pub const fn new() -> Self {
         Self { state: SubscriberState::Unknown, forced: false, demotions: 0, promotions: 0, transitions: 0 }
     }
 
-    /// The state, as it is shown and treated.
+    /// The state as shown and treated: CRITICAL instead of UNKNOWN where UNKNOWN is not allowed.
     pub const fn state(&self, thresholds: &ClassifierThresholds) -> SubscriberState {
         match self.state {
             SubscriberState::Unknown if !thresholds.allow_unknown_state => SubscriberState::Critical,
@@ -108,17 +108,17 @@ impl SubscriberClassifier {
         }
     }
 
-    /// Whether the state is forced by hand, as of the last evaluation.
+    /// Whether the state was forced at the last evaluation.
     pub const fn is_forced(&self) -> bool {
         self.forced
     }
 
-    /// Changes of the shown state so far, those by hand included.
+    /// Changes of the shown state so far, including those to a forced state.
     pub const fn transitions(&self) -> u64 {
         self.transitions
     }
 
-    /// One evaluation. `forced` is the state that is set by hand, if any.
+    /// Evaluates one reading. `forced` is the state that the configuration forces, if any.
     pub fn evaluate(
         &mut self,
         reading: &LinkReading,
@@ -159,8 +159,8 @@ impl SubscriberClassifier {
         }
     }
 
-    /// Nobody classifies this subscriber, and nothing is forced: whatever was found or forced before is no
-    /// longer looked after, so that it is UNKNOWN again.
+    /// Resets the state to UNKNOWN, because the classifier is off and no state is forced: the last state would
+    /// become outdated.
     pub fn unclassified(&mut self, thresholds: &ClassifierThresholds) -> Option<Transition> {
         self.forced = false;
         self.demotions = 0;
@@ -168,7 +168,7 @@ impl SubscriberClassifier {
         self.change(SubscriberState::Unknown, TransitionReason::Unclassified, thresholds)
     }
 
-    /// `None` when nothing changes that is shown.
+    /// Changes the state; `None` when the shown state stays the same.
     fn change(
         &mut self,
         to: SubscriberState,
@@ -201,13 +201,13 @@ fn verdict(reading: &LinkReading, thresholds: &ClassifierThresholds) -> Verdict 
     }
 }
 
-/// Whether a reading has enough data to say anything.
+/// Whether a reading has enough data for a decision.
 const fn is_sufficient(reading: &LinkReading) -> bool {
     reading.settled >= MIN_SETTLED || reading.full
 }
 
-/// Whether to forget a subscriber that the configuration doesn't list. One that was never heard is not there
-/// to be forgotten: it becomes known with its first answer.
+/// Whether to remove a subscriber that the configuration does not list; `heard_at` is its last response. Such a
+/// subscriber becomes known with its first response, so that there always is one.
 pub const fn is_forgotten(heard_at: MonotonicNs, now: MonotonicNs) -> bool {
     now.since(heard_at) > FORGET_UNLISTED_MS * 1_000_000
 }

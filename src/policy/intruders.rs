@@ -1,7 +1,7 @@
-//! Readers on other hosts that reach past the bridge.
+//! Detects intruders: readers on other hosts that bypass the bridge.
 //!
-//! The bridge can't keep a laptop from subscribing to the publisher's own topic, or to a topic of the
-//! critical lane; that laptop's link then holds back what the bridge is there to protect. It can say so.
+//! The bridge cannot prevent a laptop from subscribing to an input topic or to a topic of the critical lane. The
+//! link of that laptop can then slow down what the bridge protects. The bridge can warn of it.
 
 // Addresses only: `core::net` has no sockets.
 use core::net::IpAddr;
@@ -11,56 +11,56 @@ use std::fmt;
 use super::whereabouts::{Location, Whereabouts};
 use crate::model::{Guid, MonotonicNs, TopicName};
 
-/// How long the name of a reader's node is waited for. Reader and node are announced by different topics, in
-/// either order and within a second of each other.
+/// How long a warning waits for the name of the reader's node. Reader and node are announced on different
+/// topics, in any order and within a second of each other.
 pub const NODE_PATIENCE_MS: u64 = 2_000;
 
-/// Readers that are remembered, those that were told and have left included. More are only counted. That
-/// is more than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)), as some have left.
+/// The most readers that are remembered, including those that were reported and have left; further ones are
+/// only counted. More than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)).
 pub const MAX_REMEMBERED_INTRUDERS: usize = 64;
 
-/// A reader that comes back within this time after it was gone is the same intruder, which was told already:
-/// a laptop on bad Wi-Fi goes and comes all the time. Thus no more than
-/// [`MAX_REMEMBERED_INTRUDERS`] are told in it, whatever the network makes up.
+/// A reader that returns within this time after it left is the same intruder and causes no second warning: a
+/// laptop with bad Wi-Fi leaves and returns frequently. In this time at most [`MAX_REMEMBERED_INTRUDERS`] are
+/// reported, whatever the network announces.
 pub const REMEMBER_MS: u64 = 600_000;
 
-/// Why no other host should read a topic.
+/// Why other hosts should not read a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Guarded {
-    /// It is the input of a route: a remote reader holds back the publisher itself.
+    /// The topic is the input of a route: a remote reader can slow down the publisher.
     Input,
-    /// It is an output of the critical lane: a remote reader holds back the critical subscribers.
+    /// The topic is an output of the critical lane: a remote reader can slow down the critical subscribers.
     CriticalOutput,
 }
 
-/// A topic that no other host should read.
+/// A topic that other hosts should not read.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GuardedTopic {
     /// The topic.
     pub topic: TopicName,
-    /// Why.
+    /// Why other hosts should not read it.
     pub guarded: Guarded,
-    /// The route's output on a noncritical lane, which is for other hosts; `None` if it has none.
+    /// The route's output on a noncritical lane, which other hosts should read; `None` if it has none.
     pub instead: Option<TopicName>,
 }
 
-/// A remote reader of a guarded topic. As text, it is the warning, with what to do about it.
+/// A remote reader of a guarded topic. Its text form is the warning, with the remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Intruder {
     /// The reader.
     pub reader: Guid,
-    /// What it reads, and what it should.
+    /// The topic that it reads, and the one that it should read.
     pub topic: GuardedTopic,
-    /// An address of its host; `None` if none tells hosts apart.
+    /// An address of its host; `None` if no address identifies the host.
     pub host: Option<IpAddr>,
-    /// Its node, such as `/rviz`; `None` if its participant never said, as one that is no ROS 2 node.
+    /// Its node, such as `/rviz`; `None` if its participant announced none, as one that is not of ROS 2.
     pub node: Option<String>,
     /// When it was first seen.
     pub since: MonotonicNs,
 }
 
 impl Intruder {
-    /// What to do about it, as an imperative.
+    /// The remedy, as an imperative.
     pub fn mending_step(&self) -> String {
         match (self.topic.guarded, &self.topic.instead) {
             (Guarded::Input, Some(instead)) => format!("point it at {instead}"),
@@ -77,7 +77,7 @@ impl fmt::Display for Intruder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.node {
             Some(node) => write!(f, "node {node} on ")?,
-            None => write!(f, "a reader of no known node on ")?,
+            None => write!(f, "a reader without a known node on ")?,
         }
         match self.host {
             Some(host) => write!(f, "host {host}")?,
@@ -85,51 +85,52 @@ impl fmt::Display for Intruder {
         }
         let topic = &self.topic.topic;
         match self.topic.guarded {
-            Guarded::Input => {
-                write!(f, " subscribes to {topic} itself, past the bridge, and can hold back its publisher")?
-            }
+            Guarded::Input => write!(
+                f,
+                " subscribes to {topic} directly, bypasses the bridge, and can slow down the publisher"
+            )?,
             Guarded::CriticalOutput => {
-                write!(f, " subscribes to {topic}, and can hold back the critical subscribers")?;
+                write!(f, " subscribes to {topic}, and can slow down the critical subscribers")?;
             }
         }
         write!(f, ": {}", self.mending_step())
     }
 }
 
-/// What there is to say.
+/// A change to log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum IntruderEvent {
-    /// A new one: warn.
+    /// A new intruder, to warn of.
     Appeared(Intruder),
-    /// One of which [`Appeared`](Self::Appeared) was said is gone.
+    /// An intruder reported as [`Appeared`](Self::Appeared) left.
     Left(Intruder),
-    /// One that left is back, and needs no second warning.
+    /// An intruder that left has returned, without a second warning.
     Returned(Intruder),
 }
 
-/// How many intruders there are.
+/// Counts of intruders.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct IntruderCounts {
-    /// There now, of those that were told.
+    /// Intruders present, of those that were reported.
     pub present: u64,
-    /// Told since the beginning.
+    /// Intruders reported so far.
     pub told: u64,
-    /// Sightings of others while [`MAX_REMEMBERED_INTRUDERS`] were remembered; one that announces itself
-    /// again counts again.
+    /// Discoveries of further readers while [`MAX_REMEMBERED_INTRUDERS`] were remembered; a reader that is
+    /// announced again counts again.
     pub untold: u64,
 }
 
-/// Watches for remote readers of guarded topics. Memory is bounded by [`MAX_REMEMBERED_INTRUDERS`], and
-/// an event is given once.
+/// Watches for remote readers of guarded topics, and returns each event once. Memory is bounded by
+/// [`MAX_REMEMBERED_INTRUDERS`].
 #[derive(Clone, Debug)]
 pub struct IntruderWatch {
     guarded: Vec<GuardedTopic>,
-    /// By DDS name, beside `guarded`.
+    /// The DDS names, parallel to `guarded`.
     dds_names: Vec<String>,
     tracked: Vec<Tracked>,
     events: VecDeque<IntruderEvent>,
-    told: u64,
-    untold: u64,
+    reported: u64,
+    unreported: u64,
 }
 
 #[derive(Clone, Debug)]
@@ -140,34 +141,34 @@ struct Tracked {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
-    /// Found, and not told yet: the name of its node may come.
+    /// Discovered, and not reported yet: the name of its node may still arrive.
     Waiting { found_at: MonotonicNs },
-    /// Told, and there.
+    /// Reported, and present.
     Present,
-    /// Told, and gone.
+    /// Reported, and gone.
     Gone { at: MonotonicNs },
 }
 
 impl IntruderWatch {
-    /// For these topics.
+    /// A watch for readers of these topics.
     pub fn new(guarded: Vec<GuardedTopic>) -> Self {
         Self {
             dds_names: guarded.iter().map(|guarded| guarded.topic.to_dds()).collect(),
             guarded,
             tracked: Vec::new(),
             events: VecDeque::new(),
-            told: 0,
-            untold: 0,
+            reported: 0,
+            unreported: 0,
         }
     }
 
-    /// Whether readers of this DDS topic are of interest.
+    /// Whether this DDS topic is guarded.
     pub fn guards(&self, dds_topic: &str) -> bool {
         self.dds_names.iter().any(|name| name == dds_topic)
     }
 
-    /// Discovery sees a reader, new or changed, of any DDS topic. `own` are the addresses of this host; a
-    /// reader on this host, or of which nobody knows where it is, is no intruder.
+    /// Records a reader, new or changed, that discovery found on any DDS topic. `own` are the addresses of this
+    /// host. A reader on this host or on an unknown one is no intruder.
     pub fn found(
         &mut self,
         reader: Guid,
@@ -178,11 +179,11 @@ impl IntruderWatch {
     ) {
         let Some(at) = self.dds_names.iter().position(|name| name == dds_topic) else { return };
         if location.whereabouts(own) != Whereabouts::Remote {
-            // It was taken for a remote one if the host had not all its addresses yet.
+            // It may have counted as remote before this host had all its addresses.
             self.gone_where(|guid| guid == reader, now);
             return;
         }
-        self.forget(now);
+        self.remove_expired(now);
         if let Some(known) = self.tracked.iter_mut().find(|tracked| tracked.intruder.reader == reader) {
             known.intruder.host = location.host();
             if matches!(known.state, State::Gone { .. }) {
@@ -194,24 +195,24 @@ impl IntruderWatch {
             let intruder = Intruder { reader, topic, host: location.host(), node: None, since: now };
             self.tracked.push(Tracked { intruder, state: State::Waiting { found_at: now } });
         } else {
-            self.untold += 1;
+            self.unreported += 1;
         }
     }
 
-    /// A reader is gone.
+    /// Records that a reader is gone.
     pub fn gone(&mut self, reader: Guid, now: MonotonicNs) {
         self.gone_where(|guid| guid == reader, now);
     }
 
-    /// A participant is gone, and with it all its readers.
+    /// Records that a participant is gone, with all its readers.
     pub fn participant_gone(&mut self, prefix: [u8; 12], now: MonotonicNs) {
         self.gone_where(|guid| guid.prefix() == prefix, now);
     }
 
-    /// The next event, if there is one. `node_of` names the node of a reader if that is known.
+    /// The next event, if there is one. `node_of` returns the node of a reader if it is known.
     ///
-    /// A new reader is told as soon as its node is known, or after [`NODE_PATIENCE_MS`] without; a name that
-    /// comes later still is filled in without an event.
+    /// A new reader is reported as soon as its node is known, or without it after [`NODE_PATIENCE_MS`]; a name
+    /// that arrives later is added without an event.
     pub fn poll<'graph>(
         &mut self,
         now: MonotonicNs,
@@ -227,32 +228,33 @@ impl IntruderWatch {
             let State::Waiting { found_at } = tracked.state else { continue };
             if tracked.intruder.node.is_some() || now >= found_at.plus_ms(NODE_PATIENCE_MS) {
                 tracked.state = State::Present;
-                self.told += 1;
+                self.reported += 1;
                 return Some(IntruderEvent::Appeared(tracked.intruder.clone()));
             }
         }
         None
     }
 
-    /// Those that were told and are there, in the order in which they were found.
+    /// The intruders that were reported and are present, in the order of their discovery.
     pub fn present(&self) -> impl Iterator<Item = &Intruder> {
         let present = self.tracked.iter().filter(|tracked| tracked.state == State::Present);
         present.map(|tracked| &tracked.intruder)
     }
 
-    /// How many there are.
+    /// Counts of intruders.
     pub fn counts(&self) -> IntruderCounts {
-        IntruderCounts { present: self.present().count() as u64, told: self.told, untold: self.untold }
+        let present = self.present().count() as u64;
+        IntruderCounts { present, told: self.reported, untold: self.unreported }
     }
 
-    fn gone_where(&mut self, is_it: impl Fn(Guid) -> bool, now: MonotonicNs) {
+    fn gone_where(&mut self, is_gone: impl Fn(Guid) -> bool, now: MonotonicNs) {
         let events = &mut self.events;
         self.tracked.retain_mut(|tracked| {
-            if !is_it(tracked.intruder.reader) {
+            if !is_gone(tracked.intruder.reader) {
                 return true;
             }
             match tracked.state {
-                // Nobody was told, so nothing is to be taken back.
+                // It was not reported, so that it leaves without an event.
                 State::Waiting { .. } => false,
                 State::Present => {
                     tracked.state = State::Gone { at: now };
@@ -264,14 +266,14 @@ impl IntruderWatch {
         });
     }
 
-    fn forget(&mut self, now: MonotonicNs) {
+    fn remove_expired(&mut self, now: MonotonicNs) {
         self.tracked
             .retain(|tracked| !matches!(tracked.state, State::Gone { at } if now >= at.plus_ms(REMEMBER_MS)));
     }
 }
 
-/// Adds an event of a reader that was told. It takes the place of one about the same reader that nobody has
-/// asked for yet, so that there are no more events than readers.
+/// Adds an event about a reader that was reported. It cancels a pending event about the same reader, so that
+/// there are never more events than readers.
 fn push(events: &mut VecDeque<IntruderEvent>, event: IntruderEvent) {
     let reader_of = |event: &IntruderEvent| match event {
         IntruderEvent::Appeared(intruder)
@@ -280,7 +282,7 @@ fn push(events: &mut VecDeque<IntruderEvent>, event: IntruderEvent) {
     };
     let before = events.len();
     events.retain(|waiting| reader_of(waiting) != reader_of(&event));
-    // What it takes back nobody has heard of.
+    // If it cancelled one, the reader's state is again the one last returned to the caller.
     if events.len() == before {
         events.push_back(event);
     }
@@ -334,141 +336,145 @@ mod tests {
         None
     }
 
-    /// All that there is to say, with the node for every reader.
-    fn told(watch: &mut IntruderWatch, now: MonotonicNs, node: Option<&str>) -> Vec<String> {
-        let mut said = Vec::new();
+    /// All pending events as text; `node` is the node of every reader.
+    fn events(watch: &mut IntruderWatch, now: MonotonicNs, node: Option<&str>) -> Vec<String> {
+        let mut texts = Vec::new();
         while let Some(event) = watch.poll(now, |_| node) {
-            said.push(match event {
+            texts.push(match event {
                 IntruderEvent::Appeared(intruder) => format!("appeared: {intruder}"),
                 IntruderEvent::Left(intruder) => format!("left: {:?}", intruder.reader.0[12]),
                 IntruderEvent::Returned(intruder) => format!("returned: {:?}", intruder.reader.0[12]),
             });
         }
-        said
+        texts
     }
 
     #[test]
-    fn an_intruder_is_told_once_with_host_node_and_the_mending_step() {
+    fn an_intruder_is_reported_once_with_host_node_and_remedy() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
         watch.found(guid(1, 2), "rt/adaptive_bridge/critical/scan", &at("10.0.0.9"), &own(), START);
         let expected = [
-            "appeared: node /rviz on host 10.0.0.9 subscribes to /scan itself, past the bridge, and can hold back \
-             its publisher: point it at /adaptive_bridge/noncritical/scan",
-            "appeared: node /rviz on host 10.0.0.9 subscribes to /adaptive_bridge/critical/scan, and can hold back \
+            "appeared: node /rviz on host 10.0.0.9 subscribes to /scan directly, bypasses the bridge, and can slow \
+             down the publisher: point it at /adaptive_bridge/noncritical/scan",
+            "appeared: node /rviz on host 10.0.0.9 subscribes to /adaptive_bridge/critical/scan, and can slow down \
              the critical subscribers: point it at /adaptive_bridge/noncritical/scan, or give it a lane of its own",
         ];
-        assert_eq!(told(&mut watch, START, Some("/rviz")), expected);
-        // Discovery repeats itself.
+        assert_eq!(events(&mut watch, START, Some("/rviz")), expected);
+        // Discovery reports the same reader repeatedly.
         find(&mut watch, guid(1, 1), START.plus_ms(10));
-        assert_eq!(told(&mut watch, START.plus_ms(10), Some("/rviz")), [""; 0]);
+        assert_eq!(events(&mut watch, START.plus_ms(10), Some("/rviz")), [""; 0]);
         assert_eq!(watch.counts(), IntruderCounts { present: 2, told: 2, untold: 0 });
     }
 
     #[test]
-    fn readers_of_this_host_of_unknown_place_and_of_other_topics_are_none() {
+    fn readers_on_this_host_on_an_unknown_host_and_of_other_topics_are_no_intruders() {
         let mut watch = watch();
         assert!(watch.guards("rt/scan") && !watch.guards("rt/adaptive_bridge/noncritical/scan"));
         watch.found(guid(1, 1), "rt/scan", &at("10.0.0.5"), &own(), START);
         watch.found(guid(1, 2), "rt/scan", &at("127.0.0.1"), &own(), START);
         watch.found(guid(1, 3), "rt/scan", &Location::default(), &own(), START);
         watch.found(guid(1, 4), "rt/adaptive_bridge/noncritical/scan", &at("10.0.0.9"), &own(), START);
-        assert_eq!(told(&mut watch, START.plus_ms(60_000), None), [""; 0]);
+        assert_eq!(events(&mut watch, START.plus_ms(60_000), None), [""; 0]);
         assert_eq!(watch.counts(), IntruderCounts::default());
     }
 
     #[test]
-    fn the_name_of_the_node_is_waited_for_and_not_for_ever() {
+    fn a_warning_waits_a_limited_time_for_the_name_of_the_node() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
         assert_eq!(watch.poll(START.plus_ms(NODE_PATIENCE_MS - 1), nameless), None);
-        let named = told(&mut watch, START.plus_ms(NODE_PATIENCE_MS - 1), Some("/late"));
+        let named = events(&mut watch, START.plus_ms(NODE_PATIENCE_MS - 1), Some("/late"));
         assert!(named[0].contains("node /late on host 10.0.0.9"), "{named:?}");
 
         find(&mut watch, guid(2, 2), START);
-        let nameless = told(&mut watch, START.plus_ms(NODE_PATIENCE_MS), None);
-        assert!(nameless[0].contains("a reader of no known node on host 10.0.0.9"), "{nameless:?}");
-        assert_eq!(told(&mut watch, START.plus_ms(NODE_PATIENCE_MS + 1), Some("/later")), [""; 0]);
+        let nameless = events(&mut watch, START.plus_ms(NODE_PATIENCE_MS), None);
+        assert!(nameless[0].contains("a reader without a known node on host 10.0.0.9"), "{nameless:?}");
+        assert_eq!(events(&mut watch, START.plus_ms(NODE_PATIENCE_MS + 1), Some("/later")), [""; 0]);
         let nodes: Vec<_> = watch.present().map(|intruder| intruder.node.as_deref()).collect();
         assert_eq!(nodes, [Some("/late"), Some("/later")]);
     }
 
     #[test]
-    fn one_that_leaves_and_returns_is_not_warned_of_again() {
+    fn an_intruder_that_leaves_and_returns_causes_no_second_warning() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
         find(&mut watch, guid(1, 2), START);
-        assert_eq!(told(&mut watch, START, Some("/rviz")).len(), 2);
+        assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 2);
         watch.gone(guid(1, 1), START);
         watch.gone(guid(1, 1), START);
-        assert_eq!(told(&mut watch, START, None), ["left: 1"]);
+        assert_eq!(events(&mut watch, START, None), ["left: 1"]);
         watch.participant_gone(guid(1, 0).prefix(), START);
-        assert_eq!(told(&mut watch, START, None), ["left: 2"]);
+        assert_eq!(events(&mut watch, START, None), ["left: 2"]);
         assert_eq!(watch.counts().present, 0);
         find(&mut watch, guid(1, 2), START.plus_ms(REMEMBER_MS - 1));
-        assert_eq!(told(&mut watch, START.plus_ms(REMEMBER_MS - 1), None), ["returned: 2"]);
+        assert_eq!(events(&mut watch, START.plus_ms(REMEMBER_MS - 1), None), ["returned: 2"]);
         find(&mut watch, guid(1, 1), START.plus_ms(REMEMBER_MS));
-        assert_eq!(told(&mut watch, START.plus_ms(REMEMBER_MS), Some("/rviz")).len(), 1, "long forgotten");
+        assert_eq!(
+            events(&mut watch, START.plus_ms(REMEMBER_MS), Some("/rviz")).len(),
+            1,
+            "no longer remembered"
+        );
         assert_eq!(watch.counts(), IntruderCounts { present: 2, told: 3, untold: 0 });
     }
 
     #[test]
-    fn one_that_is_gone_before_it_was_told_is_not_told() {
+    fn a_reader_that_is_gone_before_it_is_reported_causes_no_event() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
         watch.gone(guid(1, 1), START.plus_ms(1_000));
-        assert_eq!(told(&mut watch, START.plus_ms(NODE_PATIENCE_MS), Some("/brief")), [""; 0]);
+        assert_eq!(events(&mut watch, START.plus_ms(NODE_PATIENCE_MS), Some("/brief")), [""; 0]);
     }
 
     #[test]
-    fn what_goes_and_comes_between_two_looks_says_nothing() {
+    fn a_reader_that_leaves_and_returns_between_two_polls_causes_no_event() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
-        assert_eq!(told(&mut watch, START, Some("/rviz")).len(), 1);
+        assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 1);
         for _ in 0..1_000 {
             watch.gone(guid(1, 1), START);
             find(&mut watch, guid(1, 1), START);
         }
         assert!(watch.events.len() <= 1);
-        assert_eq!(told(&mut watch, START, None), [""; 0]);
+        assert_eq!(events(&mut watch, START, None), [""; 0]);
         watch.gone(guid(1, 1), START);
-        assert_eq!(told(&mut watch, START, None), ["left: 1"]);
+        assert_eq!(events(&mut watch, START, None), ["left: 1"]);
     }
 
     #[test]
-    fn one_that_turns_out_to_be_local_has_left() {
+    fn an_intruder_that_proves_to_be_local_has_left() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
-        assert_eq!(told(&mut watch, START, Some("/rviz")).len(), 1);
+        assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 1);
         // The host has joined the network since.
         let own = [own(), vec!["10.0.0.9".parse().unwrap()]].concat();
         watch.found(guid(1, 1), "rt/scan", &at("10.0.0.9"), &own, START);
-        assert_eq!(told(&mut watch, START, None), ["left: 1"]);
+        assert_eq!(events(&mut watch, START, None), ["left: 1"]);
     }
 
     #[test]
     fn a_flood_of_readers_costs_bounded_memory_and_a_bounded_log() {
         let mut watch = watch();
-        let mut said = 0;
+        let mut count = 0;
         for number in 0..100_000_u32 {
             let mut reader = [0; 16];
             reader[..4].copy_from_slice(&number.to_le_bytes());
-            // One each ms, and each gone after 100 ms, told or not.
+            // One reader per ms, each gone after 100 ms, reported or not.
             let now = START.plus_ms(u64::from(number));
             find(&mut watch, Guid(reader), now);
-            said += told(&mut watch, now, Some("/flood")).len();
+            count += events(&mut watch, now, Some("/flood")).len();
             if let Some(old) = number.checked_sub(100) {
                 reader[..4].copy_from_slice(&old.to_le_bytes());
                 watch.gone(Guid(reader), now);
             }
-            said += told(&mut watch, now, None).len();
+            count += events(&mut watch, now, None).len();
             assert!(
                 watch.tracked.len() <= MAX_REMEMBERED_INTRUDERS
                     && watch.events.len() <= MAX_REMEMBERED_INTRUDERS
             );
         }
-        // Each of those told appeared and left.
-        assert_eq!(said, 2 * MAX_REMEMBERED_INTRUDERS);
+        // Each of those reported appeared and left.
+        assert_eq!(count, 2 * MAX_REMEMBERED_INTRUDERS);
         let counts = watch.counts();
         assert_eq!(counts.told + counts.untold, 100_000);
     }

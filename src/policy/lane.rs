@@ -1,4 +1,4 @@
-//! What a lane does with a sample: the rate, the bytes, the staleness and the mode taken together.
+//! Decides what a lane does with a sample, from its rate, bytes, staleness and mode.
 
 use super::lane_queue::{Allowance, LaneQueue, Stamps};
 use super::token_bucket::{ByteBudget, TokenBucket, burst_for};
@@ -9,22 +9,22 @@ use crate::model::{
 /// What a noncritical lane does next on one route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision<T> {
-    /// Send this sample. Its token and bytes are taken. Ask again: there may be another.
+    /// Send this sample, whose token and bytes are taken; then poll again, as there may be another.
     Send(T, Stamps),
-    /// Neither token nor bytes until then: whatever arrives meanwhile may wait in shared memory, and no
-    /// wake-up is worth its cost.
+    /// Sleep: nothing can be sent until that instant. Samples that arrive in the meantime may wait in shared
+    /// memory, without a wake-up.
     SleepUntil(MonotonicNs),
-    /// The next sample can be sent as soon as it arrives, and none waits.
+    /// Wait: none is queued, and the next sample can be sent as soon as it arrives.
     WaitForSample,
-    /// This mode forwards nothing. What is offered is dropped, and may be taken out of shared memory at
-    /// leisure.
+    /// The mode forwards nothing. Offered samples are dropped; there is no hurry to take them out of shared
+    /// memory.
     Closed,
 }
 
-/// One route on a noncritical lane: a token bucket and a queue, set by the mode.
+/// One route on a noncritical lane: a token bucket and a queue, configured by the mode.
 ///
-/// The caller takes all samples out of shared memory whenever it is awake, offers them, and then polls until
-/// the answer is not [`Decision::Send`]. It allocates when made, when its rates are changed, and else never.
+/// When the caller wakes, it takes all samples out of shared memory, offers them, and polls until the decision
+/// is not [`Decision::Send`]. The shaper allocates only on construction and when its rates change.
 #[derive(Debug)]
 pub struct RouteShaper<T> {
     rates: LaneRates,
@@ -42,7 +42,7 @@ impl<T> RouteShaper<T> {
             bucket: TokenBucket::new(0.0, 1.0, now),
             queue: LaneQueue::new(rates.normal.drop_policy, capacity_for(&rates)),
         };
-        // Nothing waits yet that could be dropped.
+        // The queue is empty, so nothing is dropped.
         shaper.set_mode(LaneMode::Normal, now, |_, _, _| {});
         shaper
     }
@@ -57,9 +57,8 @@ impl<T> RouteShaper<T> {
         self.queue.len()
     }
 
-    /// Changes the mode from the next sample on. A mode that forwards nothing drops what waits; in any other,
-    /// what has no place in the new mode's queue gives way. A lane that was suspended earns no tokens for
-    /// that time.
+    /// Changes the mode from the next sample on. A mode that forwards nothing drops all waiting samples; any
+    /// other drops those above the limit of its queue. No tokens accrue while a lane is suspended.
     pub fn set_mode(&mut self, mode: LaneMode, now: MonotonicNs, on_drop: impl FnMut(T, Stamps, DropReason)) {
         self.mode = mode;
         match self.forwarding() {
@@ -74,8 +73,8 @@ impl<T> RouteShaper<T> {
         }
     }
 
-    /// Applies other rates from the next sample on. Tokens already there stay, up to the new burst; what has
-    /// no place in the new queue gives way as [`RouteShaper::set_mode`] has it.
+    /// Applies other rates from the next sample on. Tokens stay, up to the new burst; samples above the limit
+    /// of the queue are dropped as in [`RouteShaper::set_mode`].
     pub fn set_rates(
         &mut self,
         rates: LaneRates,
@@ -87,7 +86,7 @@ impl<T> RouteShaper<T> {
         self.set_mode(self.mode, now, on_drop);
     }
 
-    /// Takes in a sample, in the order of the route's sequence.
+    /// Queues or drops a sample. The caller offers samples in the order of their sequence numbers.
     pub fn offer(&mut self, item: T, stamps: Stamps, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
         match self.forwarding() {
             Ok(_) => self.queue.offer(item, stamps, on_drop),
@@ -95,8 +94,8 @@ impl<T> RouteShaper<T> {
         }
     }
 
-    /// What to do at `now`. `budget` is that of the lane, in the same mode ([`ByteBudget::set_mode`]); the
-    /// routes that share it are to be polled in [`TurnOrder`].
+    /// Decides what to do at `now`. `budget` is that of the lane, in the same mode ([`ByteBudget::set_mode`]);
+    /// the caller polls the routes that share it in [`TurnOrder`].
     pub fn poll(
         &mut self,
         budget: &mut ByteBudget,
@@ -132,13 +131,13 @@ impl<T> RouteShaper<T> {
         }
     }
 
-    /// Drops every waiting sample for `reason`, at a shutdown for instance.
+    /// Drops every waiting sample for `reason`, such as at shutdown.
     pub fn clear(&mut self, reason: DropReason, on_drop: impl FnMut(T, Stamps, DropReason)) {
         self.queue.clear(reason, on_drop);
     }
 
-    /// The rate policy that applies, or why nothing is forwarded. A rate of 0 is how the original's files
-    /// suspend a lane in a mode, and counts as that.
+    /// The rate policy of the mode, or the drop reason if the mode forwards nothing. A rate of 0, by which
+    /// configuration files of the original package suspend a lane in a mode, counts as suspended.
     fn forwarding(&self) -> Result<RatePolicy, DropReason> {
         match self.rates.in_mode(self.mode) {
             Some(rate) if rate.max_rate_hz > 0.0 && rate.max_bytes_per_s != Some(0) => Ok(*rate),
@@ -148,14 +147,13 @@ impl<T> RouteShaper<T> {
     }
 }
 
-/// Samples that may wait in one mode or the other.
+/// The queue capacity needed in all modes.
 fn capacity_for(rates: &LaneRates) -> usize {
     rates.normal.queue_samples.max(rates.degraded.queue_samples)
 }
 
-/// Whose turn it is among the routes of a lane that share a [`ByteBudget`]: the one after that which sent
-/// last is asked first. In a fixed order the first route would take every byte when they don't suffice for
-/// all.
+/// The order in which to poll the routes of a lane that share a [`ByteBudget`]. It starts with the route after
+/// the one that sent last: in a fixed order the first route would take all bytes when they do not suffice.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TurnOrder {
     first: usize,
@@ -168,14 +166,14 @@ impl TurnOrder {
         (first..routes).chain(0..first)
     }
 
-    /// Route `index` has sent a sample.
+    /// Records that route `index` has sent a sample.
     pub const fn sent(&mut self, index: usize) {
         self.first = index + 1;
     }
 }
 
-/// Why a critical lane drops a sample in `mode`; `None` forwards it. Only a stop does: degraded and suspended
-/// are what the noncritical lanes give up so that the critical ones need not.
+/// The reason for which a critical lane drops a sample in `mode`; `None` to forward it. Only the stopped mode
+/// drops: the degraded and suspended modes limit noncritical lanes in favour of critical ones.
 pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
     match mode {
         LaneMode::Normal | LaneMode::Degraded | LaneMode::Suspended => None,
@@ -183,14 +181,15 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
     }
 }
 
-/// The mode that a lane applies, given what the policy board says.
+/// The mode that a lane applies, from its policy on the policy board:
 ///
-/// - An override by hand, until it expires.
-/// - Else what control decided, while control confirms it at least every `policy_hold_ms`; when it no longer
-///   does, the safe default, which is full rate for a critical lane and degraded for a noncritical one. Where
-///   control never ran: normal.
-/// - Never milder than safety demands, as long as control confirms that. So a stop that control ordered does
-///   not outlive control, and an operator's override does not outweigh an emergency.
+/// - the override by hand, until it expires;
+/// - else control's mode, while control confirms it at least every `policy_hold_ms`;
+/// - else the safe default, which is normal for a critical lane and degraded for a noncritical one; normal if
+///   control has never run;
+/// - in each case at least the safety floor, while control confirms it.
+///
+/// A stop by control therefore ends when control dies, and an override cannot lift an emergency.
 pub const fn effective_mode(
     policy: &LanePolicy,
     class: TrafficClass,
@@ -214,7 +213,7 @@ pub const fn effective_mode(
     if confirmed && floor as u8 > mode as u8 { floor } else { mode }
 }
 
-/// A number that is no mode, which only a foreign process can have written, reads as normal.
+/// The mode with that number; an undefined number, which only a foreign process can write, counts as normal.
 const fn mode_of(number: u8) -> LaneMode {
     match LaneMode::from_u8(number) {
         Some(mode) => mode,
@@ -252,7 +251,7 @@ mod tests {
         Stamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
     }
 
-    /// A route, its budget, and what was dropped; the item is its own sequence.
+    /// A route, its budget, and the dropped samples; each item is its sequence number.
     struct Bench {
         shaper: RouteShaper<u64>,
         budget: ByteBudget,
@@ -304,11 +303,11 @@ mod tests {
         assert_eq!(bench.poll(0), Decision::WaitForSample);
         bench.offer(1, 7);
         assert_eq!(sent(bench.poll(7)), Some(1));
-        assert_eq!(bench.poll(7), Decision::SleepUntil(at_ms(100)), "the 7 ms of waiting are not lost");
+        assert_eq!(bench.poll(7), Decision::SleepUntil(at_ms(100)), "credit accrued in the first 7 ms");
     }
 
     #[test]
-    fn without_a_token_the_lane_sleeps_also_when_samples_wait() {
+    fn without_a_token_the_lane_sleeps_even_when_samples_wait() {
         let mut bench = Bench::new(RATES);
         bench.offer(1, 0);
         assert_eq!(sent(bench.poll(0)), Some(1));
@@ -331,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lane_in_debt_of_bytes_sleeps_until_it_is_paid() {
+    fn a_lane_in_byte_debt_sleeps_until_it_is_paid_off() {
         let mut bench = Bench::new(RATES);
         bench.set_mode(LaneMode::Degraded, 0);
         let big = Stamps { bytes: 3_000, ..stamps(1, at_ms(0)) };
@@ -342,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn suspended_and_stopped_drop_what_waits_and_what_is_offered() {
+    fn suspended_and_stopped_drop_waiting_and_offered_samples() {
         for (mode, reason) in
             [(LaneMode::Suspended, DropReason::Suspended), (LaneMode::Stopped, DropReason::Stopped)]
         {
@@ -357,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_suspended_lane_earns_no_tokens() {
+    fn no_tokens_accrue_while_a_lane_is_suspended() {
         let mut bench = Bench::new(RATES);
         bench.offer(1, 0);
         assert_eq!(sent(bench.poll(0)), Some(1));
@@ -367,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_mode_brings_its_rate_queue_and_threshold_with_it() {
+    fn a_new_mode_applies_its_rate_queue_and_threshold() {
         let mut bench = Bench::new(RATES);
         for sequence in 1..=5 {
             bench.offer(sequence, 0);
@@ -383,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn other_rates_apply_at_once_and_what_waits_goes_on_waiting() {
+    fn other_rates_apply_immediately_and_keep_waiting_samples() {
         let mut bench = Bench::new(RATES);
         bench.offer(1, 0);
         assert_eq!(sent(bench.poll(0)), Some(1));
@@ -394,17 +393,17 @@ mod tests {
         let faster = RatePolicy { max_rate_hz: 20.0, queue_samples: 8, ..RATES.normal };
         bench.set_rates(LaneRates { normal: faster, ..RATES }, 10);
         assert_eq!((bench.shaper.waiting(), bench.dropped.len()), (4, 0));
-        // Half of the token had come in 50 ms at 10 Hz; the other half comes at 20 Hz.
+        // 0.1 tokens accrued in 10 ms at 10 Hz; the other 0.9 accrue in 45 ms at 20 Hz.
         assert_eq!(bench.poll(50), Decision::SleepUntil(at_ms(55)));
         for sequence in 6..=9 {
             bench.offer(sequence, 50);
         }
-        assert_eq!((bench.shaper.waiting(), bench.dropped.len()), (8, 0), "there is room for more");
+        assert_eq!((bench.shaper.waiting(), bench.dropped.len()), (8, 0), "the queue is larger");
         assert_eq!(sent(bench.poll(55)), Some(9));
     }
 
     #[test]
-    fn a_smaller_queue_names_what_gives_way_and_a_mode_that_forwards_nothing_stays_closed() {
+    fn a_smaller_queue_drops_samples_with_a_reason_and_a_suspended_lane_stays_closed() {
         let mut bench = Bench::new(RATES);
         for sequence in 1..=5 {
             bench.offer(sequence, 0);
@@ -440,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn clearing_drops_what_waits_for_the_reason_given() {
+    fn clearing_drops_waiting_samples_for_the_given_reason() {
         let mut bench = Bench::new(RATES);
         bench.offer(1, 0);
         let dropped = &mut bench.dropped;
@@ -449,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_begin_after_the_route_that_sent_last() {
+    fn the_order_starts_after_the_route_that_sent_last() {
         let mut turns = TurnOrder::default();
         assert_eq!(turns.order(3).collect::<Vec<_>>(), [0, 1, 2]);
         turns.sent(0);
@@ -460,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn a_critical_sample_goes_on_in_every_mode_but_a_stop() {
+    fn a_critical_sample_is_forwarded_in_every_mode_except_stopped() {
         for mode in [LaneMode::Normal, LaneMode::Degraded, LaneMode::Suspended] {
             assert_eq!(critical_drop(mode), None);
         }
@@ -468,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_by_control_holds_while_it_is_confirmed() {
+    fn the_mode_of_control_applies_while_control_confirms_it() {
         let policy = LanePolicy {
             epoch: 4,
             written_at: at_ms(1_000),
@@ -484,7 +483,7 @@ mod tests {
     }
 
     #[test]
-    fn an_override_holds_until_it_expires_and_then_control_decides_again() {
+    fn an_override_applies_until_it_expires_and_then_the_mode_of_control() {
         let mut policy = LanePolicy {
             epoch: 1,
             written_at: at_ms(4_000),
@@ -502,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn safety_holds_against_an_override_as_long_as_control_confirms_it() {
+    fn the_safety_floor_outranks_an_override_while_control_confirms_it() {
         let policy = LanePolicy {
             epoch: 1,
             written_at: at_ms(1_000),

@@ -1,38 +1,38 @@
-//! The mode of a lane (paper, section III-D): the worst of its subscribers decides, and the safety mode sets
-//! a floor.
+//! Decides the mode of a lane (paper, section III-D) by its worst subscriber, and the floor that the safety mode
+//! sets.
 
 use crate::model::{LaneMode, SafetyMode, SafetyRules, SubscriberState, TrafficClass};
 
 /// Why a lane has its mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LaneReason<'a> {
-    /// A critical lane forwards every sample, whatever its subscribers' links are like.
+    /// A critical lane forwards every sample, regardless of its subscribers' links.
     CriticalLane,
     /// Subscribers are not classified.
     ClassifierOff,
     /// Noncritical lanes may not be degraded (`safety.allow_noncritical_degrade`).
     DegradeForbidden,
-    /// Nobody who could be degraded.
+    /// The lane has no subscribers.
     NoSubscribers,
     /// No subscriber is NONCRITICAL.
     Healthy {
-        /// Of how many.
+        /// Subscribers of the lane.
         subscribers: usize,
-        /// Of those, UNKNOWN: they count as healthy, because to take a healthy subscriber for a degraded one
-        /// could cost it samples, and the reverse only costs bandwidth.
+        /// Of those, the UNKNOWN ones. They count as healthy: treating a healthy subscriber as degraded could
+        /// cost it samples, and the reverse only costs bandwidth.
         unknown: usize,
     },
-    /// A subscriber is NONCRITICAL.
+    /// At least one subscriber is NONCRITICAL.
     Subscriber {
-        /// Which; the first, if there are several.
+        /// The id of the first such subscriber.
         worst: &'a str,
-        /// How many are.
+        /// The number of such subscribers.
         impaired: usize,
     },
 }
 
 impl LaneReason<'_> {
-    /// A word for logs and diagnostics.
+    /// The label in logs and diagnostics.
     pub const fn label(&self) -> &'static str {
         match self {
             Self::CriticalLane => "critical_lane",
@@ -48,14 +48,14 @@ impl LaneReason<'_> {
 /// The mode of a lane, and why.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LaneDecision<'a> {
-    /// What the lane is told to do.
+    /// The mode.
     pub mode: LaneMode,
     /// Why.
     pub reason: LaneReason<'a>,
 }
 
-/// The mode that the classifier gives a lane of that class. `subscribers` are those of the lane, by id and
-/// state.
+/// The mode that control sets for a lane of that class; `subscribers` are the ids and states of the lane's
+/// subscribers.
 pub fn lane_mode<'a>(
     class: TrafficClass,
     classifier_enabled: bool,
@@ -94,9 +94,9 @@ pub fn lane_mode<'a>(
     }
 }
 
-/// The mildest mode that a safety mode leaves a lane (paper, section III-E): DEGRADED suspends the
-/// noncritical lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where
-/// the configuration doesn't preserve the critical path, it is given up for its own trouble only.
+/// The mildest mode that a safety mode allows a lane (paper, section III-E): DEGRADED suspends the noncritical
+/// lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where the
+/// configuration does not preserve the critical path, only trouble of that path itself stops it in DEGRADED.
 ///
 /// [`SafetyDecision::critical_trouble`]: super::SafetyDecision::critical_trouble
 pub const fn safety_floor(

@@ -1,19 +1,19 @@
-//! Which samples of a route wait in a noncritical lane, and which give way.
+//! The queue of one route in a noncritical lane: which samples wait, and which are dropped.
 
 use std::collections::VecDeque;
 
 use super::staleness::{age_ns, is_stale};
 use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SourceTimestamp, WallNs};
 
-/// What the queue knows of a sample; it never looks at the sample itself.
+/// The metadata by which the queue decides; it does not read the sample itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Stamps {
-    /// The sample's number on its route.
+    /// The sample's sequence number in its route.
     pub sequence: u64,
-    /// The publisher's DDS source timestamp, unless its clock disagrees with ours.
+    /// The publisher's DDS source timestamp; none if the publisher's clock disagrees with this host's.
     pub source_timestamp: SourceTimestamp,
-    /// When ingress took the sample, less its lateness; stands in for a source timestamp that is missing or
-    /// can't be trusted.
+    /// The instant from which the age is measured without a source timestamp: when ingress took the sample,
+    /// minus its age on arrival.
     pub taken_at: MonotonicNs,
     /// Size of the serialized payload.
     pub bytes: u64,
@@ -31,18 +31,18 @@ impl Stamps {
     }
 }
 
-/// What may be sent at one instant, and what is too old for it.
+/// What a lane may send at one instant, and the age from which samples are stale.
 #[derive(Clone, Copy, Debug)]
 pub struct Allowance {
     /// The instant.
     pub now: MonotonicNs,
-    /// The same instant on the wall clock, against which source timestamps are held.
+    /// The same instant on the wall clock, for comparison with source timestamps.
     pub now_wall: WallNs,
-    /// Whole tokens there; 0 sends nothing.
+    /// Whole tokens; with 0 nothing is sent.
     pub tokens: u64,
-    /// Bytes that may be sent without debt. The last sample sent may exceed them.
+    /// Bytes that can be sent without debt. The last sample sent may exceed them.
     pub bytes: u64,
-    /// A sample older than this is dropped; 0 never.
+    /// A sample older than this is dropped as stale; 0 turns that off.
     pub stale_threshold_ms: u64,
 }
 
@@ -53,15 +53,14 @@ impl Allowance {
     }
 }
 
-/// The bounded waiting room of one route on a noncritical lane.
+/// The bounded queue of one route in a noncritical lane.
 ///
-/// Samples are offered in the order of their sequence, and leave in that order: sent, or dropped and handed
-/// to the caller's `on_drop` with the reason. Nothing else removes a sample, so that
-/// offered = sent + dropped + waiting, always. It allocates when made, when given another capacity, and else
-/// never.
+/// The caller offers samples in the order of their sequence numbers. Each is either sent or dropped, which
+/// passes it to the caller's `on_drop` with the reason, so that offered = sent + dropped + waiting, always. The
+/// queue allocates only on construction and when its capacity changes.
 #[derive(Debug)]
 pub struct LaneQueue<T> {
-    /// Oldest in front.
+    /// The oldest is at the front.
     waiting: VecDeque<(T, Stamps)>,
     capacity: usize,
     limit: usize,
@@ -69,7 +68,7 @@ pub struct LaneQueue<T> {
 }
 
 impl<T> LaneQueue<T> {
-    /// An empty queue with room for `capacity` samples (at least 1), all of which it uses.
+    /// An empty queue of `capacity` samples (at least 1), which is also its limit.
     pub fn new(policy: DropPolicy, capacity: usize) -> Self {
         let capacity = capacity.max(1);
         Self { waiting: VecDeque::with_capacity(capacity), capacity, limit: capacity, policy }
@@ -85,15 +84,15 @@ impl<T> LaneQueue<T> {
         self.waiting.is_empty()
     }
 
-    /// Makes room for `capacity` samples (at least 1). The limit stays until [`LaneQueue::set_policy`] sets
-    /// another; so what waits is not touched.
+    /// Changes the capacity (at least 1). The limit and the waiting samples stay until
+    /// [`LaneQueue::set_policy`] changes the limit.
     pub fn set_capacity(&mut self, capacity: usize) {
         self.capacity = capacity.max(1);
         self.waiting.reserve(self.capacity.saturating_sub(self.waiting.len()));
     }
 
-    /// Applies another policy and lets at most `limit` samples wait, which is held to 1 to the capacity.
-    /// Those that have no place any more give way as the new policy has it.
+    /// Applies another policy and limits the waiting samples to `limit`, clamped to 1 to the capacity. Drops
+    /// samples above the limit according to the new policy.
     pub fn set_policy(
         &mut self,
         policy: DropPolicy,
@@ -103,34 +102,34 @@ impl<T> LaneQueue<T> {
         self.policy = policy;
         self.limit = limit.clamp(1, self.capacity);
         while self.waiting.len() > self.limit {
-            self.give_way(&mut on_drop);
+            self.drop_one(&mut on_drop);
         }
     }
 
-    /// Takes in a sample. When the queue is full, one gives way: with `DropOldest` the oldest as superseded,
-    /// with `DropStale` the oldest and with `DropLatest` this one as queue full.
+    /// Adds a sample. When the queue is full, it drops one: with `DropOldest` the oldest as superseded, with
+    /// `DropStale` the oldest and with `DropLatest` the new one as queue full.
     pub fn offer(&mut self, item: T, stamps: Stamps, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
         if self.waiting.len() >= self.limit {
             if self.policy == DropPolicy::DropLatest {
                 on_drop(item, stamps, DropReason::QueueFull);
                 return;
             }
-            self.give_way(&mut on_drop);
+            self.drop_one(&mut on_drop);
         }
         self.waiting.push_back((item, stamps));
     }
 
-    /// The sample to send next, or `None` when there is none that may be sent.
+    /// Removes the sample to send next; `None` when no sample may be sent.
     ///
-    /// - `DropOldest`: as many of the freshest as the allowance pays for remain, and all older ones are
-    ///   dropped as superseded; of those that remain the oldest is returned, so that order is kept. With one
-    ///   token, the usual case, that is the freshest. More tokens are there only when the lane was late by
-    ///   more than the interval of the rate, and then each of them sends a sample: otherwise a lane of 1 kHz
-    ///   that wakes every 2 ms would send 500 Hz.
-    /// - `DropLatest`: the oldest.
-    /// - `DropStale`: all stale ones are dropped, then the oldest is returned.
+    /// - `DropOldest`: keeps as many of the newest samples as the allowance permits and drops all older ones as
+    ///   superseded; returns the oldest of those kept, so that the order is kept. With one token, the usual
+    ///   case, that is the newest sample. There are more tokens only if the lane was late by more than the
+    ///   interval of the rate, and then each token sends a sample: otherwise a lane with a rate of 1 kHz that
+    ///   wakes every 2 ms would send 500 Hz.
+    /// - `DropLatest`: returns the oldest sample.
+    /// - `DropStale`: drops all stale samples, then returns the oldest.
     ///
-    /// A stale sample is never returned: it is dropped as stale and the next one tried.
+    /// A stale sample is never returned: it is dropped as stale, and the next one is tried.
     pub fn take(
         &mut self,
         allowance: &Allowance,
@@ -160,18 +159,19 @@ impl<T> LaneQueue<T> {
         }
     }
 
-    fn give_way(&mut self, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
-        let (leaving, reason) = match self.policy {
+    /// Drops the sample that the policy chooses when the queue is full.
+    fn drop_one(&mut self, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
+        let (dropped, reason) = match self.policy {
             DropPolicy::DropOldest => (self.waiting.pop_front(), DropReason::Superseded),
             DropPolicy::DropStale => (self.waiting.pop_front(), DropReason::QueueFull),
             DropPolicy::DropLatest => (self.waiting.pop_back(), DropReason::QueueFull),
         };
-        if let Some((item, stamps)) = leaving {
+        if let Some((item, stamps)) = dropped {
             on_drop(item, stamps, reason);
         }
     }
 
-    /// Keeps the freshest samples that the allowance pays for, and drops all that are older.
+    /// Keeps as many of the newest samples as the allowance permits, and drops all older ones.
     fn supersede(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
         let mut kept = 0;
         let mut older_bytes = 0_u64;
@@ -180,7 +180,7 @@ impl<T> LaneQueue<T> {
             if allowance.is_stale(stamps) {
                 continue;
             }
-            // The freshest goes last and may make debt, so that only what goes before it must be paid for.
+            // The newest is sent last and may make debt, so only the bytes of those before it must be available.
             if kept > 0 {
                 older_bytes = older_bytes.saturating_add(stamps.bytes);
                 if older_bytes > allowance.bytes {
@@ -201,14 +201,15 @@ impl<T> LaneQueue<T> {
         }
     }
 
-    /// Publishers of one topic have clocks of their own, so a stale sample may stand behind a fresh one.
+    /// Drops all stale samples. One may wait behind a fresh one, because each publisher of a topic has its own
+    /// clock.
     fn drop_stale(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
         for _ in 0..self.waiting.len() {
             let Some((item, stamps)) = self.waiting.pop_front() else { return };
             if allowance.is_stale(&stamps) {
                 on_drop(item, stamps, DropReason::Stale);
             } else {
-                // Takes the place just vacated: never grows.
+                // Does not allocate: a sample was just removed.
                 self.waiting.push_back((item, stamps));
             }
         }
@@ -231,7 +232,7 @@ mod tests {
         Allowance { now, now_wall: WallNs(0), tokens, bytes: u64::MAX, stale_threshold_ms: 200 }
     }
 
-    /// A queue of three in which samples 1, 2, … of those ages were offered, and what was dropped.
+    /// A queue of three to which samples 1, 2, … of given ages were offered, and the dropped samples.
     struct Bench {
         queue: LaneQueue<u64>,
         dropped: Vec<(u64, DropReason)>,
@@ -262,7 +263,7 @@ mod tests {
     use DropReason::{QueueFull, Stale, Superseded};
 
     #[test]
-    fn drop_oldest_sends_the_freshest_and_supersedes_the_others() {
+    fn drop_oldest_sends_the_newest_and_supersedes_the_others() {
         let mut bench = Bench::new(DropPolicy::DropOldest, &[90, 60, 30]);
         assert_eq!(bench.take(&allowance(1)), Some(3));
         assert_eq!(bench.dropped, [(1, Superseded), (2, Superseded)]);
@@ -278,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn drop_oldest_sends_the_freshest_when_bytes_pay_for_one_only() {
+    fn drop_oldest_sends_the_newest_when_the_bytes_suffice_for_one_only() {
         let mut bench = Bench::new(DropPolicy::DropOldest, &[90, 60, 30]);
         assert_eq!(bench.take(&Allowance { bytes: 99, ..allowance(3) }), Some(3));
         let mut bench = Bench::new(DropPolicy::DropOldest, &[90, 60, 30]);
@@ -286,14 +287,14 @@ mod tests {
     }
 
     #[test]
-    fn drop_oldest_overflows_at_the_old_end() {
+    fn drop_oldest_drops_the_oldest_of_a_full_queue() {
         let bench = Bench::new(DropPolicy::DropOldest, &[90, 60, 30, 20, 10]);
         assert_eq!(bench.dropped, [(1, Superseded), (2, Superseded)]);
         assert_eq!(bench.queue.len(), 3);
     }
 
     #[test]
-    fn drop_oldest_passes_over_a_stale_sample_to_the_next_freshest() {
+    fn drop_oldest_skips_a_stale_sample_for_the_next_newest() {
         // The third is from a publisher whose clock is behind.
         let mut bench = Bench::new(DropPolicy::DropOldest, &[90, 60, 900]);
         assert_eq!(bench.take(&allowance(1)), Some(2));
@@ -312,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn drop_latest_is_first_in_first_out_and_refuses_what_has_no_place() {
+    fn drop_latest_is_first_in_first_out_and_drops_the_new_sample_of_a_full_queue() {
         let mut bench = Bench::new(DropPolicy::DropLatest, &[90, 60, 30, 20]);
         assert_eq!(bench.dropped, [(4, QueueFull)]);
         assert_eq!(bench.take(&allowance(1)), Some(1));
@@ -320,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn drop_latest_drops_a_stale_head_and_tries_the_next() {
+    fn drop_latest_drops_a_stale_oldest_sample_and_tries_the_next() {
         let mut bench = Bench::new(DropPolicy::DropLatest, &[300, 60, 300]);
         assert_eq!(bench.take(&allowance(1)), Some(2));
         assert_eq!(bench.dropped, [(1, Stale)]);
@@ -335,13 +336,13 @@ mod tests {
     }
 
     #[test]
-    fn drop_stale_overflows_at_the_old_end() {
+    fn drop_stale_drops_the_oldest_of_a_full_queue() {
         let bench = Bench::new(DropPolicy::DropStale, &[90, 60, 30, 20]);
         assert_eq!(bench.dropped, [(1, QueueFull)]);
     }
 
     #[test]
-    fn without_a_token_nothing_moves() {
+    fn without_a_token_nothing_is_sent_or_dropped() {
         for policy in [DropPolicy::DropOldest, DropPolicy::DropLatest, DropPolicy::DropStale] {
             let mut bench = Bench::new(policy, &[500, 60, 30]);
             assert_eq!(bench.take(&allowance(0)), None);
@@ -350,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lower_limit_makes_samples_give_way_as_the_new_policy_has_it() {
+    fn a_lower_limit_drops_samples_according_to_the_new_policy() {
         let cases = [
             (DropPolicy::DropOldest, [(1, Superseded), (2, Superseded)]),
             (DropPolicy::DropStale, [(1, QueueFull), (2, QueueFull)]),
@@ -366,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn the_queue_never_outgrows_the_room_it_was_made_with() {
+    fn the_queue_never_exceeds_or_reallocates_its_capacity() {
         let mut queue = LaneQueue::new(DropPolicy::DropStale, 4);
         let room = queue.waiting.capacity();
         queue.set_policy(DropPolicy::DropStale, usize::MAX, |_: u64, _, _| {});

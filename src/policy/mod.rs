@@ -1,25 +1,25 @@
-//! Pure decisions: no IO, no clock, no threads, no logs; time is an argument.
+//! Decisions without side effects: no IO, no clock, no threads, no logs; the time is an argument.
 //!
-//! Those of the data plane allocate when they are made and never afterwards.
+//! The types of the data plane allocate only on construction and when their configuration changes.
 //!
-//! - [`TokenBucket`] and [`ByteBudget`]: when a rate allows the next sample.
-//! - [`age_ns`] and [`is_stale`]: how old a sample is.
-//! - [`ClockOffset`]: whether a publisher's clock disagrees with ours.
-//! - [`LaneQueue`]: which samples wait, and which give way.
-//! - [`RouteShaper`]: those three together, for one route on a noncritical lane.
-//! - [`critical_drop`] and [`effective_mode`]: what a mode does to a critical sample, and which mode applies.
-//! - [`SequenceTracker`]: what the number of a sample says about those that are missing.
-//! - [`publisher_place`]: which publisher's account gives way when another one comes.
-//! - [`ProbeWindow`]: what the probes say about the link to one subscriber.
+//! - [`TokenBucket`] and [`ByteBudget`]: rate limits for samples and bytes.
+//! - [`age_ns`] and [`is_stale`]: the age of a sample.
+//! - [`ClockOffset`]: whether a publisher's clock disagrees with this host's.
+//! - [`LaneQueue`]: which samples wait in a noncritical lane, and which it drops.
+//! - [`RouteShaper`]: rate, queue and staleness of one route on a noncritical lane.
+//! - [`critical_drop`] and [`effective_mode`]: whether a critical lane drops a sample, and which mode applies.
+//! - [`SequenceTracker`]: missing samples, by their sequence numbers.
+//! - [`publisher_place`]: which account a new publisher replaces.
+//! - [`ProbeWindow`]: the state of the link to one subscriber, measured with probes.
 //! - [`SubscriberClassifier`]: the state of one subscriber.
-//! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, and why; the mildest that safety leaves it.
-//! - [`SafetySupervisor`]: the mode of the whole bridge.
-//! - [`ReplayGuard`] and [`SenderLimits`]: which control messages are acted on, and how many are looked at.
-//! - [`SubscriberWarnings`]: which figures of a subscriber are worth a warning.
-//! - [`IntruderWatch`]: which readers on other hosts reach past the bridge, and what to say of them.
-//! - [`AbsenceWatch`]: which network interfaces and peers on other hosts are away.
+//! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, with the reason, and the mildest mode allowed.
+//! - [`SafetySupervisor`]: the safety mode of the whole bridge.
+//! - [`ReplayGuard`] and [`SenderLimits`]: which probe messages are accepted.
+//! - [`SubscriberWarnings`]: warnings about figures of a subscriber.
+//! - [`IntruderWatch`]: remote subscribers that bypass the bridge.
+//! - [`AbsenceWatch`]: network interfaces and peers that are away.
 //! - [`Location`]: whether a DDS endpoint is on this host.
-//! - [`RestartBackoff`]: when a supervised child is started again.
+//! - [`RestartBackoff`]: when to restart a child process.
 
 mod absences;
 mod classifier;

@@ -1,61 +1,62 @@
-//! What the probes say about the link to one subscriber (paper, section III-C): a sliding window of the
-//! newest probes whose fate is known.
+//! Measures the link to one subscriber with probes (paper, section III-C), over a sliding window of the newest
+//! probes that were answered or lost.
 
 use std::collections::VecDeque;
 
 use crate::model::MonotonicNs;
 
-/// Probes that may wait for their answer at once. At 5 Hz and a timeout of 500 ms it is 3; even at 60 s it is
-/// 300. Beyond the limit the oldest counts as lost: an answer that so many later probes overtook is late.
+/// The most probes that wait for a response at once. At 5 Hz and a timeout of 500 ms 3 probes wait; even at a
+/// timeout of 60 s it is 300. Beyond the limit the oldest counts as lost.
 pub const MAX_OUTSTANDING: usize = 4_096;
 
-/// Probes whose fate is known and whose number is still known too, to tell a late or repeated answer.
+/// Probes that the window remembers after they were answered, lost or excused, to recognize late and repeated
+/// responses.
 const REMEMBERED: usize = 64;
 
-/// A control process that woke so much after the instant it asked for was stopped, or starved of its CPU: a
-/// round trip that it measures then is its own delay and not that of the link. See [`ProbeWindow::stopped`].
+/// A control process that wakes this much later than planned was stopped, or got no CPU time: round trips that
+/// it measures then include its own delay. See [`ProbeWindow::stopped`].
 pub const STOPPED_NS: u64 = 100_000_000;
 
-/// What the window makes of a response.
+/// How the window counts a probe response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Answer {
-    /// The probe's first answer, in time.
+    /// The probe's first response, in time.
     Counted {
-        /// From the sending of the probe to this answer.
+        /// From the sending of the probe to the response.
         rtt_ns: u64,
     },
-    /// The probe counts as lost already, or was excused.
+    /// The probe had already been counted as lost or excused.
     Late,
     /// The probe was answered before.
     Repeated,
-    /// No such probe was sent, or not lately.
+    /// No such probe was sent, or the window does not remember it any more.
     Unknown,
 }
 
-/// The link to one subscriber, as the window shows it.
+/// The state of the link to one subscriber, computed from the window.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LinkReading {
-    /// Probes whose fate is known, at most those that the window holds; `answered + lost`.
+    /// Probes in the window; `answered + lost`.
     pub settled: usize,
     /// Of those, answered in time.
     pub answered: usize,
     /// Of those, not answered in time.
     pub lost: usize,
-    /// Whether the window holds as many as it can.
+    /// Whether the window is full.
     pub full: bool,
-    /// `lost / settled`, 0 to 1; 0 while nothing is settled.
+    /// `lost / settled`, 0 to 1; 0 when nothing is settled.
     pub loss: f64,
-    /// Mean RTT of the answered; `None` when none was.
+    /// Mean RTT of the answered probes; `None` when there are none.
     pub rtt_mean_ms: Option<f64>,
-    /// The RTT at or below which 95 % of the answered lie (nearest rank).
+    /// The RTT at or below which 95 % of those of the answered probes lie (nearest rank).
     pub rtt_p95_ms: Option<f64>,
-    /// Mean absolute difference of the RTTs of consecutive answers, in the order of their arrival; `None` for
-    /// fewer than two. RFC 3550 (section 6.4.1) smooths the same differences with a filter that never quite
-    /// forgets; the mean has the window's memory, as all else in a reading.
+    /// Mean absolute difference of the RTTs of consecutive responses, in the order of their arrival; `None`
+    /// for fewer than two. RFC 3550 (section 6.4.1) smooths the same differences with a filter of unlimited
+    /// memory; the mean covers the window, as the other figures do.
     pub jitter_ms: Option<f64>,
 }
 
-/// What became of all probes: `sent = answered + lost + excused + outstanding`, always.
+/// Counts of all probes by outcome: `sent = answered + lost + excused + outstanding`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ProbeTotals {
     /// Probes sent.
@@ -64,13 +65,13 @@ pub struct ProbeTotals {
     pub answered: u64,
     /// Not answered in time.
     pub lost: u64,
-    /// Probes that say nothing about the link: sent before the subscriber's first answer, under way when the
-    /// control process was stopped, or left behind by a numbering that began anew.
+    /// Probes that say nothing about the link: sent before the subscriber's first response, outstanding while
+    /// the control process was stopped, or outstanding when the numbering restarted.
     pub excused: u64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Fate {
+enum Outcome {
     Outstanding,
     Answered,
     Lost,
@@ -81,34 +82,33 @@ enum Fate {
 struct Probe {
     seq: u64,
     sent_at: MonotonicNs,
-    fate: Fate,
+    outcome: Outcome,
 }
 
-/// The sliding window of one subscriber.
+/// The sliding window of the probes to one subscriber.
 ///
-/// - It opens with the subscriber's first answer, be it late. Probes before it say nothing: nobody may have
-///   been there to answer, or DDS had not yet matched the two sides. So a subscriber never heard has no
-///   settled probes, and one that falls silent has lost ones.
-/// - A probe that is not answered within the timeout is lost. One still under way doesn't count.
-/// - Probes that were never sent are not lost: the window knows only what it was told was sent.
-/// - It holds at most `window_size` fates and [`MAX_OUTSTANDING`] + 64 probes, whatever arrives.
+/// - It starts with the subscriber's first response, even a late one. Earlier probes do not count: there may
+///   have been no responder, or DDS had not yet matched the two sides. A subscriber that never responded
+///   therefore has no settled probes, and one that falls silent has lost probes.
+/// - A probe that is not answered within the timeout is lost. An outstanding one does not count yet.
+/// - A probe that was never sent is not lost: the window counts only probes passed to [`sent`](Self::sent).
+/// - It holds at most `window_size` settled probes and [`MAX_OUTSTANDING`] + 64 others, whatever arrives.
 #[derive(Clone, Debug)]
 pub struct ProbeWindow {
     window_size: usize,
     timeout_ns: u64,
-    /// RTTs in nanoseconds, `None` for a lost probe, in the order in which the fates became known.
+    /// RTTs in nanoseconds, `None` for a lost probe, in the order in which the probes were answered or lost.
     settled: VecDeque<Option<u64>>,
-    /// By ascending number, and by the time of sending.
+    /// By ascending number, which is also the order of sending.
     probes: VecDeque<Probe>,
     totals: ProbeTotals,
     heard_at: Option<MonotonicNs>,
-    /// For the quantile.
+    /// A buffer for the quantile.
     scratch: Vec<u64>,
 }
 
 impl ProbeWindow {
-    /// A window of the newest `window_size` probes, at least 1; an answer later than `timeout_ms` doesn't
-    /// count.
+    /// A window of the newest `window_size` probes, at least 1; a probe is lost after `timeout_ms`.
     pub fn new(window_size: usize, timeout_ms: u64) -> Self {
         let window_size = window_size.max(1);
         Self {
@@ -122,7 +122,7 @@ impl ProbeWindow {
         }
     }
 
-    /// Applies a new configuration. Fates already known stay; a smaller window forgets the oldest.
+    /// Applies a new configuration. Settled probes stay; a smaller window removes the oldest.
     pub fn set_limits(&mut self, window_size: usize, timeout_ms: u64) {
         self.window_size = window_size.max(1);
         self.timeout_ns = timeout_ms.saturating_mul(1_000_000);
@@ -130,77 +130,77 @@ impl ProbeWindow {
         self.settled.drain(..excess);
     }
 
-    /// A probe was sent. Its number is above all before it, by any amount; a lower one means that the
-    /// numbering began anew, and what was under way is excused, since its answers cannot be told from those
-    /// to come.
+    /// Records a probe that was sent. Numbers increase, by any amount. A number that is not above the last one
+    /// means that the numbering restarted: outstanding probes are excused then, because their responses could
+    /// be confused with those to new probes.
     pub fn sent(&mut self, seq: u64, at: MonotonicNs) {
         self.settle(at);
         if self.probes.back().is_some_and(|newest| newest.seq >= seq) {
             self.excuse(|_| true);
             self.probes.clear();
         }
-        // What is left at the front is under way, see `trim`.
+        // The probe at the front is outstanding, see `trim`.
         if self.probes.len() >= MAX_OUTSTANDING + REMEMBERED && self.probes.pop_front().is_some() {
-            self.lose(1);
+            self.count_lost(1);
         }
-        self.probes.push_back(Probe { seq, sent_at: at, fate: Fate::Outstanding });
+        self.probes.push_back(Probe { seq, sent_at: at, outcome: Outcome::Outstanding });
         self.totals.sent += 1;
         self.trim();
     }
 
-    /// A response to probe `seq` arrived.
+    /// Records a response to probe `seq`.
     pub fn answered(&mut self, seq: u64, at: MonotonicNs) -> Answer {
         self.settle(at);
         let Ok(index) = self.probes.binary_search_by_key(&seq, |probe| probe.seq) else {
             return Answer::Unknown;
         };
         let probe = self.probes[index];
-        if probe.fate == Fate::Answered {
+        if probe.outcome == Outcome::Answered {
             return Answer::Repeated;
         }
         if self.heard_at.is_none() {
             self.excuse(|earlier| earlier.seq < seq);
         }
         self.heard_at = Some(at);
-        if probe.fate != Fate::Outstanding {
+        if probe.outcome != Outcome::Outstanding {
             return Answer::Late;
         }
         let rtt_ns = at.since(probe.sent_at);
-        self.probes[index].fate = Fate::Answered;
+        self.probes[index].outcome = Outcome::Answered;
         self.totals.answered += 1;
-        self.keep(Some(rtt_ns));
+        self.push_settled(Some(rtt_ns));
         self.trim();
         Answer::Counted { rtt_ns }
     }
 
-    /// The control process did not run from `from` to `until`: it was stopped (SIGSTOP, a suspended machine)
-    /// or starved. An answer that came meanwhile could not be taken, and would be late only because of us, so
-    /// that every probe that was under way at any time of the pause is excused.
+    /// Excuses every probe that was outstanding at any time from `from` to `until`, while the control process
+    /// did not run: it was stopped (SIGSTOP, a suspended machine) or got no CPU time. Responses that arrived
+    /// in that time would count as late only because control did not read them.
     ///
-    /// Nobody but the caller can tell: it knows when it asked to be woken. To be called first in a turn that
-    /// began more than [`STOPPED_NS`] too late, before the answers that piled up are handed in.
+    /// The caller detects the pause, because it knows when it should have woken. It calls this first in a turn
+    /// that began more than [`STOPPED_NS`] late, before it passes the responses that queued up.
     pub fn stopped(&mut self, from: MonotonicNs, until: MonotonicNs) {
         self.settle(from);
         self.excuse(|probe| probe.sent_at <= until);
         self.trim();
     }
 
-    /// When the subscriber was last heard, in time or late; `None` when never.
+    /// When the subscriber's last response arrived, in time or late; `None` for never.
     pub const fn heard_at(&self) -> Option<MonotonicNs> {
         self.heard_at
     }
 
-    /// What became of all probes so far.
+    /// Counts of all probes so far, by outcome.
     pub const fn totals(&self) -> ProbeTotals {
         self.totals
     }
 
-    /// Probes that wait for their answer.
+    /// Probes that wait for their response.
     pub fn outstanding(&self) -> usize {
-        self.probes.iter().filter(|probe| probe.fate == Fate::Outstanding).count()
+        self.probes.iter().filter(|probe| probe.outcome == Outcome::Outstanding).count()
     }
 
-    /// The link as it shows at `now`.
+    /// The state of the link at `now`.
     pub fn reading(&mut self, now: MonotonicNs) -> LinkReading {
         self.settle(now);
         self.scratch.clear();
@@ -224,7 +224,7 @@ impl ProbeWindow {
         }
     }
 
-    /// Gives up on what has timed out: lost, or excused while nobody was heard yet.
+    /// Times out outstanding probes: they are lost, or excused before the subscriber's first response.
     fn settle(&mut self, now: MonotonicNs) {
         let heard = self.heard_at.is_some();
         let mut lost = 0;
@@ -232,30 +232,30 @@ impl ProbeWindow {
             if now.since(probe.sent_at) <= self.timeout_ns {
                 break;
             }
-            match probe.fate {
-                Fate::Outstanding if heard => {
-                    probe.fate = Fate::Lost;
+            match probe.outcome {
+                Outcome::Outstanding if heard => {
+                    probe.outcome = Outcome::Lost;
                     lost += 1;
                 }
-                Fate::Outstanding => {
-                    probe.fate = Fate::Excused;
+                Outcome::Outstanding => {
+                    probe.outcome = Outcome::Excused;
                     self.totals.excused += 1;
                 }
-                Fate::Answered | Fate::Lost | Fate::Excused => {}
+                Outcome::Answered | Outcome::Lost | Outcome::Excused => {}
             }
         }
-        self.lose(lost);
+        self.count_lost(lost);
         self.trim();
     }
 
-    fn lose(&mut self, probes: u64) {
+    fn count_lost(&mut self, probes: u64) {
         self.totals.lost += probes;
         for _ in 0..probes {
-            self.keep(None);
+            self.push_settled(None);
         }
     }
 
-    fn keep(&mut self, rtt_ns: Option<u64>) {
+    fn push_settled(&mut self, rtt_ns: Option<u64>) {
         if self.settled.len() >= self.window_size {
             self.settled.pop_front();
         }
@@ -264,17 +264,17 @@ impl ProbeWindow {
 
     fn excuse(&mut self, which: impl Fn(&Probe) -> bool) {
         for probe in &mut self.probes {
-            if probe.fate == Fate::Outstanding && which(probe) {
-                probe.fate = Fate::Excused;
+            if probe.outcome == Outcome::Outstanding && which(probe) {
+                probe.outcome = Outcome::Excused;
                 self.totals.excused += 1;
             }
         }
     }
 
-    /// Forgets the numbers of old probes, but of none that is under way.
+    /// Removes the oldest probes beyond [`REMEMBERED`], up to the first outstanding one.
     fn trim(&mut self) {
         while self.probes.len() > REMEMBERED
-            && self.probes.front().is_some_and(|oldest| oldest.fate != Fate::Outstanding)
+            && self.probes.front().is_some_and(|oldest| oldest.outcome != Outcome::Outstanding)
         {
             self.probes.pop_front();
         }

@@ -1,15 +1,16 @@
-//! Which publisher's account gives way when another one comes.
+//! Chooses the account that a new publisher of a route replaces.
 
 use crate::model::{MonotonicNs, PublisherAccount};
 
-/// A publisher that is matched and has been silent for so long may give way to another one.
+/// The silence after which the account of a matched publisher may be replaced.
 pub const PUBLISHER_SILENT_MS: u64 = 60_000;
 
-/// The place for the account of a new publisher: a vacant one; else that of the publisher silent longest of
-/// those that are gone; else that of the one silent longest, if for [`PUBLISHER_SILENT_MS`].
+/// The index of the account that a new publisher replaces. `accounts` has each account and whether its
+/// publisher is gone.
 ///
-/// `None` when all places belong to publishers that are there and write: a flood of announced publishers
-/// pushes none of these out.
+/// A vacant account comes first, then that of the gone publisher that has been silent longest, then that of
+/// the publisher that has been silent longest if its silence is at least [`PUBLISHER_SILENT_MS`]. `None` when
+/// all accounts belong to publishers that still write: announcing many publishers replaces none of these.
 pub fn publisher_place<'a>(
     accounts: impl IntoIterator<Item = (&'a PublisherAccount, bool)>,
     now: MonotonicNs,
@@ -41,7 +42,7 @@ mod tests {
     }
 
     #[test]
-    fn vacant_places_then_gone_publishers_then_silent_ones_give_way() {
+    fn vacant_accounts_are_replaced_first_then_gone_publishers_then_silent_ones() {
         let now = MonotonicNs(0).plus_ms(100_000);
         let (old, older, live) = (account(1, 30_000), account(2, 20_000), account(3, 99_000));
         let vacant = PublisherAccount::default();

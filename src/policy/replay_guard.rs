@@ -1,46 +1,46 @@
-//! What a signed message may do once only, and a sender only so often.
+//! Protection of the probe protocol: each signed message is accepted once, and each sender has a rate limit.
 
 use std::collections::VecDeque;
 
 use super::token_bucket::{TokenBucket, burst_for};
 use crate::model::{MonotonicNs, WallNs};
 
-/// What the guard makes of a message.
+/// Whether the guard accepts a message, or why not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Admission {
-    /// Not seen before, and of now.
+    /// Accepted: new, and sent within the window.
     Fresh,
-    /// Seen before.
+    /// Received before.
     Replayed,
     /// Sent longer ago than the window.
     TooOld,
-    /// Sent further ahead than the window: the clocks differ.
+    /// Sent further in the future than the window: the clocks differ.
     Ahead,
-    /// Not older than the window, but than what the guard can remember: it could be a replay.
+    /// Within the window but not newer than a message that the guard has removed: it could be a replay.
     Forgotten,
 }
 
-/// Admits each message of one sender once, and none that is older than a window.
+/// Accepts each message of one sender once, and none that is older than a window.
 ///
-/// Only messages whose signature was verified are to be shown to it, otherwise forged ones would take the
-/// places of genuine ones; and each sender needs a guard of its own, for the same reason.
+/// The caller passes only messages whose signature it has verified, and uses one guard for each sender:
+/// otherwise forged messages, or those of another sender, would displace genuine ones.
 ///
-/// The memory is fixed. What it forgets, because it is full or because the window has passed, it remembers as
-/// an instant before which nothing is admitted any more, so that neither a flood nor a clock that steps back
-/// lets a replay in.
+/// The memory is fixed. When the guard removes a message, because it is full or because the window has passed,
+/// it keeps its instant and accepts no message sent at or before it, so that neither a flood nor a clock that
+/// steps back permits a replay.
 #[derive(Clone, Debug)]
 pub struct ReplayGuard {
     window_ns: u64,
     capacity: usize,
-    /// Ascending.
+    /// The messages remembered, in ascending order.
     seen: VecDeque<(WallNs, [u8; 16])>,
-    /// The latest instant of what was forgotten.
+    /// The latest instant of the messages removed.
     forgotten: Option<WallNs>,
 }
 
 impl ReplayGuard {
-    /// A guard with room for `capacity` messages, at least 1. The rate of the sender times twice the window
-    /// is enough to forget none early.
+    /// A guard that remembers `capacity` messages, at least 1. The sender's rate times twice the window is
+    /// enough to remove none before the window has passed.
     pub fn new(window_ms: u64, capacity: usize) -> Self {
         let capacity = capacity.max(1);
         Self {
@@ -51,7 +51,7 @@ impl ReplayGuard {
         }
     }
 
-    /// Applies a new window. What was forgotten stays so.
+    /// Applies a new window. Messages already removed stay removed.
     pub const fn set_window(&mut self, window_ms: u64) {
         self.window_ns = window_ms.saturating_mul(1_000_000);
     }
@@ -66,7 +66,7 @@ impl ReplayGuard {
         self.seen.is_empty()
     }
 
-    /// Whether to act on a message that its sender numbered `nonce` and stamped `sent`.
+    /// Decides whether to accept a message that its sender marked with `nonce` and the instant `sent`.
     pub fn admit(&mut self, nonce: [u8; 16], sent: WallNs, now: WallNs) -> Admission {
         while let Some(&(oldest, _)) = self.seen.front()
             && now.since(oldest) > self.window_ns
@@ -89,7 +89,7 @@ impl ReplayGuard {
         if self.seen.len() < self.capacity {
             self.seen.insert(place, (sent, nonce));
         } else if place == 0 {
-            // It would be the first to be forgotten again.
+            // It is the oldest, and would be the next one to remove.
             self.forgotten = Some(sent);
         } else {
             self.forget_oldest();
@@ -105,21 +105,21 @@ impl ReplayGuard {
     }
 }
 
-/// A sender that was not heard for so long gives its place to another.
+/// The silence after which a new sender may replace a sender in the table.
 pub const IDLE_SENDER_MS: u64 = 10_000;
 
-/// How many messages of each sender are looked at per second, before anything is computed for them.
+/// Limits the messages of each sender per second, before they are decoded or verified.
 ///
-/// `K` names a sender by something that costs nothing to compare: the GUID of its DDS writer, say, and not an
-/// id in the message, which a forger could share with its victim. The table is fixed: senders beyond it share
-/// one rate, so that a flood from any number of names costs no more than `capacity + 1` senders would, and a
-/// sender that is heard regularly keeps its place.
+/// `K` identifies a sender by something that is cheap to compare and that a forger cannot share with its
+/// victim: the GUID of the DDS writer, not an id in the message. The table is fixed: senders beyond it share
+/// one rate, so that a flood from any number of senders costs no more than one from `capacity + 1`, and a
+/// sender that sends regularly stays in the table.
 #[derive(Clone, Debug)]
 pub struct SenderLimits<K> {
     rate_hz: f64,
     capacity: usize,
     senders: Vec<Sender<K>>,
-    /// For those that have no place.
+    /// Shared by the senders that are not in the table.
     others: TokenBucket,
     refused: u64,
 }
@@ -132,7 +132,7 @@ struct Sender<K> {
 }
 
 impl<K: PartialEq> SenderLimits<K> {
-    /// `rate_hz` for each of at most `capacity` senders.
+    /// A limit of `rate_hz` for each of at most `capacity` senders.
     pub fn new(rate_hz: f64, capacity: usize, now: MonotonicNs) -> Self {
         Self {
             rate_hz,
@@ -152,7 +152,7 @@ impl<K: PartialEq> SenderLimits<K> {
         }
     }
 
-    /// Whether to look at a message of `key`.
+    /// Whether the rate allows a message of `key`.
     pub fn allow(&mut self, key: K, now: MonotonicNs) -> bool {
         let allowed = match self.senders.iter().position(|sender| sender.key == key) {
             Some(index) => {
@@ -166,17 +166,17 @@ impl<K: PartialEq> SenderLimits<K> {
         allowed
     }
 
-    /// Messages not looked at so far.
+    /// Messages refused so far.
     pub const fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Senders that have a place.
+    /// Senders in the table.
     pub fn len(&self) -> usize {
         self.senders.len()
     }
 
-    /// Whether no sender has a place.
+    /// Whether the table has no senders.
     pub fn is_empty(&self) -> bool {
         self.senders.is_empty()
     }

@@ -1,20 +1,20 @@
-//! When a supervised child process is started again.
+//! Decides when the supervisor restarts a child process that ended.
 
 use crate::model::MonotonicNs;
 
-/// The wait before the second restart in a row. The first is at once, because most deaths are single ones and
-/// every millisecond of a data-plane process that is down loses samples.
+/// The wait before the second restart in a row. The first is immediate, because most processes die only once
+/// and every millisecond without a data-plane process loses samples.
 pub const FIRST_BACKOFF_MS: u64 = 100;
 
-/// The longest wait. A child that dies at each start then costs a few starts a minute and no more, and one
-/// whose trouble is over (a network interface that comes up late, say) is back within 5 s.
+/// The longest wait. It limits a child that dies at each start to a few starts a minute, and a child whose
+/// cause of failure is gone (such as a network interface that comes up late) runs again within 5 s.
 pub const MAX_BACKOFF_MS: u64 = 5_000;
 
-/// A child that ran this long was well: the next restart is at once again. Twice the longest wait, so that a
-/// child which dies a little after each start is not taken for a healthy one.
+/// A child that ran this long was healthy: the next restart is immediate again. Twice the longest wait, so that
+/// a child which dies shortly after each start does not count as healthy.
 pub const GOOD_RUN_MS: u64 = 10_000;
 
-/// How a child ended.
+/// How a child process ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildExit {
     /// It exited with this code.
@@ -23,7 +23,7 @@ pub enum ChildExit {
     Signal(i32),
 }
 
-/// Why a child is not started again: it would end the same way each time.
+/// Why the supervisor does not restart a child: it would end in the same way each time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GiveUpReason {
     /// It exited with 2: wrong command line.
@@ -32,37 +32,37 @@ pub enum GiveUpReason {
     BadConfiguration,
 }
 
-/// What to do about a child that ended.
+/// Whether and when to restart a child that ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RestartDecision {
-    /// Start it again then, or at once if that has passed.
+    /// Restart it at that instant, or immediately if it has passed.
     RestartAt(MonotonicNs),
-    /// Leave it.
+    /// Do not restart it.
     GiveUp(GiveUpReason),
 }
 
-/// The restarts of one child: the first at once, then after 100, 200, 400, … 5,000 ms, and from the beginning
-/// after a run of [`GOOD_RUN_MS`].
+/// The restart waits of one child: 0, 100, 200, 400, … 5,000 ms, and from the beginning after a run of
+/// [`GOOD_RUN_MS`].
 #[derive(Clone, Copy, Debug)]
 pub struct RestartBackoff {
     started_at: MonotonicNs,
-    /// 0: the next restart is at once.
+    /// 0 when the next restart is immediate.
     next_wait_ms: u64,
 }
 
 impl RestartBackoff {
-    /// For a child that is started at `now`.
+    /// The waits of a child that is started at `now`.
     pub const fn new(now: MonotonicNs) -> Self {
         Self { started_at: now, next_wait_ms: 0 }
     }
 
-    /// The child was started again at `now`.
+    /// Records that the child was restarted at `now`.
     pub const fn started(&mut self, now: MonotonicNs) {
         self.started_at = now;
     }
 
-    /// The child ended at `now`, unasked; an exit with 0 counts as any other. A start that failed is reported
-    /// as an exit too.
+    /// Decides about a child that ended at `now` without having been stopped. An exit with 0 counts as any
+    /// other; the caller passes a failed start as an exit too.
     pub fn ended(&mut self, exit: ChildExit, now: MonotonicNs) -> RestartDecision {
         match exit {
             ChildExit::Code(2) => return RestartDecision::GiveUp(GiveUpReason::WrongCommandLine),
@@ -84,7 +84,7 @@ mod tests {
 
     const KILLED: ChildExit = ChildExit::Signal(9);
 
-    /// The wait that follows a run of `run_ms`, and the instant of the restart.
+    /// The wait after a run of `run_ms`; advances `now` to the restart.
     fn wait_ms(backoff: &mut RestartBackoff, now: &mut MonotonicNs, run_ms: u64) -> u64 {
         *now = now.plus_ms(run_ms);
         match backoff.ended(KILLED, *now) {
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_restart_is_at_once_and_the_waits_double_up_to_five_seconds() {
+    fn the_first_restart_is_immediate_and_the_waits_double_up_to_five_seconds() {
         let mut now = MonotonicNs(3);
         let mut backoff = RestartBackoff::new(now);
         let waits: Vec<_> = (0..9).map(|_| wait_ms(&mut backoff, &mut now, 20)).collect();
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn a_good_run_begins_anew_and_a_shorter_one_does_not() {
+    fn a_good_run_resets_the_waits_and_a_shorter_one_does_not() {
         let mut now = MonotonicNs(0);
         let mut backoff = RestartBackoff::new(now);
         for _ in 0..5 {
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_child_that_would_fail_again_is_left() {
+    fn a_child_with_a_wrong_command_line_or_configuration_is_not_restarted() {
         let mut backoff = RestartBackoff::new(MonotonicNs(0));
         for (code, reason) in [(2, GiveUpReason::WrongCommandLine), (78, GiveUpReason::BadConfiguration)] {
             let decision = backoff.ended(ChildExit::Code(code), MonotonicNs(9));
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn any_other_end_is_followed_by_a_restart() {
+    fn a_child_with_any_other_exit_is_restarted() {
         for exit in [ChildExit::Code(0), ChildExit::Code(1), ChildExit::Signal(2), ChildExit::Signal(78)] {
             let mut backoff = RestartBackoff::new(MonotonicNs(0));
             assert_eq!(

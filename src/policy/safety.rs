@@ -1,56 +1,56 @@
-//! The safety supervisor (paper, section III-E): a mode for the whole bridge, from queues, lags, errors and
-//! silence.
+//! The safety supervisor (paper, section III-E) decides the safety mode of the whole bridge from queues, lags,
+//! errors and silence.
 //!
-//! Who can stop a robot's data by mistake? EMERGENCY stops every lane, so only what shows that the bridge
-//! itself no longer keeps up on the critical path speaks for it: a full queue, samples that wait for seconds
-//! between shared memory and their writer, samples lost in shared memory, a process that is gone for long.
-//! What others can bring about does not:
+//! EMERGENCY stops every lane, so it must not be entered by mistake. Only signs that the bridge itself no longer
+//! keeps up on the critical path call for it: a full queue, samples that wait for seconds between shared memory
+//! and their writer, samples lost in shared memory, a process that is gone for long. Causes outside the bridge
+//! do not:
 //!
-//! - noncritical lanes, whatever they do: DEGRADED at most;
-//! - a subscriber that does not keep up (`reader_overrun`): nothing. The other subscribers have its samples;
+//! - noncritical lanes: DEGRADED at most;
+//! - a subscriber that does not keep up (`reader_overrun`): no effect; other subscribers receive the samples;
 //! - a write that DDS refuses (`write_failed`): DEGRADED at most;
 //! - a publisher's clock: the lag from source to shared memory leads to DEGRADED at most, see [`SourceLag`];
-//! - a restart: the way up takes six readings in a row, 3 s by default, and what waits for a process that
-//!   doesn't turn doesn't count as its queue;
-//! - a lane that waits for its token on purpose: the caller leaves that time out of its lag.
+//! - a restart: EMERGENCY requires six consecutive readings, 3 s by default, and the samples that wait for a
+//!   process without turns do not count as its queue;
+//! - a lane that waits for its rate: the caller excludes that time from its lag.
 
 use crate::model::{FixedText, MonotonicNs, SafetyMode, SafetyRules, TrafficClass};
 
-/// A lag from source to shared memory beyond this is a difference between two hosts' clocks.
+/// The largest plausible lag from source to shared memory; a larger one is a difference between clocks.
 pub const MAX_SOURCE_LAG_MS: f64 = 10_000.0;
 
-/// How long the least lag is remembered, once to twice.
+/// The period of the minimum lag, which is that of the current and the previous period.
 const BASELINE_MS: u64 = 60_000;
 
-/// Every process turns ten times a second. One that has not for so long hangs, is stopped or is gone, and a
-/// full queue is no sign of overload then: it fills within 0.3 s, while a watchdog takes 2 s. To stop other
-/// lanes, and in the end the restarted one, would only make the gap longer.
+/// Time without a turn after which a full queue is no sign of overload. Every process turns ten times a second;
+/// one that does not hangs, is stopped or is gone. Its queue fills within 0.3 s, while a watchdog takes 2 s:
+/// stopping the other lanes, and then the restarted one, would only prolong the gap.
 const STALLED_MS: u64 = 500;
 
-/// The occupancy of a shorter queue says nothing: one sample under way would fill it.
+/// The smallest queue capacity at which the occupancy is meaningful: a single sample could fill a smaller one.
 const MIN_QUEUE: u64 = 8;
 
-/// How much the source lag of one route has grown.
+/// The increase of the source lag of one route.
 ///
-/// It is measured with the publisher's clock and ours, so that a constant part of it may be a difference
-/// between clocks. What counts is how far it is above the least of the last one to two minutes. When a clock
-/// steps, the new difference is the least after two minutes at most. A lag that is negative or beyond
-/// [`MAX_SOURCE_LAG_MS`] is such a difference for sure and is not looked at.
+/// The lag is measured with the clocks of the publisher and this host, so that a constant part of it may be a
+/// difference between clocks. Only the increase above the minimum of the last one to two minutes counts. When
+/// a clock steps, the minimum includes the new difference after two minutes at most. A lag that is negative or
+/// above [`MAX_SOURCE_LAG_MS`] is certainly a difference between clocks and is ignored.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SourceLag {
     since: MonotonicNs,
-    least_ms: Option<f64>,
-    least_before_ms: Option<f64>,
+    min_ms: Option<f64>,
+    previous_min_ms: Option<f64>,
 }
 
 impl SourceLag {
-    /// A route that was never measured.
+    /// The lag of a route without measurements.
     pub const fn new() -> Self {
-        Self { since: MonotonicNs(0), least_ms: None, least_before_ms: None }
+        Self { since: MonotonicNs(0), min_ms: None, previous_min_ms: None }
     }
 
-    /// Takes in the p99 of one evaluation, as `LatencyHistogram` gives it, and says how much of it is lag of
-    /// ours; `None` for a difference between clocks.
+    /// Applies the p99 lag of one evaluation, from a `LatencyHistogram`, and returns its increase above the
+    /// minimum; `None` for a difference between clocks.
     pub fn excess_ms(&mut self, p99_ms: f64, now: MonotonicNs) -> Option<f64> {
         if !(0.0..=MAX_SOURCE_LAG_MS).contains(&p99_ms) {
             return None;
@@ -58,15 +58,15 @@ impl SourceLag {
         let elapsed_ns = now.since(self.since);
         if elapsed_ns > BASELINE_MS * 1_000_000 {
             let recent = elapsed_ns <= 2 * BASELINE_MS * 1_000_000;
-            self.least_before_ms = if recent { self.least_ms } else { None };
-            self.least_ms = None;
+            self.previous_min_ms = if recent { self.min_ms } else { None };
+            self.min_ms = None;
             self.since = now;
         }
-        let least_ms = self.least_ms.map_or(p99_ms, |least_ms| least_ms.min(p99_ms));
-        self.least_ms = Some(least_ms);
-        let least_ms = self.least_before_ms.map_or(least_ms, |before_ms| before_ms.min(least_ms));
-        // The histogram rounds up by a sixteenth at most: of a large difference that is a lot.
-        Some((p99_ms - least_ms - p99_ms / 16.0).max(0.0))
+        let min_ms = self.min_ms.map_or(p99_ms, |min_ms| min_ms.min(p99_ms));
+        self.min_ms = Some(min_ms);
+        let min_ms = self.previous_min_ms.map_or(min_ms, |previous_ms| previous_ms.min(min_ms));
+        // The histogram rounds up by at most a sixteenth, which is much if the clocks differ by much.
+        Some((p99_ms - min_ms - p99_ms / 16.0).max(0.0))
     }
 }
 
@@ -75,42 +75,42 @@ impl SourceLag {
 pub struct ErrorCounts {
     /// Samples that the DDS library refused.
     pub write_failed: u64,
-    /// Samples for which shared memory had no slot.
+    /// Samples for which the pool had no free slot.
     pub pool_exhausted: u64,
-    /// Samples overwritten before a critical lane took them. On a noncritical lane that is what a limited
-    /// rate does, and not looked at.
+    /// Samples overwritten before a critical lane took them. They are ignored on a noncritical lane, where a
+    /// limited rate causes them.
     pub queue_overflow: u64,
     /// Starts of the process.
     pub restarts: u64,
 }
 
-/// One process of the data plane, as its counters show it. A process that never fed its health board, or that
-/// said goodbye when it was told to shut down, is not there rather than silent: the caller leaves it out.
+/// The load of one process of the data plane, from its counters. The caller leaves out a process that never
+/// wrote its health record or that shut down in order: it is absent, not silent.
 #[derive(Clone, Copy, Debug)]
 pub struct ProcessLoad<'a> {
     /// Its name in logs and diagnostics: `ingress`, or the lane.
     pub name: &'a str,
     /// The class of its lane; ingress is on the critical path.
     pub class: TrafficClass,
-    /// Since its data path last turned.
+    /// Time since its last turn.
     pub silent_ms: u64,
-    /// Since the last evaluation.
+    /// Errors since the last evaluation.
     pub errors: ErrorCounts,
-    /// Samples that wait in shared memory for a critical lane, of the route where it is the largest share.
+    /// Samples that wait in shared memory for a critical lane, of the route with the highest occupancy.
     pub queued: u64,
-    /// For how many of those there is room; 0 where there is no such queue.
+    /// The capacity of that queue; 0 when there is no such queue.
     pub queue_capacity: u64,
-    /// Samples that wait in a noncritical lane, of the route where they are most.
+    /// Samples that wait in a noncritical lane, of the route with the most.
     pub waiting: u64,
-    /// Ingress: the largest [`SourceLag::excess_ms`] of all routes; `None` when nothing came.
+    /// Ingress: the largest [`SourceLag::excess_ms`] of all routes; `None` when no sample arrived.
     pub source_lag_ms: Option<f64>,
-    /// p99 of the time from shared memory to the writer in this evaluation, without what a sample waited for
-    /// its token and without samples caught up with after a restart; `None` when nothing was written.
+    /// p99 of the time from shared memory to the writer in this evaluation, excluding the wait for the rate and
+    /// samples that the lane caught up with after a restart; `None` when nothing was written.
     pub writer_lag_ms: Option<f64>,
 }
 
 impl<'a> ProcessLoad<'a> {
-    /// A process that does nothing.
+    /// The load of an idle process.
     pub const fn idle(name: &'a str, class: TrafficClass) -> Self {
         Self {
             name,
@@ -126,33 +126,33 @@ impl<'a> ProcessLoad<'a> {
     }
 }
 
-/// What one evaluation goes by.
+/// The inputs of one evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct SafetyInputs<'a> {
-    /// Every process of the data plane that is, or should be, there.
+    /// Every process of the data plane that runs or should run.
     pub processes: &'a [ProcessLoad<'a>],
 }
 
-/// What is wrong, with the number that decided and the threshold that it reached.
+/// What is wrong with a process, with the measured value and the threshold that it reached.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SafetyTrouble {
-    /// A critical lane doesn't take its samples out of shared memory.
+    /// A critical lane takes its samples out of shared memory too slowly.
     Queue {
         /// Samples that wait.
         queued: u64,
-        /// For how many there is room.
+        /// The capacity of the queue.
         capacity: u64,
     },
     /// Too many samples wait in a noncritical lane.
     Waiting {
-        /// How many.
+        /// Samples that wait.
         samples: u64,
         /// `safety.max_noncritical_queue`.
         limit: u64,
     },
     /// Samples take long from their source to shared memory.
     SourceLag {
-        /// p99, as far as it has grown.
+        /// The increase of the p99 above its minimum.
         lag_ms: f64,
         /// The threshold.
         limit_ms: f64,
@@ -164,16 +164,16 @@ pub enum SafetyTrouble {
         /// The threshold.
         limit_ms: f64,
     },
-    /// Samples are lost, or the process is started again and again.
+    /// Samples are lost, or the process restarts repeatedly.
     Errors {
         /// Errors per second.
         per_s: f64,
         /// The threshold.
         limit_per_s: f64,
     },
-    /// The process doesn't turn.
+    /// The process makes no turns.
     Silent {
-        /// Since when.
+        /// Time since its last turn.
         silent_ms: u64,
         /// The threshold.
         limit_ms: u64,
@@ -194,7 +194,7 @@ impl SafetyTrouble {
     }
 }
 
-/// What is wrong and who has it.
+/// The trouble of one process, and the mode that it calls for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SafetyCause {
     /// The name of the process.
@@ -203,7 +203,7 @@ pub struct SafetyCause {
     pub class: TrafficClass,
     /// What is wrong.
     pub trouble: SafetyTrouble,
-    /// What it speaks for: DEGRADED or EMERGENCY.
+    /// The mode that it calls for: DEGRADED or EMERGENCY.
     pub speaks_for: SafetyMode,
 }
 
@@ -212,32 +212,34 @@ pub struct SafetyCause {
 pub struct SafetyDecision {
     /// The mode from now on.
     pub mode: SafetyMode,
-    /// The former mode, when this evaluation changed it.
+    /// The former mode, if this evaluation changed it.
     pub changed_from: Option<SafetyMode>,
-    /// The worst of this reading; of a clean one in a mode other than NORMAL, the last there was.
+    /// The worst trouble of this reading; after a reading without trouble the last one, until the bridge is in
+    /// NORMAL again.
     pub cause: Option<SafetyCause>,
-    /// Whether this reading was clean.
+    /// Whether this reading had no trouble.
     pub clean: bool,
-    /// Whether the critical path has had trouble of its own since NORMAL was left, other than of source lag.
+    /// Whether the critical path itself, apart from source lag, has had trouble since NORMAL was left.
     pub critical_trouble: bool,
 }
 
-/// The supervisor.
+/// The safety supervisor.
 ///
-/// Up: `hysteresis_count` readings in a row that speak for DEGRADED or worse, and from there as many that
-/// speak for EMERGENCY. Back: `recovery_count` readings in a row, below EMERGENCY for the step to DEGRADED
-/// and clean for that to NORMAL. DEGRADED frees what the noncritical lanes used, so that the trouble may
-/// return when they do; the longer way back keeps them from being switched on and off all the time.
+/// DEGRADED requires `hysteresis_count` consecutive readings that call for DEGRADED or worse; EMERGENCY then
+/// requires as many that call for EMERGENCY. Each step back requires `recovery_count` consecutive readings:
+/// none that calls for EMERGENCY for the step to DEGRADED, none with trouble for the step to NORMAL. DEGRADED
+/// frees the resources of the noncritical lanes, so that the trouble may return with these lanes; the larger
+/// `recovery_count` prevents frequent switching.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SafetySupervisor {
     mode: SafetyMode,
-    /// Readings in a row that speak for DEGRADED or worse.
+    /// Consecutive readings that call for DEGRADED or worse.
     degraded_run: u32,
-    /// Readings in a row that speak for EMERGENCY.
+    /// Consecutive readings that call for EMERGENCY.
     emergency_run: u32,
-    /// Readings in a row that speak for the way back.
+    /// Consecutive readings that allow the step back.
     recovery_run: u32,
-    /// Readings in a row in which the critical path itself has trouble.
+    /// Consecutive readings in which the critical path itself has trouble.
     critical_run: u32,
     critical_trouble: bool,
     cause: Option<SafetyCause>,
@@ -246,7 +248,7 @@ pub struct SafetySupervisor {
 }
 
 impl SafetySupervisor {
-    /// In NORMAL.
+    /// A supervisor in NORMAL.
     pub const fn new() -> Self {
         Self {
             mode: SafetyMode::Normal,
@@ -271,14 +273,14 @@ impl SafetySupervisor {
         self.transitions
     }
 
-    /// One evaluation. A caller that was stopped doesn't make up for those that it missed.
+    /// Evaluates one reading. A caller that was stopped does not repeat missed evaluations.
     pub fn evaluate(
         &mut self,
         inputs: &SafetyInputs<'_>,
         rules: &SafetyRules,
         now: MonotonicNs,
     ) -> SafetyDecision {
-        // Nobody knows in what time the errors of the first reading came about.
+        // The first reading has no errors per second: the time in which its errors occurred is unknown.
         let elapsed_s = self.evaluated_at.map(|last| now.since(last) as f64 / 1e9);
         self.evaluated_at = Some(now);
         let reading = Reading::of(inputs, rules, elapsed_s.filter(|&elapsed_s| elapsed_s > 0.0));
@@ -334,15 +336,16 @@ impl SafetySupervisor {
     }
 }
 
-fn count(run: &mut u32, goes_on: bool) {
-    *run = if goes_on { run.saturating_add(1) } else { 0 };
+/// Counts a reading in a run of consecutive ones, or resets the run.
+fn count(run: &mut u32, continues: bool) {
+    *run = if continues { run.saturating_add(1) } else { 0 };
 }
 
-/// What one evaluation sees.
+/// The troubles of one evaluation.
 #[derive(Default)]
 struct Reading {
     worst: Option<SafetyCause>,
-    /// Whether the critical path itself has trouble, other than of source lag.
+    /// Whether the critical path itself, apart from source lag, has trouble.
     critical: bool,
 }
 
@@ -361,7 +364,7 @@ impl Reading {
     fn critical_path(&mut self, process: &ProcessLoad<'_>, rules: &SafetyRules, elapsed_s: Option<f64>) {
         let silent_ms = process.silent_ms;
         if silent_ms >= rules.silent_ms {
-            // What waits for it, and what it had not done, is the same trouble once more.
+            // Its queue, lag and errors are consequences of the silence.
             let is_long = rules.emergency_silent_ms != 0 && silent_ms >= rules.emergency_silent_ms;
             let limit_ms = if is_long { rules.emergency_silent_ms } else { rules.silent_ms };
             return self.add(process, SafetyTrouble::Silent { silent_ms, limit_ms }, is_long);
@@ -406,8 +409,8 @@ impl Reading {
         }
     }
 
-    /// DEGRADED suspends all noncritical lanes, so that what is wrong with one of them and harms nobody else,
-    /// a reader that doesn't acknowledge, must not speak for it.
+    /// DEGRADED suspends all noncritical lanes. Trouble of one of them that does not affect the others, such as a
+    /// reader that does not acknowledge, must not call for it.
     fn noncritical_lane(&mut self, process: &ProcessLoad<'_>, rules: &SafetyRules, elapsed_s: Option<f64>) {
         let is_silent = process.silent_ms >= rules.silent_ms;
         if !is_silent {
@@ -425,7 +428,7 @@ impl Reading {
         let errors = &process.errors;
         let counted = errors.write_failed.saturating_add(errors.restarts);
         let counted_per_s = elapsed_s.map_or(0.0, |elapsed_s| counted as f64 / elapsed_s);
-        // Its silence is an error a second: by default that suspends nobody.
+        // Silence counts as one error per second, which by default does not suspend the noncritical lanes.
         let per_s = counted_per_s + if is_silent { 1.0 } else { 0.0 };
         if per_s >= rules.degraded_errors_per_s {
             let limit_per_s = rules.degraded_errors_per_s;
@@ -433,7 +436,8 @@ impl Reading {
         }
     }
 
-    /// Of two that speak for the same, that of the critical path counts, then the first.
+    /// Keeps the worst trouble: EMERGENCY before DEGRADED, then the critical path before noncritical lanes, then
+    /// the first one.
     fn add(&mut self, process: &ProcessLoad<'_>, trouble: SafetyTrouble, is_extreme: bool) {
         let class = process.class;
         let is_critical = class == TrafficClass::Critical;

@@ -1,21 +1,21 @@
-//! What the number of a sample says about those that are missing.
+//! Counts missing samples by their sequence numbers.
 //!
-//! Ingress numbers the samples of a route 1, 2, 3, … without a gap, also across its restarts, so a lane that
-//! sees numbers `a` and then `b` did not get `b - a - 1` samples, and knows it without asking anybody.
+//! Ingress numbers the samples of a route 1, 2, 3, … without gaps, also across its restarts. A lane that takes
+//! the numbers `a` and then `b` therefore missed exactly `b - a - 1` samples.
 
-/// What a lane makes of the number of the sample it just took.
+/// How the sequence number of a sample relates to those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sighting {
-    /// The next one, or the first that the lane ever saw.
+    /// The next number, or the first that the lane ever took.
     InOrder,
-    /// So many samples before this one are missing. The caller knows why: its queue overflowed, no process
-    /// served the lane, or an ingress process died.
+    /// This many samples before it are missing. The caller knows why: its queue overflowed, no process served
+    /// the lane, or an ingress process died.
     AfterGap(u64),
-    /// Accounted for before.
+    /// Already accounted for.
     Duplicate,
 }
 
-/// Keeps the account of one route on one lane: every number in `first()+1 ..= last()` was seen or is missing.
+/// The account of one route on one lane: every number in `first()+1 ..= last()` was taken or is missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SequenceTracker {
     first: u64,
@@ -24,16 +24,16 @@ pub struct SequenceTracker {
 }
 
 impl SequenceTracker {
-    /// A lane that never saw a sample of the route. The account begins at the first one it sees, so that what
-    /// was published before the lane existed does not count as missing.
+    /// The account of a lane that has taken no sample of the route. It begins at the first sample, so that those
+    /// published before the lane existed do not count as missing.
     pub const fn new() -> Self {
         Self { first: 0, last: 0, begun: false }
     }
 
-    /// Goes on with the account of a former process: `first` and `last` are what its tracker showed
-    /// (`first_sequence` and `last_sequence` of the lane's counters). What was published since is then
-    /// missing or yet to be seen. Both 0 stand for a process that never saw a sample, if `last` is below
-    /// `first` the account is damaged and begins anew at `first`.
+    /// Continues the account of a former process with its `first()` and `last()` (`first_sequence` and
+    /// `last_sequence` of the lane's counters). Samples published since are missing until the lane takes them.
+    /// Both are 0 if the process took no sample. If `last` is below `first`, the account is damaged and
+    /// restarts at `first`.
     pub const fn resume(first: u64, last: u64) -> Self {
         let last = if last < first { first } else { last };
         Self { first, last, begun: last > 0 }
@@ -49,8 +49,8 @@ impl SequenceTracker {
         self.last
     }
 
-    /// Accounts for `sequence`, and for those missing before it. 0 is a number that ingress never gives; it
-    /// reads as a duplicate.
+    /// Accounts for `sequence` and the numbers missing before it. 0, which ingress never assigns, counts as a
+    /// duplicate.
     pub const fn see(&mut self, sequence: u64) -> Sighting {
         if sequence <= self.last || sequence == 0 {
             return Sighting::Duplicate;
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_account_begins_at_the_first_sample_seen() {
+    fn the_account_begins_at_the_first_sample() {
         let mut tracker = SequenceTracker::new();
         assert_eq!(tracker.see(500), Sighting::InOrder);
         assert_eq!((tracker.first(), tracker.last()), (499, 500));
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_counts_the_missing_and_not_the_one_seen() {
+    fn a_gap_counts_only_the_missing_samples() {
         let mut tracker = SequenceTracker::new();
         tracker.see(1);
         assert_eq!(tracker.see(5), Sighting::AfterGap(3));
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resumed_account_names_what_was_missed_meanwhile() {
+    fn a_resumed_account_counts_the_samples_missed_in_between() {
         let mut tracker = SequenceTracker::resume(10, 40);
         assert_eq!(tracker.see(40), Sighting::Duplicate);
         assert_eq!(tracker.see(43), Sighting::AfterGap(2));
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_number_overflows_nothing() {
+    fn the_largest_number_does_not_overflow() {
         let mut tracker = SequenceTracker::new();
         tracker.see(1);
         assert_eq!(tracker.see(u64::MAX), Sighting::AfterGap(u64::MAX - 2));

@@ -1,10 +1,10 @@
-//! How old a sample is.
+//! The age of a sample, and whether the sample is stale.
 
 use crate::model::{MonotonicNs, SourceTimestamp, WallNs};
 
-/// The age of a sample in nanoseconds: since its source timestamp, or since ingress took it at `taken_at`
-/// when it has none. 0 when that lies ahead, because a clock stepped back or the publisher's clock is ahead
-/// of ours.
+/// The age of a sample in nanoseconds: since its source timestamp, or, without one, since ingress took it at
+/// `taken_at`. 0 when that instant is in the future, because a clock stepped back or the publisher's clock is
+/// ahead.
 pub fn age_ns(
     source_timestamp: SourceTimestamp,
     taken_at: MonotonicNs,
@@ -33,13 +33,13 @@ mod tests {
     }
 
     #[test]
-    fn age_runs_from_the_source_timestamp() {
+    fn the_age_is_measured_from_the_source_timestamp() {
         let source = SourceTimestamp::from_wall(EPOCH);
         assert_eq!(age_ns(source, MonotonicNs(0), MonotonicNs(u64::MAX), later(201)), 201_000_000);
     }
 
     #[test]
-    fn without_a_source_timestamp_age_runs_from_the_arrival() {
+    fn without_a_source_timestamp_the_age_is_measured_from_the_arrival() {
         let age = age_ns(SourceTimestamp::NONE, MonotonicNs(5), MonotonicNs(12), later(9));
         assert_eq!(age, 7);
     }

@@ -1,39 +1,41 @@
-//! When a rate allows the next sample: a token bucket for samples, and one with debt for bytes.
+//! Rate limits: a token bucket for samples, and a budget with debt for bytes.
 //!
-//! Both count in integers and are therefore exact: credit is (rate × elapsed time), added up without
-//! rounding, so that nothing drifts, however often or late the bucket is asked. Equivalent to the generic
-//! cell rate algorithm (ITU-T I.371) in what conforms: in any window of `t` seconds at most `rate × t +
-//! burst` tokens.
+//! Both count in integers and are therefore exact: credit is (rate × elapsed time), summed without rounding,
+//! so that nothing drifts, however often or late the caller polls. The bucket admits the same samples as the
+//! generic cell rate algorithm (ITU-T I.371): at most `rate × t + burst` tokens in any window of `t` seconds.
 //!
-//! Why the bucket must hold more than one token: docs/decisions/0003-token-bucket.md has the measurements.
+//! docs/decisions/0003-token-bucket.md has the measurements that show why the bucket must hold more than one
+//! token.
 
 use crate::model::{LaneMode, LaneRates, MonotonicNs};
 
 /// The highest rate of a [`TokenBucket`], in hertz.
 pub const MAX_RATE_HZ: f64 = 100_000.0;
 
-/// What accrues in this time is added to every burst, so that late wake-ups cost no rate: 50 ms.
+/// Every burst includes the credit that accrues in this time, so that late wake-ups do not lower the rate:
+/// 50 ms.
 ///
-/// Two wake-ups may be late one after the other, that for the token and that for a sample, so this covers 25
-/// ms each. The latest on an idle machine without real-time scheduling was 2.3 ms; ten times that leaves room
-/// for a loaded one, and is still only half a sample at 10 Hz.
+/// Two consecutive wake-ups may be late, that for the token and that for a sample, so this covers 25 ms each.
+/// The latest on an idle machine without real-time scheduling was 2.3 ms; ten times that leaves room for a
+/// loaded one, and is still only half a sample at 10 Hz.
 pub const BURST_WINDOW_NS: u64 = 50_000_000;
 
-/// One token. Credit counts nanohertz times nanoseconds, which is 10⁻¹⁸ of a token: a rate of 0.01 Hz is then
-/// exact to 5 × 10⁻⁸, and the credit of 584 years at 100 kHz is below 2 × 10³³ of the 3 × 10³⁸ that fit.
+/// One token in units of credit. A unit is one nanohertz times one nanosecond, 10⁻¹⁸ of a token: a rate of
+/// 0.01 Hz is then exact to 5 × 10⁻⁸, and the credit of 584 years at 100 kHz is below 2 × 10³³, where 3 × 10³⁸
+/// fit.
 const TOKEN: u128 = 1_000_000_000_000_000_000;
 
 /// One byte in units of (byte per second) × nanosecond.
 const BYTE: i128 = 1_000_000_000;
 
-/// The burst, in tokens, with which a lane reaches `rate_hz`: two tokens and what accrues in
+/// The burst, in tokens, with which a lane reaches `rate_hz`: two tokens plus those that accrue in
 /// [`BURST_WINDOW_NS`].
 ///
-/// Nothing is lost while the burst is at least 1 + rate × (jitter + 2 × lateness): one token, which the next
-/// sample takes, and what accrues while the publisher or the consumer is late. The second token is for a
-/// jitter of a whole input interval, peak to peak; the rest for lateness. With wake-ups up to 3 ms late, a
-/// burst of one token gives 9.85 Hz of 10 and 396 of 1,000, two tokens 710 of 1,000, one token and 50 ms
-/// 0.483 of 0.5 under that jitter, and this gives all of each.
+/// The lane reaches the rate if the burst is at least 1 + rate × (jitter + 2 × lateness): one token, which the
+/// next sample takes, plus those that accrue while the publisher or the consumer is late. The second token
+/// covers a jitter of a whole input interval, peak to peak; the rest covers lateness. With wake-ups up to 3 ms
+/// late, a burst of one token reaches 9.85 of 10 Hz and 396 of 1,000 Hz, two tokens reach 710 of 1,000 Hz, and
+/// one token plus 50 ms reaches 0.483 of 0.5 Hz with that jitter; this burst reaches each of these rates.
 pub fn burst_for(rate_hz: f64) -> f64 {
     2.0 + usable_rate(rate_hz) * (BURST_WINDOW_NS as f64 / 1e9)
 }
@@ -42,41 +44,41 @@ fn usable_rate(rate_hz: f64) -> f64 {
     if rate_hz.is_nan() { 0.0 } else { rate_hz.clamp(0.0, MAX_RATE_HZ) }
 }
 
-/// A token bucket: tokens accrue at a rate up to a burst, and a sample takes one.
+/// A token bucket: tokens accrue at a rate, up to a burst, and each sample takes one.
 #[derive(Clone, Debug)]
 pub struct TokenBucket {
     rate_nhz: u64,
-    /// The most credit that is kept.
+    /// The largest credit.
     cap: u128,
-    /// At `updated_at`; never above `cap`.
+    /// The credit at `updated_at`, at most `cap`.
     credit: u128,
     updated_at: MonotonicNs,
 }
 
 impl TokenBucket {
-    /// A bucket that holds one token, so that the first sample goes at once and a process that is restarted
-    /// again and again doesn't send a burst each time.
+    /// A bucket that holds one token, so that the first sample passes immediately and a process that restarts
+    /// repeatedly does not send a burst each time.
     ///
-    /// `rate_hz` is rounded to nanohertz and limited to 0 to [`MAX_RATE_HZ`]; not a number reads as 0, which
-    /// never gives a further token. `burst` is in tokens, at least 1; see [`burst_for`].
+    /// `rate_hz` is rounded to nanohertz and limited to 0 to [`MAX_RATE_HZ`]; NaN counts as 0. At rate 0 no
+    /// further token accrues. `burst` is in tokens, at least 1; see [`burst_for`].
     pub fn new(rate_hz: f64, burst: f64, now: MonotonicNs) -> Self {
         let mut bucket = Self { rate_nhz: 0, cap: TOKEN, credit: TOKEN, updated_at: now };
         bucket.set_rate(rate_hz, burst, now);
         bucket
     }
 
-    /// Accrues at `rate_hz` from `now` on. Tokens already there stay, up to the new `burst`.
+    /// Accrues at `rate_hz` from `now` on. The credit stays, up to the new `burst`.
     pub fn set_rate(&mut self, rate_hz: f64, burst: f64, now: MonotonicNs) {
         self.settle(now);
         let rate_nhz = usable_rate(rate_hz) * 1e9;
-        // A rate above 0 never rounds to the 0 that means never.
+        // A rate above 0 is never rounded to 0, at which no token accrues.
         self.rate_nhz = if rate_nhz > 0.0 { rate_nhz.round().max(1.0) as u64 } else { 0 };
-        // `as` saturates, and reads not-a-number as 0.
+        // `as` saturates, and converts NaN to 0.
         self.cap = ((burst * TOKEN as f64) as u128).max(TOKEN);
         self.credit = self.credit.min(self.cap);
     }
 
-    /// When a token is there: `now` or later; `None` when never, because the rate is 0.
+    /// The instant of the next token: `now` if the bucket has one, else later; `None` if the rate is 0.
     pub fn ready_at(&self, now: MonotonicNs) -> Option<MonotonicNs> {
         let missing = TOKEN.saturating_sub(self.credit);
         if missing == 0 {
@@ -90,12 +92,12 @@ impl TokenBucket {
         Some(self.updated_at.plus_ns(wait_ns).max(now))
     }
 
-    /// Whole tokens there at `now`.
+    /// Whole tokens in the bucket at `now`.
     pub fn tokens(&self, now: MonotonicNs) -> u64 {
         u64::try_from(self.credit_at(now) / TOKEN).unwrap_or(u64::MAX)
     }
 
-    /// Takes a token if one is there.
+    /// Takes a token if the bucket has one, and returns whether it had.
     pub fn try_take(&mut self, now: MonotonicNs) -> bool {
         self.settle(now);
         match self.credit.checked_sub(TOKEN) {
@@ -112,28 +114,28 @@ impl TokenBucket {
         (self.credit + accrued).min(self.cap)
     }
 
-    /// A clock that stepped back accrues nothing until it has caught up.
+    /// Updates the credit to `now`. After a clock has stepped back, none accrues until it reaches `updated_at`.
     fn settle(&mut self, now: MonotonicNs) {
         self.credit = self.credit_at(now);
         self.updated_at = self.updated_at.max(now);
     }
 }
 
-/// Bytes per second, with debt: a sample of any size passes while the balance is not negative, and what it
-/// takes beyond the balance delays the next. So a sample larger than a second's bytes is still sent, and the
-/// long-term rate is exact whatever the sizes are.
+/// A limit of bytes per second, with debt: a sample of any size passes while the balance is not negative, and
+/// the debt that it makes delays the next. A sample larger than the bytes of one second therefore still passes,
+/// and the long-term rate is exact for samples of any size.
 ///
-/// The balance is kept up to what accrues in [`BURST_WINDOW_NS`] and the largest sample so far, the same two
-/// parts as in [`burst_for`]. In any window of `t` seconds at most `rate × t` bytes, that burst, and one
-/// sample of debt pass.
+/// The balance is limited to the bytes that accrue in [`BURST_WINDOW_NS`] plus the largest sample so far, the
+/// same two parts as in [`burst_for`]. In any window of `t` seconds at most `rate × t` bytes, that burst, and
+/// one sample of debt pass.
 ///
-/// Routes that share one are to be polled in turn, see [`TurnOrder`](super::TurnOrder): otherwise the one
-/// that is asked first takes it all.
+/// The caller polls routes that share a budget in turn, see [`TurnOrder`](super::TurnOrder): otherwise the
+/// route polled first takes all of it.
 #[derive(Clone, Debug)]
 pub struct ByteBudget {
     /// `None` is unlimited.
     bytes_per_s: Option<u64>,
-    /// At `updated_at`.
+    /// The balance at `updated_at`.
     balance: i128,
     largest: u64,
     updated_at: MonotonicNs,
@@ -145,22 +147,22 @@ impl ByteBudget {
         Self { bytes_per_s, balance: 0, largest: 0, updated_at: now }
     }
 
-    /// Accrues at `bytes_per_s` from `now` on. Debt stays, but for that an unlimited budget forgives it.
+    /// Accrues at `bytes_per_s` from `now` on. Debt stays, except that `None` (unlimited) cancels it.
     pub fn set_rate(&mut self, bytes_per_s: Option<u64>, now: MonotonicNs) {
         self.settle(now);
         self.bytes_per_s = bytes_per_s;
         self.balance = if bytes_per_s.is_some() { self.balance.min(self.cap()) } else { 0 };
     }
 
-    /// Accrues at the rate of `mode`; where that forwards nothing the former rate goes on, so that debt is
-    /// paid.
+    /// Accrues at the rate of `mode`. In a mode that forwards nothing the former rate applies, so that debt is
+    /// still paid off.
     pub fn set_mode(&mut self, rates: &LaneRates, mode: LaneMode, now: MonotonicNs) {
         if let Some(rate) = rates.in_mode(mode) {
             self.set_rate(rate.max_bytes_per_s, now);
         }
     }
 
-    /// When the balance is not negative: `now` or later; `None` when never, because the rate is 0.
+    /// The instant from which the balance is not negative: `now` or later; `None` in debt at rate 0.
     pub fn ready_at(&self, now: MonotonicNs) -> Option<MonotonicNs> {
         match self.bytes_per_s {
             None => Some(now),
@@ -174,7 +176,7 @@ impl ByteBudget {
         }
     }
 
-    /// Takes `bytes` if the balance is not negative.
+    /// Takes `bytes` if the balance is not negative, and returns whether it did.
     pub fn try_take(&mut self, bytes: u64, now: MonotonicNs) -> bool {
         if self.bytes_per_s.is_none() {
             return true;
@@ -188,7 +190,7 @@ impl ByteBudget {
         true
     }
 
-    /// Whole bytes that may be taken at `now` without debt; 0 while in debt.
+    /// Whole bytes that can be taken at `now` without debt; 0 while in debt.
     pub fn balance_bytes(&self, now: MonotonicNs) -> u64 {
         if self.bytes_per_s.is_none() {
             return u64::MAX;
@@ -221,7 +223,7 @@ mod tests {
     const SECOND: u64 = 1_000_000_000;
 
     #[test]
-    fn the_first_token_is_there_at_once_and_the_second_one_interval_later() {
+    fn the_bucket_starts_with_one_token_and_the_second_comes_one_interval_later() {
         let start = MonotonicNs(7);
         let mut bucket = TokenBucket::new(8.0, 2.0, start);
         assert_eq!(bucket.ready_at(start), Some(start));
@@ -247,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_of_zero_gives_no_further_token() {
+    fn at_rate_zero_no_further_token_accrues() {
         for rate_hz in [0.0, -1.0, f64::NAN, f64::NEG_INFINITY] {
             let mut bucket = TokenBucket::new(rate_hz, f64::NAN, MonotonicNs(0));
             assert!(bucket.try_take(MonotonicNs(0)));
@@ -257,17 +259,17 @@ mod tests {
     }
 
     #[test]
-    fn tokens_stop_at_the_burst() {
+    fn tokens_are_limited_to_the_burst() {
         let mut bucket = TokenBucket::new(10.0, 2.5, MonotonicNs(0));
         let late = MonotonicNs(u64::MAX / 2);
         assert_eq!(bucket.tokens(late), 2);
         assert!(bucket.try_take(late) && bucket.try_take(late) && !bucket.try_take(late));
-        // The half token that is left is worth half an interval.
+        // The remaining half token shortens the wait by half an interval.
         assert_eq!(bucket.ready_at(late), Some(late.plus_ms(50)));
     }
 
     #[test]
-    fn nothing_drifts_in_thirty_days_of_odd_wake_ups() {
+    fn the_rate_is_exact_over_thirty_days_of_irregular_wake_ups() {
         let mut bucket = TokenBucket::new(7.3, 4.0, MonotonicNs(0));
         let mut taken = 0_u64;
         let (mut now, end) = (MonotonicNs(0), 30 * 86_400 * SECOND);
@@ -278,12 +280,12 @@ mod tests {
             late_ns = (late_ns * 48_271) % 2_147_483_647;
             now = bucket.ready_at(now).expect("a rate above 0").plus_ns(late_ns % 3_000_000);
         }
-        // 7.3 Hz for 2,592,000 s, the token of the start, and the last wake-up may be late.
+        // 7.3 Hz for 2,592,000 s, plus the first token; the last wake-up may be late.
         assert!(taken.abs_diff(18_921_600 + 1) <= 1, "{taken}");
     }
 
     #[test]
-    fn a_clock_that_steps_back_neither_gives_nor_takes_tokens() {
+    fn a_clock_that_steps_back_neither_adds_nor_removes_tokens() {
         let mut bucket = TokenBucket::new(10.0, 2.0, MonotonicNs(0));
         let now = MonotonicNs(10 * SECOND);
         assert!(bucket.try_take(now) && bucket.try_take(now));
@@ -294,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_rate_applies_from_then_on() {
+    fn a_new_rate_applies_from_the_change_on() {
         let mut bucket = TokenBucket::new(10.0, 2.0, MonotonicNs(0));
         assert!(bucket.try_take(MonotonicNs(0)));
         // Half a token at 10 Hz, and the other half at 1 Hz.
@@ -307,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn extreme_instants_and_rates_overflow_nothing() {
+    fn extreme_instants_and_rates_do_not_overflow() {
         let mut bucket = TokenBucket::new(f64::INFINITY, f64::INFINITY, MonotonicNs(0));
         assert!(bucket.try_take(MonotonicNs(u64::MAX)));
         assert!(bucket.tokens(MonotonicNs(u64::MAX)) > 1_000_000);
@@ -330,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unlimited_budget_is_always_ready_and_forgives_debt() {
+    fn an_unlimited_budget_is_always_ready_and_cancels_debt() {
         let start = MonotonicNs(0);
         let mut budget = ByteBudget::new(Some(1), start);
         assert!(budget.try_take(1_000_000, start));

@@ -1,9 +1,9 @@
-//! When a figure of a subscriber is worth a warning. A warning is shown and decides nothing.
+//! Warnings about figures of a subscriber. They are shown only and have no influence on any mode.
 
 use super::probe_window::LinkReading;
 use crate::model::SubscriberWarning;
 
-/// Above what a figure is worth a warning (`probes.*_threshold`).
+/// The thresholds above which a figure causes a warning (`probes.*_threshold`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WarningThresholds {
     /// Mean round trip, in milliseconds.
@@ -12,38 +12,39 @@ pub struct WarningThresholds {
     pub loss: f64,
     /// Jitter, in milliseconds.
     pub jitter_ms: f64,
-    /// Consecutive readings that it takes to show a warning, and to withdraw it; at least 1.
+    /// Consecutive readings required to show a warning, and to withdraw it; at least 1.
     pub readings: u32,
 }
 
-/// The warnings of one subscriber.
+/// The warnings of one subscriber, with hysteresis.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SubscriberWarnings {
     /// In the order of [`SubscriberWarning::ALL`].
-    gates: [Gate; 3],
+    figures: [Hysteresis; 3],
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Gate {
+struct Hysteresis {
+    /// Whether the warning is shown.
     shown: bool,
-    /// Consecutive readings that speak against what is shown.
-    against: u32,
+    /// Consecutive readings that contradict `shown`.
+    contrary: u32,
 }
 
 impl SubscriberWarnings {
-    /// Takes a reading; a figure that cannot be told leaves its warning as it is. Returns the warnings that
-    /// are shown, as [`SubscriberWarning`]'s bits.
+    /// Applies a reading and returns the warnings to show, as [`SubscriberWarning`]'s bits. The warning of a
+    /// figure that the reading does not have stays as it is.
     pub fn read(&mut self, thresholds: &WarningThresholds, link: &LinkReading) -> u8 {
         let loss = (link.settled > 0).then_some(link.loss);
         let (rtt_ms, jitter_ms) = (link.rtt_mean_ms, link.jitter_ms);
         let figures =
             [(rtt_ms, thresholds.rtt_ms), (loss, thresholds.loss), (jitter_ms, thresholds.jitter_ms)];
         let mut bits = 0;
-        for ((gate, (figure, threshold)), warning) in
-            self.gates.iter_mut().zip(figures).zip(SubscriberWarning::ALL)
+        for ((hysteresis, (figure, threshold)), warning) in
+            self.figures.iter_mut().zip(figures).zip(SubscriberWarning::ALL)
         {
-            gate.read(figure.map(|figure| figure > threshold), thresholds.readings);
-            if gate.shown {
+            hysteresis.read(figure.map(|figure| figure > threshold), thresholds.readings);
+            if hysteresis.shown {
                 bits |= warning as u8;
             }
         }
@@ -51,14 +52,14 @@ impl SubscriberWarnings {
     }
 }
 
-impl Gate {
+impl Hysteresis {
     fn read(&mut self, above: Option<bool>, readings: u32) {
         match above {
-            Some(above) if above != self.shown => self.against += 1,
-            Some(_) | None => self.against = 0,
+            Some(above) if above != self.shown => self.contrary += 1,
+            Some(_) | None => self.contrary = 0,
         }
-        if self.against > 0 && self.against >= readings {
-            *self = Self { shown: !self.shown, against: 0 };
+        if self.contrary > 0 && self.contrary >= readings {
+            *self = Self { shown: !self.shown, contrary: 0 };
         }
     }
 }
@@ -84,7 +85,7 @@ mod tests {
         }
     }
 
-    /// What is shown after each of these round trips.
+    /// The warnings shown after each of these round trips.
     fn shown(rtt_ms: &[f64]) -> Vec<u8> {
         let mut warnings = SubscriberWarnings::default();
         let read = |rtt_ms: &f64| warnings.read(&THRESHOLDS, &link(Some(*rtt_ms), Some(0.0), Some(0.0)));
@@ -92,14 +93,14 @@ mod tests {
     }
 
     #[test]
-    fn a_warning_takes_consecutive_readings_both_ways() {
+    fn a_warning_is_shown_and_withdrawn_after_consecutive_readings() {
         assert_eq!(shown(&[101.0, 101.0, 101.0, 99.0, 99.0, 100.0]), [0, 0, 1, 1, 1, 0]);
         assert_eq!(shown(&[101.0, 101.0, 99.0, 101.0, 101.0]), [0; 5]);
         assert_eq!(shown(&[100.0; 9]), [0; 9]);
     }
 
     #[test]
-    fn each_figure_has_a_warning_of_its_own() {
+    fn each_figure_has_its_own_warning() {
         let mut warnings = SubscriberWarnings::default();
         let once = WarningThresholds { readings: 1, ..THRESHOLDS };
         let loss = SubscriberWarning::Loss as u8;

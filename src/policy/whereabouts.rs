@@ -1,45 +1,45 @@
-//! Whether a DDS endpoint is on this host.
+//! Decides whether a DDS endpoint is on this host.
 
 // Addresses only: `core::net` has no sockets.
 use core::net::IpAddr;
 
-/// What is known of where an endpoint is.
+/// The addresses of an endpoint's participant.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Location {
-    /// Where the last datagram of its participant came from; `None` when none came from the participant
-    /// itself, because a discovery server passed on what it announces, say.
+    /// The source address of the participant's last datagram; `None` when none arrived from the participant
+    /// itself, for example because a discovery server forwards its announcements.
     pub seen_from: Option<IpAddr>,
-    /// Where it says that it receives unicast over UDP.
+    /// The addresses at which it announces to receive unicast over UDP.
     pub announced: Vec<IpAddr>,
 }
 
-/// Where an endpoint is.
+/// Whether an endpoint is on this host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Whereabouts {
     /// On this host.
     Local,
-    /// On another one.
+    /// On another host.
     Remote,
-    /// Nothing says.
+    /// The addresses do not show it.
     Unknown,
 }
 
 impl Location {
-    /// Whether that is here, on the host whose interfaces have the addresses `own`.
+    /// Whether the endpoint is on this host, whose interfaces have the addresses `own`.
     ///
-    /// The sender of the participant's datagrams decides if it is known: the kernel sends what stays on a
-    /// host from an address of that host, and lets nothing in that claims one. What is announced decides
-    /// otherwise, and is weaker evidence:
-    /// - 127.0.0.1 says nothing beside other addresses, for some libraries announce it to all. Alone it means
-    ///   that only this host is served.
-    /// - An address of ours means here, as long as it is not one that many hosts have, such as 172.17.0.1,
-    ///   the default of Docker's bridge: a robot and a laptop that both have it look alike.
-    /// - A node that announces an address which its host had once is not taken for another host's if it
-    ///   announces a present one too.
+    /// The source address of the participant's datagrams decides if it is known: the kernel sends local
+    /// traffic from an address of this host, and drops traffic from outside that claims one. Otherwise the
+    /// announced addresses decide, which are weaker evidence:
+    /// - 127.0.0.1 beside other addresses is ignored, because some libraries announce it to all hosts. Alone it
+    ///   means that the endpoint is on this host.
+    /// - An address of this host means local. That is wrong for an address that many hosts have, such as
+    ///   172.17.0.1, the default of Docker's bridge: a robot and a laptop that both have it look alike.
+    /// - One current address of this host is enough: a node may also announce addresses that the host no longer
+    ///   has.
     ///
-    /// A container that shares the host's network is this host. One with a network of its own is another:
-    /// what it receives crosses a virtual switch, and nothing tells that from a real one. Shared-memory
-    /// locators are no addresses: an endpoint with these alone is unknown, and can't be remote.
+    /// A container that shares the host's network is this host. One with its own network is another host: its
+    /// traffic crosses a virtual switch, which cannot be distinguished from a real one. Shared-memory locators
+    /// are not addresses: an endpoint with no others is unknown.
     pub fn whereabouts(&self, own: &[IpAddr]) -> Whereabouts {
         let is_here = |address: &IpAddr| {
             let address = address.to_canonical();
@@ -48,9 +48,13 @@ impl Location {
         if let Some(source) = &self.seen_from {
             return if is_here(source) { Whereabouts::Local } else { Whereabouts::Remote };
         }
-        let mut telling = self.telling().peekable();
-        if telling.peek().is_some() {
-            if telling.any(|address| is_here(&address)) { Whereabouts::Local } else { Whereabouts::Remote }
+        let mut distinctive = self.distinctive().peekable();
+        if distinctive.peek().is_some() {
+            if distinctive.any(|address| is_here(&address)) {
+                Whereabouts::Local
+            } else {
+                Whereabouts::Remote
+            }
         } else if self.announced.iter().any(|address| address.to_canonical().is_loopback()) {
             Whereabouts::Local
         } else {
@@ -58,14 +62,14 @@ impl Location {
         }
     }
 
-    /// The address by which to name the host: where its datagrams come from, or else the first that it
-    /// announces and that tells hosts apart.
+    /// The address to show for the host: the source address of its datagrams, or else the first announced
+    /// address that identifies a host.
     pub fn host(&self) -> Option<IpAddr> {
-        self.seen_from.map(|source| source.to_canonical()).or_else(|| self.telling().next())
+        self.seen_from.map(|source| source.to_canonical()).or_else(|| self.distinctive().next())
     }
 
-    /// The announced addresses that belong to one host or another.
-    fn telling(&self) -> impl Iterator<Item = IpAddr> {
+    /// The announced addresses that identify a host: not loopback, unspecified or multicast.
+    fn distinctive(&self) -> impl Iterator<Item = IpAddr> {
         let announced = self.announced.iter().map(IpAddr::to_canonical);
         announced
             .filter(|address| !address.is_loopback() && !address.is_unspecified() && !address.is_multicast())
@@ -88,20 +92,20 @@ mod tests {
     }
 
     #[test]
-    fn the_sender_of_the_datagrams_decides() {
+    fn the_source_address_of_the_datagrams_decides() {
         for here in
             ["127.0.0.1", "127.0.1.1", "10.0.0.5", "192.168.1.5", "2001:db8::5", "::1", "::ffff:10.0.0.5"]
         {
             assert_eq!(place(Some(here), &["192.168.1.9"]), Whereabouts::Local, "{here}");
         }
-        // A laptop with Docker, as the robot has it, and a library that announces 127.0.0.1.
+        // A laptop with Docker, which the robot has too, and a library that announces 127.0.0.1.
         let laptop = place(Some("192.168.1.9"), &["127.0.0.1", "192.168.1.9", "172.17.0.1"]);
         assert_eq!(laptop, Whereabouts::Remote);
         assert_eq!(place(Some("2001:db8::9"), &[]), Whereabouts::Remote);
     }
 
     #[test]
-    fn what_is_announced_decides_otherwise() {
+    fn without_datagrams_the_announced_addresses_decide() {
         assert_eq!(place(None, &["10.0.0.5"]), Whereabouts::Local);
         assert_eq!(place(None, &["10.0.0.77", "192.168.1.5"]), Whereabouts::Local, "it had 10.0.0.77 once");
         assert_eq!(place(None, &["127.0.0.1"]), Whereabouts::Local);
@@ -114,13 +118,13 @@ mod tests {
     }
 
     #[test]
-    fn without_an_address_nothing_is_known() {
+    fn without_an_address_the_host_is_unknown() {
         assert_eq!(place(None, &[]), Whereabouts::Unknown);
         assert_eq!(place(None, &["0.0.0.0", "239.255.0.1", "::"]), Whereabouts::Unknown);
     }
 
     #[test]
-    fn a_host_is_named_by_an_address_that_is_its_own() {
+    fn the_host_address_identifies_one_host() {
         let announced = addresses(&["127.0.0.1", "0.0.0.0", "10.0.0.9"]);
         assert_eq!(
             Location { seen_from: None, announced: announced.clone() }.host(),
