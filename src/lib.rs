@@ -10,8 +10,8 @@
 //! - [`dds`]: DDS readers, writers and discovery, on RustDDS.
 //! - [`shm`]: channels, boards and pools in shared memory, on iceoryx2.
 //! - [`telemetry`]: snapshots of the boards, status, metrics, diagnostics, logs.
-//! - [`process`]: ingress, egress, control, responder and supervisor; the only module that combines DDS, shared
-//!   memory and policy.
+//! - [`process`]: ingress, egress, control, responder and supervisor; the only module that combines DDS,
+//!   shared memory and policy.
 //! - [`cli`]: the subcommands.
 //! - [`eval`]: the evaluation harness (feature `eval`).
 

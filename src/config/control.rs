@@ -1,4 +1,5 @@
-//! What the control process does: classifier, probes, safety, security, diagnostics, subscribers.
+//! Reads the sections of the control process: classifier, probes, safety, security, diagnostics, overrides
+//! and subscribers.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -13,23 +14,23 @@ use super::settings::{
 };
 use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
 
-/// Slowest and fastest rate of something periodic in the control process.
+/// The allowed rates of periodic work in the control process.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
 
-/// The longest round trip worth a threshold: an hour.
+/// The largest threshold for round trips: an hour.
 const MAX_RTT_MS: f64 = 3_600_000.0;
 
-/// Slowest and fastest rate of the safety supervisor. In less than 50 ms a few errors would look like many
-/// a second.
+/// The allowed rates of the safety supervisor. At intervals below 50 ms a few errors would count as many
+/// errors per second.
 const SAFETY_RATES_HZ: std::ops::RangeInclusive<f64> = 0.1..=20.0;
 
-/// The longest silence worth a threshold: an hour.
+/// The largest threshold for silence: an hour.
 const HOUR_MS: u64 = 3_600_000;
 
-/// An idle process turns every 100 ms or so: a shorter silence is none.
+/// The smallest threshold for silence: an idle process makes a turn about every 100 ms.
 const MIN_SILENT_MS: u64 = 500;
 
-/// More than any process could count.
+/// The largest threshold for errors: more than any process can count.
 const MAX_ERRORS_PER_S: f64 = 1_000_000.0;
 
 pub(super) const TRUST_MODES: &[(&str, TrustMode)] = &[
@@ -52,7 +53,7 @@ const STATES: &[(&str, SubscriberState)] = &[
     ("NONCRITICAL", SubscriberState::Noncritical),
 ];
 
-/// `classifier`.
+/// Reads `classifier`.
 pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     let section = root.section("classifier");
     let subscriber = section.get("subscriber_id").text().filter(|id| !id.is_empty());
@@ -83,13 +84,13 @@ pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     classifier
 }
 
-/// Without a gap between the thresholds a subscriber would be promoted and demoted in turn, and the step from
-/// DEGRADED to EMERGENCY would be none.
+/// Checks that one threshold is below the other. Without a gap between them a subscriber would be promoted
+/// and demoted alternately, and EMERGENCY would be called for at the same value as DEGRADED.
 fn check_below((lower, low): (&Field<'_>, f64), (upper, high): (&Field<'_>, f64)) {
     if low < high || lower.was_reported() || upper.was_reported() {
         return;
     }
-    // Where only the other one is given, that is the one to change.
+    // The value to change is one that the file gives.
     if lower.is_given() {
         lower.report::<()>(&format!("must be below {} ({high})", upper.path));
     } else {
@@ -97,13 +98,13 @@ fn check_below((lower, low): (&Field<'_>, f64), (upper, high): (&Field<'_>, f64)
     }
 }
 
-/// A number of consecutive readings.
+/// Reads a number of consecutive readings.
 fn readings(field: &Field<'_>, default: u32) -> u32 {
     let count = field.whole(1..=1_000);
     count.and_then(|count| u32::try_from(count).ok()).unwrap_or(default)
 }
 
-/// `probes`. `max_probe_rate_hz` is what a responder lets through.
+/// Reads `probes`. `max_probe_rate_hz` is the rate that a responder accepts.
 pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
     let section = root.section("probes");
     let rate = section.get("rate_hz");
@@ -128,7 +129,9 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
     }
     if probes.request_topic == probes.response_topic && !request.was_reported() && !response.was_reported() {
         let given = if response.is_given() { response } else { request };
-        given.report::<()>("must be another topic than that of the other direction");
+        given.report::<()>(
+            "must not be the topic of the other direction: requests and responses need one each",
+        );
     }
     probes
 }
@@ -140,7 +143,7 @@ fn topic(field: &Field<'_>, default: &str) -> TopicName {
     given.unwrap_or_else(|| TopicName::try_from(default).expect("a default topic name"))
 }
 
-/// `safety`.
+/// Reads `safety`.
 pub(super) fn safety(root: &Field<'_>) -> Safety {
     let section = root.section("safety");
     let flag = |name: &str| section.get(name).flag().unwrap_or(true);
@@ -193,7 +196,7 @@ pub(super) fn safety(root: &Field<'_>) -> Safety {
     }
 }
 
-/// `security`. The secret itself is looked at only to see whether there is one.
+/// Reads `security`; of the secret only whether there is one.
 pub(super) fn security(root: &Field<'_>) -> Security {
     let section = root.section("security");
     let inline = section.get("hmac_secret");
@@ -214,7 +217,7 @@ pub(super) fn security(root: &Field<'_>) -> Security {
             .collect();
     if let [(first, _), others @ ..] = sources.as_slice() {
         for (field, _) in others {
-            field.report_key(&format!("must not be given beside {}: one source of the secret", first.path));
+            field.report_key(&format!("must not be given together with {}: use one of them", first.path));
         }
     }
     let rate = section.get("max_probe_rate_hz").whole(1..=10_000);
@@ -231,7 +234,7 @@ pub(super) fn security(root: &Field<'_>) -> Security {
     }
 }
 
-/// `diagnostics`.
+/// Reads `diagnostics`.
 pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
     let section = root.section("diagnostics");
     let interval_s = section.get("publish_interval_s").decimal(0.01..=3_600.0).unwrap_or(1.0);
@@ -247,7 +250,8 @@ pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
     }
 }
 
-/// The page shows what runs on the robot to whoever can reach it: nobody beyond the machine.
+/// Parses the address of the metrics page. It must be reachable from this host only, because the page shows
+/// without authentication what runs on the robot.
 fn metrics_listener(text: &str) -> Option<MetricsListener> {
     if let Some(path) = text.strip_prefix("unix:") {
         // `sockaddr_un` has room for 107 bytes and a zero (unix(7)).
@@ -258,13 +262,13 @@ fn metrics_listener(text: &str) -> Option<MetricsListener> {
     is_usable.then(|| MetricsListener::Tcp(address.ip(), address.port()))
 }
 
-/// A path that means the same whatever the working directory.
+/// Parses an absolute path, which does not depend on the working directory.
 pub(super) fn absolute_path(text: &str) -> Option<PathBuf> {
     let is_path = text.starts_with('/') && !text.contains('\0');
     is_path.then(|| PathBuf::from(text))
 }
 
-/// `overrides`: states forced by hand.
+/// Reads `overrides`: states that the user forces.
 pub(super) fn overrides(root: &Field<'_>) -> BTreeMap<String, SubscriberState> {
     let entries = root.get("overrides").entries();
     let states = entries.into_iter().filter_map(|(id, field)| {
@@ -274,7 +278,7 @@ pub(super) fn overrides(root: &Field<'_>) -> BTreeMap<String, SubscriberState> {
     states.collect()
 }
 
-/// `subscribers`: the lane of each, as `id: lane` or `id: {lane: lane}`.
+/// Reads `subscribers`: the lane of each, as `id: lane` or `id: {lane: lane}`.
 pub(super) fn subscribers(root: &Field<'_>, lanes: &[Lane]) -> BTreeMap<String, LaneName> {
     let names: Vec<&str> = lanes.iter().map(|lane| lane.name.as_str()).collect();
     let entries = root.get("subscribers").entries();
@@ -291,7 +295,7 @@ pub(super) fn subscribers(root: &Field<'_>, lanes: &[Lane]) -> BTreeMap<String, 
     on_lanes.collect()
 }
 
-/// A subscriber's id travels in every probe.
+/// Checks that a subscriber's id is valid in probe messages.
 fn check_id(id: &str, field: &Field<'_>) {
     if !is_probe_id(id) {
         field.report_key("must be a subscriber's id: 1 to 127 bytes without control characters");
@@ -304,7 +308,7 @@ mod tests {
     use crate::config::problem::Problems;
 
     #[test]
-    fn the_default_topics_are_topic_names() {
+    fn the_default_topics_are_valid_topic_names() {
         let problems = Problems::default();
         let root = Field::root(None, &problems);
         assert_eq!(probes(&root, 20).request_topic.as_str(), "/adaptive_bridge/probe_req");
@@ -314,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn the_metrics_page_is_for_this_machine_only() {
+    fn the_metrics_page_is_reachable_from_this_host_only() {
         let tcp = |address: &str| MetricsListener::Tcp(address.parse().unwrap(), 9464);
         assert_eq!(metrics_listener("127.0.0.1:9464"), Some(tcp("127.0.0.1")));
         assert_eq!(metrics_listener("[::1]:9464"), Some(tcp("::1")));

@@ -1,16 +1,16 @@
-//! The environment variables of ROS 2 that stand in where the file says nothing.
+//! Reads the environment variables of ROS 2 that supply defaults for the file.
 
 use std::net::Ipv4Addr;
 
 use super::problem::{Place, Problem, Problems, shown};
 use super::settings::NetworkSelector;
 
-/// What the environment says.
+/// The defaults from the environment.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Environment {
     /// `ROS_DOMAIN_ID`; 0 without it, as in ROS 2.
     pub domain_id: u16,
-    /// Bytes of a graph identifier in the distribution that `ROS_DISTRO` names.
+    /// The bytes of a graph identifier in the distribution that `ROS_DISTRO` names.
     pub graph_gid_bytes: usize,
     localhost_only: bool,
 }
@@ -76,7 +76,7 @@ impl Environment {
         Self { domain_id, graph_gid_bytes, localhost_only }
     }
 
-    /// The interfaces to use where the file names none: all, or the loopback one.
+    /// The interfaces to use if the file names none: all (an empty list), or only loopback.
     pub fn default_interfaces(&self) -> Vec<NetworkSelector> {
         match self.localhost_only {
             true => vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)],

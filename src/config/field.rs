@@ -1,5 +1,5 @@
-//! A value of the file at its key path, and the ways to read it. A wrong value is reported, and then counts
-//! as not given: the reader goes on, so that one run finds every problem.
+//! A value at a key path of the file, and functions to read it. A wrong value is reported and then counts as
+//! missing: reading continues, so that one run finds every problem.
 
 use std::ops::RangeInclusive;
 
@@ -7,29 +7,29 @@ use super::keys::joined;
 use super::problem::{Place, Problem, Problems, did_you_mean, shown};
 use super::yaml::{Content, Node};
 
-/// A place in the file, with or without a value.
+/// A key path of the file, with or without a value.
 #[derive(Clone, Debug)]
 pub(super) struct Field<'a> {
     /// Its key path, such as `topics[0].id`.
     pub path: String,
-    /// The line of its key, or of the nearest key above it that there is.
+    /// The line of its key; for a missing key that of the closest existing parent.
     pub line: usize,
     node: Option<&'a Node>,
     problems: &'a Problems,
 }
 
 impl<'a> Field<'a> {
-    /// The whole file.
+    /// The field of the whole file.
     pub fn root(node: Option<&'a Node>, problems: &'a Problems) -> Self {
         Self { path: String::new(), line: 1, node, problems }
     }
 
-    /// Whether there is a value, and not null.
+    /// Whether there is a value other than null.
     pub fn is_given(&self) -> bool {
         self.value().is_some()
     }
 
-    /// Whether the key is there with the value null, which is otherwise the same as not being there.
+    /// Whether the key exists with the value null, which all other functions treat as missing.
     pub fn is_null(&self) -> bool {
         self.node.is_some_and(Node::is_null)
     }
@@ -38,7 +38,7 @@ impl<'a> Field<'a> {
         self.node.filter(|node| !node.is_null())
     }
 
-    /// The field of this name in a mapping; without a value if this is no mapping or has no such key.
+    /// The field with this name in a mapping; without a value if this is no mapping or has no such key.
     pub fn get(&self, name: &str) -> Self {
         let entry = match self.value().map(|node| &node.content) {
             Some(Content::Map(entries)) => entries.iter().find(|entry| entry.key == name),
@@ -52,7 +52,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// The field of this name, which must be a mapping if it is there.
+    /// The field with this name; reports a value that is no mapping.
     pub fn section(&self, name: &str) -> Self {
         let section = self.get(name);
         section.entries();
@@ -64,7 +64,8 @@ impl<'a> Field<'a> {
         matches!(self.value().map(|node| &node.content), Some(Content::Map(_)))
     }
 
-    /// The keys of a mapping with their fields, each key once; none if there is no value.
+    /// The keys of a mapping with their fields, each key once; none if there is no value. Reports a value
+    /// that is no mapping.
     pub fn entries(&self) -> Vec<(&'a str, Self)> {
         let Some(node) = self.value() else { return Vec::new() };
         let Content::Map(entries) = &node.content else {
@@ -81,7 +82,7 @@ impl<'a> Field<'a> {
         .collect()
     }
 
-    /// The items of a list; `None` if there is no value, or another.
+    /// The items of a list; `None` if there is no value. Reports a value that is no list.
     pub fn items(&self) -> Option<Vec<Self>> {
         let Content::List(items) = &self.value()?.content else {
             return self.report("must be a list");
@@ -103,7 +104,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// A truth value.
+    /// A boolean.
     pub fn flag(&self) -> Option<bool> {
         const ALLOWED: &str = "must be true or false";
         self.value()?;
@@ -120,24 +121,24 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// A whole number; `10.0` is one too.
+    /// A whole number in a range; `10.0` is one too.
     pub fn whole(&self, range: RangeInclusive<u64>) -> Option<u64> {
         let allowed = format!("must be a whole number from {} to {}", range.start(), range.end());
         self.whole_where(&allowed, |number| range.contains(&number))
     }
 
-    /// A whole number that fulfils a condition.
+    /// A whole number that satisfies a condition.
     pub fn whole_where(&self, allowed: &str, accept: impl Fn(u64) -> bool) -> Option<u64> {
         self.value()?;
         self.number(allowed, |text| parse_whole(text).filter(|&number| accept(number)))
     }
 
-    /// A whole number that memory can be counted in.
+    /// A whole number in a range, as `usize`.
     pub fn count(&self, range: RangeInclusive<u64>) -> Option<usize> {
         self.whole(range).and_then(|number| usize::try_from(number).ok())
     }
 
-    /// A finite number.
+    /// A finite number in a range.
     pub fn decimal(&self, range: RangeInclusive<f64>) -> Option<f64> {
         self.value()?;
         let allowed = format!("must be a number from {} to {}", range.start(), range.end());
@@ -154,7 +155,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Text. A number or truth value is not, unless in quotes: other readers of the file would change `010`.
+    /// A text. A number or boolean must be in quotes, because other YAML parsers would change `010`.
     pub fn text(&self) -> Option<&'a str> {
         self.value()?;
         match self.scalar() {
@@ -166,13 +167,13 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Text that a parser of it accepts.
+    /// A text that `parse` accepts.
     pub fn parsed<T>(&self, allowed: &str, parse: impl FnOnce(&str) -> Option<T>) -> Option<T> {
         let text = self.text()?;
         parse(text).or_else(|| self.report(&format!("must be {allowed}")))
     }
 
-    /// One of a few words, whatever their case.
+    /// One of a few words, in any case.
     pub fn choice<T: Copy>(&self, choices: &[(&str, T)]) -> Option<T> {
         self.value()?;
         let word = self.scalar().map_or("", |(text, _)| text);
@@ -184,7 +185,7 @@ impl<'a> Field<'a> {
         })
     }
 
-    /// The name of something that the file defines elsewhere, found by `find` among `names`.
+    /// A reference by name to something that the file defines elsewhere; `find` looks it up.
     pub fn reference<T>(
         &self,
         what: &str,
@@ -198,12 +199,12 @@ impl<'a> Field<'a> {
         })
     }
 
-    /// Reports this field's value, or its absence. Always `None`, to be returned at once.
+    /// Reports this field's value, or that it is missing. Always returns `None`, which the caller can return.
     pub fn report<T>(&self, allowed: &str) -> Option<T> {
         self.report_with(allowed, None)
     }
 
-    /// The same with a remedy.
+    /// As [`report`](Self::report), with a hint at the remedy.
     pub fn report_with<T>(&self, allowed: &str, hint: Option<String>) -> Option<T> {
         match self.value() {
             Some(node) => self.add(self.shown(node), allowed.to_owned(), hint),
@@ -215,25 +216,25 @@ impl<'a> Field<'a> {
         None
     }
 
-    /// Reports the key itself, or that this value is not what `allowed` says of it beside the others.
+    /// Reports the key without its value.
     pub fn report_key(&self, allowed: &str) {
         self.add(None, allowed.to_owned(), None);
     }
 
-    /// Reports a key that had to be the name of something.
+    /// Reports a key that is not one of the known names.
     pub fn report_unknown_key(&self, what: &str, name: &str, known: &[&str]) {
         let hint = self.problems.hint(name, known);
         self.add(None, one_of(what, known), hint);
     }
 
-    /// Reports a value that the program worked out itself, from this field or for want of it.
+    /// Reports a value that the loader computed from this field or from defaults.
     pub fn report_value(&self, value: &str, allowed: String) {
         self.add(Some(shown(value)), allowed, None);
     }
 
-    /// Whether something was said about exactly this field already.
+    /// Whether a problem with exactly this key path has been reported.
     pub fn was_reported(&self) -> bool {
-        self.problems.concern(&[&self.path])
+        self.problems.has_key(&self.path)
     }
 
     fn add(&self, value: Option<String>, allowed: String, hint: Option<String>) {
@@ -241,7 +242,7 @@ impl<'a> Field<'a> {
         self.problems.report(Problem { place, key: self.path.clone(), value, allowed, hint });
     }
 
-    /// The value as a message may repeat it. What may be a secret, or hold one, it may not.
+    /// The value for a message; `None` if it may contain a secret.
     fn shown(&self, node: &Node) -> Option<String> {
         if self.path == "security" || self.path.starts_with("security.hmac_secret") {
             return None;
@@ -255,7 +256,7 @@ impl<'a> Field<'a> {
     }
 }
 
-/// What a name may be. A thousand topics would bury the message, so that a long list is left out.
+/// The allowed names, for a message. A list of more than 16 names is left out, to keep the message readable.
 fn one_of(what: &str, names: &[&str]) -> String {
     match names.len() {
         0 => format!("must be {what}, and there is none"),
@@ -264,21 +265,21 @@ fn one_of(what: &str, names: &[&str]) -> String {
     }
 }
 
-/// A whole number that is not negative.
+/// Parses a whole number that is not negative.
 fn parse_whole(text: &str) -> Option<u64> {
     let digits = text.strip_prefix('+').unwrap_or(text);
-    // 010 is ten in YAML 1.2 and eight in YAML 1.1: neither reading is safe.
+    // 010 is ten in YAML 1.2 and eight in YAML 1.1, so it is refused.
     if digits.starts_with('0') && digits.as_bytes().get(1).is_some_and(u8::is_ascii_digit) {
         return None;
     }
     digits.parse().ok().or_else(|| {
-        // Beyond 2^53 (9.007e15) a float no longer knows the units digit.
+        // Above 2^53 (9.007e15) an `f64` cannot represent every whole number.
         let number = parse_decimal(digits)?;
         (number.fract() == 0.0 && (0.0..=9.0e15).contains(&number)).then_some(number as u64)
     })
 }
 
-/// A finite number in decimal notation; no `.nan`, `.inf`, `0x10` or `1_000`.
+/// Parses a finite number in decimal notation; not `.nan`, `.inf`, `0x10` or `1_000`.
 fn parse_decimal(text: &str) -> Option<f64> {
     let is_number = text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'+' | b'-' | b'.' | b'e' | b'E'));
     let number = if is_number { text.parse::<f64>().ok() } else { None };

@@ -1,4 +1,4 @@
-//! The configuration in force, in the form in which it is kept beside the boards of a running bridge.
+//! The configuration in force, and its encoding in the file next to the boards of a running bridge.
 
 use std::fmt;
 
@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 use super::reload::Reload;
 use super::settings::Settings;
 
-/// Settings and the secret that stood in the same file.
+/// Settings and the secret from the same file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Configuration {
     /// The settings.
     pub settings: Settings,
-    /// `security.hmac_secret` of the file. The settings never hold it: they are logged.
+    /// `security.hmac_secret` of the file. It is not in the settings, because they are logged.
     pub inline_secret: Option<InlineSecret>,
 }
 
@@ -45,7 +45,7 @@ impl From<Settings> for Configuration {
     }
 }
 
-/// What is written. The fingerprint detects a reader whose `Settings` differ from the writer's.
+/// The encoded form. The fingerprint detects a program whose `Settings` type differs from the writer's.
 #[derive(Serialize, Deserialize)]
 struct Encoded {
     program_version: String,
@@ -54,7 +54,7 @@ struct Encoded {
     inline_secret: Option<InlineSecret>,
 }
 
-/// Why a stored configuration cannot be read: it was written by another version of the program, or damaged.
+/// The error for a stored configuration that another version of the program wrote, or that is damaged.
 #[derive(Debug)]
 pub struct DecodeError(String);
 
@@ -67,16 +67,17 @@ impl fmt::Display for DecodeError {
 impl std::error::Error for DecodeError {}
 
 impl Configuration {
-    /// As [`Settings::reloaded`]: this configuration with all that a running bridge takes over from `new`.
+    /// As [`Settings::reloaded`]: this configuration with all changes in `new` that a running bridge can
+    /// apply.
     pub fn reloaded(&self, new: Self) -> (Self, Reload) {
         let (settings, reload) = self.settings.reloaded(new.settings);
         (Self { settings, inline_secret: new.inline_secret }, reload)
     }
 
-    /// The configuration as bytes that [`decode`](Self::decode) reads. They hold the secret.
+    /// Encodes the configuration, including the secret, for [`decode`](Self::decode).
     ///
     /// # Errors
-    /// None that is known: every value of the settings can be encoded.
+    /// None known: every value of the settings can be encoded.
     pub fn encode(&self) -> Result<Vec<u8>, serde_json::Error> {
         serde_json::to_vec(&Encoded {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -86,15 +87,16 @@ impl Configuration {
         })
     }
 
-    /// The configuration that was encoded, exactly.
+    /// Decodes a configuration exactly as it was encoded.
     ///
     /// # Errors
-    /// The bytes are not those of this version of the program.
+    /// Another version of the program wrote the bytes, or they are damaged.
     pub fn decode(bytes: &[u8]) -> Result<Self, DecodeError> {
         let Encoded { program_version, fingerprint, settings, inline_secret } =
             serde_json::from_slice(bytes).map_err(|error| DecodeError(error.to_string()))?;
         if settings.fingerprint() != fingerprint {
-            return Err(DecodeError(format!("version {program_version} of the program has other settings")));
+            let what = format!("written by version {program_version} of the program, whose settings differ");
+            return Err(DecodeError(what));
         }
         Ok(Self { settings, inline_secret })
     }

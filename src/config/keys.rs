@@ -1,12 +1,13 @@
-//! Every key that a configuration may have, once: unknown keys, suggestions and the documentation's tests all
-//! go by this list.
+//! The list of all configuration keys, used to find unknown keys, to suggest similar ones and to test the
+//! documentation.
 
 use std::collections::HashMap;
 
 use super::problem::{Place, Problem, Problems, did_you_mean, shown};
 use super::yaml::{Content, Entry, Node};
 
-/// The path of every key. `[]` is an item of a list; a name in angle brackets is the user's.
+/// The path of every key. `[]` is an item of a list; a name in angle brackets is a name that the user
+/// chooses.
 pub const KEYS: &[&str] = &[
     "instance",
     "ros.domain_id",
@@ -144,12 +145,12 @@ pub const KEYS: &[&str] = &[
     "diagnostics.metrics",
 ];
 
-/// Reports every key that is unknown and every key that is given twice, in the whole file.
+/// Reports every unknown key and every repeated key of the file.
 pub(super) fn check(root: &Node, problems: &Problems) {
     walk(root, Some(""), "", problems);
 }
 
-/// `pattern` is the path in the terms of [`KEYS`], `None` below a key that is unknown.
+/// Checks a value and all below it. `pattern` is its path as in [`KEYS`]; `None` below an unknown key.
 fn walk(node: &Node, pattern: Option<&str>, path: &str, problems: &Problems) {
     match &node.content {
         Content::Scalar { .. } => {}
@@ -169,7 +170,7 @@ fn walk(node: &Node, pattern: Option<&str>, path: &str, problems: &Problems) {
                         place: Place::Line(entry.line),
                         key: path.clone(),
                         value: None,
-                        allowed: format!("must be given once; it is there in line {first_line} already"),
+                        allowed: format!("must be given only once; line {first_line} already has it"),
                         hint: None,
                     });
                 }
@@ -178,7 +179,8 @@ fn walk(node: &Node, pattern: Option<&str>, path: &str, problems: &Problems) {
                     Some(name) => Some(*name),
                     None => known.iter().find(|name| name.starts_with('<')).copied(),
                 };
-                // A mapping where the list of keys has none is a value of the wrong type: its reader says so.
+                // A mapping at a key that has no keys below it is a value of the wrong type, which its reader
+                // reports.
                 if name.is_none() && !known.is_empty() {
                     problems.report(unknown(entry, &path, &known, problems));
                 }
@@ -190,7 +192,7 @@ fn walk(node: &Node, pattern: Option<&str>, path: &str, problems: &Problems) {
 }
 
 fn unknown(entry: &Entry, path: &str, known: &[&str], problems: &Problems) -> Problem {
-    // A key that is right elsewhere is more likely misplaced than misspelt beyond recognition.
+    // Without a similar key here, a key that exists elsewhere is probably misplaced.
     let hint = problems.hint(&entry.key, known).or_else(|| {
         let elsewhere = KEYS.iter().find(|key| key.rsplit('.').next() == Some(&entry.key));
         elsewhere.map(|key| did_you_mean(key))
@@ -202,7 +204,7 @@ fn unknown(entry: &Entry, path: &str, known: &[&str], problems: &Problems) -> Pr
     Problem { place: Place::Line(entry.line), key: path.to_owned(), value: None, allowed, hint }
 }
 
-/// The names that may stand directly below a path of [`KEYS`], in the order of that list.
+/// The names allowed directly below a path of [`KEYS`], in the order of that list.
 fn names_below(pattern: &str) -> Vec<&'static str> {
     let mut names: Vec<&'static str> = Vec::new();
     for key in KEYS {
@@ -219,7 +221,8 @@ fn names_below(pattern: &str) -> Vec<&'static str> {
     names
 }
 
-/// A key as a message may repeat it. `{hmac_secret:abc}`, without a space, is a key that holds the secret.
+/// A key for a message. `{hmac_secret:abc}`, without a space, is a key that contains the secret, so that a
+/// key below `security` is cut at the first separator.
 fn shown_key(path: &str, key: &str) -> String {
     let end = if path == "security" { key.find([':', '=', ' ']) } else { None };
     shown(&key[..end.unwrap_or(key.len())])

@@ -1,4 +1,4 @@
-//! Lanes: who is on which network, at what rate, scheduled how.
+//! Reads the lanes: their networks, queues, rates and scheduling.
 
 use super::environment::Environment;
 use super::field::Field;
@@ -7,27 +7,27 @@ use super::rates::{self, MAX_QUEUE, RoutingPolicy};
 use super::settings::{DdsNetwork, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
 use crate::model::{LaneName, TrafficClass};
 
-/// Each lane is a process with a DDS participant of its own, of which a domain has 120 on a host (RTPS 2.5
-/// clause 9.6.2.3).
+/// The most lanes. Each is a process with its own DDS participant, and a domain allows 120 participants on a
+/// host (RTPS 2.5 clause 9.6.2.3).
 const MAX_LANES: usize = 32;
 
 /// The largest sample, in bytes.
 pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
-/// The nice value of noncritical lanes: where a sample wakes several lanes and there is a CPU for one, the
-/// critical one has it. The scheduler gives them a ninth of its weight.
+/// The nice value of noncritical lanes: when a sample wakes several lanes and one CPU is free, the critical
+/// lane gets it. The scheduler gives a noncritical lane a ninth of the critical lane's weight.
 const NONCRITICAL_NICE: u8 = 10;
 
-/// The shortest slice that Linux grants: whoever else has the CPU gives way when a sample comes
-/// (docs/decisions/0010-time-slices.md).
+/// The shortest slice that Linux grants, so that a critical lane preempts other processes when a sample
+/// arrives (docs/decisions/0010-time-slices.md).
 const CRITICAL_SLICE_US: u32 = 100;
 
-/// Longer than the slice of any program that does not ask for one, which is 0.7 to 2.8 ms by the number of
-/// CPUs: all of them take the CPU from a noncritical lane when they wake. Short beside the 100 ms between its
-/// samples.
+/// Longer than the default slice of other programs, which is 0.7 to 2.8 ms depending on the number of CPUs,
+/// so that each of them preempts a noncritical lane when it wakes. Short compared with the 100 ms between the
+/// lane's samples.
 const NONCRITICAL_SLICE_US: u32 = 10_000;
 
-/// How a process is scheduled unless told otherwise.
+/// The default scheduling of a process: of a lane by its class, of others with `None`.
 pub(super) fn default_scheduling(class: Option<TrafficClass>) -> Scheduling {
     match class {
         Some(TrafficClass::Critical) => {
@@ -48,13 +48,13 @@ pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
     ("rr", SchedulingPolicy::RoundRobin),
 ];
 
-/// A lane, and the QoS that its outputs have unless they say otherwise.
+/// A lane without its outputs, and the default QoS of its outputs.
 pub(super) struct LaneDraft {
     pub lane: Lane,
     pub qos: PartialQos,
 }
 
-/// All lanes, without outputs: `critical`, `noncritical`, then the user's in the order of the file.
+/// Reads all lanes, without outputs: `critical`, `noncritical`, then the user's in the order of the file.
 pub(super) fn read(
     root: &Field<'_>,
     profiles: &Profiles<'_>,
@@ -73,9 +73,11 @@ pub(super) fn read(
             continue;
         }
         match LaneName::try_from(name) {
-            // `topics[].qos_overrides.input` is the reader's side.
+            // `topics[].qos_overrides.input` is the QoS of the ingress reader.
             Ok(_) if name == "input" => {
-                field.report_key("must be a lane name other than input, which means the publisher's side");
+                field.report_key(
+                    "must be a lane name other than input, which qos_overrides uses for the input",
+                );
             }
             Ok(name) => lanes.push((name, field)),
             Err(error) => {
@@ -123,7 +125,7 @@ impl LaneReader<'_> {
                 .unwrap_or(65_536),
             window_samples: field.get("window_samples").count(1..=100_000).unwrap_or(256),
             rates: match class {
-                TrafficClass::Critical => rates::refuse(field),
+                TrafficClass::Critical => rates::critical_rates(field),
                 TrafficClass::Noncritical => self.policy.lane_rates(field),
             },
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
@@ -137,7 +139,7 @@ impl LaneReader<'_> {
     }
 }
 
-/// `domain_id` and `networks` of a section; what it does not say is that of `base`.
+/// Reads `domain_id` and `networks` of a section; missing values are those of `base`.
 pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {
     let domain = section.get("domain_id").whole(0..=232).and_then(|id| u16::try_from(id).ok());
     let interfaces = section.get("networks").items().map(|items| {
@@ -152,13 +154,13 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
     }
 }
 
-/// A `scheduling` section; what it does not say is that of `default`.
+/// Reads a `scheduling` section; missing values are those of `default`.
 pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling {
     let policy = section.get("policy");
     let priority = section.get("priority");
     let kind = policy.choice(SCHEDULING_POLICIES);
     let priority = match kind.unwrap_or_default() {
-        // Where the policy itself is wrong, nothing is known of what the priority may be.
+        // If the policy itself is wrong, the allowed priority is unknown.
         SchedulingPolicy::Other if policy.was_reported() => 0,
         SchedulingPolicy::Other => priority
             .whole_where("must be 0 unless policy is fifo or rr", |priority| priority == 0)

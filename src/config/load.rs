@@ -1,4 +1,4 @@
-//! Finds, reads and checks a configuration file.
+//! Finds, reads and validates a configuration file.
 
 use std::fs::File;
 use std::io::Read;
@@ -14,14 +14,14 @@ use super::settings::{SecretSource, Settings, SharedMemory};
 use super::{control, keys, lanes, routes, yaml};
 use crate::model::{InstanceName, TrafficClass};
 
-/// The environment variable that names the file where the command line does not.
+/// The environment variable that names the file if the command line does not.
 pub const PATH_VARIABLE: &str = "ADAPTIVE_BRIDGE_CONFIG";
 
-/// The file that is read where neither the command line nor the environment names one.
+/// The file that is read if neither the command line nor the environment names one.
 pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
 
-/// Reads the settings from a file: from `path`, else from the one that `$ADAPTIVE_BRIDGE_CONFIG` names, else
-/// from `/etc/adaptive-bridge/config.yaml`. `env` looks up environment variables.
+/// Loads the settings from a file: `path`, else the file that `$ADAPTIVE_BRIDGE_CONFIG` names, else
+/// `/etc/adaptive-bridge/config.yaml`. `env` looks up environment variables.
 ///
 /// # Errors
 /// Every problem of the file and of the environment at once; one problem when there is no file or it cannot
@@ -30,7 +30,7 @@ pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result
     load_configuration(path, env).map(|configuration| configuration.settings)
 }
 
-/// As [`load`], with the secret that the file may hold.
+/// As [`load`], with the secret if the file contains one.
 ///
 /// # Errors
 /// As for [`load`].
@@ -44,11 +44,11 @@ pub fn load_configuration(
     parse_configuration(&bytes, &name, env)
 }
 
-/// As [`load_configuration`], for a program that can do without a file: without one, the defaults, in this
-/// environment. They have one route, which means nothing.
+/// As [`load_configuration`], for a program that does not need a file: without one, loads the defaults with
+/// this environment. They contain one placeholder route.
 ///
 /// # Errors
-/// As for [`load`], but for that no file need exist.
+/// As for [`load`], except that a missing default file is no error.
 pub fn load_or_default(
     path: Option<&Path>,
     env: &dyn Fn(&str) -> Option<String>,
@@ -59,7 +59,7 @@ pub fn load_or_default(
     }
 }
 
-/// The file that is to be read; `None` where there is none at the default path and none is named.
+/// The file to read; `None` if none is named and the default file does not exist.
 fn find(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>, default: &Path) -> Option<PathBuf> {
     if let Some(path) = path {
         return Some(path.to_owned());
@@ -73,14 +73,14 @@ fn find(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>, default: &Pat
 fn find_or_fail(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<PathBuf, ConfigError> {
     find(path, env, Path::new(DEFAULT_PATH)).ok_or_else(|| {
         let what = format!(
-            "there is no such file, and neither --config nor ${PATH_VARIABLE} names another; begin with one \
-             that says `topics: [{{id: scan, input_topic: /scan}}]`"
+            "this file does not exist, and neither --config nor ${PATH_VARIABLE} names another; create one with \
+             `topics: [{{id: scan, input_topic: /scan}}]`"
         );
         failure(DEFAULT_PATH, Place::File, what)
     })
 }
 
-/// The content of a regular file. Of a pipe or a device nobody knows whether it ever ends.
+/// Reads a regular file. A pipe or a device is refused, because it may never end.
 fn read(path: &Path) -> Result<Vec<u8>, String> {
     let cannot = |error: std::io::Error| format!("cannot be read: {error}");
     let metadata = std::fs::metadata(path).map_err(cannot)?;
@@ -88,7 +88,7 @@ fn read(path: &Path) -> Result<Vec<u8>, String> {
         return Err("must be a regular file".to_owned());
     }
     let mut bytes = Vec::new();
-    // One byte more than allowed tells a file that is too long from one that just fits.
+    // One byte more than allowed distinguishes a file that is too long from one of the largest size.
     let limit = yaml::MAX_BYTES as u64 + 1;
     File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes)).map_err(cannot)?;
     Ok(bytes)
@@ -99,7 +99,8 @@ fn failure(file: &str, place: Place, allowed: String) -> ConfigError {
     ConfigError::new(file, vec![problem])
 }
 
-/// Reads the settings from the content of a file; `file_name` is for messages. Pure, but for what `env` does.
+/// Parses the settings from the content of a file; `file_name` is for messages. It has no side effects except
+/// those of `env`.
 ///
 /// # Errors
 /// Every problem of the content and of the environment at once; one problem when the content is not YAML.
@@ -146,19 +147,20 @@ fn parse_configuration(
     Ok(Configuration { settings, inline_secret })
 }
 
-/// The secret in a file without problems.
+/// The secret in the file.
 fn inline_secret(document: Option<&yaml::Node>) -> Option<InlineSecret> {
     let problems = Problems::default();
     Field::root(document, &problems).section("security").get("hmac_secret").text().map(InlineSecret::new)
 }
 
-/// The settings, of which nothing is worth anything where problems were reported.
+/// Builds the settings, which are valid only if no problems are reported.
 fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let instance =
         root.get("instance").parsed(InstanceName::ALLOWED, |text| InstanceName::try_from(text).ok());
-    // `default` is an instance name.
+    // `default` is a valid instance name.
     #[allow(clippy::expect_used)]
-    let instance = instance.unwrap_or_else(|| InstanceName::try_from("default").expect("an instance name"));
+    let instance =
+        instance.unwrap_or_else(|| InstanceName::try_from("default").expect("a valid instance name"));
 
     let profiles = Profiles::read(root);
     let input = routes::input_network(root, environment);

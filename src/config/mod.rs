@@ -1,8 +1,8 @@
-//! The configuration: YAML in, validated [`Settings`] out, or every problem of the file at once.
+//! The configuration: reads YAML into validated [`Settings`], or reports every problem of the file at once.
 //!
-//! `yaml` turns text into a tree of values that know their lines; `keys` has the list of all keys and finds
-//! the unknown ones; `field` reads one value, checks it and reports it; the other modules put the settings
-//! together, a file for each part.
+//! `yaml` parses text into a tree of values with their lines; `keys` lists all keys and finds unknown ones;
+//! `field` reads and checks one value and reports its problems; the other modules build the settings, with
+//! one file for each part.
 
 mod control;
 mod environment;

@@ -1,4 +1,4 @@
-//! What is wrong with a configuration: all of it at once, each with its place, value and remedy.
+//! The problems of a configuration, collected in one error, each with its place, value and remedy.
 
 use std::cell::RefCell;
 use std::collections::HashSet;
@@ -15,17 +15,17 @@ pub enum Place {
     Line(usize),
 }
 
-/// One thing that is wrong with a configuration.
+/// One problem of a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
-    /// Where.
+    /// Where it is.
     pub place: Place,
-    /// The key path, such as `topics[0].input_topic`; empty when the problem is the file's or its syntax'.
+    /// The key path, such as `topics[0].input_topic`; empty for a problem of the whole file or of its syntax.
     pub key: String,
-    /// What the file says, cut to a readable length; `None` when a key is missing or unknown, and where the
-    /// value is secret.
+    /// The value in the file, cut to a readable length; `None` when a key is missing or unknown, or the value
+    /// is secret.
     pub value: Option<String>,
-    /// What is allowed, as a phrase that begins with "must be" or says what else is wrong.
+    /// What is allowed, as a phrase that begins with "must"; or what else is wrong.
     pub allowed: String,
     /// A remedy, such as "did you mean `depth`?".
     pub hint: Option<String>,
@@ -39,8 +39,7 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
-    /// An error of at least one problem. They are sorted by their place, and what two readers of the same
-    /// value said in the same words is said once.
+    /// An error with at least one problem. Sorts the problems by their place, and removes repetitions.
     pub(super) fn new(file: &str, mut problems: Vec<Problem>) -> Self {
         let mut seen = HashSet::new();
         problems.retain(|problem| seen.insert((problem.place, problem.key.clone(), problem.allowed.clone())));
@@ -48,7 +47,7 @@ impl ConfigError {
         Self { file: file.to_owned(), problems }
     }
 
-    /// The file, as it was named to the loader.
+    /// The name of the file as given to the loader.
     pub fn file(&self) -> &str {
         &self.file
     }
@@ -97,46 +96,46 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Where readers of the file report to. Shared by all of them at once, hence the cell.
+/// Collects the problems of a file. All fields share it, which requires the `RefCell`.
 #[derive(Debug, Default)]
 pub(super) struct Problems(RefCell<Vec<Problem>>);
 
 impl Problems {
-    /// Adds one.
+    /// Adds a problem.
     pub fn report(&self, problem: Problem) {
         self.0.borrow_mut().push(problem);
     }
 
-    /// Whether something was already said about exactly one of these keys, so that a check across several of
-    /// them would only repeat it.
-    pub fn concern(&self, keys: &[&str]) -> bool {
-        self.0.borrow().iter().any(|problem| keys.contains(&problem.key.as_str()))
+    /// Whether a problem with exactly this key path was added.
+    pub fn has_key(&self, key: &str) -> bool {
+        self.0.borrow().iter().any(|problem| problem.key == key)
     }
 
-    /// The usual hint at the name that `word` was meant to be, if one is near.
+    /// A "did you mean" hint at the name closest to `word`, if one is similar.
     pub fn hint(&self, word: &str, names: &[&str]) -> Option<String> {
-        // Comparing is the one costly thing here; a file this wrong is not put right by hints.
+        // The comparison is costly, and hints do not help with a file that has so many problems.
         if self.0.borrow().len() >= MAX_HINTS {
             return None;
         }
         nearest(word, names).map(did_you_mean)
     }
 
-    /// All of them.
+    /// All problems.
     pub fn into_inner(self) -> Vec<Problem> {
         self.0.into_inner()
     }
 }
 
-/// The longest piece of the user's text that a message repeats, in characters.
+/// The most characters of the user's text that a message repeats.
 const SHOWN_CHARS: usize = 60;
 
-/// Bounds of the search for the nearest name: its time grows with the product of the three, the last squared.
+/// Limits of the search for similar names. Its time is proportional to the product of the first two and the
+/// square of the third.
 const MAX_HINTS: usize = 128;
 const MAX_COMPARED_NAMES: usize = 512;
 const MAX_COMPARED_BYTES: usize = 64;
 
-/// The user's text made fit to print: no control characters, no more than a line.
+/// Escapes control characters in the user's text, and cuts it to [`SHOWN_CHARS`].
 pub(super) fn shown(text: &str) -> String {
     let mut shown: String = text.chars().take(SHOWN_CHARS).flat_map(char::escape_debug).collect();
     if text.chars().nth(SHOWN_CHARS).is_some() {
@@ -145,7 +144,7 @@ pub(super) fn shown(text: &str) -> String {
     shown
 }
 
-/// The name that `word` was probably meant to be: at most a third of its letters away, whatever the case.
+/// The most similar name: at most a third of the letters of `word` differ, ignoring case.
 fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
     if word.len() > MAX_COMPARED_BYTES {
         return None;
@@ -162,7 +161,7 @@ fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
         .map(|(_, name)| name)
 }
 
-/// The usual wording of a hint.
+/// The text of a hint.
 pub(super) fn did_you_mean(name: &str) -> String {
     format!("did you mean `{name}`?")
 }
@@ -199,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_word_is_near() {
+    fn the_nearest_name_is_similar() {
         assert_eq!(nearest("reliabilty", &["reliability", "durability"]), Some("reliability"));
         assert_eq!(nearest("RELIABEL", &["RELIABLE", "BEST_EFFORT"]), Some("RELIABLE"));
         assert_eq!(nearest("colour", &["depth", "history"]), None);

@@ -1,4 +1,4 @@
-//! QoS policies as the file gives them: each may be missing, and what is missing comes from what lies below.
+//! Reads QoS policies. Each may be missing in the file; the next layer of defaults then supplies it.
 
 use std::collections::BTreeMap;
 
@@ -6,14 +6,14 @@ use super::field::Field;
 use super::settings::InputQos;
 use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 
-/// The deepest HISTORY and the most samples that may be retained. DDS itself allows 2^31; at 10,000 a route
-/// of 1 KiB samples takes 10 MiB on each lane.
+/// The largest depth of HISTORY and the most retained samples. DDS allows 2^31; with 10,000 a route of 1 KiB
+/// samples takes 10 MiB on each lane.
 pub(super) const MAX_DEPTH: u64 = 10_000;
 
-/// The longest LIFESPAN, DEADLINE or age: a day.
+/// The longest LIFESPAN, DEADLINE, stale threshold or replay window: a day.
 pub(super) const DAY_MS: u64 = 86_400_000;
 
-/// KEEP_LAST without a depth: that of ROS 2's default profile.
+/// The depth of KEEP_LAST without a depth in the file: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
 
 pub(super) const RELIABILITIES: &[(&str, Reliability)] =
@@ -29,7 +29,7 @@ enum HistoryKind {
     KeepAll,
 }
 
-/// Some of the policies.
+/// QoS policies, each of which may be missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct PartialQos {
     reliability: Option<Reliability>,
@@ -41,7 +41,7 @@ pub(super) struct PartialQos {
 }
 
 impl PartialQos {
-    /// Reads a mapping of policies; nothing of it is required.
+    /// Reads a mapping of policies, all of which are optional.
     pub fn read(field: &Field<'_>) -> Self {
         field.entries();
         Self {
@@ -54,7 +54,7 @@ impl PartialQos {
         }
     }
 
-    /// These policies, and those of `base` where these say nothing.
+    /// These policies, with missing ones from `base`.
     pub fn over(self, base: Self) -> Self {
         Self {
             reliability: self.reliability.or(base.reliability),
@@ -66,7 +66,7 @@ impl PartialQos {
         }
     }
 
-    /// The whole profile of a writer: what is still missing is the paper's for the lane's class.
+    /// The profile of a writer: missing policies are the paper's for the lane's class.
     pub fn complete(self, class: TrafficClass) -> QosProfile {
         let default = match class {
             TrafficClass::Critical => QosProfile::CRITICAL,
@@ -87,7 +87,7 @@ impl PartialQos {
         }
     }
 
-    /// What ingress asks of the publisher: what is missing stays open.
+    /// The QoS that ingress requests: missing policies follow the publisher's offer.
     pub fn input(self) -> InputQos {
         let history = match (self.history, self.depth) {
             (Some(HistoryKind::KeepAll), _) => Some(History::KeepAll),
@@ -105,17 +105,17 @@ impl PartialQos {
     }
 }
 
-/// `qos_profiles`, by name.
+/// The section `qos_profiles`, by name.
 pub(super) struct Profiles<'a>(BTreeMap<&'a str, PartialQos>);
 
 impl<'a> Profiles<'a> {
-    /// Reads them all, used or not.
+    /// Reads all profiles, used or not.
     pub fn read(root: &Field<'a>) -> Self {
         let entries = root.get("qos_profiles").entries();
         Self(entries.into_iter().map(|(name, field)| (name, PartialQos::read(&field))).collect())
     }
 
-    /// The profile that a field names; `None` where it names none.
+    /// The profile that a field names; `None` if the field has no value.
     pub fn named(&self, field: &Field<'_>) -> Option<PartialQos> {
         if !field.is_given() {
             return None;

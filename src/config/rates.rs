@@ -1,24 +1,25 @@
-//! Rates, ages and queues of noncritical lanes: `routing_policy`, and what a lane says for itself.
+//! Reads the rates, stale thresholds and queues of noncritical lanes, from `routing_policy` and from each
+//! lane.
 
 use super::field::Field;
 use super::qos::DAY_MS;
 use super::settings::{DropPolicy, LaneRates, RatePolicy};
 
-/// The most samples that may wait in a queue or be borrowed: each of them occupies `max_sample_bytes`.
+/// The most samples in a queue or borrowed at once; each of them occupies `max_sample_bytes`.
 pub(super) const MAX_QUEUE: u64 = 4_096;
 
-/// The fastest rate, in samples per second.
+/// The highest rate, in samples per second.
 const MAX_RATE_HZ: f64 = 100_000.0;
 
-/// The most bytes per second: 1 TB/s, beyond any memory.
+/// The most bytes per second: 1 TB/s, more than the bandwidth of any memory.
 const MAX_BYTES_PER_S: u64 = 1_000_000_000_000;
 
-/// The paper's rates and age (section III-D).
+/// The paper's rates and stale threshold (section III-D).
 const NORMAL_RATE_HZ: f64 = 10.0;
 const DEGRADED_RATE_HZ: f64 = 3.0;
 const STALE_THRESHOLD_MS: u64 = 200;
 
-/// Samples that wait in a noncritical lane: the depth of the paper's writer, and fewer in DEGRADED.
+/// The default queue of a noncritical lane: the depth of the paper's writer, and fewer samples in DEGRADED.
 const NORMAL_DEPTH: u64 = 5;
 const DEGRADED_DEPTH: u64 = 2;
 
@@ -30,7 +31,7 @@ pub(super) const DROP_POLICIES: &[(&str, DropPolicy)] = &[
 
 const MODES: &[&str] = &["normal", "degraded", "disabled", "emergency", "failure"];
 
-/// The keys that a critical lane cannot have.
+/// The keys that a critical lane must not have.
 const RATE_KEYS: &[&str] = &[
     "max_rate_hz",
     "degraded_rate_hz",
@@ -42,9 +43,9 @@ const RATE_KEYS: &[&str] = &[
     "queue_samples",
 ];
 
-/// The rates of a critical lane, which has none: it forwards every sample, and a rate that somebody wrote
-/// down for it would be a promise not kept.
-pub(super) fn refuse(lane: &Field<'_>) -> LaneRates {
+/// The rates of a critical lane, which are unlimited: it forwards every sample. Reports a rate in the file,
+/// because it would have no effect.
+pub(super) fn critical_rates(lane: &Field<'_>) -> LaneRates {
     for key in RATE_KEYS {
         let rate = lane.get(key);
         if rate.is_given() {
@@ -61,7 +62,7 @@ pub(super) fn refuse(lane: &Field<'_>) -> LaneRates {
     LaneRates { normal: unlimited, degraded: unlimited }
 }
 
-/// `routing_policy`: what holds for every noncritical lane that says nothing else.
+/// The section `routing_policy`: the defaults of all noncritical lanes.
 pub(super) struct RoutingPolicy {
     enabled: bool,
     normal_rate_hz: f64,
@@ -72,7 +73,7 @@ pub(super) struct RoutingPolicy {
     degraded_queue: Queue,
 }
 
-/// What waits for a token, and what gives way.
+/// The queue of a mode.
 struct Queue {
     drop_policy: DropPolicy,
     samples: usize,
@@ -95,7 +96,7 @@ impl RoutingPolicy {
         for (name, mode) in modes.entries() {
             match name {
                 "normal" | "degraded" => {}
-                _ if MODES.contains(&name) => check_silent_mode(&mode),
+                _ if MODES.contains(&name) => check_closed_mode(&mode),
                 _ => mode.report_unknown_key("a mode", name, MODES),
             }
         }
@@ -104,7 +105,7 @@ impl RoutingPolicy {
             let depth = mode.get("noncritical_depth").whole(0..=MAX_QUEUE).unwrap_or(default);
             Queue {
                 drop_policy: mode.get("noncritical_drop_policy").choice(DROP_POLICIES).unwrap_or(drop_policy),
-                // One sample always waits: the one that the next token is for.
+                // At least one sample waits: the one that the next token sends.
                 samples: usize::try_from(depth.min(cap).max(1)).unwrap_or(1),
             }
         };
@@ -122,14 +123,14 @@ impl RoutingPolicy {
         }
     }
 
-    /// The rates of one noncritical lane: its own, else those of the mode.
+    /// The rates of one noncritical lane: its own, else the defaults of the mode.
     pub fn lane_rates(&self, lane: &Field<'_>) -> LaneRates {
         let rate_hz = |key: &str| lane.get(key).decimal(0.0..=MAX_RATE_HZ);
         let bytes_per_s = |key: &str| lane.get(key).whole(1..=MAX_BYTES_PER_S);
         let stale_ms = |key: &str| lane.get(key).whole(0..=DAY_MS);
 
         let normal_rate_hz = rate_hz("max_rate_hz").unwrap_or(self.normal_rate_hz);
-        // A lane that is slower than 3 Hz by choice does not speed up because it is degraded.
+        // A lane with a normal rate below 3 Hz does not become faster in DEGRADED.
         let degraded_rate_hz = rate_hz("degraded_rate_hz")
             .or(self.degraded_rate_hz)
             .unwrap_or_else(|| DEGRADED_RATE_HZ.min(normal_rate_hz));
@@ -155,8 +156,8 @@ impl RoutingPolicy {
     }
 }
 
-/// The modes in which noncritical lanes forward nothing. Their other values are checked and have no effect.
-fn check_silent_mode(mode: &Field<'_>) {
+/// Checks a mode in which noncritical lanes forward nothing. Its values have no effect.
+fn check_closed_mode(mode: &Field<'_>) {
     mode.entries();
     let rate = mode.get("noncritical_max_rate_hz");
     rate.whole_where("must be 0: noncritical lanes forward nothing in this mode", |rate| rate == 0);

@@ -1,7 +1,8 @@
-//! What of a changed file a running bridge takes over, and what waits for a restart of the whole bridge.
+//! Reload: which changes of a file a running bridge applies, and which wait for a restart of the whole
+//! bridge.
 //!
-//! Each structure of the settings is put together or taken apart here field by field, so that a new field
-//! does not compile until somebody has decided which of the two it is.
+//! Each structure of the settings is built or destructured here field by field, so that code with a new field
+//! compiles only when this module decides which of the two applies to it.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -15,15 +16,15 @@ use super::settings::{
 use super::shown::Shown;
 use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, TrafficClass, fnv1a};
 
-/// One setting that differs between two files, in the words of the file.
+/// One setting that differs between the configuration in force and a file, with its values as in the file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Change {
-    /// Its key path. Routes stand in it by their id, as in `topics[scan].max_sample_bytes`, and what
-    /// `routing_policy` sets stands in it under the lanes that it changes.
+    /// Its key path. Routes are named by their id, as in `topics[scan].max_sample_bytes`; settings of
+    /// `routing_policy` are listed under the lanes that they change.
     pub key: String,
-    /// What the bridge was told before; `none` for nothing.
+    /// The value in force; `none` if there is none.
     pub old: String,
-    /// What the file says now.
+    /// The value in the file; `none` if there is none.
     pub new: String,
 }
 
@@ -33,24 +34,23 @@ impl fmt::Display for Change {
     }
 }
 
-/// What a changed file came to.
+/// The changes of a reload.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reload {
-    /// What is in force from now on.
+    /// Changes that are now in force.
     pub changed: Vec<Change>,
-    /// What differs and waits for a restart of the whole bridge.
+    /// Changes that wait for a restart of the whole bridge.
     pub waits: Vec<Change>,
 }
 
 impl Settings {
-    /// A number that differs when settings differ, between processes of one version of the program. The
-    /// content of a secret is not in it.
+    /// A hash of the settings, without the content of a secret. It is comparable between processes of the
+    /// same version of the program.
     pub fn fingerprint(&self) -> u64 {
         fnv1a(format!("{self:?}").as_bytes())
     }
 
-    /// These settings with all that a running bridge can take over from `new`, and what became of each
-    /// difference.
+    /// These settings with all changes in `new` that a running bridge can apply, and the list of the changes.
     pub fn reloaded(&self, new: Self) -> (Self, Reload) {
         let mut differ = Differ::default();
         let d = &mut differ;
@@ -89,12 +89,12 @@ impl Settings {
     }
 }
 
-/// Collects the differences.
+/// Collects the changes.
 #[derive(Default)]
 struct Differ(Reload);
 
 impl Differ {
-    /// A setting that is taken over.
+    /// Applies the new value of a setting.
     fn take<T: PartialEq + Shown>(&mut self, key: &str, old: &T, new: T) -> T {
         if *old != new {
             self.0.changed.push(Change { key: key.to_owned(), old: old.shown(), new: new.shown() });
@@ -102,7 +102,7 @@ impl Differ {
         new
     }
 
-    /// A setting that stays as it is until the whole bridge is restarted.
+    /// Keeps the old value of a setting until the whole bridge is restarted.
     fn keep<T: Clone + PartialEq + Shown>(&mut self, key: &str, old: &T, new: &T) -> T {
         if old != new {
             self.0.waits.push(Change { key: key.to_owned(), old: old.shown(), new: new.shown() });
@@ -143,7 +143,7 @@ fn scheduling(d: &mut Differ, of: &str, old: &Scheduling, new: &Scheduling) -> S
     }
 }
 
-/// The routes are left as they are, whatever differs.
+/// Compares the routes, which stay as they are.
 fn routes(d: &mut Differ, old: &Settings, new: &Settings) {
     let ids = |settings: &Settings| -> Vec<String> {
         settings.routes.iter().map(|route| route.id.to_string()).collect()
@@ -185,7 +185,7 @@ fn compare_route(d: &mut Differ, old: &Route, new: &Route) {
 
 fn compare_output(d: &mut Differ, id: &RouteId, lane: &LaneName, old: Option<&Output>, new: Option<&Output>) {
     let (Some(old), Some(new)) = (old, new) else {
-        // Which lanes serve a route decides how its samples are shared out in memory.
+        // The lanes that serve a route determine the size of its pool in shared memory.
         let key = format!("topics[{id}].lanes.{lane}");
         d.keep(&key, &old.is_some(), &new.is_some());
         return;
@@ -235,7 +235,7 @@ fn reload_lane(d: &mut Differ, old: &Lane, new: &Lane) -> Lane {
 }
 
 fn lane_rates(d: &mut Differ, old: &Lane, new: &Lane) -> LaneRates {
-    // What waits in the lane occupies shared memory, which was shared out at the start.
+    // Samples that wait in the lane occupy shared memory, whose size is fixed at the start.
     let would_borrow = Lane { rates: new.rates, ..old.clone() }.max_borrowed_in_all();
     let has_room = old.class == TrafficClass::Critical || would_borrow == old.max_borrowed_in_all();
     let LaneRates { normal, degraded } = &old.rates;
@@ -252,8 +252,8 @@ fn lane_rates(d: &mut Differ, old: &Lane, new: &Lane) -> LaneRates {
     }
 }
 
-/// The rates of a mode, which is `[0]` before a key that there is for each mode, and `[1]` behind one that is
-/// for both.
+/// Reloads the rates of one mode. `mode` has the prefix of keys that exist for each mode, and the suffix that
+/// distinguishes keys which apply to both.
 fn rate_policy(
     d: &mut Differ,
     lane: &LaneName,
@@ -262,10 +262,10 @@ fn rate_policy(
     old: &RatePolicy,
     new: RatePolicy,
 ) -> RatePolicy {
-    let [before, behind] = mode;
-    let key = |name: &str| format!("lanes.{lane}.{before}{name}");
-    let common_key = |name: &str| format!("lanes.{lane}.{name}{behind}");
-    let rate_key = if before.is_empty() { key("max_rate_hz") } else { key("rate_hz") };
+    let [prefix, suffix] = mode;
+    let key = |name: &str| format!("lanes.{lane}.{prefix}{name}");
+    let common_key = |name: &str| format!("lanes.{lane}.{name}{suffix}");
+    let rate_key = if prefix.is_empty() { key("max_rate_hz") } else { key("rate_hz") };
     RatePolicy {
         max_rate_hz: d.take(&rate_key, &old.max_rate_hz, new.max_rate_hz),
         max_bytes_per_s: d.take(&key("max_bytes_per_s"), &old.max_bytes_per_s, new.max_bytes_per_s),
@@ -283,7 +283,7 @@ fn rate_policy(
     }
 }
 
-/// A structure all of whose fields are taken over, each with the last part of its key.
+/// Applies the new values of all fields of a structure; each field has the last part of its key.
 macro_rules! take_each {
     ($d:ident, $of:literal, $old:expr, $new:expr, $type:ident { $($field:ident: $key:literal),+ $(,)? }) => {
         $type { $($field: $d.take(concat!($of, ".", $key), &$old.$field, $new.$field)),+ }
@@ -400,7 +400,8 @@ fn overrides<T: Clone + PartialEq + Shown>(
     new
 }
 
-/// A subscriber on a lane that the bridge gets only with a restart stays where it is.
+/// Reloads the lanes of the subscribers. A subscriber stays on its lane if the new one exists only after a
+/// restart.
 fn subscribers(
     d: &mut Differ,
     lanes: &[Lane],
@@ -409,11 +410,11 @@ fn subscribers(
 ) -> BySubscriber<LaneName> {
     let mut reloaded = BTreeMap::new();
     for (id, lane) in new {
-        if lanes.iter().any(|there| there.name == lane) {
+        if lanes.iter().any(|existing| existing.name == lane) {
             reloaded.insert(id, lane);
         } else {
-            let before = old.get(&id).cloned();
-            let kept = d.keep(&format!("subscribers.{id}"), &before, &Some(lane));
+            let old_lane = old.get(&id).cloned();
+            let kept = d.keep(&format!("subscribers.{id}"), &old_lane, &Some(lane));
             reloaded.extend(kept.map(|lane| (id, lane)));
         }
     }

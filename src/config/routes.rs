@@ -1,4 +1,4 @@
-//! Routes and their outputs, and the checks across all of them.
+//! Reads the routes and their outputs, and checks them against each other.
 
 use std::collections::{HashMap, HashSet};
 
@@ -9,13 +9,13 @@ use super::qos::{MAX_DEPTH, PartialQos, Profiles};
 use super::settings::{DdsNetwork, Lane, Output, Route};
 use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
 
-/// The most routes: each has a pool of shared memory, a reader, and a writer on each of its lanes.
+/// The most routes. Each has a pool in shared memory, a reader, and a writer on each of its lanes.
 const MAX_ROUTES: usize = 1_024;
 
-/// Samples retained for a lane that comes back, where no output asks for more.
+/// Samples retained for a restarted lane when no output is TRANSIENT_LOCAL.
 const RETAINED_SAMPLES: usize = 8;
 
-/// Where the publishers are.
+/// Reads the network of the publishers.
 pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
     let base = DdsNetwork { domain_id: environment.domain_id, interfaces: Vec::new() };
     lanes::network(&root.section("ros"), &base, environment)
@@ -45,7 +45,8 @@ pub(super) fn read(
     reader.check_topic_qos(&read);
     check_topics(&read, input, &drafts);
 
-    // With problems the settings are thrown away, so that a route without a topic need not be kept.
+    // A route without an id or topic can be left out, because the settings are discarded if there are
+    // problems.
     let mut routes = Vec::new();
     let mut lanes: Vec<Lane> = drafts.into_iter().map(|draft| draft.lane).collect();
     for draft in read {
@@ -58,7 +59,7 @@ pub(super) fn read(
     (routes, lanes)
 }
 
-/// One entry of `topics` as far as it could be read.
+/// One entry of `topics`, with the parts that are valid.
 struct RouteDraft<'a> {
     field: Field<'a>,
     id: Option<RouteId>,
@@ -71,7 +72,7 @@ struct OutputDraft<'a> {
     /// Index of the lane.
     lane: usize,
     topic: TopicName,
-    /// Where the topic is given, or would be.
+    /// The field of the topic, given or not.
     field: Field<'a>,
     qos: QosProfile,
 }
@@ -87,7 +88,7 @@ impl<'f> RouteReader<'_, 'f> {
     fn read(&self, field: &Field<'f>) -> RouteDraft<'f> {
         field.entries();
         if field.was_reported() {
-            // Of what is no mapping it would be idle to say which keys it lacks.
+            // It is no mapping, so its missing keys are not reported.
             return RouteDraft {
                 field: field.clone(),
                 id: None,
@@ -143,12 +144,12 @@ impl<'f> RouteReader<'_, 'f> {
             if matches!(name, "critical" | "noncritical") {
                 let short = field.get(&format!("{name}_output"));
                 if short.is_given() && given.is_given() {
-                    given.report::<()>(&format!("must not be given beside {}", short.path));
+                    given.report::<()>(&format!("must not be given together with {}", short.path));
                 } else if short.is_given() {
                     given = short;
                 }
             }
-            // Every value is checked, also on lanes that do not serve the route.
+            // Values of lanes that do not serve the route are checked too.
             let topic = given.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
             let override_qos = PartialQos::read(&overrides.get(name));
             let profile = topic_qos.as_ref().and_then(|section| self.profiles.named(&section.get(name)));
@@ -192,12 +193,12 @@ impl<'f> RouteReader<'_, 'f> {
         serving
     }
 
-    /// What a lane that was restarted must find again: the history that its TRANSIENT_LOCAL writers offer.
+    /// The samples that a restarted lane needs: the largest history of the TRANSIENT_LOCAL outputs.
     fn retained_samples(&self, outputs: &[OutputDraft<'_>]) -> usize {
         let durable = outputs.iter().filter(|output| output.qos.durability == Durability::TransientLocal);
         let depths = durable.map(|output| match output.qos.depth() {
             Some(depth) => depth as usize,
-            // KEEP_ALL keeps what the writer has room for.
+            // KEEP_ALL keeps as many samples as the writer's window.
             None => self.lanes[output.lane].lane.window_samples,
         });
         depths.max().unwrap_or(RETAINED_SAMPLES)
@@ -207,7 +208,7 @@ impl<'f> RouteReader<'_, 'f> {
         self.lanes.iter().map(|draft| draft.lane.name.as_str()).collect()
     }
 
-    /// Checks that the keys of a mapping are lanes, or one of `others`.
+    /// Checks that the keys of a mapping are lanes or one of `others`.
     fn check_lane_keys(&self, section: &Field<'_>, others: &[&str]) {
         let mut known = others.to_vec();
         known.extend(self.lane_names());
@@ -233,7 +234,7 @@ impl<'f> RouteReader<'_, 'f> {
     }
 }
 
-/// A text that must be there and right.
+/// Reads a required text.
 fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Option<T>) -> Option<T> {
     if !field.is_given() {
         return field.report(&format!("must be {allowed}"));
@@ -241,7 +242,8 @@ fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Opt
     field.parsed(allowed, parse)
 }
 
-/// Ids are unique; no topic is read or written twice in a domain, and none is both: that would be a loop.
+/// Checks that ids are unique, and that each topic of a domain is only one input or one output. A topic that
+/// is both would be a loop.
 fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraft]) {
     let mut ids: HashMap<&str, &Field<'_>> = HashMap::new();
     let mut inputs: HashMap<&str, &Field<'_>> = HashMap::new();
@@ -250,7 +252,10 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
             match ids.get(id.as_str()) {
                 Some(first) => {
                     let first = first.get("id");
-                    route.field.get("id").report::<()>(&format!("must be unique; {} has it too", at(&first)));
+                    route
+                        .field
+                        .get("id")
+                        .report::<()>(&format!("must be unique; it is the same as {}", at(&first)));
                 }
                 None => {
                     ids.insert(id.as_str(), &route.field);
@@ -289,7 +294,7 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
     }
 }
 
-/// A field as a message refers to it.
+/// The key path and line of a field, for a message.
 fn at(field: &Field<'_>) -> String {
     format!("{}, line {}", field.path, field.line)
 }

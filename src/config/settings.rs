@@ -1,6 +1,7 @@
-//! The validated configuration: every value is in range, every name resolved, every default filled in.
+//! The validated configuration: every value is in range, every name is resolved and every default is filled
+//! in.
 //!
-//! Nothing below this type needs to check again or to know what YAML is.
+//! Code that uses these types does not check values again and does not depend on YAML.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
@@ -17,9 +18,9 @@ use crate::model::{
 /// The whole configuration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
-    /// Which bridge this is; the namespace of its shared memory.
+    /// The name of this bridge; the namespace of its shared memory.
     pub instance: InstanceName,
-    /// Where the publishers are.
+    /// The network of the publishers.
     pub input: DdsNetwork,
     /// The bytes of a graph identifier in `ros_discovery_info`: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
@@ -29,7 +30,7 @@ pub struct Settings {
     pub lanes: Vec<Lane>,
     /// Shared memory.
     pub shared_memory: SharedMemory,
-    /// How long a lane keeps its last policy when control is gone, in milliseconds.
+    /// How long a lane applies its last policy when control does not confirm it, in milliseconds.
     pub policy_hold_ms: u64,
     /// Scheduling of the ingress process.
     pub ingress_scheduling: Scheduling,
@@ -45,20 +46,20 @@ pub struct Settings {
     pub security: Security,
     /// Diagnostics.
     pub diagnostics: Diagnostics,
-    /// States forced by hand, by subscriber id.
+    /// States that the user forces, by subscriber id.
     pub overrides: BTreeMap<String, SubscriberState>,
-    /// Known subscribers, and the lane each is on.
+    /// The lanes of the listed subscribers, by subscriber id.
     pub subscribers: BTreeMap<String, LaneName>,
 }
 
 impl Settings {
-    /// The lane of that name.
+    /// The lane with that name.
     pub fn lane(&self, name: &LaneName) -> Option<&Lane> {
         self.lanes.iter().find(|lane| lane.name == *name)
     }
 }
 
-/// One DDS domain and the network interfaces used in it.
+/// A DDS domain and the network interfaces used in it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DdsNetwork {
     /// DDS domain, 0 to 232.
@@ -70,22 +71,22 @@ pub struct DdsNetwork {
 /// A network interface, by name or by one of its addresses.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum NetworkSelector {
-    /// Such as `wlan0`.
+    /// A name, such as `wlan0`.
     Name(String),
-    /// Such as `192.168.0.7`.
+    /// An address, such as `192.168.0.7`.
     Address(Ipv4Addr),
 }
 
 impl NetworkSelector {
-    /// What is allowed, as a phrase that completes "must be …".
+    /// The allowed texts, as a phrase that completes "must be …".
     pub const ALLOWED: &'static str = "the name of a network interface or an IPv4 address";
 
-    /// An interface name as Linux allows it (15 bytes, no `/`, no space), or an IPv4 address.
+    /// Parses an interface name that Linux allows (at most 15 bytes, no `/`, no space), or an IPv4 address.
     pub fn parse(text: &str) -> Option<Self> {
         if let Ok(address) = text.parse() {
             return Some(Self::Address(address));
         }
-        // 300.1.1.1 would do as a name, but is meant as an address; so is anything with a colon, of IPv6.
+        // 300.1.1.1 is a valid name but meant as an address; text with a colon is meant as an IPv6 address.
         let meant_as_address = text.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
         let is_name = (1..=15).contains(&text.len())
             && text.bytes().all(|byte| byte.is_ascii_graphic() && !matches!(byte, b'/' | b':'));
@@ -93,32 +94,32 @@ impl NetworkSelector {
     }
 }
 
-/// One input topic.
+/// A route: one input topic and how ingress reads it. Its outputs are in the lanes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Route {
     /// The user's name for it.
     pub id: RouteId,
-    /// What ingress subscribes to.
+    /// The topic that ingress subscribes to.
     pub input_topic: TopicName,
-    /// The message type; `None` is found by discovery.
+    /// The message type; `None` to discover it.
     pub message_type: Option<TypeName>,
-    /// What ingress asks of the publisher.
+    /// The QoS that ingress requests from the publisher.
     pub input_qos: InputQos,
-    /// The largest sample taken in, in bytes of serialized payload.
+    /// The largest sample that ingress accepts, in bytes of serialized payload.
     pub max_sample_bytes: usize,
-    /// Samples kept in shared memory for a lane that comes back: what a `TRANSIENT_LOCAL` lane offers to late
-    /// joiners after it was restarted, and what a restarted lane catches up with.
+    /// Samples kept in shared memory for a restarted lane: those that it catches up with, and those that a
+    /// `TRANSIENT_LOCAL` lane offers to late joiners.
     pub retained_samples: usize,
 }
 
-/// What the ingress reader asks of the publisher. A policy that is `None` follows what the publisher offers.
+/// The QoS that the ingress reader requests. A policy that is `None` follows the publisher's offer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct InputQos {
     /// RELIABILITY.
     pub reliability: Option<Reliability>,
     /// DURABILITY.
     pub durability: Option<Durability>,
-    /// HISTORY of the reader: what may wait between the DDS library and ingress.
+    /// HISTORY of the reader: the samples that may wait between the DDS library and ingress.
     pub history: Option<History>,
     /// DEADLINE in milliseconds.
     pub deadline_ms: Option<u64>,
@@ -131,27 +132,27 @@ pub struct Lane {
     pub name: LaneName,
     /// Critical or noncritical.
     pub class: TrafficClass,
-    /// Where its subscribers are.
+    /// The network of its subscribers.
     pub network: DdsNetwork,
-    /// What it forwards: one for each route that it serves, in the order of the routes.
+    /// Its outputs, one for each route that it serves, in the order of the routes.
     pub outputs: Vec<Output>,
-    /// Samples for each route that may wait for the lane in shared memory.
+    /// The most samples of each route that wait for the lane in shared memory.
     pub queue_depth: usize,
-    /// Samples that the lane may hold in shared memory at once, for each route, while DDS sends them.
+    /// The most samples of each route that the lane holds in shared memory while DDS sends them.
     pub max_borrowed: usize,
-    /// Samples of at least so many bytes are handed to DDS by reference, smaller ones copied.
+    /// Samples of at least this size are passed to DDS by reference, smaller ones are copied.
     pub by_reference_min_bytes: usize,
-    /// Unacknowledged samples that a RELIABLE writer of the lane may have outstanding.
+    /// The most unacknowledged samples of a RELIABLE writer of the lane.
     pub window_samples: usize,
-    /// Rates and staleness by mode. A critical lane has no use for them: there the rate is infinite.
+    /// Rates and staleness by mode. A critical lane does not use them; its rate is infinite.
     pub rates: LaneRates,
     /// Scheduling of the lane's process.
     pub scheduling: Scheduling,
 }
 
 impl Lane {
-    /// Samples that the lane may hold in shared memory at once, for each route: a noncritical one also
-    /// borrows what waits in its own queue, the sample it takes next and the one that it sends.
+    /// The most samples of each route that the lane holds in shared memory: a noncritical lane also holds
+    /// those in its own queue, the sample that it takes next and the one that it sends.
     pub fn max_borrowed_in_all(&self) -> usize {
         let waiting = match self.class {
             TrafficClass::Critical => 0,
@@ -163,23 +164,23 @@ impl Lane {
     }
 }
 
-/// One route on one lane.
+/// The output of one route on one lane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Output {
     /// Index into [`Settings::routes`].
     pub route: usize,
-    /// What the lane publishes to.
+    /// The topic that the lane publishes to.
     pub topic: TopicName,
-    /// How.
+    /// The QoS of its writer.
     pub qos: QosProfile,
 }
 
-/// Shared memory of one bridge.
+/// The shared memory of one bridge.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SharedMemory {
     /// The folder of the bridge's own files; `None` lets the program choose (see `config/README.md`).
     pub root_path: Option<PathBuf>,
-    /// Local programs that may tap a route at once.
+    /// The most local programs that tap a route at once.
     pub max_taps: usize,
 }
 
@@ -190,11 +191,12 @@ pub struct Scheduling {
     pub policy: SchedulingPolicy,
     /// 1 to 99 for FIFO and round robin, 0 otherwise.
     pub priority: u8,
-    /// Nice value, 0 to 19: higher ones leave the CPU to others. Nothing to FIFO and round robin.
+    /// Nice value, 0 to 19; a higher one leaves more CPU time to other processes. No effect with FIFO and
+    /// round robin.
     pub nice: u8,
-    /// The time slice asked of the kernel's fair scheduler, in microseconds; `None` for the kernel's own. A
-    /// process that wakes takes the CPU at once from one with a longer slice. Nothing to FIFO and round
-    /// robin, nor to a kernel before 6.12.
+    /// The time slice requested from the kernel's fair scheduler, in microseconds; `None` for the kernel's
+    /// default. A process that wakes preempts one with a longer slice. No effect with FIFO and round robin,
+    /// and before Linux 6.12.
     pub slice_us: Option<u32>,
     /// CPUs that the process may run on; empty for all.
     pub cpus: Vec<usize>,
@@ -214,127 +216,127 @@ pub enum SchedulingPolicy {
     RoundRobin,
 }
 
-/// The classifier.
+/// The settings of the classifier.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Classifier {
-    /// Whether subscribers are classified at all.
+    /// Whether subscribers are classified.
     pub enabled: bool,
-    /// The one responder that counts; `None` for any.
+    /// The id of the only responder that is classified; `None` for all.
     pub subscriber_id: Option<String>,
     /// Evaluations per second.
     pub evaluate_rate_hz: f64,
-    /// What it decides by.
+    /// Its thresholds.
     pub thresholds: ClassifierThresholds,
 }
 
-/// Active probing.
+/// The settings of the probes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Probes {
     /// Whether probes are sent.
     pub enabled: bool,
     /// Probes per second.
     pub rate_hz: f64,
-    /// Shown as a warning above it; decides nothing.
+    /// Mean RTT above which a warning is shown; no other effect.
     pub rtt_threshold_ms: f64,
-    /// Shown as a warning above it; decides nothing.
+    /// Loss above which a warning is shown; no other effect.
     pub loss_threshold: f64,
-    /// Shown as a warning above it; decides nothing.
+    /// Jitter above which a warning is shown; no other effect.
     pub jitter_threshold_ms: f64,
     /// Probes in the sliding window.
     pub window_size: usize,
     /// Consecutive readings before a warning is shown or withdrawn.
     pub hysteresis_count: u32,
-    /// A response later than this counts as lost.
+    /// Time after which a probe without a response is lost.
     pub timeout_ms: u64,
-    /// Topic of the requests.
+    /// Topic of the probe requests.
     pub request_topic: TopicName,
-    /// Topic of the responses.
+    /// Topic of the probe responses.
     pub response_topic: TopicName,
 }
 
-/// The safety supervisor.
+/// The settings of the safety supervisor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Safety {
     /// Evaluations per second.
     pub evaluate_rate_hz: f64,
-    /// What it decides by.
+    /// Its thresholds and counts.
     pub rules: SafetyRules,
 }
 
-/// What is done about control messages that do not authenticate.
+/// How the bridge treats probe messages that are not authenticated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum TrustMode {
-    /// They are refused.
+    /// It refuses them.
     DefaultDeny,
-    /// They are accepted and logged.
+    /// It accepts and logs them.
     Permissive,
-    /// They are accepted.
+    /// It accepts them.
     Off,
 }
 
-/// Where the shared secret is. The secret itself is never held in the settings, so that it cannot be logged.
+/// The source of the shared secret. The settings never contain the secret itself, so that it is not logged.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SecretSource {
-    /// The file's first line.
+    /// The first line of this file.
     File(PathBuf),
     /// The value of this environment variable.
     Environment(String),
-    /// `security.hmac_secret` of the configuration file itself, as the original package has it.
+    /// `security.hmac_secret` of the configuration file, as in the original package.
     ConfigFile,
 }
 
-/// Authentication of control messages.
+/// The settings for authentication of probe messages.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Security {
-    /// What is done about messages that do not authenticate.
+    /// How messages that are not authenticated are treated.
     pub trust_mode: TrustMode,
     /// Whether probes are signed.
     pub enable_probe_hmac: bool,
-    /// Where the secret is; `None` when there is none.
+    /// The source of the secret; `None` when there is none.
     pub secret: Option<SecretSource>,
-    /// How old a signed message may be.
+    /// The largest age of a signed message.
     pub replay_window_ms: u64,
-    /// Probes and responses that are looked at per second, of one sender.
+    /// The most probe requests or responses of one sender that are processed per second.
     pub max_probe_rate_hz: u32,
     /// Whether an override may name a subscriber by its node name.
     pub allow_legacy_node_name_overrides: bool,
 }
 
-/// Diagnostics.
+/// The settings of diagnostics, logs and metrics.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Diagnostics {
-    /// Whether they are published.
+    /// Whether diagnostics are published.
     pub enabled: bool,
-    /// How often, in milliseconds.
+    /// The interval of the diagnostics, in milliseconds.
     pub publish_interval_ms: u64,
-    /// Topic of the original's JSON diagnostics.
+    /// The topic of the JSON diagnostics of the original package.
     pub topic: TopicName,
-    /// What is logged where `RUST_LOG` says nothing.
+    /// The log level where `RUST_LOG` does not set one.
     pub verbosity: Verbosity,
-    /// Address of the Prometheus page; `None` for none.
+    /// The address of the Prometheus page; `None` for no page.
     pub metrics: Option<MetricsListener>,
 }
 
 /// The least severe level that is logged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Verbosity {
-    /// What failed.
+    /// Failures.
     Error,
-    /// Also what is wrong and goes on.
+    /// Also problems after which the process continues.
     Warn,
-    /// Also what happens seldom.
+    /// Also rare events.
     Info,
-    /// Also what helps to find a fault.
+    /// Also details for finding a fault.
     Debug,
     /// Everything.
     Trace,
 }
 
-/// Where the Prometheus page is served.
+/// The address of the Prometheus page.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum MetricsListener {
-    /// TCP; a loopback address.
+    /// A loopback address and a TCP port.
     Tcp(IpAddr, u16),
-    /// A unix socket.
+    /// The path of a unix socket.
     Unix(PathBuf),
 }

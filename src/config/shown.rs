@@ -1,4 +1,4 @@
-//! Settings as an operator reads them, in the words of the file.
+//! Formats settings for operators, as they are written in the file.
 
 use std::path::PathBuf;
 
@@ -14,9 +14,9 @@ use crate::model::{
     TypeName,
 };
 
-/// A value that can be shown. A secret has none.
+/// A value that can be shown as in the file. Secrets do not implement it.
 pub(super) trait Shown {
-    /// The value in the words of the file.
+    /// The value as it is written in the file.
     fn shown(&self) -> String;
 }
 

@@ -1,11 +1,11 @@
-//! What the loader makes of single keys: each value that it accepts, each message that it gives. Pure.
+//! Tests of the loader for each key: the values that it accepts and the messages that it reports.
 
 use std::fmt::Write;
 
 use super::*;
 use crate::model::{Durability, History, LaneName, QosProfile, Reliability, SubscriberState};
 
-/// One topic, in line 1.
+/// A file with one topic, in line 1.
 const TOPIC: &str = "topics: [{id: scan, input_topic: /scan}]\n";
 
 fn no_env(_: &str) -> Option<String> {
@@ -64,7 +64,7 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
 }
 
 #[test]
-fn null_is_the_same_as_leaving_a_key_out() {
+fn null_is_the_same_as_a_missing_key() {
     let nulls = "instance: ~\nlanes: {critical: null, noncritical: {max_rate_hz: }}\nprobes:\n";
     assert_eq!(with(nulls), settings(TOPIC));
 }
@@ -98,14 +98,14 @@ fn qos_comes_from_override_then_profile_then_lane_then_class() {
 }
 
 #[test]
-fn a_keep_all_transient_local_output_retains_its_lanes_window() {
+fn a_keep_all_transient_local_output_retains_the_window_of_its_lane() {
     let text =
         "lanes: {noncritical: {window_samples: 30, qos: {history: KEEP_ALL, durability: TRANSIENT_LOCAL}}}\n";
     assert_eq!(with(text).routes[0].retained_samples, 30);
 }
 
 #[test]
-fn what_the_input_does_not_say_follows_the_publisher() {
+fn missing_input_qos_follows_the_publisher() {
     let input = |text: &str| {
         let text = format!("topics: [{{id: a, input_topic: /a, qos_overrides: {{input: {text}}}}}]");
         settings(&text).routes[0].input_qos
@@ -179,14 +179,14 @@ fn rates_come_from_lane_then_mode_then_routing_policy() {
 }
 
 #[test]
-fn a_queue_is_capped_where_the_mode_has_no_cap_of_its_own() {
+fn the_safety_limit_applies_to_the_queue_of_a_mode_without_its_own_limit() {
     let text =
         "safety: {max_noncritical_queue: 6}\nrouting_policy: {modes: {normal: {noncritical_depth: 30}}}\n";
     assert_eq!(with(text).lanes[1].rates.normal.queue_samples, 6);
 }
 
 #[test]
-fn noncritical_lanes_that_are_not_enabled_forward_nothing() {
+fn disabled_noncritical_lanes_forward_nothing() {
     let settings = with("routing_policy: {noncritical_enabled: false}\nlanes: {rviz: {max_rate_hz: 5}}\n");
     for name in ["noncritical", "rviz"] {
         let rates = lane(&settings, name).rates;
@@ -196,7 +196,7 @@ fn noncritical_lanes_that_are_not_enabled_forward_nothing() {
 }
 
 #[test]
-fn lanes_have_networks_and_scheduling_of_their_own() {
+fn lanes_have_their_own_networks_and_scheduling() {
     let settings = with(
         "ros: {domain_id: 4, networks: [eth0, 10.0.0.7]}\n\
          lanes:\n\
@@ -239,7 +239,7 @@ fn lanes_have_networks_and_scheduling_of_their_own() {
 }
 
 #[test]
-fn subscribers_and_overrides_are_known_by_their_ids() {
+fn subscribers_and_overrides_are_read_by_id() {
     let settings = with(
         "lanes: {rviz: {}}\n\
          subscribers: {laptop: rviz, tablet: {lane: noncritical}, gone: {lane: null}}\n\
@@ -252,7 +252,7 @@ fn subscribers_and_overrides_are_known_by_their_ids() {
 }
 
 #[test]
-fn a_secret_is_known_by_its_source_only() {
+fn the_settings_contain_the_source_of_a_secret_only() {
     let secret = |text: &str| with(&format!("security: {{{text}}}\n")).security.secret;
     assert_eq!(secret("hmac_secret: ''"), None);
     assert_eq!(secret("hmac_secret: swordfish"), Some(SecretSource::ConfigFile));
@@ -262,7 +262,7 @@ fn a_secret_is_known_by_its_source_only() {
 }
 
 #[test]
-fn no_message_ever_repeats_a_secret() {
+fn no_message_contains_a_secret() {
     for text in [
         "security: swordfish",
         "security: [swordfish]",
@@ -286,7 +286,7 @@ fn no_message_ever_repeats_a_secret() {
 }
 
 #[test]
-fn aliases_and_merge_keys_are_written_out() {
+fn aliases_and_merge_keys_are_expanded() {
     let settings = settings(
         "topics: [{id: a, input_topic: /a}]\n\
          qos_profiles:\n\
@@ -300,7 +300,7 @@ fn aliases_and_merge_keys_are_written_out() {
 }
 
 #[test]
-fn a_topic_may_have_the_name_of_its_input_in_another_domain() {
+fn an_output_in_another_domain_may_have_the_name_of_its_input() {
     let settings = settings(
         "topics: [{id: a, input_topic: /a, noncritical_output: /a}]\nlanes: {noncritical: {domain_id: 1}}\n",
     );
@@ -308,7 +308,7 @@ fn a_topic_may_have_the_name_of_its_input_in_another_domain() {
 }
 
 #[test]
-fn a_default_output_that_is_too_long_is_named() {
+fn a_default_output_that_is_too_long_is_reported() {
     let input = format!("/{}", "a".repeat(240));
     let found = messages(&format!("topics: [{{id: a, input_topic: {input}}}]"));
     assert_eq!(found.len(), 2);
@@ -320,7 +320,7 @@ fn a_default_output_that_is_too_long_is_named() {
 }
 
 #[test]
-fn each_mistake_is_named_with_its_line_value_and_what_is_allowed() {
+fn each_mistake_is_reported_with_line_value_and_what_is_allowed() {
     let cases = include_str!("../../tests/fixtures/config/messages.txt").split("\n\n").skip(1);
     let mut count = 0;
     for case in cases {
@@ -336,7 +336,7 @@ fn each_mistake_is_named_with_its_line_value_and_what_is_allowed() {
 }
 
 #[test]
-fn a_file_without_topics_says_so() {
+fn a_file_without_topics_is_refused() {
     let found = messages("instance: a");
     assert_eq!(found.len(), 1);
     assert!(
@@ -346,7 +346,7 @@ fn a_file_without_topics_says_so() {
 }
 
 #[test]
-fn what_is_not_a_configuration_at_all_is_said_so() {
+fn files_that_are_empty_no_mapping_or_invalid_yaml_are_refused() {
     for text in ["", "\n\n", "# nothing\n", "---\n", "~", "---\n...\n", "\u{feff}"] {
         let found = messages(text);
         assert_eq!(found.len(), 1, "{text:?}");
@@ -361,11 +361,11 @@ fn what_is_not_a_configuration_at_all_is_said_so() {
         ("a: 1\n---\nb: 2\n", "f.yaml:2: must be one YAML document; a second one begins here"),
         ("a: 1\n? [b]\n: 2\n", "f.yaml:2: a key must be text, not a list or a mapping"),
         ("a: *b\n", "f.yaml:1: not YAML: "),
-        ("a: &a\n  b: *a\n", "f.yaml:2: this alias refers to what it is part of"),
-        ("a: &a\n  c: 1\n  b: [*a]\n", "f.yaml:3: this alias refers to what it is part of"),
-        ("a: !include b\n", "f.yaml:1: must be without YAML tags (`!name`)"),
-        ("a: 1\nb: !!int c\n", "f.yaml:2: must be without YAML tags (`!name`)"),
-        ("a: 1\nb: !!binary c\n", "f.yaml:2: must be without YAML tags (`!name`)"),
+        ("a: &a\n  b: *a\n", "f.yaml:2: must not be an alias of a value that contains it"),
+        ("a: &a\n  c: 1\n  b: [*a]\n", "f.yaml:3: must not be an alias of a value that contains it"),
+        ("a: !include b\n", "f.yaml:1: must not use YAML tags (`!name`)"),
+        ("a: 1\nb: !!int c\n", "f.yaml:2: must not use YAML tags (`!name`)"),
+        ("a: 1\nb: !!binary c\n", "f.yaml:2: must not use YAML tags (`!name`)"),
         ("a: 1\n...\n# the end\nb: 2\n", "f.yaml:4: must be one YAML document; a second one begins here"),
     ] {
         let found = messages(text);
@@ -377,8 +377,8 @@ fn what_is_not_a_configuration_at_all_is_said_so() {
 }
 
 #[test]
-fn lines_are_those_of_an_editor() {
-    // A byte order mark is no line, both bytes of CR LF are one, NEL and LS end none.
+fn lines_are_counted_as_in_an_editor() {
+    // A byte order mark is not a line, CR LF is one line break, NEL and LS are none.
     for (text, line) in [
         ("\n\ninstance: 7", 4),
         ("\r\n# a\r\ninstance: 7", 4),
@@ -401,14 +401,14 @@ fn lines_are_those_of_an_editor() {
 }
 
 #[test]
-fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
+fn files_designed_to_exhaust_the_loader_are_refused() {
     let mut bomb = String::from("a0: &a0 [x, x, x, x, x, x, x, x, x]\n");
     for level in 1..40 {
         let aliases = vec![format!("*a{}", level - 1); 9].join(", ");
         writeln!(bomb, "a{level}: &a{level} [{aliases}]").unwrap();
     }
     let mebibyte = 1 << 20;
-    let many = "must have at most 65536 keys and values, those of aliases included";
+    let many = "must have at most 65536 keys and values, including those of aliases";
     let deep = "must be nested at most 32 deep";
     for (text, message) in [
         (bomb, format!("f.yaml:5: {many}")),
@@ -420,13 +420,13 @@ fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
         (" ".repeat(mebibyte + 1), "f.yaml: must be at most 1048576 bytes long".to_owned()),
         (
             format!("a: &a {}\nb:\n- *a\n- *a\n- *a", "b ".repeat(mebibyte / 2 - 50)),
-            "f.yaml:4: must have at most 2097152 bytes of text, that of aliases included".to_owned(),
+            "f.yaml:4: must have at most 2097152 bytes of text, including that of aliases".to_owned(),
         ),
         (
             format!("a: &a '{}'\nb: [{}]\n", "b".repeat(mebibyte / 2), "*a, ".repeat(4000)),
             "f.yaml:2: must use at most 993 aliases in a file of this size".to_owned(),
         ),
-        // What is after the end of the document is not read by the library, and was not counted by it.
+        // The library neither reads nor counts content after the end of the document.
         (
             format!("a: 1\n...\n{}", "{a: ".repeat(mebibyte / 5)),
             "f.yaml:3: must be one YAML document; a second one begins here".to_owned(),
@@ -434,7 +434,7 @@ fn a_file_that_is_made_to_exhaust_the_loader_is_refused() {
     ] {
         assert_eq!(messages(&text), [message]);
     }
-    // Mixed nesting stays below both limits of the parser, and is counted here.
+    // Mixed nesting stays below both limits of the library; the loader counts it.
     let mixed = messages(&"- [\n".repeat(40));
     assert!(mixed[0].starts_with("f.yaml:"), "{mixed:?}");
 }
@@ -457,7 +457,7 @@ fn too_many_lanes_or_topics_are_refused() {
 }
 
 #[test]
-fn environment_variables_stand_in_where_the_file_is_silent() {
+fn environment_variables_supply_values_missing_in_the_file() {
     let parse_in = |text: &str, name: &'static str, value: &'static str| {
         let text = format!("{TOPIC}{text}");
         parse(&text, "f.yaml", &|asked: &str| (asked == name).then(|| value.to_owned())).unwrap()
@@ -483,7 +483,7 @@ fn environment_variables_stand_in_where_the_file_is_silent() {
 }
 
 #[test]
-fn a_wrong_environment_variable_is_named() {
+fn a_wrong_environment_variable_is_reported() {
     for (name, value, message) in [
         ("ROS_DOMAIN_ID", "233", "must be a whole number from 0 to 232"),
         ("ROS_DOMAIN_ID", "-1", "must be a whole number from 0 to 232"),
@@ -507,7 +507,7 @@ fn a_wrong_environment_variable_is_named() {
 }
 
 #[test]
-fn the_supervisors_thresholds_come_in_pairs_with_a_gap() {
+fn each_degraded_threshold_of_safety_is_below_its_emergency_threshold() {
     let rules =
         with("safety: {emergency_lag_ms: 900, silent_ms: 600, emergency_silent_ms: 0}\n").safety.rules;
     assert_eq!((rules.degraded_lag_ms, rules.emergency_lag_ms), (500.0, 900.0));

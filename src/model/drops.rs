@@ -69,14 +69,10 @@ impl DropReason {
         match self {
             Self::TooLarge => "larger than the route's max_sample_bytes; raise it",
             Self::PoolExhausted => "no free slot in shared memory; raise queue_depth",
-            Self::Malformed => {
-                "an encapsulation that DDS does not define, or a payload that cannot be decoded"
-            }
+            Self::Malformed => "an encapsulation that DDS does not define, or an undecodable payload",
             Self::IngressDied => "an ingress process died before it published them",
             Self::QueueOverflow => "the lane took them too slowly; raise its queue_depth",
-            Self::LaneDown => {
-                "published while no process served the lane, or held by a process that was killed"
-            }
+            Self::LaneDown => "published while no process served the lane, or held by one that was killed",
             Self::NoWriter => "the message type is not known yet",
             Self::NoReader => "no subscriber was matched, or not again yet after a restart of the lane",
             Self::WriteFailed => "the DDS library refused them",

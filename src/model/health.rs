@@ -31,8 +31,8 @@ pub struct PublisherAccount {
     pub repeated: u64,
     /// When the last sample was taken.
     pub last_at: MonotonicNs,
-    /// The reliability that the writer offers according to discovery: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT` or
-    /// `OFFERS_RELIABLE`.
+    /// The reliability that the writer offers according to discovery: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT`
+    /// or `OFFERS_RELIABLE`.
     pub offered_reliability: u64,
 }
 
@@ -93,8 +93,8 @@ pub struct IngressCounters {
     pub drops: DropCounts,
     /// Samples lost before ingress: their publisher numbered them, and the DDS reader never returned them.
     pub lost_upstream: u64,
-    /// Samples discarded because their sequence number was at or below the high-water mark of their publisher;
-    /// not among the received.
+    /// Samples discarded because their sequence number was at or below the high-water mark of their
+    /// publisher; not among the received.
     pub repeated: u64,
     /// Of the received, those of publishers beyond [`MAX_PUBLISHERS`], which have no high-water mark.
     pub unmarked: u64,
@@ -107,8 +107,8 @@ pub struct IngressCounters {
     pub writers: u64,
     /// When the last sample was taken.
     pub last_received_at: MonotonicNs,
-    /// How far the clock of `clock_writer` is behind this host's, in nanoseconds, negative when it is ahead; 0
-    /// while the clocks of all publishers agree with this host's.
+    /// How far the clock of `clock_writer` is behind this host's, in nanoseconds, negative when it is ahead;
+    /// 0 while the clocks of all publishers agree with this host's.
     pub clock_offset_ns: i64,
     /// The writer whose clock differs most; all zero for none.
     pub clock_writer: Guid,
@@ -146,8 +146,8 @@ pub struct LaneCounters {
     pub last_writer_sequence: i64,
     /// Readers matched at present.
     pub readers: u64,
-    /// Overruns summed over all readers ever matched: samples that left the writer's history before one reader
-    /// acknowledged them. The lane forwarded these samples, and other readers may have received them.
+    /// Overruns summed over all readers ever matched: samples that left the writer's history before one
+    /// reader acknowledged them. The lane forwarded these samples, and other readers may have received them.
     pub reader_overrun: u64,
 }
 
@@ -224,7 +224,8 @@ pub struct ProcessHealth {
     /// The process' DDS participant. If the process is killed, its successor announces to remote participants
     /// that this one has left.
     pub participant: Guid,
-    /// Failures in the process other than of samples: housekeeping, a board, a policy that it could not write.
+    /// Failures in the process other than of samples: housekeeping, a board, a policy that it could not
+    /// write.
     pub errors: u64,
     /// The fingerprint of the configuration that the process applies.
     pub settings_fingerprint: u64,
@@ -311,8 +312,8 @@ pub struct RouteInfo {
     pub dds_type: FixedText,
 }
 
-/// Buckets of each octave. The relative width of a bucket is at most 1/16, so that a quantile is at most 6.3 %
-/// too large.
+/// Buckets of each octave. The relative width of a bucket is at most 1/16, so that a quantile is at most
+/// 6.3 % too large.
 const SUB_BUCKETS: usize = 16;
 /// Octaves, from 2^10 ns (1 µs) to 2^37 ns (137 s).
 const OCTAVES: usize = 27;
@@ -347,8 +348,8 @@ impl LatencyHistogram {
         self.counts.iter().fold(0, |total, count| total.saturating_add(*count))
     }
 
-    /// The latency at or below which the share `quantile` (0 to 1) of all counted latencies lies, as the upper
-    /// edge of its bucket in nanoseconds; `None` when none was counted.
+    /// The latency at or below which the share `quantile` (0 to 1) of all counted latencies lies, as the
+    /// upper edge of its bucket in nanoseconds; `None` when none was counted.
     pub fn quantile_ns(&self, quantile: f64) -> Option<u64> {
         let total = self.count();
         if total == 0 {

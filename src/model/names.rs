@@ -9,7 +9,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 pub struct NameError {
     /// The kind of name, such as `lane name`.
     pub kind: &'static str,
-    /// What is allowed, as a phrase that completes "must be …".
+    /// The allowed texts, as a phrase that completes "must be …".
     pub allowed: &'static str,
 }
 
@@ -46,7 +46,7 @@ macro_rules! checked_name {
         pub struct $name(String);
 
         impl $name {
-            /// What is allowed, as a phrase that completes "must be …".
+            /// The allowed texts, as a phrase that completes "must be …".
             pub const ALLOWED: &'static str = $allowed;
 
             /// The name as text.
@@ -129,7 +129,7 @@ pub struct TypeName {
 }
 
 impl TypeName {
-    /// What is allowed, as a phrase that completes "must be …".
+    /// The allowed texts, as a phrase that completes "must be …".
     pub const ALLOWED: &'static str = "package/msg/Name or package/Name, such as sensor_msgs/msg/LaserScan";
 
     /// The DDS type name: `sensor_msgs::msg::dds_::LaserScan_`.

@@ -53,8 +53,8 @@ impl fmt::Display for Guid {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct SampleHeader {
-    /// The sample's number in its route. Ingress assigns 1, 2, 3, … without gaps, also across its restarts, so
-    /// that a gap which a lane finds is the number of samples that the lane did not receive.
+    /// The sample's number in its route. Ingress assigns 1, 2, 3, … without gaps, also across its restarts,
+    /// so that a gap which a lane finds is the number of samples that the lane did not receive.
     pub sequence: u64,
     /// The publisher's DDS source timestamp.
     pub source_timestamp: SourceTimestamp,

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The thresholds of the classifier (paper, section III-C): one set for demotion and one for promotion, with a
-/// gap between them.
+/// The thresholds of the classifier (paper, section III-C): one set for demotion and one for promotion, with
+/// a gap between them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClassifierThresholds {
     /// Loss, 0 to 1, above which a reading calls for demotion.

@@ -215,7 +215,8 @@ impl AbsenceWatch {
         }
     }
 
-    /// Adds the interfaces by which a peer is reached. Others appear and disappear with containers and tunnels.
+    /// Adds the interfaces by which a peer is reached. Others appear and disappear with containers and
+    /// tunnels.
     fn find_interfaces(&mut self, present: &[HostInterface]) {
         for found in present.iter().filter(|found| found.has_link) {
             let Some((address, _)) = found.address else { continue };

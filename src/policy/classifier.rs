@@ -8,9 +8,10 @@ use crate::model::{ClassifierThresholds, MonotonicNs, SubscriberState};
 /// when a single slow response is the whole mean. A window of fewer probes is sufficient when it is full.
 pub const MIN_SETTLED: usize = 10;
 
-/// The silence after which control removes a subscriber that the configuration does not list, so that a laptop
-/// that was closed does not keep its lane degraded. A minute is longer than a fade of the link or a restart of
-/// the subscriber takes; until then, unanswered probes count as lost. A listed subscriber is never removed.
+/// The silence after which control removes a subscriber that the configuration does not list, so that a
+/// laptop that was closed does not keep its lane degraded. A minute is longer than a fade of the link or a
+/// restart of the subscriber takes; until then, unanswered probes count as lost. A listed subscriber is never
+/// removed.
 pub const FORGET_UNLISTED_MS: u64 = 60_000;
 
 /// Why the state of a subscriber changed.
@@ -75,16 +76,17 @@ enum Verdict {
 
 /// The classifier of one subscriber.
 ///
-/// - The state is UNKNOWN until there is enough data; then the same thresholds lead to CRITICAL or NONCRITICAL.
-///   A subscriber that never responded has no data and stays UNKNOWN, which lane modes count as healthy.
-/// - A change requires `hysteresis_count` consecutive readings beyond the thresholds; any other reading resets
-///   the count.
+/// - The state is UNKNOWN until there is enough data; then the same thresholds lead to CRITICAL or
+///   NONCRITICAL. A subscriber that never responded has no data and stays UNKNOWN, which lane modes count as
+///   healthy.
+/// - A change requires `hysteresis_count` consecutive readings beyond the thresholds; any other reading
+///   resets the count.
 /// - A forced state takes precedence over readings and applies immediately. When it ends, the classifier
 ///   continues from that state.
 /// - Where UNKNOWN is not allowed, it is shown and treated as CRITICAL.
 ///
-/// One call of [`evaluate`](Self::evaluate) is one evaluation. A caller that was stopped does not repeat missed
-/// evaluations: they would all use the same reading.
+/// One call of [`evaluate`](Self::evaluate) is one evaluation. A caller that was stopped does not repeat
+/// missed evaluations: they would all use the same reading.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SubscriberClassifier {
     state: SubscriberState,
@@ -159,8 +161,8 @@ impl SubscriberClassifier {
         }
     }
 
-    /// Resets the state to UNKNOWN, because the classifier is off and no state is forced: the last state would
-    /// become outdated.
+    /// Resets the state to UNKNOWN, because the classifier is off and no state is forced: the last state
+    /// would become outdated.
     pub fn unclassified(&mut self, thresholds: &ClassifierThresholds) -> Option<Transition> {
         self.forced = false;
         self.demotions = 0;
@@ -206,8 +208,8 @@ const fn is_sufficient(reading: &LinkReading) -> bool {
     reading.settled >= MIN_SETTLED || reading.full
 }
 
-/// Whether to remove a subscriber that the configuration does not list; `heard_at` is its last response. Such a
-/// subscriber becomes known with its first response, so that there always is one.
+/// Whether to remove a subscriber that the configuration does not list; `heard_at` is its last response. Such
+/// a subscriber becomes known with its first response, so that there always is one.
 pub const fn is_forgotten(heard_at: MonotonicNs, now: MonotonicNs) -> bool {
     now.since(heard_at) > FORGET_UNLISTED_MS * 1_000_000
 }

@@ -1,5 +1,5 @@
-//! Detects whether a publisher's clock disagrees with this host's, and measures the age of its samples in spite
-//! of that.
+//! Detects whether a publisher's clock disagrees with this host's, and measures the age of its samples in
+//! spite of that.
 //!
 //! A single one-way delay cannot distinguish a clock that is behind from a slow link. The change of the delay
 //! can: in a queue that keeps the order, source timestamps increase, so that the delay grows no faster than
@@ -9,8 +9,8 @@ use crate::model::{AgeBasis, MonotonicNs, WallNs};
 
 const MS: i64 = 1_000_000;
 
-/// A steady delay outside these bounds, measured from the source timestamp, is an offset between the clocks. A
-/// true delay is never negative; 50 ms are the tolerance for clocks that NTP synchronizes over Wi-Fi.
+/// A steady delay outside these bounds, measured from the source timestamp, is an offset between the clocks.
+/// A true delay is never negative; 50 ms are the tolerance for clocks that NTP synchronizes over Wi-Fi.
 const AHEAD_NS: i64 = 50 * MS;
 const BEHIND_NS: i64 = 100 * MS;
 
@@ -24,8 +24,8 @@ const STEP_NS: i64 = 50 * MS;
 const STEADY_MS: u64 = 2_000;
 const STEADY_SAMPLES: u32 = 5;
 
-/// The minimum delay may increase by 5 ms in 10 s (500 ppm): more than the drift between two crystals and less
-/// than the growth of a queue.
+/// The minimum delay may increase by 5 ms in 10 s (500 ppm): more than the drift between two crystals and
+/// less than the growth of a queue.
 const DRIFT_WINDOW_MS: u64 = 10_000;
 const DRIFT_NS: i64 = 5 * MS;
 
@@ -337,7 +337,8 @@ mod tests {
                 simulation.sample(number as i64 * 20, 2 + jitter_ms);
             }
             let offset_ms = simulation.clock.offset_ns().map(|offset_ns| offset_ns / MS);
-            prop_assert!(offset_ms.is_some_and(|found| (found + publisher_ms).abs() <= 70), "{:?}", offset_ms);
+            let is_close = |found: i64| (found + publisher_ms).abs() <= 70;
+            prop_assert!(offset_ms.is_some_and(is_close), "{:?}", offset_ms);
             let age_ms = simulation.sample(4_000, late_ms);
             prop_assert!((age_ms - late_ms).abs() <= 70, "{} for {}", age_ms, late_ms);
         }

@@ -1,7 +1,7 @@
 //! Detects intruders: readers on other hosts that bypass the bridge.
 //!
-//! The bridge cannot prevent a laptop from subscribing to an input topic or to a topic of the critical lane. The
-//! link of that laptop can then slow down what the bridge protects. The bridge can warn of it.
+//! The bridge cannot prevent a laptop from subscribing to an input topic or to a topic of the critical lane.
+//! The link of that laptop can then slow down what the bridge protects. The bridge can warn of it.
 
 // Addresses only: `core::net` has no sockets.
 use core::net::IpAddr;
@@ -167,8 +167,8 @@ impl IntruderWatch {
         self.dds_names.iter().any(|name| name == dds_topic)
     }
 
-    /// Records a reader, new or changed, that discovery found on any DDS topic. `own` are the addresses of this
-    /// host. A reader on this host or on an unknown one is no intruder.
+    /// Records a reader, new or changed, that discovery found on any DDS topic. `own` are the addresses of
+    /// this host. A reader on this host or on an unknown one is no intruder.
     pub fn found(
         &mut self,
         reader: Guid,
@@ -211,8 +211,8 @@ impl IntruderWatch {
 
     /// The next event, if there is one. `node_of` returns the node of a reader if it is known.
     ///
-    /// A new reader is reported as soon as its node is known, or without it after [`NODE_PATIENCE_MS`]; a name
-    /// that arrives later is added without an event.
+    /// A new reader is reported as soon as its node is known, or without it after [`NODE_PATIENCE_MS`]; a
+    /// name that arrives later is added without an event.
     pub fn poll<'graph>(
         &mut self,
         now: MonotonicNs,

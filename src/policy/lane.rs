@@ -23,8 +23,8 @@ pub enum Decision<T> {
 
 /// One route on a noncritical lane: a token bucket and a queue, configured by the mode.
 ///
-/// When the caller wakes, it takes all samples out of shared memory, offers them, and polls until the decision
-/// is not [`Decision::Send`]. The shaper allocates only on construction and when its rates change.
+/// When the caller wakes, it takes all samples out of shared memory, offers them, and polls until the
+/// decision is not [`Decision::Send`]. The shaper allocates only on construction and when its rates change.
 #[derive(Debug)]
 pub struct RouteShaper<T> {
     rates: LaneRates,
@@ -94,8 +94,8 @@ impl<T> RouteShaper<T> {
         }
     }
 
-    /// Decides what to do at `now`. `budget` is that of the lane, in the same mode ([`ByteBudget::set_mode`]);
-    /// the caller polls the routes that share it in [`TurnOrder`].
+    /// Decides what to do at `now`. `budget` is that of the lane, in the same mode
+    /// ([`ByteBudget::set_mode`]); the caller polls the routes that share it in [`TurnOrder`].
     pub fn poll(
         &mut self,
         budget: &mut ByteBudget,
@@ -152,8 +152,9 @@ fn capacity_for(rates: &LaneRates) -> usize {
     rates.normal.queue_samples.max(rates.degraded.queue_samples)
 }
 
-/// The order in which to poll the routes of a lane that share a [`ByteBudget`]. It starts with the route after
-/// the one that sent last: in a fixed order the first route would take all bytes when they do not suffice.
+/// The order in which to poll the routes of a lane that share a [`ByteBudget`]. It starts with the route
+/// after the one that sent last: in a fixed order the first route would take all bytes when they do not
+/// suffice.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TurnOrder {
     first: usize,

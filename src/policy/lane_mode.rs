@@ -1,5 +1,5 @@
-//! Decides the mode of a lane (paper, section III-D) by its worst subscriber, and the floor that the safety mode
-//! sets.
+//! Decides the mode of a lane (paper, section III-D) by its worst subscriber, and the floor that the safety
+//! mode sets.
 
 use crate::model::{LaneMode, SafetyMode, SafetyRules, SubscriberState, TrafficClass};
 
@@ -94,9 +94,10 @@ pub fn lane_mode<'a>(
     }
 }
 
-/// The mildest mode that a safety mode allows a lane (paper, section III-E): DEGRADED suspends the noncritical
-/// lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where the
-/// configuration does not preserve the critical path, only trouble of that path itself stops it in DEGRADED.
+/// The mildest mode that a safety mode allows a lane (paper, section III-E): DEGRADED suspends the
+/// noncritical lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where
+/// the configuration does not preserve the critical path, only trouble of that path itself stops it in
+/// DEGRADED.
 ///
 /// [`SafetyDecision::critical_trouble`]: super::SafetyDecision::critical_trouble
 pub const fn safety_floor(

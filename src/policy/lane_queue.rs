@@ -56,8 +56,8 @@ impl Allowance {
 /// The bounded queue of one route in a noncritical lane.
 ///
 /// The caller offers samples in the order of their sequence numbers. Each is either sent or dropped, which
-/// passes it to the caller's `on_drop` with the reason, so that offered = sent + dropped + waiting, always. The
-/// queue allocates only on construction and when its capacity changes.
+/// passes it to the caller's `on_drop` with the reason, so that offered = sent + dropped + waiting, always.
+/// The queue allocates only on construction and when its capacity changes.
 #[derive(Debug)]
 pub struct LaneQueue<T> {
     /// The oldest is at the front.
@@ -121,11 +121,11 @@ impl<T> LaneQueue<T> {
 
     /// Removes the sample to send next; `None` when no sample may be sent.
     ///
-    /// - `DropOldest`: keeps as many of the newest samples as the allowance permits and drops all older ones as
-    ///   superseded; returns the oldest of those kept, so that the order is kept. With one token, the usual
-    ///   case, that is the newest sample. There are more tokens only if the lane was late by more than the
-    ///   interval of the rate, and then each token sends a sample: otherwise a lane with a rate of 1 kHz that
-    ///   wakes every 2 ms would send 500 Hz.
+    /// - `DropOldest`: keeps as many of the newest samples as the allowance permits and drops all older ones
+    ///   as superseded; returns the oldest of those kept, so that the order is kept. With one token, the
+    ///   usual case, that is the newest sample. There are more tokens only if the lane was late by more than
+    ///   the interval of the rate, and then each token sends a sample: otherwise a lane with a rate of 1 kHz
+    ///   that wakes every 2 ms would send 500 Hz.
     /// - `DropLatest`: returns the oldest sample.
     /// - `DropStale`: drops all stale samples, then returns the oldest.
     ///
@@ -180,7 +180,8 @@ impl<T> LaneQueue<T> {
             if allowance.is_stale(stamps) {
                 continue;
             }
-            // The newest is sent last and may make debt, so only the bytes of those before it must be available.
+            // The newest is sent last and may make debt, so only the bytes of those before it must be
+            // available.
             if kept > 0 {
                 older_bytes = older_bytes.saturating_add(stamps.bytes);
                 if older_bytes > allowance.bytes {
@@ -201,8 +202,8 @@ impl<T> LaneQueue<T> {
         }
     }
 
-    /// Drops all stale samples. One may wait behind a fresh one, because each publisher of a topic has its own
-    /// clock.
+    /// Drops all stale samples. One may wait behind a fresh one, because each publisher of a topic has its
+    /// own clock.
     fn drop_stale(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
         for _ in 0..self.waiting.len() {
             let Some((item, stamps)) = self.waiting.pop_front() else { return };

@@ -7,7 +7,8 @@
 //! - [`ClockOffset`]: whether a publisher's clock disagrees with this host's.
 //! - [`LaneQueue`]: which samples wait in a noncritical lane, and which it drops.
 //! - [`RouteShaper`]: rate, queue and staleness of one route on a noncritical lane.
-//! - [`critical_drop`] and [`effective_mode`]: whether a critical lane drops a sample, and which mode applies.
+//! - [`critical_drop`] and [`effective_mode`]: whether a critical lane drops a sample, and which mode
+//!   applies.
 //! - [`SequenceTracker`]: missing samples, by their sequence numbers.
 //! - [`publisher_place`]: which account a new publisher replaces.
 //! - [`ProbeWindow`]: the state of the link to one subscriber, measured with probes.

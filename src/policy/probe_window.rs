@@ -1,5 +1,5 @@
-//! Measures the link to one subscriber with probes (paper, section III-C), over a sliding window of the newest
-//! probes that were answered or lost.
+//! Measures the link to one subscriber with probes (paper, section III-C), over a sliding window of the
+//! newest probes that were answered or lost.
 
 use std::collections::VecDeque;
 
@@ -13,8 +13,8 @@ pub const MAX_OUTSTANDING: usize = 4_096;
 /// responses.
 const REMEMBERED: usize = 64;
 
-/// A control process that wakes this much later than planned was stopped, or got no CPU time: round trips that
-/// it measures then include its own delay. See [`ProbeWindow::stopped`].
+/// A control process that wakes this much later than planned was stopped, or got no CPU time: round trips
+/// that it measures then include its own delay. See [`ProbeWindow::stopped`].
 pub const STOPPED_NS: u64 = 100_000_000;
 
 /// How the window counts a probe response.
@@ -65,7 +65,7 @@ pub struct ProbeTotals {
     pub answered: u64,
     /// Not answered in time.
     pub lost: u64,
-    /// Probes that say nothing about the link: sent before the subscriber's first response, outstanding while
+    /// Probes excluded from the measurement: sent before the subscriber's first response, outstanding while
     /// the control process was stopped, or outstanding when the numbering restarted.
     pub excused: u64,
 }
@@ -130,9 +130,9 @@ impl ProbeWindow {
         self.settled.drain(..excess);
     }
 
-    /// Records a probe that was sent. Numbers increase, by any amount. A number that is not above the last one
-    /// means that the numbering restarted: outstanding probes are excused then, because their responses could
-    /// be confused with those to new probes.
+    /// Records a probe that was sent. Numbers increase, by any amount. A number that is not above the last
+    /// one means that the numbering restarted: outstanding probes are excused then, because their responses
+    /// could be confused with those to new probes.
     pub fn sent(&mut self, seq: u64, at: MonotonicNs) {
         self.settle(at);
         if self.probes.back().is_some_and(|newest| newest.seq >= seq) {
@@ -177,8 +177,8 @@ impl ProbeWindow {
     /// did not run: it was stopped (SIGSTOP, a suspended machine) or got no CPU time. Responses that arrived
     /// in that time would count as late only because control did not read them.
     ///
-    /// The caller detects the pause, because it knows when it should have woken. It calls this first in a turn
-    /// that began more than [`STOPPED_NS`] late, before it passes the responses that queued up.
+    /// The caller detects the pause, because it knows when it should have woken. It calls this first in a
+    /// turn that began more than [`STOPPED_NS`] late, before it passes the responses that queued up.
     pub fn stopped(&mut self, from: MonotonicNs, until: MonotonicNs) {
         self.settle(from);
         self.excuse(|probe| probe.sent_at <= until);

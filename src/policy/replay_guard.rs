@@ -25,9 +25,9 @@ pub enum Admission {
 /// The caller passes only messages whose signature it has verified, and uses one guard for each sender:
 /// otherwise forged messages, or those of another sender, would displace genuine ones.
 ///
-/// The memory is fixed. When the guard removes a message, because it is full or because the window has passed,
-/// it keeps its instant and accepts no message sent at or before it, so that neither a flood nor a clock that
-/// steps back permits a replay.
+/// The memory is fixed. When the guard removes a message, because it is full or because the window has
+/// passed, it keeps its instant and accepts no message sent at or before it, so that neither a flood nor a
+/// clock that steps back permits a replay.
 #[derive(Clone, Debug)]
 pub struct ReplayGuard {
     window_ns: u64,

@@ -10,8 +10,8 @@ pub const FIRST_BACKOFF_MS: u64 = 100;
 /// cause of failure is gone (such as a network interface that comes up late) runs again within 5 s.
 pub const MAX_BACKOFF_MS: u64 = 5_000;
 
-/// A child that ran this long was healthy: the next restart is immediate again. Twice the longest wait, so that
-/// a child which dies shortly after each start does not count as healthy.
+/// A child that ran this long was healthy: the next restart is immediate again. Twice the longest wait, so
+/// that a child which dies shortly after each start does not count as healthy.
 pub const GOOD_RUN_MS: u64 = 10_000;
 
 /// How a child process ended.

@@ -1,10 +1,10 @@
-//! The safety supervisor (paper, section III-E) decides the safety mode of the whole bridge from queues, lags,
-//! errors and silence.
+//! The safety supervisor (paper, section III-E) decides the safety mode of the whole bridge from queues,
+//! lags, errors and silence.
 //!
-//! EMERGENCY stops every lane, so it must not be entered by mistake. Only signs that the bridge itself no longer
-//! keeps up on the critical path call for it: a full queue, samples that wait for seconds between shared memory
-//! and their writer, samples lost in shared memory, a process that is gone for long. Causes outside the bridge
-//! do not:
+//! EMERGENCY stops every lane, so it must not be entered by mistake. Only signs that the bridge itself no
+//! longer keeps up on the critical path call for it: a full queue, samples that wait for seconds between
+//! shared memory and their writer, samples lost in shared memory, a process that is gone for long. Causes
+//! outside the bridge do not:
 //!
 //! - noncritical lanes: DEGRADED at most;
 //! - a subscriber that does not keep up (`reader_overrun`): no effect; other subscribers receive the samples;
@@ -22,20 +22,21 @@ pub const MAX_SOURCE_LAG_MS: f64 = 10_000.0;
 /// The period of the minimum lag, which is that of the current and the previous period.
 const BASELINE_MS: u64 = 60_000;
 
-/// Time without a turn after which a full queue is no sign of overload. Every process turns ten times a second;
-/// one that does not hangs, is stopped or is gone. Its queue fills within 0.3 s, while a watchdog takes 2 s:
-/// stopping the other lanes, and then the restarted one, would only prolong the gap.
+/// Time without a turn after which a full queue is no sign of overload. Every process turns ten times a
+/// second; one that does not hangs, is stopped or is gone. Its queue fills within 0.3 s, while a watchdog
+/// takes 2 s: stopping the other lanes, and then the restarted one, would only prolong the gap.
 const STALLED_MS: u64 = 500;
 
-/// The smallest queue capacity at which the occupancy is meaningful: a single sample could fill a smaller one.
+/// The smallest queue capacity at which the occupancy is meaningful: a single sample could fill a smaller
+/// one.
 const MIN_QUEUE: u64 = 8;
 
 /// The increase of the source lag of one route.
 ///
 /// The lag is measured with the clocks of the publisher and this host, so that a constant part of it may be a
 /// difference between clocks. Only the increase above the minimum of the last one to two minutes counts. When
-/// a clock steps, the minimum includes the new difference after two minutes at most. A lag that is negative or
-/// above [`MAX_SOURCE_LAG_MS`] is certainly a difference between clocks and is ignored.
+/// a clock steps, the minimum includes the new difference after two minutes at most. A lag that is negative
+/// or above [`MAX_SOURCE_LAG_MS`] is certainly a difference between clocks and is ignored.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SourceLag {
     since: MonotonicNs,
@@ -104,8 +105,8 @@ pub struct ProcessLoad<'a> {
     pub waiting: u64,
     /// Ingress: the largest [`SourceLag::excess_ms`] of all routes; `None` when no sample arrived.
     pub source_lag_ms: Option<f64>,
-    /// p99 of the time from shared memory to the writer in this evaluation, excluding the wait for the rate and
-    /// samples that the lane caught up with after a restart; `None` when nothing was written.
+    /// p99 of the time from shared memory to the writer in this evaluation, excluding the wait for the rate
+    /// and samples that the lane caught up with after a restart; `None` when nothing was written.
     pub writer_lag_ms: Option<f64>,
 }
 
@@ -201,7 +202,7 @@ pub struct SafetyCause {
     pub who: FixedText,
     /// Whether it is on the critical path.
     pub class: TrafficClass,
-    /// What is wrong.
+    /// The trouble.
     pub trouble: SafetyTrouble,
     /// The mode that it calls for: DEGRADED or EMERGENCY.
     pub speaks_for: SafetyMode,
@@ -214,8 +215,8 @@ pub struct SafetyDecision {
     pub mode: SafetyMode,
     /// The former mode, if this evaluation changed it.
     pub changed_from: Option<SafetyMode>,
-    /// The worst trouble of this reading; after a reading without trouble the last one, until the bridge is in
-    /// NORMAL again.
+    /// The worst trouble of this reading; after a reading without trouble the last one, until the bridge is
+    /// in NORMAL again.
     pub cause: Option<SafetyCause>,
     /// Whether this reading had no trouble.
     pub clean: bool,
@@ -395,13 +396,13 @@ impl Reading {
         }
         if let Some(elapsed_s) = elapsed_s {
             let errors = &process.errors;
-            let ours = errors.queue_overflow.saturating_add(errors.pool_exhausted);
-            let ours_per_s = ours as f64 / elapsed_s;
+            let lost = errors.queue_overflow.saturating_add(errors.pool_exhausted);
+            let lost_per_s = lost as f64 / elapsed_s;
             let per_s =
-                ours.saturating_add(errors.write_failed).saturating_add(errors.restarts) as f64 / elapsed_s;
-            if ours_per_s >= rules.emergency_errors_per_s {
+                lost.saturating_add(errors.write_failed).saturating_add(errors.restarts) as f64 / elapsed_s;
+            if lost_per_s >= rules.emergency_errors_per_s {
                 let limit_per_s = rules.emergency_errors_per_s;
-                self.add(process, SafetyTrouble::Errors { per_s: ours_per_s, limit_per_s }, true);
+                self.add(process, SafetyTrouble::Errors { per_s: lost_per_s, limit_per_s }, true);
             } else if per_s >= rules.degraded_errors_per_s {
                 let limit_per_s = rules.degraded_errors_per_s;
                 self.add(process, SafetyTrouble::Errors { per_s, limit_per_s }, false);
@@ -409,8 +410,8 @@ impl Reading {
         }
     }
 
-    /// DEGRADED suspends all noncritical lanes. Trouble of one of them that does not affect the others, such as a
-    /// reader that does not acknowledge, must not call for it.
+    /// DEGRADED suspends all noncritical lanes. Trouble of one of them that does not affect the others, such
+    /// as a reader that does not acknowledge, must not call for it.
     fn noncritical_lane(&mut self, process: &ProcessLoad<'_>, rules: &SafetyRules, elapsed_s: Option<f64>) {
         let is_silent = process.silent_ms >= rules.silent_ms;
         if !is_silent {
@@ -436,8 +437,8 @@ impl Reading {
         }
     }
 
-    /// Keeps the worst trouble: EMERGENCY before DEGRADED, then the critical path before noncritical lanes, then
-    /// the first one.
+    /// Keeps the worst trouble: EMERGENCY before DEGRADED, then the critical path before noncritical lanes,
+    /// then the first one.
     fn add(&mut self, process: &ProcessLoad<'_>, trouble: SafetyTrouble, is_extreme: bool) {
         let class = process.class;
         let is_critical = class == TrafficClass::Critical;

@@ -1,7 +1,7 @@
 //! Counts missing samples by their sequence numbers.
 //!
-//! Ingress numbers the samples of a route 1, 2, 3, … without gaps, also across its restarts. A lane that takes
-//! the numbers `a` and then `b` therefore missed exactly `b - a - 1` samples.
+//! Ingress numbers the samples of a route 1, 2, 3, … without gaps, also across its restarts. A lane that
+//! takes the numbers `a` and then `b` therefore missed exactly `b - a - 1` samples.
 
 /// How the sequence number of a sample relates to those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,15 +24,15 @@ pub struct SequenceTracker {
 }
 
 impl SequenceTracker {
-    /// The account of a lane that has taken no sample of the route. It begins at the first sample, so that those
-    /// published before the lane existed do not count as missing.
+    /// The account of a lane that has taken no sample of the route. It begins at the first sample, so that
+    /// those published before the lane existed do not count as missing.
     pub const fn new() -> Self {
         Self { first: 0, last: 0, begun: false }
     }
 
     /// Continues the account of a former process with its `first()` and `last()` (`first_sequence` and
-    /// `last_sequence` of the lane's counters). Samples published since are missing until the lane takes them.
-    /// Both are 0 if the process took no sample. If `last` is below `first`, the account is damaged and
+    /// `last_sequence` of the lane's counters). Samples published since are missing until the lane takes
+    /// them. Both are 0 if the process took no sample. If `last` is below `first`, the account is damaged and
     /// restarts at `first`.
     pub const fn resume(first: u64, last: u64) -> Self {
         let last = if last < first { first } else { last };

@@ -21,8 +21,8 @@ pub const MAX_RATE_HZ: f64 = 100_000.0;
 pub const BURST_WINDOW_NS: u64 = 50_000_000;
 
 /// One token in units of credit. A unit is one nanohertz times one nanosecond, 10⁻¹⁸ of a token: a rate of
-/// 0.01 Hz is then exact to 5 × 10⁻⁸, and the credit of 584 years at 100 kHz is below 2 × 10³³, where 3 × 10³⁸
-/// fit.
+/// 0.01 Hz is then exact to 5 × 10⁻⁸, and the credit of 584 years at 100 kHz is below 2 × 10³³,
+/// where 3 × 10³⁸ fit.
 const TOKEN: u128 = 1_000_000_000_000_000_000;
 
 /// One byte in units of (byte per second) × nanosecond.
@@ -31,11 +31,12 @@ const BYTE: i128 = 1_000_000_000;
 /// The burst, in tokens, with which a lane reaches `rate_hz`: two tokens plus those that accrue in
 /// [`BURST_WINDOW_NS`].
 ///
-/// The lane reaches the rate if the burst is at least 1 + rate × (jitter + 2 × lateness): one token, which the
-/// next sample takes, plus those that accrue while the publisher or the consumer is late. The second token
-/// covers a jitter of a whole input interval, peak to peak; the rest covers lateness. With wake-ups up to 3 ms
-/// late, a burst of one token reaches 9.85 of 10 Hz and 396 of 1,000 Hz, two tokens reach 710 of 1,000 Hz, and
-/// one token plus 50 ms reaches 0.483 of 0.5 Hz with that jitter; this burst reaches each of these rates.
+/// The lane reaches the rate if the burst is at least 1 + rate × (jitter + 2 × lateness): one token, which
+/// the next sample takes, plus those that accrue while the publisher or the consumer is late. The second
+/// token covers a jitter of a whole input interval, peak to peak; the rest covers lateness. With wake-ups up
+/// to 3 ms late, a burst of one token reaches 9.85 of 10 Hz and 396 of 1,000 Hz, two tokens reach 710 of
+/// 1,000 Hz, and one token plus 50 ms reaches 0.483 of 0.5 Hz with that jitter; this burst reaches each of
+/// these rates.
 pub fn burst_for(rate_hz: f64) -> f64 {
     2.0 + usable_rate(rate_hz) * (BURST_WINDOW_NS as f64 / 1e9)
 }
@@ -114,7 +115,8 @@ impl TokenBucket {
         (self.credit + accrued).min(self.cap)
     }
 
-    /// Updates the credit to `now`. After a clock has stepped back, none accrues until it reaches `updated_at`.
+    /// Updates the credit to `now`. After a clock has stepped back, none accrues until it reaches
+    /// `updated_at`.
     fn settle(&mut self, now: MonotonicNs) {
         self.credit = self.credit_at(now);
         self.updated_at = self.updated_at.max(now);
@@ -122,8 +124,8 @@ impl TokenBucket {
 }
 
 /// A limit of bytes per second, with debt: a sample of any size passes while the balance is not negative, and
-/// the debt that it makes delays the next. A sample larger than the bytes of one second therefore still passes,
-/// and the long-term rate is exact for samples of any size.
+/// the debt that it makes delays the next. A sample larger than the bytes of one second therefore still
+/// passes, and the long-term rate is exact for samples of any size.
 ///
 /// The balance is limited to the bytes that accrue in [`BURST_WINDOW_NS`] plus the largest sample so far, the
 /// same two parts as in [`burst_for`]. In any window of `t` seconds at most `rate × t` bytes, that burst, and
@@ -154,8 +156,8 @@ impl ByteBudget {
         self.balance = if bytes_per_s.is_some() { self.balance.min(self.cap()) } else { 0 };
     }
 
-    /// Accrues at the rate of `mode`. In a mode that forwards nothing the former rate applies, so that debt is
-    /// still paid off.
+    /// Accrues at the rate of `mode`. In a mode that forwards nothing the former rate applies, so that debt
+    /// is still paid off.
     pub fn set_mode(&mut self, rates: &LaneRates, mode: LaneMode, now: MonotonicNs) {
         if let Some(rate) = rates.in_mode(mode) {
             self.set_rate(rate.max_bytes_per_s, now);

@@ -30,16 +30,16 @@ impl Location {
     /// The source address of the participant's datagrams decides if it is known: the kernel sends local
     /// traffic from an address of this host, and drops traffic from outside that claims one. Otherwise the
     /// announced addresses decide, which are weaker evidence:
-    /// - 127.0.0.1 beside other addresses is ignored, because some libraries announce it to all hosts. Alone it
-    ///   means that the endpoint is on this host.
+    /// - 127.0.0.1 beside other addresses is ignored, because some libraries announce it to all hosts. Alone
+    ///   it means that the endpoint is on this host.
     /// - An address of this host means local. That is wrong for an address that many hosts have, such as
     ///   172.17.0.1, the default of Docker's bridge: a robot and a laptop that both have it look alike.
-    /// - One current address of this host is enough: a node may also announce addresses that the host no longer
-    ///   has.
+    /// - One current address of this host is enough: a node may also announce addresses that the host no
+    ///   longer has.
     ///
     /// A container that shares the host's network is this host. One with its own network is another host: its
-    /// traffic crosses a virtual switch, which cannot be distinguished from a real one. Shared-memory locators
-    /// are not addresses: an endpoint with no others is unknown.
+    /// traffic crosses a virtual switch, which cannot be distinguished from a real one. Shared-memory
+    /// locators are not addresses: an endpoint with no others is unknown.
     pub fn whereabouts(&self, own: &[IpAddr]) -> Whereabouts {
         let is_here = |address: &IpAddr| {
             let address = address.to_canonical();

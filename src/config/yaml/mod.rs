@@ -1,13 +1,13 @@
-//! YAML text to a tree of nodes that know their line. The only module that knows which library parses YAML.
+//! Parses YAML into a tree of nodes with their lines. Only this module depends on the YAML library.
 //!
-//! The size, the depth and the number of nodes are bounded, aliases counted as if they were written out, so
-//! that no file of any content can make the loader hang or exhaust the memory.
+//! The size, the depth and the number of nodes are limited, with aliases counted as if they were written out,
+//! so that no file can make the loader hang or exhaust the memory.
 //!
-//! The library reads through serde, which was made neither for lines nor for numbers as they were written. So
-//! the file is read twice: once to see where everything is and what kind of value it is ([`Survey`]), and,
-//! knowing that, for the text of every scalar ([`Reading`]). Both rely on what this version of the library
-//! does and serde does not ask of it, hence the exact version in `Cargo.toml`: a seed that fails before it
-//! has read a value leaves it to the next one.
+//! The library reads through serde, which supports neither lines nor the original text of numbers. The file
+//! is therefore read twice: a first pass finds the line and kind of each value ([`Survey`]), and a second
+//! pass uses these to read the text of each scalar ([`NodeSeed`]). Both depend on behaviour of this version
+//! of the library that serde does not guarantee, so `Cargo.toml` requires that exact version: a seed that
+//! fails before it has read a value leaves the value to the next seed.
 
 mod survey;
 
@@ -26,37 +26,38 @@ use survey::{Kind, Outline, Position, SECOND_DOCUMENT, Shape, Survey};
 /// The largest configuration file, in bytes. The default one has 6 KiB.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
-/// The most keys and values that a file may have, each use of an alias counted: 1,024 routes of 30 keys each.
+/// The most keys and values in a file, including each use of an alias: 1,024 routes of 30 keys each.
 const MAX_NODES: usize = 65_536;
 
-/// The deepest nesting. The deepest key there is, `lanes.<lane>.scheduling.cpus[]`, is 5 deep.
+/// The deepest nesting. The deepest key, `lanes.<lane>.scheduling.cpus[]`, is 5 deep.
 const MAX_DEPTH: usize = 32;
 
-/// The most text in a file, each use of an alias counted. Escapes make text longer than it is in the file, by
-/// a half at most: `\L` stands for three bytes.
+/// The most bytes of text in a file, including each use of an alias. Escapes make text longer than in the
+/// file, by at most a half: the two bytes `\L` become three.
 const MAX_TEXT_BYTES: usize = 2 * MAX_BYTES;
 
-/// The most bytes to be read if each alias stood for the whole file: a number of a megabyte is read anew, in
-/// 2 ms, for each alias of it. 200 KiB, which is 1,024 routes, may have 2,621 aliases.
+/// The most bytes to read if each alias referred to the whole file: the library reads a value again for each
+/// alias of it, which takes 2 ms for a number of a megabyte. A file of 200 KiB, enough for 1,024 routes, may
+/// have 2,621 aliases.
 const MAX_ALIASED_BYTES: usize = 1 << 29;
 
 /// One value of the file.
 #[derive(Debug)]
 pub(super) struct Node {
-    /// The line, counted from 1, of the key whose value this is, or of this item of a list.
+    /// The line, counted from 1, of the key of this value, or of this item of a list.
     pub line: usize,
-    /// What it is.
+    /// The value.
     pub content: Content,
 }
 
-/// What a value is. Values are shared where a merge key repeats them.
+/// The content of a value. Values that a merge key repeats are shared.
 #[derive(Debug)]
 pub(super) enum Content {
-    /// Text, number, truth value or null: which of them is for its reader to say.
+    /// A text, number, boolean or null; the reader of the field interprets it.
     Scalar {
-        /// As written, escapes resolved.
+        /// The original text, with escapes resolved.
         text: String,
-        /// Whether it may be something else than text: `10` may, `"10"` may not.
+        /// Whether it may be a number, boolean or null: `10` may, `"10"` may not.
         plain: bool,
     },
     /// A sequence.
@@ -77,7 +78,7 @@ pub(super) struct Entry {
 }
 
 impl Node {
-    /// Whether this stands for "not given": an empty value, `~` or `null`.
+    /// Whether this is null: an empty value, `~` or `null`.
     pub fn is_null(&self) -> bool {
         match &self.content {
             Content::Scalar { text, plain: true } => {
@@ -88,7 +89,7 @@ impl Node {
     }
 }
 
-/// Why a text could not be read as YAML.
+/// The error for a text that is not valid YAML or exceeds a limit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct SyntaxError {
     /// The line, counted from 1; `None` for the file as a whole.
@@ -107,7 +108,7 @@ impl SyntaxError {
     }
 }
 
-/// Reads the one document of a file; `None` when there is none in it.
+/// Parses the only document of a file; `None` for a file without a document.
 pub(super) fn parse(bytes: &[u8]) -> Result<Option<Rc<Node>>, SyntaxError> {
     if bytes.len() > MAX_BYTES {
         return Err(SyntaxError::of_file(format!("must be at most {MAX_BYTES} bytes long")));
@@ -124,7 +125,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Rc<Node>>, SyntaxError> {
     let outline = outline.into_inner();
     surveyed.map_err(|error| outline.stop.clone().unwrap_or_else(|| outline.explain(&error)))?;
     if let Some(line) = line_after_end(text) {
-        // The library leaves it unread.
+        // The library does not read it.
         return Err(SyntaxError::at(line, SECOND_DOCUMENT));
     }
     if outline.shapes.is_empty() {
@@ -132,17 +133,17 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Rc<Node>>, SyntaxError> {
     }
 
     let (next, text_bytes) = (Cell::new(0), Cell::new(0));
-    let reading = Reading { source: text, shapes: &outline.shapes, next: &next, text_bytes: &text_bytes };
-    let mut root = reading.deserialize(deserializer(text)).map_err(|error| {
+    let seed = NodeSeed { source: text, shapes: &outline.shapes, next: &next, text_bytes: &text_bytes };
+    let mut root = seed.deserialize(deserializer(text)).map_err(|error| {
         if text_bytes.get() <= MAX_TEXT_BYTES {
             return outline.explain(&error);
         }
         let line = outline.shapes.get(next.get().saturating_sub(1)).map(|shape| shape.line);
-        let message = format!("must have at most {MAX_TEXT_BYTES} bytes of text, that of aliases included");
+        let message = format!("must have at most {MAX_TEXT_BYTES} bytes of text, including that of aliases");
         SyntaxError { line, message }
     })?;
     if !matches!(root.content, Content::Map(_)) {
-        // That will be reported, and the root is the one value whose line nothing has told so far.
+        // The caller reports it, and only the root's line is not known yet.
         let found =
             Position::default().deserialize(deserializer(text)).err().and_then(|error| error.location());
         root.line = found.map_or(1, |location| outline.line_in_editor(location.line()));
@@ -160,7 +161,7 @@ fn deserializer(text: &str) -> serde_yaml::Deserializer<'_> {
     serde_yaml::Deserializer::from_str_with_options(text, &options)
 }
 
-/// The line of the first thing that comes after the marker of the document's end.
+/// The line of the first content after the end marker of the document.
 fn line_after_end(text: &str) -> Option<usize> {
     let is_end = |line: &str| {
         line.strip_prefix("...").is_some_and(|rest| rest.is_empty() || rest.starts_with(char::is_whitespace))
@@ -175,7 +176,7 @@ fn max_aliases(text: &str) -> usize {
     MAX_ALIASED_BYTES / text.len().max(1)
 }
 
-/// What the library checks before it reads anything: its parser takes quadratic time for deep nesting.
+/// The limits that the library checks before it parses: its parser takes quadratic time for deep nesting.
 fn budget() -> Budget {
     Budget {
         max_events: usize::MAX,
@@ -191,24 +192,24 @@ fn budget() -> Budget {
 }
 
 fn too_many() -> String {
-    format!("must have at most {MAX_NODES} keys and values, those of aliases included")
+    format!("must have at most {MAX_NODES} keys and values, including those of aliases")
 }
 
 fn too_deep() -> String {
     format!("must be nested at most {MAX_DEPTH} deep")
 }
 
-/// The second reading, of one value, whose kind is known.
+/// The second pass: reads one value, whose kind is known, into a [`Node`].
 #[derive(Clone, Copy)]
-struct Reading<'r> {
+struct NodeSeed<'r> {
     source: &'r str,
     shapes: &'r [Shape],
-    /// The place of the next value among them.
+    /// The index of the next value in `shapes`.
     next: &'r Cell<usize>,
     text_bytes: &'r Cell<usize>,
 }
 
-impl<'de> DeserializeSeed<'de> for Reading<'_> {
+impl<'de> DeserializeSeed<'de> for NodeSeed<'_> {
     type Value = Node;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Node, D::Error> {
@@ -234,7 +235,7 @@ impl<'de> DeserializeSeed<'de> for Reading<'_> {
     }
 }
 
-impl<'de> Visitor<'de> for Reading<'_> {
+impl<'de> Visitor<'de> for NodeSeed<'_> {
     type Value = Content;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -268,7 +269,7 @@ struct Scalar {
     may_be_plain: bool,
 }
 
-/// Reads a scalar of this source as text.
+/// Reads a scalar of the source as text.
 struct ScalarVisitor<'s>(&'s str);
 
 impl<'de> Visitor<'de> for ScalarVisitor<'_> {
@@ -278,7 +279,7 @@ impl<'de> Visitor<'de> for ScalarVisitor<'_> {
         f.write_str("text")
     }
 
-    /// A part of the source: in quotes if there is a quote before it.
+    /// A slice of the source; in quotes if a quote precedes it.
     fn visit_borrowed_str<E: serde::de::Error>(self, text: &'de str) -> Result<Scalar, E> {
         let offset = text.as_ptr().addr().wrapping_sub(self.0.as_ptr().addr());
         let before = self.0.as_bytes().get(offset.wrapping_sub(1));
@@ -286,13 +287,14 @@ impl<'de> Visitor<'de> for ScalarVisitor<'_> {
         Ok(Scalar { text: text.to_owned(), may_be_plain })
     }
 
-    /// Something else than a part of the source: a block, or text with escapes or line breaks.
+    /// No slice of the source: a block, or text with escapes or line breaks.
     fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<Scalar, E> {
         Ok(Scalar { text: text.to_owned(), may_be_plain: false })
     }
 }
 
-/// Whether this, if plain, is a number, truth value or null. That it was not taken for it is due to `!!str`.
+/// Whether plain text is a number, boolean or null. If the library did not treat it as such, it has a `!!str`
+/// tag.
 fn has_type(text: &str) -> bool {
     let is_number = || serde_yaml::parse_f64(text).is_some() && !serde_yaml::digits_but_not_number(text);
     matches!(text, "" | "~" | "null" | "Null" | "NULL")
@@ -301,8 +303,8 @@ fn has_type(text: &str) -> bool {
         || is_number()
 }
 
-/// The entries with each merge key (`<<: *alias`) replaced by what it names, unless the mapping says
-/// otherwise. A `<<` of anything but mappings stays, and is reported as the unknown key that it then is.
+/// Replaces each merge key (`<<: *alias`) by the entries of the mapping that it names, except keys that the
+/// mapping itself has. A `<<` with a value other than mappings stays, and is reported as an unknown key.
 fn merged(entries: Vec<Entry>) -> Vec<Entry> {
     if !entries.iter().any(|entry| entry.key == "<<") {
         return entries;

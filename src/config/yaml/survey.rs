@@ -1,4 +1,4 @@
-//! The first reading: where everything is, and what kind of value it is.
+//! The first pass: finds the line and the kind of each value.
 
 use std::cell::RefCell;
 use std::fmt;
@@ -9,10 +9,10 @@ use serde_yaml::budget::{BudgetBreach, check_yaml_budget};
 
 use super::{MAX_DEPTH, MAX_NODES, SyntaxError, budget, max_aliases, too_deep, too_many};
 
-/// Learns the position of the next value without reading it.
+/// Finds the position of the next value without reading it.
 ///
-/// To the library a newtype is the value that it wraps. Newtypes within newtypes come to its limit of
-/// recursion, and the error tells where the value is that it has not begun to read.
+/// The library treats a newtype as the value that it wraps. Nested newtypes reach its recursion limit, and
+/// the error has the position of the value, which the library has not begun to read.
 #[derive(Clone, Copy)]
 pub(super) struct Position {
     wrappings_left: usize,
@@ -20,7 +20,7 @@ pub(super) struct Position {
 
 impl Default for Position {
     fn default() -> Self {
-        // Enough at any depth, and an end if the limit were not kept.
+        // Enough to reach the limit at any depth, and an end if the library does not enforce the limit.
         Self { wrappings_left: MAX_DEPTH + 2 }
     }
 }
@@ -48,18 +48,18 @@ impl<'de> Visitor<'de> for Position {
     }
 }
 
-/// Line and column of an error as it is printed; within a visitor nothing else is known of it.
+/// The line and column in the text of an error; a visitor has no other access to them.
 fn printed_position(error: &impl fmt::Display) -> Option<(usize, usize)> {
     let text = error.to_string();
     let Some((_, position)) = text.rsplit_once(" at line ") else {
-        // The very beginning is not printed.
+        // The library does not print the position of the start of the file.
         return Some((1, 1));
     };
     let (line, column) = position.split_once(" column ")?;
     Some((line.parse().ok()?, column.parse().ok()?))
 }
 
-/// What is known of a value before its text is.
+/// The line and the kind of a value.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Shape {
     pub line: usize,
@@ -68,7 +68,7 @@ pub(super) struct Shape {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
-    /// `typed` when the library takes it for a number, a truth value or null.
+    /// `typed` when the library treats it as a number, a boolean or null.
     Scalar {
         typed: bool,
     },
@@ -76,21 +76,22 @@ pub(super) enum Kind {
     Map,
 }
 
-/// What the first reading finds out.
+/// The result of the first pass.
 pub(super) struct Outline<'a> {
     pub source: &'a str,
-    /// All keys and values, those of aliases included, in the order in which serde comes upon them.
+    /// All keys and values, including those of aliases, in the order in which serde visits them.
     pub shapes: Vec<Shape>,
-    /// The greatest line on the way to the value that was read last.
+    /// The greatest line on the path to the value that was read last.
     pub latest_line: usize,
-    /// The kind and the position of the first key or item of each collection around the present value. No two
-    /// collections have both in common, so that one found here again is within itself.
+    /// The kind and the position of the first key or item of each collection around the current value. No two
+    /// collections have both in common, so that a collection found here again contains itself.
     pub open: Vec<(Kind, Option<(usize, usize)>)>,
-    /// The lines, as the library counts them, that begin after characters which end no line in an editor.
+    /// The lines, as the library counts them, that begin after characters which an editor does not treat as
+    /// line breaks.
     pub odd_lines: Vec<usize>,
-    /// The last line, as an editor counts them.
+    /// The last line, as an editor counts lines.
     pub last_line: usize,
-    /// Why reading was broken off.
+    /// Why the pass was aborted.
     pub stop: Option<SyntaxError>,
 }
 
@@ -102,7 +103,7 @@ impl<'a> Outline<'a> {
             match character {
                 '\n' if before == '\r' => {}
                 '\n' | '\r' => line += 1,
-                // Line breaks of YAML 1.1, which the library counts.
+                // Line breaks of YAML 1.1, which the library counts as well.
                 '\u{85}' | '\u{2028}' | '\u{2029}' => {
                     line += 1;
                     odd_lines.push(line);
@@ -128,10 +129,11 @@ impl<'a> Outline<'a> {
         line.saturating_sub(odd).clamp(1, self.last_line)
     }
 
-    /// The error of the library in our words where it is about our limits, else in its own.
+    /// Converts an error of the library: one about this module's limits gets this module's text, any other
+    /// keeps its own.
     pub fn explain(&self, error: &serde_yaml::Error) -> SyntaxError {
         if error.is_message() {
-            // Only of a tag does the library say that a value is not what it claims to be.
+            // The library reports a value of the wrong type only for a tag.
             let line = error.location().map(|location| self.line_in_editor(location.line()));
             return SyntaxError { line, message: NO_TAGS.to_owned() };
         }
@@ -150,27 +152,29 @@ impl<'a> Outline<'a> {
             return SyntaxError::at(self.line_of_breach(), message);
         }
         if text.ends_with("more than one document is not supported") {
-            // The check goes by YAML 1.2. Where only YAML 1.1 sees the end of a document, no line is known.
+            // The check follows YAML 1.2. If a document ends only according to YAML 1.1, the line is not
+            // known.
             return SyntaxError::of_file("must be one YAML document");
         }
         let is_prescan = text.contains(" at byte ");
         let cut = [" at line ", " at byte ", " at position "].iter().filter_map(|at| text.find(at)).min();
         let info = text[..cut.unwrap_or(text.len())].chars().filter(|c| !c.is_control()).take(200);
         let line = error.location().map(|location| match is_prescan {
-            // The check before the reading counts lines as an editor does.
+            // The check before parsing counts lines as an editor does.
             true => location.line().clamp(1, self.last_line),
             false => self.line_in_editor(location.line()),
         });
         let message = match info.collect::<String>() {
-            // The check has a limit of its own, before ours, for brackets within a line.
+            // The check has its own limit for brackets within a line, which is reached before that of this
+            // module.
             info if info == "recursion limit exceeded" => too_deep(),
             info => format!("not YAML: {info}"),
         };
         SyntaxError { line, message }
     }
 
-    /// The line that breaks the budget, which the library does not tell: the last of the shortest part that
-    /// breaks it.
+    /// The line that exceeds the budget, which the library does not report: the last line of the shortest
+    /// prefix that exceeds it.
     fn line_of_breach(&self) -> usize {
         let ends: Vec<usize> = self
             .source
@@ -185,27 +189,28 @@ impl<'a> Outline<'a> {
     }
 }
 
-/// How a text breaks the budget.
+/// How a text exceeds the budget.
 pub(super) fn breach(text: &str) -> Option<BudgetBreach> {
     check_yaml_budget(text, &budget()).ok()?.breached
 }
 
 pub(super) const SECOND_DOCUMENT: &str = "must be one YAML document; a second one begins here";
-pub(super) const NO_TAGS: &str = "must be without YAML tags (`!name`)";
+pub(super) const NO_TAGS: &str = "must not use YAML tags (`!name`)";
 
-/// The first reading, of one value.
+/// The first pass over one value.
 #[derive(Clone, Copy)]
 pub(super) struct Survey<'s, 'a> {
     pub outline: &'s RefCell<Outline<'a>>,
-    /// The line of this key or item, or of the key whose value this is.
+    /// The line of this key or item, or of the key of this value.
     pub line: usize,
-    /// The greatest line on the way here. That of an alias is greater than any of what it stands for.
+    /// The greatest line on the path to this value. The line of an alias is greater than those of the value
+    /// to which it refers.
     pub latest_line: usize,
     pub is_key: bool,
 }
 
 impl Survey<'_, '_> {
-    /// Breaks the reading off.
+    /// Aborts the pass.
     fn stop<T, E: serde::de::Error>(self, message: impl Into<String>) -> Result<T, E> {
         let error = SyntaxError::at(self.latest_line, message);
         let message = error.message.clone();
@@ -241,8 +246,7 @@ impl Survey<'_, '_> {
         self.outline.borrow_mut().open.pop();
     }
 
-    /// The next key or item of the present collection, given the outcome of a [`Position`]; `None` at its
-    /// end.
+    /// The next key or item of the current collection, from the result of a [`Position`]; `None` at its end.
     fn child<E: serde::de::Error>(
         self,
         position: Result<Option<()>, E>,
@@ -254,19 +258,19 @@ impl Survey<'_, '_> {
             Err(error) => printed_position(&error),
         };
         let mut outline = self.outline.borrow_mut();
-        let mut is_within_itself = false;
-        if let Some((present, around)) = outline.open.split_last_mut()
-            && present.1.is_none()
+        let mut contains_itself = false;
+        if let Some((current, around)) = outline.open.split_last_mut()
+            && current.1.is_none()
         {
-            present.1 = position;
-            is_within_itself = position.is_some() && around.contains(present);
+            current.1 = position;
+            contains_itself = position.is_some() && around.contains(current);
         }
         let line = position.map_or(self.line, |(line, _)| outline.line_in_editor(line));
         let latest_line = self.latest_line.max(line);
         outline.latest_line = latest_line;
         drop(outline);
-        if is_within_itself {
-            return self.stop("this alias refers to what it is part of");
+        if contains_itself {
+            return self.stop("must not be an alias of a value that contains it");
         }
         Ok(Some(Self { line, latest_line, is_key, ..self }))
     }
@@ -315,7 +319,7 @@ impl<'de> Visitor<'de> for Survey<'_, '_> {
         self.typed()
     }
 
-    /// There is no document.
+    /// A file without a document.
     fn visit_none<E: serde::de::Error>(self) -> Result<(), E> {
         Ok(())
     }
@@ -336,7 +340,8 @@ impl<'de> Visitor<'de> for Survey<'_, '_> {
     fn visit_map<A: MapAccess<'de>>(self, mut entries: A) -> Result<(), A::Error> {
         self.open(Kind::Map)?;
         while let Some(key) = self.child(entries.next_key_seed(Position::default()), true)? {
-            // As a key the library would refuse one that is there twice, and with it all problems after it.
+            // Read as a key, a repeated key would be an error of the library, which would hide later
+            // problems.
             entries.next_value_seed(key)?;
             entries.next_value_seed(Self { is_key: false, ..key })?;
         }
@@ -344,7 +349,7 @@ impl<'de> Visitor<'de> for Survey<'_, '_> {
         Ok(())
     }
 
-    /// What has a tag.
+    /// A value with a tag.
     fn visit_enum<A: EnumAccess<'de>>(self, _: A) -> Result<(), A::Error> {
         self.stop(NO_TAGS)
     }
