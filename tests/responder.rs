@@ -203,7 +203,7 @@ fn requests_of_the_original_are_answered_whoever_asks() {
     assert_eq!((&response["probe_id"], &response["responder_id"]), (&json!("p-1"), &json!("laptop 1")));
     let times = ["recv_time_ns", "reply_time_ns", "response_send_time_ns"].map(|key| response[key].as_u64());
     assert!(times.is_sorted() && times[0] > Some(1_700_000_000_000_000_000), "{times:?}");
-    responder.wait_for_log("probes arrive");
+    responder.wait_for_log("probe requests arrive");
 
     // Another bridge beside it, and one that numbers its probes.
     let mut second = Asker::join(net.host("bridge"), "second");

@@ -359,7 +359,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
             bed.machine.property(unit, "StatusText").contains(text)
         });
     };
-    says(INGRESS, "reading 0 of 1 routes, 0.0 samples/s; no publisher found yet of /scan");
+    says(INGRESS, "reading 0 of 1 routes, 0.0 samples/s; no publisher found yet for /scan");
     says(EGRESS_CRITICAL, "type not known yet of route scan");
     says(CONTROL, "safety mode normal");
     bed.machine.run(&["systemctl", "start", RESPONDER]);

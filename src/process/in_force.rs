@@ -1,5 +1,5 @@
-//! The configuration in force: written beside the boards by the first process of a bridge, used by every
-//! process that starts while the bridge runs, whatever the file says by then.
+//! The configuration in force. The first process of a bridge writes it beside the boards; each process that
+//! starts while the bridge runs uses it, even if the configuration file has changed since.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -12,17 +12,17 @@ use crate::model::InstanceName;
 use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root};
 use crate::telemetry::Snapshot;
 
-/// Set by `up` for its children, to the folder of the instance that they belong to.
+/// Environment variable that `up` sets for its children, to the folder of their instance.
 pub(super) const FOLDER_VARIABLE: &str = "ADAPTIVE_BRIDGE_FOLDER";
 
-/// The configuration that this process applies, and its share in keeping that in force.
+/// The configuration that this process uses, and its share in the file that keeps it in force.
 #[derive(Debug)]
 pub struct InForce {
     configuration: Configuration,
     share: InForceShare,
 }
 
-/// Why a process has no configuration.
+/// Why a process cannot get a configuration.
 #[derive(Debug)]
 pub enum InForceError {
     /// The bridge does not run, and the file is bad.
@@ -55,8 +55,8 @@ impl From<ShmError> for InForceError {
 }
 
 impl InForce {
-    /// The configuration for a role that starts: that in force if its bridge runs, else the one of the file,
-    /// which is in force from then on. `loaded` is what reading `file` yielded.
+    /// Chooses the configuration of a process that starts: the one in force if its bridge runs, else that of
+    /// the file, which is in force from then on. `loaded` is the result of reading `file`.
     ///
     /// # Errors
     /// The bridge does not run and the file is bad, or the folder of the instance cannot be used.
@@ -81,7 +81,7 @@ impl InForce {
         Ok(Self { configuration, share })
     }
 
-    /// Puts a configuration in force for a bridge that is started as a whole.
+    /// Puts a configuration in force for a bridge whose processes are all started together (`up`).
     ///
     /// # Errors
     /// The bridge runs already, or the folder of the instance cannot be used.
@@ -133,8 +133,8 @@ impl InForce {
         (self.configuration, self.share)
     }
 
-    /// The settings in force of the bridge that runs and was started with `file`, or else that runs as the
-    /// instance that the file names now; `None` when neither runs. Takes no lock and writes nothing.
+    /// Finds the settings in force of a running bridge: the one that was started with `file`, or else the one
+    /// of the instance that the file names now; `None` when neither runs. Takes no lock and writes nothing.
     pub fn find(file: &Path, loaded: Option<&Settings>) -> Option<Settings> {
         let by_file = BridgeAddress::find(&own_root(), file)
             .and_then(|address| settings_of_running(address.root(), address.instance()));
@@ -148,7 +148,7 @@ impl InForce {
 fn settings_of_running(root: &Path, instance: &InstanceName) -> Option<Settings> {
     let bytes = InForceFile::find(root, instance).ok()??.read().ok()??;
     let settings = Configuration::decode(&bytes).ok()?.settings;
-    // A bridge that was killed leaves its file.
+    // A killed bridge leaves its file behind, so its boards are read as well.
     matches!(Snapshot::take(root, &settings), Ok(Some(_))).then_some(settings)
 }
 
@@ -160,19 +160,20 @@ fn encode(configuration: &Configuration) -> Result<Vec<u8>, ShmError> {
     })
 }
 
-/// The root that does not depend on the configuration.
+/// The default folder of shared files for this environment, whatever the configuration.
 fn own_root() -> PathBuf {
     default_root(None, |name| std::env::var_os(name))
 }
 
-/// Without the address a process still finds its bridge, as long as the file is good and names the instance.
+/// Records where the bridge of `file` runs. Without the record, a process finds its bridge only while the
+/// file is valid and names the instance.
 fn write_address(file: &Path, root: &Path, instance: &InstanceName) {
     if let Err(error) = BridgeAddress::new(file, root, instance).write(&own_root()) {
         warn!(%error, "a process that restarts finds this bridge only with a valid configuration file");
     }
 }
 
-/// Where `up` runs, if it started this process.
+/// The root and instance of the `up` process that started this one, if one did.
 fn supervised_folder() -> Option<(PathBuf, InstanceName)> {
     let folder = PathBuf::from(std::env::var_os(FOLDER_VARIABLE)?);
     let instance = InstanceName::try_from(folder.file_name()?.to_str()?).ok()?;

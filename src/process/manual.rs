@@ -1,4 +1,4 @@
-//! What an operator sets by hand.
+//! Lane modes that an operator sets by hand (`adaptive-bridge mode`).
 
 use std::time::Duration;
 
@@ -8,12 +8,12 @@ use crate::config::Settings;
 use crate::model::{LaneMode, LanePolicy, MonotonicNs};
 use crate::shm::{BridgeShape, ProcessRole, ShmNode};
 
-/// Overrides the mode of a lane for `duration`, or until another is set when that is `None`; a `mode` of
-/// `None` ends an override. Returns the epoch of the policy that says so. The lane applies it within one
-/// sample.
+/// Overrides the mode of a lane and returns the epoch of the new policy. The override ends after `duration`,
+/// or at the next call if that is `None`; a `mode` of `None` ends an override. The lane applies the policy
+/// within one sample.
 ///
 /// # Errors
-/// There is no such lane, the bridge does not run, or shared memory cannot be had.
+/// There is no such lane, the bridge does not run, or shared memory cannot be opened.
 pub fn set_mode(
     settings: &Settings,
     lane: &str,

@@ -1,8 +1,9 @@
-//! The roles: what each process of a bridge does from its start to its end. The only place where the edges
-//! meet policy.
+//! The processes of a bridge (ingress, egress, control, responder, supervisor), each from its start to its
+//! end. Only this module connects DDS and shared memory to policy.
 //!
-//! A role is a loop of turns. A turn handles what is there and then sleeps until it is woken, or until the
-//! next housekeeping, which is all that need not happen for each sample: discovery, matching, logs, health.
+//! A process runs a loop of turns. A turn handles the samples and messages that have arrived; then the
+//! process sleeps until it is woken or until its next housekeeping. Housekeeping is the work that is not
+//! needed for each sample: discovery, matching, logs, health.
 
 mod arena;
 mod control;
@@ -32,5 +33,6 @@ pub use role::RoleError;
 pub use stop::Stop;
 pub use supervisor::{SupervisorError, end_with_supervisor, up};
 
-/// How often a role keeps house. A signal to stop is seen within it, so that a role ends within a second.
+/// Interval of housekeeping. A process checks for a request to stop at least this often, so that it ends
+/// within a second of one.
 const HOUSEKEEPING_MS: u64 = 100;

@@ -1,5 +1,5 @@
-//! What a process tells the service manager that started it: that it is ready, what it does, that it turns,
-//! that it ends (sd_notify(3)). Nobody else listens; then all of this does nothing.
+//! Notifications to the service manager (sd_notify(3)): readiness, status line, watchdog, reload and
+//! shutdown. Without a service manager all of this does nothing.
 
 use std::fmt::{Display, Write};
 use std::time::Duration;
@@ -9,56 +9,56 @@ use tracing::warn;
 
 use crate::model::{DropCounts, MonotonicNs};
 
-/// A status line is sent so often at most.
+/// Shortest interval between two status lines.
 const STATUS_MS: u64 = 1_000;
 
-/// The watchdog is fed so many times within its time, so that one message more or less does not matter.
+/// Watchdog messages per watchdog timeout, so that one late message does not restart the process.
 const FEEDS_PER_TIMEOUT: u32 = 4;
 
-/// A process as its service manager sees it.
+/// Sends the state of this process to its service manager.
 #[derive(Debug)]
 pub(super) struct Notifier {
-    listens: bool,
-    /// The least time between two feeds of the watchdog; `None` when there is none.
+    is_enabled: bool,
+    /// Shortest interval between two watchdog messages; `None` without a watchdog.
     feed_every: Option<Duration>,
     feed_at: MonotonicNs,
     ready: bool,
     status: String,
     status_at: MonotonicNs,
-    /// Goes before the status.
-    remark: &'static str,
+    /// Text before each status line.
+    prefix: &'static str,
 }
 
 impl Notifier {
-    /// By what the service manager has left in the environment.
+    /// Reads the notification settings that the service manager has put into the environment.
     pub fn new() -> Self {
         Self {
-            listens: std::env::var_os("NOTIFY_SOCKET").is_some(),
+            is_enabled: std::env::var_os("NOTIFY_SOCKET").is_some(),
             feed_every: sd_notify::watchdog_enabled().map(|timeout| timeout / FEEDS_PER_TIMEOUT),
             feed_at: MonotonicNs(0),
             ready: false,
             status: String::new(),
             status_at: MonotonicNs(0),
-            remark: "",
+            prefix: "",
         }
     }
 
-    /// Whether anybody listens.
-    pub fn listens(&self) -> bool {
-        self.listens
+    /// Whether a service manager receives the notifications.
+    pub fn is_enabled(&self) -> bool {
+        self.is_enabled
     }
 
-    /// The process is up: shared memory is attached, and so are the DDS endpoints whose types are known.
-    /// Once.
+    /// Reports, once, that the process is up: shared memory is attached, and the DDS endpoints whose types
+    /// are known are created.
     pub fn ready(&mut self) {
-        if self.listens && !std::mem::replace(&mut self.ready, true) {
+        if self.is_enabled && !std::mem::replace(&mut self.ready, true) {
             send(&[NotifyState::Ready]);
         }
     }
 
-    /// The data path turned. Only to be called where that is so: a process that is alive and stuck is to be
-    /// restarted.
-    pub fn turned(&mut self, now: MonotonicNs) {
+    /// Feeds the watchdog, if it is time to. To be called only after a turn of the data path, so that the
+    /// service manager restarts a process that is alive but stuck.
+    pub fn feed_watchdog(&mut self, now: MonotonicNs) {
         if let Some(every) = self.feed_every
             && now >= self.feed_at
         {
@@ -67,14 +67,14 @@ impl Notifier {
         }
     }
 
-    /// Says what the process does, when it is time to and that has changed. `describe` writes a line.
+    /// Sends the status line that `describe` writes, if it is time to and the line has changed.
     pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
-        if !self.listens || now < self.status_at {
+        if !self.is_enabled || now < self.status_at {
             return;
         }
         self.status_at = now.plus_ms(STATUS_MS);
         let mut status = String::with_capacity(self.status.len());
-        status.push_str(self.remark);
+        status.push_str(self.prefix);
         describe(&mut status);
         if status != self.status {
             send(&[NotifyState::Status(&status)]);
@@ -82,38 +82,38 @@ impl Notifier {
         }
     }
 
-    /// A reload was dealt with.
+    /// Reports that a reload is complete.
     pub fn reloaded(&mut self, refused: bool) {
-        self.remark = if refused { "the changed configuration file is bad and not in force; " } else { "" };
+        self.prefix = if refused { "the changed configuration file is bad and not in force; " } else { "" };
         self.status_at = MonotonicNs(0);
-        if self.listens {
+        if self.is_enabled {
             send(&[NotifyState::Ready]);
         }
     }
 
-    /// The process begins to end.
+    /// Reports that the process has begun to shut down.
     pub fn stopping(&self) {
-        if self.listens {
+        if self.is_enabled {
             send(&[NotifyState::Stopping]);
         }
     }
 }
 
-/// A reload was asked for, and begins.
+/// Reports that a reload begins.
 pub(super) fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => send(&[NotifyState::Reloading, now]),
-        Err(error) => warn!(%error, "the service manager is not told of the reload"),
+        Err(error) => warn!(%error, "cannot notify the service manager of the reload"),
     }
 }
 
 fn send(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(state) {
-        warn!(%error, "the service manager cannot be told");
+        warn!(%error, "cannot notify the service manager");
     }
 }
 
-/// A count that grows, as a rate: what was counted between two readings.
+/// Computes the rate of a growing count from two readings of it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Meter {
     count: u64,
@@ -121,7 +121,7 @@ pub(super) struct Meter {
 }
 
 impl Meter {
-    /// The growth per second since the last reading; 0 at the first.
+    /// The increase of the count per second since the last call; 0 at the first call.
     pub fn per_s(&mut self, count: u64, now: MonotonicNs) -> f64 {
         let before = std::mem::replace(self, Self { count, at: now });
         let elapsed_ns = now.since(before.at);
@@ -132,7 +132,7 @@ impl Meter {
     }
 }
 
-/// Appends `; dropped` and each reason with the sum of its counts, or nothing when there was no drop.
+/// Appends `; dropped` and the sum of the counts of each reason; nothing without drops.
 pub(super) fn write_drops<'a>(line: &mut String, counts: impl Iterator<Item = &'a DropCounts>) {
     let mut drops = DropCounts::default();
     for (reason, dropped) in counts.flat_map(DropCounts::iter) {
@@ -142,7 +142,7 @@ pub(super) fn write_drops<'a>(line: &mut String, counts: impl Iterator<Item = &'
     write_list(line, "; dropped", dropped);
 }
 
-/// Appends the heading and the items, with commas between; nothing when there are none.
+/// Appends the heading and the comma-separated items; nothing without items.
 pub(super) fn write_list(line: &mut String, heading: &str, items: impl Iterator<Item = impl Display>) {
     let mut before = heading;
     for item in items {
@@ -158,7 +158,7 @@ mod tests {
     use crate::model::DropReason;
 
     #[test]
-    fn a_meter_tells_what_was_counted_per_second() {
+    fn a_meter_returns_the_rate_between_two_readings() {
         let at = |ms| MonotonicNs(1).plus_ms(ms);
         let mut meter = Meter::default();
         assert_eq!(meter.per_s(1_000, at(0)), 0.0);
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn drops_are_named_in_a_status() {
+    fn a_status_line_lists_drops_by_reason() {
         let mut drops = [DropCounts::default(); 2];
         let mut line = String::from("x");
         write_drops(&mut line, drops.iter());

@@ -1,8 +1,10 @@
-//! Reload: on SIGHUP a role reads its configuration file again and takes over what it can.
+//! Reload: on SIGHUP a process reads its configuration file again and applies the changes that need no
+//! restart.
 //!
-//! A thread of its own waits for the signal, reads and checks the file, and finds out what differs: the data
-//! path goes on meanwhile. Housekeeping picks up the outcome. What came of it is in the log, on the health
-//! board, and in a note beside the role's lock, from which `adaptive-bridge reload` reads it.
+//! A separate thread waits for the signal, reads and validates the file, and compares it with the
+//! configuration in force, so that the data path does not wait. Housekeeping picks up the outcome. The
+//! outcome is in the log, on the health board, and in a note beside the role's lock file, which
+//! `adaptive-bridge reload` reads.
 
 use std::fmt;
 use std::fs;
@@ -30,7 +32,8 @@ use crate::telemetry;
 
 type Load = Box<dyn FnMut() -> Result<Configuration, ConfigError> + Send>;
 
-/// Requests to reload. To be made before anything else that a role does: without it, SIGHUP ends a process.
+/// The source of reload requests of a process. To be created before anything else: without its handler,
+/// SIGHUP ends the process.
 #[derive(Default)]
 pub struct ReloadRequests {
     request: Option<Request>,
@@ -44,8 +47,8 @@ struct Request {
 }
 
 impl ReloadRequests {
-    /// The requests that SIGHUP makes from now on. `load` reads the configuration as it was read at the
-    /// start: the same file, the same environment.
+    /// Handles SIGHUP from now on. `load` reads the configuration as at the start: from the same file, with
+    /// the same environment.
     ///
     /// # Errors
     /// The operating system refused the signal handler.
@@ -54,16 +57,16 @@ impl ReloadRequests {
     ) -> io::Result<Self> {
         let signals = Signals::new([SIGHUP])?;
         unblock()?;
-        let request = Request { signals, load: Box::new(load), terminal: Terminal::look() };
+        let request = Request { signals, load: Box::new(load), terminal: Terminal::detect() };
         Ok(Self { request: Some(request), in_force: None })
     }
 
-    /// These requests, for a process that applies `in_force` and keeps there what it reloads.
+    /// Sets the configuration in force, which the process applies and where it stores each reload.
     pub fn kept_in(self, in_force: InForce) -> Self {
         Self { in_force: Some(in_force), ..self }
     }
 
-    /// No requests, whatever happens.
+    /// A source that never requests a reload.
     pub fn never() -> Self {
         Self::default()
     }
@@ -75,50 +78,51 @@ impl fmt::Debug for ReloadRequests {
     }
 }
 
-/// SIGHUP for a supervisor, which passes it on. To be made before anything else, as [`ReloadRequests`].
+/// Records SIGHUP for a supervisor, which forwards it to its children. To be created before anything else, as
+/// [`ReloadRequests`].
 #[derive(Debug)]
 pub struct HangUp {
-    came: Arc<AtomicBool>,
+    received: Arc<AtomicBool>,
     terminal: Terminal,
 }
 
-/// What a [`HangUp`] means.
+/// What a SIGHUP requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum HangUpMeaning {
-    /// The file is to be read again.
+    /// To read the configuration file again.
     Reload,
-    /// The terminal is gone, and with it the one who would stop us.
+    /// To stop: the terminal was closed, so that Ctrl-C can no longer stop the bridge.
     Stop,
 }
 
 impl HangUp {
-    /// SIGHUP from now on.
+    /// Handles SIGHUP from now on.
     ///
     /// # Errors
     /// The operating system refused the signal handler.
     pub fn on_signal() -> io::Result<Self> {
-        let came = Arc::new(AtomicBool::new(false));
-        signal_hook::flag::register(SIGHUP, Arc::clone(&came))?;
+        let received = Arc::new(AtomicBool::new(false));
+        signal_hook::flag::register(SIGHUP, Arc::clone(&received))?;
         unblock()?;
-        Ok(Self { came, terminal: Terminal::look() })
+        Ok(Self { received, terminal: Terminal::detect() })
     }
 
-    /// What came since the last look.
+    /// The request of a SIGHUP received since the last call.
     pub(super) fn take(&self) -> Option<HangUpMeaning> {
-        self.came.swap(false, Ordering::AcqRel).then(|| match self.terminal.is_gone() {
+        self.received.swap(false, Ordering::AcqRel).then(|| match self.terminal.is_closed() {
             true => HangUpMeaning::Stop,
             false => HangUpMeaning::Reload,
         })
     }
 }
 
-/// A supervisor starts its children with SIGHUP blocked ([`with_hang_up_blocked`]): one that comes before the
-/// handler is there waits until now.
+/// Unblocks SIGHUP. A supervisor starts its children with SIGHUP blocked ([`with_hang_up_blocked`]), so that
+/// a signal sent before the child has its handler stays pending until this call.
 fn unblock() -> io::Result<()> {
     Ok(SigSet::from(Signal::SIGHUP).thread_unblock()?)
 }
 
-/// Starts a child that takes SIGHUP itself: the signal does not end it before it has its handler.
+/// Starts a child with SIGHUP blocked, so that the signal does not end it before it has its handler.
 pub(super) fn with_hang_up_blocked<T>(start: impl FnOnce() -> io::Result<T>) -> io::Result<T> {
     let signal = SigSet::from(Signal::SIGHUP);
     signal.thread_block()?;
@@ -127,51 +131,52 @@ pub(super) fn with_hang_up_blocked<T>(start: impl FnOnce() -> io::Result<T>) -> 
     started
 }
 
-/// Whether the log went to a terminal at the start. SIGHUP is also what the kernel sends when that is closed.
+/// Whether the log went to a terminal at the start. The kernel sends SIGHUP, too, when that terminal is
+/// closed.
 #[derive(Clone, Copy, Debug)]
 struct Terminal(bool);
 
 impl Terminal {
-    fn look() -> Self {
+    fn detect() -> Self {
         Self(io::stderr().is_terminal())
     }
 
-    fn is_gone(self) -> bool {
+    fn is_closed(self) -> bool {
         self.0 && !io::stderr().is_terminal()
     }
 }
 
-/// The configuration that a role has in force.
+/// The configuration in force of this process, updated by reloads.
 pub(super) struct Reloads {
     in_force: Configuration,
     fingerprint: u64,
     refused: u64,
     outcomes: Option<Receiver<Outcome>>,
-    /// Keeps the configuration in force for the processes that start while this one runs.
+    /// Keeps the configuration in force for processes that start while this one runs.
     _share: Option<InForceShare>,
 }
 
-/// What came of one request.
+/// The outcome of one request.
 enum Outcome {
     Accepted(Box<Configuration>),
     Refused,
 }
 
-/// What [`Reloads::look`] found.
+/// What [`Reloads::poll`] found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Look {
-    /// No request, or none that has been dealt with yet.
+pub(super) enum ReloadEvent {
+    /// No reload has completed since the last call.
     Nothing,
-    /// The file is good. The configuration in force is a new one, maybe an equal one; what it refers to, such
-    /// as the file of a secret, is to be read again.
+    /// The file is valid, and its configuration in force, even if it equals the former one. The files that it
+    /// refers to, such as that of a secret, are to be read again.
     Reloaded,
-    /// The file is bad, and nothing has changed.
+    /// The file is invalid, and nothing has changed.
     Refused,
 }
 
 impl Reloads {
-    /// Begins to serve the requests. The thread has the scheduling of the one that calls this. `note` is
-    /// where each outcome is left.
+    /// Starts the reload thread, which inherits the scheduling of the calling thread. It writes each outcome
+    /// to the file `note`.
     pub fn start(requests: ReloadRequests, settings: &Settings, note: Option<PathBuf>) -> io::Result<Self> {
         let (in_force, share) = match requests.in_force.map(InForce::into_parts) {
             Some((configuration, share)) => (configuration, Some(share)),
@@ -179,12 +184,12 @@ impl Reloads {
         };
         let file = share.as_ref().map(InForceShare::file);
         let outcomes = requests.request.map(|request| {
-            // Without room: it is handed over only when housekeeping takes it, and then the note says so.
+            // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
             let (sender, outcomes) = sync_channel(0);
-            let server = Server { present: in_force.clone(), file };
+            let reloader = Reloader { current: in_force.clone(), file };
             std::thread::Builder::new()
                 .name("reload".to_owned())
-                .spawn(move || serve(request, server, &sender, note.as_deref()))
+                .spawn(move || serve(request, reloader, &sender, note.as_deref()))
                 .map(|_| outcomes)
         });
         let fingerprint = in_force.settings.fingerprint();
@@ -196,85 +201,88 @@ impl Reloads {
         &self.in_force
     }
 
-    /// Tells the settings in force from others.
+    /// The fingerprint of the settings in force.
     pub fn fingerprint(&self) -> u64 {
         self.fingerprint
     }
 
-    /// Requests that were refused.
+    /// The number of requests that were refused because the file was invalid.
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Takes what has come of a request. Never waits, and allocates nothing while there is none.
-    pub fn look(&mut self) -> Look {
+    /// Takes the outcome of a request and puts its configuration in force. Never waits, and allocates nothing
+    /// while there is no outcome.
+    pub fn poll(&mut self) -> ReloadEvent {
         match self.outcomes.as_ref().map(Receiver::try_recv) {
-            None | Some(Err(TryRecvError::Empty)) => Look::Nothing,
+            None | Some(Err(TryRecvError::Empty)) => ReloadEvent::Nothing,
             Some(Err(TryRecvError::Disconnected)) => {
-                error!("reloading has ended; SIGHUP does nothing until this process is restarted");
+                error!("the reload thread has ended; SIGHUP does nothing until this process is restarted");
                 self.outcomes = None;
-                Look::Nothing
+                ReloadEvent::Nothing
             }
             Some(Ok(Outcome::Refused)) => {
                 self.refused += 1;
-                Look::Refused
+                ReloadEvent::Refused
             }
             Some(Ok(Outcome::Accepted(configuration))) => {
                 self.fingerprint = configuration.settings.fingerprint();
                 self.in_force = *configuration;
-                Look::Reloaded
+                ReloadEvent::Reloaded
             }
         }
     }
 }
 
-/// What the reloading thread knows.
-struct Server {
-    /// The configuration that this process has in force.
-    present: Configuration,
-    /// Where the configuration in force of the bridge is kept.
+/// Applies reloads to the configuration in force, on the reload thread.
+struct Reloader {
+    /// The configuration in force of this process.
+    current: Configuration,
+    /// The file with the configuration in force of the bridge.
     file: Option<InForceFile>,
 }
 
-impl Server {
-    /// Puts into force what can be taken over from `new`, and keeps it for the processes that start later.
+impl Reloader {
+    /// Puts in force what `new` changes without a restart, and stores it for processes that start later.
     fn reload(&mut self, new: Configuration) -> Reload {
-        // Another process may have kept a reload already that this one has not seen.
-        let kept = self.file.as_ref().and_then(|file| file.read().ok()?);
-        let kept = kept.and_then(|bytes| Configuration::decode(&bytes).ok());
-        let (bridge, Reload { waits, .. }) = kept.as_ref().unwrap_or(&self.present).reloaded(new);
-        if kept.as_ref() != Some(&bridge) {
-            self.keep(&bridge);
+        // Another process may have stored a reload that this one has not applied yet.
+        let stored = self.file.as_ref().and_then(|file| file.read().ok()?);
+        let stored = stored.and_then(|bytes| Configuration::decode(&bytes).ok());
+        let (bridge, Reload { waits, .. }) = stored.as_ref().unwrap_or(&self.current).reloaded(new);
+        if stored.as_ref() != Some(&bridge) {
+            self.store(&bridge);
         }
-        let (present, Reload { changed, .. }) = self.present.reloaded(bridge);
-        self.present = present;
+        let (current, Reload { changed, .. }) = self.current.reloaded(bridge);
+        self.current = current;
         Reload { changed, waits }
     }
 
-    fn keep(&self, configuration: &Configuration) {
+    fn store(&self, configuration: &Configuration) {
         let Some(file) = &self.file else { return };
         let encoded = configuration.encode().map_err(io::Error::from);
         match encoded.and_then(|bytes| file.write(&bytes)) {
-            // The bridge is being taken down, and its folder is gone.
+            // The bridge is shutting down and has removed its folder.
             Err(error) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => error!(%error, "the reload is not kept: a process that restarts does not apply it"),
+            Err(error) => {
+                error!(%error, "cannot store the reload: a process that restarts will not apply it")
+            }
             Ok(()) => {}
         }
     }
 }
 
-/// Answers one request after the other, as long as the role is there to take the outcomes. Requests that come
-/// while one is dealt with are one more.
+/// Handles reload requests one by one until the receiver of the outcomes is dropped. Signals received while
+/// one is handled make one further request.
 fn serve(
     Request { mut signals, mut load, terminal }: Request,
-    mut server: Server,
+    mut reloader: Reloader,
     outcomes: &SyncSender<Outcome>,
     note: Option<&Path>,
 ) {
     for _ in signals.forever() {
-        if terminal.is_gone() {
-            info!("the terminal is gone");
-            // As Ctrl-C would have.
+        if terminal.is_closed() {
+            info!("the terminal was closed; stopping");
+            // Stops the process as Ctrl-C does.
             let _ = raise(Signal::SIGTERM);
             return;
         }
@@ -283,10 +291,10 @@ fn serve(
         let (outcome, result) = match load() {
             Ok(new) => {
                 let file_fingerprint = new.settings.fingerprint();
-                let reload = server.reload(new);
-                telemetry::set_verbosity(server.present.settings.diagnostics.verbosity);
+                let reload = reloader.reload(new);
+                telemetry::set_verbosity(reloader.current.settings.diagnostics.verbosity);
                 log(&reload);
-                let outcome = Outcome::Accepted(Box::new(server.present.clone()));
+                let outcome = Outcome::Accepted(Box::new(reloader.current.clone()));
                 (outcome, ReloadResult::Accepted { file_fingerprint, reload })
             }
             Err(error) => {
@@ -300,7 +308,11 @@ fn serve(
         if let Some(path) = note {
             let note = ReloadNote { pid: std::process::id(), began_at_ns: began_at.0, result };
             if let Err(error) = note.write(path) {
-                warn!(path = %path.display(), %error, "what came of the reload is not noted");
+                warn!(
+                    path = %path.display(),
+                    %error,
+                    "cannot write the outcome of the reload for `adaptive-bridge reload`"
+                );
             }
         }
     }
@@ -314,11 +326,11 @@ fn log(reload: &Reload) {
         warn!("waits for a restart of the whole bridge: {change}");
     }
     if *reload == Reload::default() {
-        info!("reloaded: nothing differs");
+        info!("reloaded: no setting has changed");
     }
 }
 
-/// What a role says of its last reload.
+/// The outcome of the last reload of a process, in the file beside the lock of its role.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct ReloadNote {
     pid: u32,
@@ -326,63 +338,63 @@ struct ReloadNote {
     result: ReloadResult,
 }
 
-/// What came of a reload.
+/// The outcome of a reload.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum ReloadResult {
-    /// The file was good, and what could be taken over is in force.
+    /// The file was valid; its changes that need no restart are in force.
     Accepted {
-        /// The fingerprint of what the file says, which is that of the settings in force unless something
-        /// waits for a restart of the whole bridge.
+        /// The fingerprint of the settings in the file. It equals that of the settings in force unless a
+        /// change waits for a restart of the whole bridge.
         file_fingerprint: u64,
-        /// What changed, and what did not.
+        /// The changes that were applied, and those that wait for a restart.
         reload: Reload,
     },
-    /// The file was bad, and nothing has changed.
+    /// The file was invalid, and nothing has changed.
     Refused {
-        /// Its problems, a line each.
+        /// The problems of the file, one per line.
         problems: String,
     },
 }
 
 impl ReloadNote {
-    /// The note in that file, if it is about a reload that the process `pid` began at `since` or later.
+    /// Reads the note, if it is of a reload that the process `pid` began at `since` or later.
     fn read(path: &Path, pid: u32, since: MonotonicNs) -> Option<Self> {
         let note: Self = serde_json::from_slice(&fs::read(path).ok()?).ok()?;
         (note.pid == pid && note.began_at_ns >= since.0).then_some(note)
     }
 
-    /// Puts it there in one step, so that nobody reads half a note.
+    /// Writes the note by renaming a new file, so that no reader sees half a note.
     fn write(&self, path: &Path) -> io::Result<()> {
         let unfinished = path.with_extension("reload-new");
         fs::write(&unfinished, serde_json::to_vec(self)?)?;
         match fs::rename(&unfinished, path) {
-            // The bridge is being taken down, and its folder is gone.
+            // The bridge is shutting down and has removed its folder.
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
             outcome => outcome,
         }
     }
 }
 
-/// How long [`reload_all`] waits for answers. A role looks ten times a second, and a file is read within
-/// milliseconds.
-const PATIENCE_MS: u64 = 5_000;
+/// How long [`reload_all`] waits for answers. A process picks up the outcome within 100 ms, and reads the
+/// file within milliseconds.
+const ANSWER_TIMEOUT_MS: u64 = 5_000;
 
-/// One process that was asked to reload.
+/// The answer of one process to a reload request.
 #[derive(Clone, Debug)]
 pub struct ReloadAnswer {
     /// `ingress`, `egress-critical`, …
     pub role: String,
     /// Its process id.
     pub pid: u32,
-    /// What came of it; `None` when it did not answer within 5 s, or ended.
+    /// The outcome; `None` if the process did not answer within 5 s, or ended.
     pub result: Option<ReloadResult>,
 }
 
-/// Asks every process of the bridge to reload, and waits for the answers; none when the bridge does not run.
-/// `root` is the folder of its shared files.
+/// Sends SIGHUP to every process of the bridge and waits for the answers. Returns an empty list if the bridge
+/// does not run. `root` is the folder of its shared files.
 ///
 /// # Errors
-/// It cannot be found out who they are.
+/// The processes of the bridge cannot be listed.
 pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnswer>, ShmError> {
     let asked_at = clock::monotonic();
     let holders = RoleHolder::all(root, instance)?;
@@ -390,11 +402,11 @@ pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnsw
     for RoleHolder { role, pid, .. } in &holders {
         match i32::try_from(*pid).map(|pid| kill(Pid::from_raw(pid), Signal::SIGHUP)) {
             Ok(Ok(())) => {}
-            refused => warn!(role, pid, ?refused, "cannot be signalled"),
+            refused => warn!(role, pid, ?refused, "cannot send SIGHUP"),
         }
         answers.push(ReloadAnswer { role: role.clone(), pid: *pid, result: None });
     }
-    let give_up_at = asked_at.plus_ms(PATIENCE_MS);
+    let give_up_at = asked_at.plus_ms(ANSWER_TIMEOUT_MS);
     loop {
         for (answer, holder) in answers.iter_mut().zip(&holders).filter(|(answer, _)| answer.result.is_none())
         {

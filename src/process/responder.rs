@@ -1,7 +1,7 @@
-//! The responder: answers the probes of bridges, beside a remote subscriber.
+//! The responder: answers the probe requests of bridges, on the host of a remote subscriber.
 //!
-//! It needs no bridge and no shared memory on its machine. Requests come from the network and cost little
-//! whatever they are: each is looked at once, and what is no good is counted.
+//! It needs no bridge and no shared memory on its host. Any message from the network is cheap to handle: the
+//! responder checks each request once, and counts the ones that it refuses.
 
 use std::fmt::Write;
 use std::time::Duration;
@@ -21,39 +21,39 @@ use crate::config::DdsNetwork;
 use crate::dds::{Participant, ParticipantOptions, RawWriter, Take};
 use crate::model::{Encapsulation, MonotonicNs, SourceTimestamp, TopicName};
 
-/// After so long without a probe the log says so.
+/// How long the responder waits for a probe request before it logs a warning.
 const SILENCE_MS: u64 = 10_000;
 
-/// Requests that are looked at before it is time to look at the rest.
+/// Requests handled in one turn, so that a flood of them does not delay housekeeping.
 const REQUESTS_PER_TURN: usize = 64;
 
-/// Samples that the DDS library may hold of our BEST_EFFORT writer.
+/// Samples that the DDS library may hold for the BEST_EFFORT response writer.
 const WINDOW_SAMPLES: usize = 16;
 
-/// What a responder is made of.
+/// The configuration of a responder.
 #[derive(Debug)]
 pub struct ResponderOptions<'a> {
-    /// The subscriber's name, by which the bridge's configuration knows it; see
+    /// The id of the subscriber in the bridge's configuration; see
     /// [`is_probe_id`](crate::model::is_probe_id).
     pub id: &'a str,
     /// Domain and interfaces.
     pub network: &'a DdsNetwork,
-    /// Length of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
+    /// Length in bytes of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
     /// Topic of the requests.
     pub request_topic: &'a TopicName,
     /// Topic of the responses.
     pub response_topic: &'a TopicName,
-    /// Who is believed.
+    /// Which requests are trusted.
     pub trust: Trust,
-    /// Requests answered per second, of one sender.
+    /// Requests of one sender that are answered per second.
     pub max_probe_rate_hz: u32,
 }
 
-/// Answers probes until `stop` is requested.
+/// Runs the responder until `stop` is requested.
 ///
 /// # Errors
-/// DDS cannot be had.
+/// The DDS participant or an endpoint cannot be created.
 pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleError> {
     let (id, topic) = (options.id.to_owned(), options.request_topic.to_string());
     let domain_id = options.network.domain_id;
@@ -84,22 +84,23 @@ struct Responder {
     responses: RawWriter,
     _participant: Participant,
     answers: Answers,
-    /// The request at hand, cut where it is longer than any can be.
+    /// The current request, cut at one byte more than the longest valid request.
     request: Vec<u8>,
     refused: RefusalWatch,
     accepted: RefusalWatch,
     housekeeping_at: MonotonicNs,
-    /// When the last probe was answered; before the first, when the responder came up.
-    heard_at: MonotonicNs,
-    said: Said,
-    where_to_look: String,
+    /// When the last request was accepted; before the first, when the responder started.
+    last_request_at: MonotonicNs,
+    logged: LoggedState,
+    /// The domain and topic of the requests, for the log.
+    listens_on: String,
     notifier: Notifier,
     answered: Meter,
 }
 
-/// What the log said last about probes.
+/// The state of the requests that was logged last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Said {
+enum LoggedState {
     Nothing,
     Arriving,
     Silent,
@@ -113,7 +114,7 @@ impl Responder {
             node_name: node_name(options.id),
             graph_gid_bytes: options.graph_gid_bytes,
         })?;
-        // First the writer, so that an answer can leave as soon as a request can come.
+        // The writer first, so that the first request can be answered at once.
         let responses = participant.create_writer(
             &options.response_topic.to_dds(),
             PROBE_TYPE,
@@ -132,24 +133,25 @@ impl Responder {
             refused: RefusalWatch::of_refused(),
             accepted: RefusalWatch::of_accepted(),
             housekeeping_at: MonotonicNs(0),
-            heard_at: now,
-            said: Said::Nothing,
-            where_to_look: format!("domain {}, topic {}", options.network.domain_id, options.request_topic),
+            last_request_at: now,
+            logged: LoggedState::Nothing,
+            listens_on: format!("domain {}, topic {}", options.network.domain_id, options.request_topic),
             notifier: Notifier::new(),
             answered: Meter::default(),
         })
     }
 
-    /// Handles what is there; whether there may be more.
+    /// Does housekeeping if it is due, and answers the requests that have arrived. Returns whether more may
+    /// be waiting.
     fn turn(&mut self) -> bool {
         let now = clock::monotonic();
         if now >= self.housekeeping_at {
-            self.keep_house(now);
+            self.housekeeping(now);
         }
         (0..REQUESTS_PER_TURN).all(|_| self.step())
     }
 
-    /// Takes one request and answers it; whether there was one.
+    /// Takes one request and answers it. Returns whether there was one.
     fn step(&mut self) -> bool {
         let request = &mut self.request;
         let mut lent = None;
@@ -175,11 +177,11 @@ impl Responder {
             return true;
         };
         let begun = clock::wall();
-        if self.said != Said::Arriving {
-            info!(sender_id = ?request.sender_id, "probes arrive");
-            self.said = Said::Arriving;
+        if self.logged != LoggedState::Arriving {
+            info!(sender_id = ?request.sender_id, "probe requests arrive");
+            self.logged = LoggedState::Arriving;
         }
-        self.heard_at = now;
+        self.last_request_at = now;
         let sent = clock::wall();
         let response = self.answers.respond(request, received, begun, sent).encode();
         let timestamp = SourceTimestamp::from_wall(sent);
@@ -189,20 +191,21 @@ impl Responder {
         true
     }
 
-    fn keep_house(&mut self, now: MonotonicNs) {
+    fn housekeeping(&mut self, now: MonotonicNs) {
         self.refused.look(&self.answers.refused, now);
         self.accepted.look(&self.answers.accepted_anyway, now);
-        if self.said != Said::Silent && now.since(self.heard_at) >= SILENCE_MS * 1_000_000 {
-            self.said = Said::Silent;
+        if self.logged != LoggedState::Silent && now.since(self.last_request_at) >= SILENCE_MS * 1_000_000 {
+            self.logged = LoggedState::Silent;
             warn!(
-                "no probes for {} s ({}); does the bridge run, and is it in reach?",
+                "no probe requests for {} s ({}); check that the bridge runs and that the network connects \
+                 it with this host",
                 SILENCE_MS / 1_000,
-                self.where_to_look
+                self.listens_on
             );
         }
-        // The first time everything is there, and any other time a turn is over.
+        // Reports readiness at the first housekeeping, when all endpoints exist.
         self.notifier.ready();
-        self.notifier.turned(now);
+        self.notifier.feed_watchdog(now);
         let (answers, answered) = (&self.answers, &mut self.answered);
         self.notifier.status(now, |line| {
             let per_s = answered.per_s(answers.answered, now);
@@ -213,7 +216,7 @@ impl Responder {
     }
 }
 
-/// `responder_` and the id, with `_` for what a node name may not have.
+/// The node name: `responder_` and the id, with `_` for each character that ROS 2 does not allow in it.
 fn node_name(id: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
     format!("responder_{}", id.chars().map(allowed).collect::<String>())

@@ -1,4 +1,5 @@
-//! What every role begins with and ends by.
+//! Start-up and shutdown that ingress, egress and control share: lock, reloads, scheduling, shared memory,
+//! health, DDS participant.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -6,7 +7,7 @@ use std::path::PathBuf;
 use tracing::info;
 
 use super::notify::Notifier;
-use super::reload::{Look, ReloadRequests, Reloads};
+use super::reload::{ReloadEvent, ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
 use crate::config::{Configuration, Scheduling, Settings};
@@ -14,28 +15,28 @@ use crate::dds::{DdsError, Participant, ParticipantOptions};
 use crate::model::{Guid, MonotonicNs, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
 
-/// Why a role could not start, or had to end.
+/// Why a process could not start, or had to end.
 #[derive(Debug)]
 pub enum RoleError {
     /// The configuration has no lane of that name.
     NoSuchLane {
         /// The name.
         name: String,
-        /// The lanes there are.
+        /// The lanes that the configuration has.
         lanes: Vec<String>,
     },
     /// No process serves the lane.
     NotRunning {
-        /// The bridge.
+        /// The instance.
         instance: String,
         /// The lane.
         lane: String,
     },
-    /// Shared memory.
+    /// Shared memory failed.
     Shm(ShmError),
-    /// DDS.
+    /// DDS failed.
     Dds(DdsError),
-    /// The operating system refused something else.
+    /// Another operating system call failed.
     Os(std::io::Error),
 }
 
@@ -77,7 +78,7 @@ impl From<std::io::Error> for RoleError {
     }
 }
 
-/// The number of the lane called `name`.
+/// The index of the lane called `name`.
 pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleError> {
     settings.lanes.iter().position(|lane| lane.name.as_str() == name).ok_or_else(|| RoleError::NoSuchLane {
         name: name.to_owned(),
@@ -90,33 +91,33 @@ pub(super) fn root(settings: &Settings) -> PathBuf {
     default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
 }
 
-/// A role that is up: nobody else serves it, shared memory is attached, health is shown.
+/// A process that is up: it holds the lock of its role, has shared memory attached and writes its health.
 pub(super) struct Role {
     pub node: ShmNode,
     pub boards: Boards,
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
     notifier: Notifier,
-    /// The participant of the process that served the role before; all zero for none.
+    /// The participant of the predecessor of this process; all zero for none, and once it is disposed of.
     former_participant: Guid,
-    /// Last, so that the role is free only when everything else is gone.
+    /// The last field, so that the lock is released only after everything else is dropped.
     _lock: RoleLock,
 }
 
 impl Role {
-    /// Takes the role `name`, applies its scheduling and attaches to shared memory.
+    /// Locks the role `name`, applies its scheduling and attaches to shared memory.
     pub fn open(
         settings: &Settings,
         requests: ReloadRequests,
         role: ProcessRole,
         name: &str,
-        how: &Scheduling,
+        scheduling: &Scheduling,
     ) -> Result<Self, RoleError> {
         let root = root(settings);
         let lock = RoleLock::acquire(&root, &settings.instance, name)?;
-        // Before the scheduling, which is for the data path: a file is read at leisure.
+        // Before the scheduling, which is for the data path: the reload thread runs without it.
         let reloads = Reloads::start(requests, settings, lock.note_path())?;
-        scheduling::apply(how);
+        scheduling::apply(scheduling);
         let node = ShmNode::open(&root, &settings.instance, name)?;
         let cleaned = node.cleaned_up();
         if cleaned.dead_processes > 0 {
@@ -144,16 +145,17 @@ impl Role {
         Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former_participant, _lock: lock })
     }
 
-    /// Opens the role's DDS participant. If the process that served the role before was killed, the others
-    /// are told that its participant is gone.
+    /// Opens the DDS participant. If the predecessor of this process was killed, the participant disposes of
+    /// the predecessor's participant, so that the others remove it.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
-        self.joined(&participant);
+        self.dispose_former(&participant);
+        self.record_participant(&participant);
         Ok(participant)
     }
 
-    /// Like [`join`](Self::join), with what the thread that receives is to do; see
-    /// [`Participant::open_receiving`]. The others are told only by
+    /// Like [`join`](Self::join), with callbacks for the receiving thread; see
+    /// [`Participant::open_receiving`]. Leaves the predecessor's participant to a later call of
     /// [`dispose_former`](Self::dispose_former).
     pub fn join_receiving(
         &mut self,
@@ -162,36 +164,32 @@ impl Role {
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
         let participant = Participant::open_receiving(options, on_arriving, on_received)?;
-        self.show(&participant);
+        self.record_participant(&participant);
         Ok(participant)
     }
 
-    fn joined(&mut self, participant: &Participant) {
-        self.dispose_former(participant);
-        self.show(participant);
-    }
-
-    /// Tells the other participants, once, that the participant of a killed predecessor is gone. A writer
-    /// then lets go of the samples that only the predecessor had not acknowledged.
+    /// Announces to the other participants, once, that the participant of a killed predecessor is gone. A
+    /// writer then releases the samples that only the predecessor had not acknowledged.
     pub fn dispose_former(&mut self, participant: &Participant) {
         participant.say_goodbye_for(std::mem::take(&mut self.former_participant));
     }
 
-    /// Whether the participant of a killed predecessor has yet to be disposed of.
+    /// Whether the participant of a killed predecessor is not disposed of yet.
     pub fn has_former(&self) -> bool {
         self.former_participant != Guid::default()
     }
 
-    fn show(&mut self, participant: &Participant) {
+    /// Writes the participant to the health board, for a successor that has to dispose of it.
+    fn record_participant(&mut self, participant: &Participant) {
         let guid = participant.guid();
         self.health.update(|health| health.participant = guid);
     }
 
-    /// Takes over what was reloaded since the last look, if anything was, and shows it. What is yielded then
-    /// is the configuration in force from now on, for the role to apply.
+    /// Returns the new configuration in force if a reload has completed since the last call, for the caller
+    /// to apply. Writes the outcome to the health board and to the service manager.
     pub fn reload(&mut self) -> Option<&Configuration> {
-        let look = self.reloads.look();
-        if look == Look::Nothing {
+        let event = self.reloads.poll();
+        if event == ReloadEvent::Nothing {
             return None;
         }
         let (fingerprint, refused) = (self.reloads.fingerprint(), self.reloads.refused());
@@ -199,31 +197,32 @@ impl Role {
             health.settings_fingerprint = fingerprint;
             health.refused_reloads = refused;
         });
-        self.notifier.reloaded(look == Look::Refused);
-        (look == Look::Reloaded).then(|| self.reloads.configuration())
+        self.notifier.reloaded(event == ReloadEvent::Refused);
+        (event == ReloadEvent::Reloaded).then(|| self.reloads.configuration())
     }
 
-    /// The role is up: its DDS endpoints are there, but for those whose type discovery has yet to tell.
+    /// Reports, once, that the process is up: its DDS endpoints exist, except those of a type not yet
+    /// discovered.
     pub fn ready(&mut self) {
         self.notifier.ready();
     }
 
-    /// Says what the role does, about once a second, if anybody listens. `describe` writes a line.
+    /// Sends the status line that `describe` writes to the service manager, at most once a second.
     pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
         self.notifier.status(now, describe);
     }
 
-    /// The role begins to end.
+    /// Reports that the process has begun to shut down.
     pub fn stopping(&self) {
         self.notifier.stopping();
     }
 
-    /// Counts a failure that cost no sample.
+    /// Counts an error that dropped no sample.
     pub fn failed(&mut self) {
         self.health.update(|health| health.errors += 1);
     }
 
-    /// Shows that the data path turned, and what it applies.
+    /// Records a turn of the data path, and the mode and policy that it applies; feeds the watchdog.
     pub fn turned(&mut self, mode: u8, policy_epoch: u64) {
         let now = clock::monotonic();
         self.health.update(|health| {
@@ -232,7 +231,7 @@ impl Role {
             health.mode = mode;
             health.policy_epoch = policy_epoch;
         });
-        self.notifier.turned(now);
+        self.notifier.feed_watchdog(now);
     }
 }
 
@@ -244,7 +243,7 @@ impl Drop for Role {
     }
 }
 
-/// The ROS 2 namespace of a bridge's nodes: that of the default instance is short.
+/// The ROS 2 namespace of the bridge's nodes; the default instance has no name in it.
 pub(super) fn namespace(settings: &Settings) -> String {
     match settings.instance.as_str() {
         "default" => "/adaptive_bridge".to_owned(),

@@ -1,4 +1,4 @@
-//! How the operating system is to schedule this process.
+//! Applies the configured scheduling (CPUs, nice value, time slice, policy, memory locking) to this process.
 
 use nix::errno::Errno;
 use nix::libc;
@@ -9,12 +9,13 @@ use tracing::{debug, info, warn};
 
 use crate::config::{Scheduling, SchedulingPolicy};
 
-/// The FIFO priority of a process for which the configuration names no policy: what its service unit thinks
-/// right.
+/// Environment variable with the FIFO priority of a process for which the configuration names no policy; its
+/// service unit sets it.
 const DEFAULT_VARIABLE: &str = "ADAPTIVE_BRIDGE_FIFO_PRIORITY";
 
-/// Applies what is configured to this process and the threads that it starts from now on. What the system
-/// refuses is a warning that says what would allow it: a bridge with the wrong priority is better than none.
+/// Applies `scheduling` to this process and the threads that it starts from now on. A setting that the system
+/// refuses is only a warning, which names the permission it needs: a bridge with the wrong priority is better
+/// than none.
 pub(super) fn apply(scheduling: &Scheduling) {
     if !scheduling.cpus.is_empty() {
         match set_affinity(&scheduling.cpus) {
@@ -24,7 +25,8 @@ pub(super) fn apply(scheduling: &Scheduling) {
             }
         }
     }
-    // Lower than it was started with takes a privilege, and whoever started it so knew why.
+    // A nice value higher than the configured one was set on purpose by the parent, and to lower it needs a
+    // privilege.
     if scheduling.nice > 0 && i32::from(scheduling.nice) > current_nice() {
         match set_nice(scheduling.nice) {
             Ok(()) => info!(nice = scheduling.nice, "nice value set"),
@@ -68,24 +70,24 @@ pub(super) fn apply(scheduling: &Scheduling) {
     }
 }
 
-/// For a thread that only gets others up, on the CPUs that they have. With a fair policy it never takes the
-/// CPU from a program that runs: whom it would get up then only waits, and a publisher that is held up while
-/// it sends cost 20 µs of CPU more for each sample. Whether it is on those CPUs: where ingress receives it
-/// must not be.
+/// Applies the scheduling of the lookout thread, which only wakes lanes and runs on their CPUs. With a fair
+/// policy it never preempts a running program: the lane that it wakes would only wait, and a publisher that
+/// is preempted while it sends cost 20 µs of CPU more for each sample. Returns whether the thread is on
+/// `cpus`; it must not run on the CPUs of ingress.
 pub(super) fn apply_to_lookout(cpus: &[usize]) -> bool {
     if let Err(error) = set_affinity(cpus) {
-        warn!(?cpus, %error, "no lookout, for it may not run there: critical lanes get up later");
+        warn!(?cpus, %error, "no lookout, because its CPUs cannot be set: critical lanes wake up later");
         return false;
     }
     if scheduling_attributes().is_ok_and(|attributes| attributes.sched_policy == libc::SCHED_OTHER as u32)
         && let Err(error) = set_policy(libc::SCHED_BATCH, 0)
     {
-        debug!(%error, "the lookout may take the CPU from a program that runs");
+        debug!(%error, "the lookout may preempt a running program");
     }
     true
 }
 
-/// `None` without the variable, or where it is empty.
+/// The priority in [`DEFAULT_VARIABLE`]; `None` if that is unset, empty or not 1 to 99.
 fn default_priority() -> Option<u8> {
     let text = std::env::var(DEFAULT_VARIABLE).ok().filter(|text| !text.is_empty())?;
     let priority = text.parse().ok().filter(|priority| (1..=99).contains(priority));
@@ -105,8 +107,8 @@ fn set_affinity(cpus: &[usize]) -> nix::Result<()> {
 
 /// The nice value of this process.
 fn current_nice() -> i32 {
-    // SAFETY: the call takes two numbers and returns one. nix has no wrapper for it. An error is -1, as a
-    // nice value may be, and below all that can be configured.
+    // SAFETY: the call takes two numbers and returns one. nix has no wrapper for it. It returns -1 on
+    // error, which is also a nice value, and below each value that can be configured.
     unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) }
 }
 
@@ -116,8 +118,8 @@ fn set_nice(nice: u8) -> nix::Result<()> {
     Errno::result(outcome).map(drop)
 }
 
-/// Asks the fair scheduler for a time slice, in microseconds; what it granted. `None` where somebody has
-/// started this process with another scheduler.
+/// Requests a time slice from the fair scheduler and returns the granted one in microseconds; `None` if this
+/// process was started with another scheduling policy.
 fn set_slice(slice_us: u32) -> nix::Result<Option<u64>> {
     let mut attributes = scheduling_attributes()?;
     let fair = [libc::SCHED_OTHER, libc::SCHED_BATCH].map(|policy| policy as u32);

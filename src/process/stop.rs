@@ -1,4 +1,4 @@
-//! The request to stop: SIGINT or SIGTERM.
+//! The request to stop a process, which SIGINT and SIGTERM set.
 
 use std::io;
 use std::sync::Arc;
@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-/// Whether the process was asked to stop. Clones see the same request.
+/// Flag that requests the process to stop. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct Stop(Arc<AtomicBool>);
 
 impl Stop {
-    /// A request that SIGINT and SIGTERM make.
+    /// Creates a flag that SIGINT and SIGTERM set.
     ///
     /// # Errors
     /// The operating system refused the signal handlers.
@@ -23,12 +23,12 @@ impl Stop {
         Ok(stop)
     }
 
-    /// Makes the request.
+    /// Requests the stop.
     pub fn request(&self) {
         self.0.store(true, Ordering::Release);
     }
 
-    /// Whether it was made.
+    /// Whether the stop was requested.
     pub fn is_requested(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }

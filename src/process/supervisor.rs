@@ -1,8 +1,8 @@
-//! `up`: all roles of a bridge as children of one process, for a terminal or a container.
+//! `up`: runs all processes of a bridge as children of one supervisor, for a terminal or a container.
 //!
-//! On a robot systemd supervises the roles. Here a child that dies is started again, with a backoff; each
-//! line of a child's log is passed on with the child's name before it; and no child outlives this process,
-//! because each asks the kernel to be terminated when its parent dies, however that dies.
+//! On a robot, systemd supervises the processes. Here the supervisor restarts a child that dies, with a
+//! backoff, and prints each line of a child's log with the child's name before it. No child outlives the
+//! supervisor: each asks the kernel for SIGTERM when its parent dies, whatever the parent dies of.
 
 use std::ffi::OsString;
 use std::fmt::{self, Write as _};
@@ -29,16 +29,17 @@ use crate::policy::{ChildExit, GiveUpReason, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError};
 use crate::telemetry::Snapshot;
 
-/// How often the children are looked at.
-const LOOK_MS: u64 = 20;
+/// Interval at which the supervisor checks its children.
+const POLL_MS: u64 = 20;
 
-/// How often the boards are looked at for the service manager.
-const ACCOUNT_MS: u64 = 250;
+/// Interval at which the supervisor reads the boards for its report to the service manager.
+const REPORT_MS: u64 = 250;
 
-/// Roles end within a second of a request; one that has not by then is killed.
+/// How long a child may take to end after SIGTERM; then it is killed. A process ends within a second of a
+/// request to stop.
 const GRACE_MS: u64 = 900;
 
-/// Set for children, to the process id of their supervisor.
+/// Environment variable that `up` sets for its children, to its own process id.
 const SUPERVISOR_VARIABLE: &str = "ADAPTIVE_BRIDGE_SUPERVISOR";
 
 /// Why `up` had to end.
@@ -48,10 +49,10 @@ pub enum SupervisorError {
     Start {
         /// Its name.
         name: String,
-        /// What the operating system said.
+        /// The operating system's error.
         error: io::Error,
     },
-    /// No child is left that could be started again.
+    /// Every child has failed in a way that a restart does not cure.
     AllGaveUp,
     /// The bridge runs already, or the folder of the instance cannot be used.
     Shm(ShmError),
@@ -75,7 +76,7 @@ impl From<ShmError> for SupervisorError {
     }
 }
 
-/// To be called by a role before anything else: if `up` started this process, it ends with `up`.
+/// Makes this process end when `up` ends, if `up` started it. To be called before anything else.
 pub fn end_with_supervisor() {
     let Some(supervisor) = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok()) else {
         return;
@@ -83,17 +84,17 @@ pub fn end_with_supervisor() {
     if let Err(error) = set_pdeathsig(Signal::SIGTERM) {
         warn!(%error, "this process may outlive its supervisor");
     }
-    // The supervisor may have died before the request was made.
+    // The supervisor may have died before the call above.
     if getppid() != Pid::from_raw(supervisor) {
-        error!("the supervisor is gone already");
+        error!("the supervisor has already ended");
         std::process::exit(1);
     }
 }
 
 /// Puts `configuration`, which was read from `file`, in force, and runs ingress, every lane and control as
-/// children until `stop` is requested. `arguments` are passed on to each, after its own (the configuration
-/// file, say). A hang-up is passed on, too: each child checks the file
-/// itself before it changes anything. Lanes that the file has got since are not started.
+/// children until `stop` is requested. Each child gets `arguments` (such as the configuration file) after its
+/// own. The supervisor forwards a SIGHUP to its children, each of which validates the file before it applies
+/// any change. Lanes that were added to the file after the start are not started.
 ///
 /// # Errors
 /// The bridge runs already, the first start of a child failed, or all children gave up.
@@ -107,7 +108,7 @@ pub fn up(
     let in_force = InForce::begin(file, configuration)?;
     let settings = &in_force.configuration().settings;
     let root = root(settings);
-    // By this role another `up` finds the process id of this one.
+    // The lock file tells another `up` the process id of this one.
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
     let mut children = vec![Supervised::new("ingress", &["ingress"], arguments, &folder)];
@@ -124,61 +125,62 @@ pub fn up(
             break;
         }
     }
-    let mut account = Account::new(settings);
+    let mut report = ManagerReport::new(settings);
     while outcome.is_ok() && !stop.is_requested() {
-        std::thread::sleep(Duration::from_millis(LOOK_MS));
+        std::thread::sleep(Duration::from_millis(POLL_MS));
         match hang_up.take() {
             Some(HangUpMeaning::Reload) => {
-                info!("reload: passed on to every child");
+                info!("reload: SIGHUP sent to every child");
                 children.iter().for_each(Supervised::reload);
             }
             Some(HangUpMeaning::Stop) => {
-                info!("the terminal is gone");
+                info!("the terminal was closed; stopping");
                 break;
             }
             None => {}
         }
         let now = clock::monotonic();
         for child in &mut children {
-            child.look(now);
+            child.poll(now);
         }
-        account.give(&children, now);
+        report.send(&children, now);
         if children.iter().all(|child| child.state == State::GaveUp) {
             outcome = Err(SupervisorError::AllGaveUp);
         }
     }
-    account.notifier.stopping();
-    end(&mut children);
+    report.notifier.stopping();
+    stop_all(&mut children);
     outcome
 }
 
-/// What the service manager of `up` is told, where there is one.
-struct Account<'a> {
+/// Reports the state of all children to the service manager of `up`, where there is one.
+struct ManagerReport<'a> {
     settings: &'a Settings,
     notifier: Notifier,
-    look_at: MonotonicNs,
+    report_at: MonotonicNs,
     last: Option<Snapshot>,
 }
 
-impl<'a> Account<'a> {
+impl<'a> ManagerReport<'a> {
     fn new(settings: &'a Settings) -> Self {
-        Self { settings, notifier: Notifier::new(), look_at: MonotonicNs(0), last: None }
+        Self { settings, notifier: Notifier::new(), report_at: MonotonicNs(0), last: None }
     }
 
-    /// Ready when each child has turned once, which is when it is ready itself. `up` has no data path: its
-    /// work is to look after the children, and that was just done.
-    fn give(&mut self, children: &[Supervised], now: MonotonicNs) {
-        self.notifier.turned(now);
-        if !self.notifier.listens() || now < self.look_at {
+    /// Feeds the watchdog, reports readiness, and sends the status line. `up` is ready when each child has
+    /// completed a turn, which is when the child itself is ready. As `up` has no data path, its watchdog
+    /// shows that it checks its children; the caller has just done so.
+    fn send(&mut self, children: &[Supervised], now: MonotonicNs) {
+        self.notifier.feed_watchdog(now);
+        if !self.notifier.is_enabled() || now < self.report_at {
             return;
         }
-        self.look_at = now.plus_ms(ACCOUNT_MS);
+        self.report_at = now.plus_ms(REPORT_MS);
         let next = match Snapshot::take(&root(self.settings), self.settings) {
             Ok(Some(next)) => next,
-            // The children have yet to make the boards, or the present ones are of another configuration.
+            // The children have not created the boards yet, or the boards are of another configuration.
             Ok(None) | Err(ShmError::Incompatible { .. }) => return,
             Err(error) => {
-                warn!(%error, "the bridge cannot be looked at");
+                warn!(%error, "cannot read the boards of the bridge");
                 return;
             }
         };
@@ -209,8 +211,8 @@ impl<'a> Account<'a> {
     }
 }
 
-/// Asks all children to end and sees to it that they do.
-fn end(children: &mut [Supervised]) {
+/// Stops all children: sends SIGTERM, waits for `GRACE_MS`, and kills the ones that still run.
+fn stop_all(children: &mut [Supervised]) {
     for child in children.iter() {
         child.signal(Signal::SIGTERM);
     }
@@ -218,9 +220,9 @@ fn end(children: &mut [Supervised]) {
     while children.iter_mut().any(|child| !child.has_ended()) {
         if clock::monotonic() >= deadline {
             for child in children.iter_mut().filter(|child| child.process.is_some()) {
-                warn!(child = child.name, "did not end in time; killed");
+                warn!(child = child.name, "did not end in time after SIGTERM; killed");
                 child.signal(Signal::SIGKILL);
-                // SIGKILL cannot be refused, so this wait is short; also for a stopped process.
+                // A process cannot block SIGKILL, not even in SIGSTOP, so this wait is short.
                 if let Some(mut process) = child.process.take() {
                     let _ = process.wait();
                 }
@@ -238,6 +240,7 @@ enum State {
     GaveUp,
 }
 
+/// A child process, with its command line and its restarts.
 struct Supervised {
     name: String,
     arguments: Vec<OsString>,
@@ -249,9 +252,9 @@ struct Supervised {
 }
 
 impl Supervised {
-    fn new(name: &str, own: &[&str], passed_on: &[OsString], folder: &Path) -> Self {
+    fn new(name: &str, own: &[&str], common: &[OsString], folder: &Path) -> Self {
         let mut arguments: Vec<OsString> = own.iter().map(OsString::from).collect();
-        arguments.extend_from_slice(passed_on);
+        arguments.extend_from_slice(common);
         Self {
             name: name.to_owned(),
             arguments,
@@ -266,7 +269,8 @@ impl Supervised {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
         command.env(FOLDER_VARIABLE, &self.folder);
-        // The children answer to this process, and this one to the service manager.
+        // The service manager supervises this process only; without these the children send it no
+        // notifications.
         for variable in ["NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"] {
             command.env_remove(variable);
         }
@@ -274,7 +278,7 @@ impl Supervised {
         let mut process = with_hang_up_blocked(|| command.spawn())?;
         if let Some(log) = process.stderr.take() {
             let name = self.name.clone();
-            std::thread::spawn(move || pass_on(&name, log));
+            std::thread::spawn(move || forward_log(&name, log));
         }
         info!(child = self.name, pid = process.id(), "started");
         self.process = Some(process);
@@ -286,15 +290,16 @@ impl Supervised {
         self.process.as_ref().map(|process| u64::from(process.id()))
     }
 
-    fn look(&mut self, now: MonotonicNs) {
+    /// Notices the end of the child, and restarts it when its backoff is over.
+    fn poll(&mut self, now: MonotonicNs) {
         match self.state {
             State::GaveUp => {}
             State::RestartAt(at) => {
                 if now >= at {
                     self.backoff.started(now);
                     if let Err(error) = self.start() {
-                        error!(child = self.name, %error, "not started again");
-                        // The same as a child that fails at once.
+                        error!(child = self.name, %error, "restart failed");
+                        // Counts as a child that fails at once.
                         self.ended(ChildExit::Code(1), now);
                     }
                 }
@@ -305,10 +310,12 @@ impl Supervised {
                     Some(Ok(Some(status))) => {
                         self.process = None;
                         let exit = exit_of(status);
-                        warn!(child = self.name, ?exit, "ended unasked");
+                        warn!(child = self.name, ?exit, "ended unexpectedly");
                         self.ended(exit, now);
                     }
-                    Some(Err(error)) => error!(child = self.name, %error, "cannot be waited for"),
+                    Some(Err(error)) => {
+                        error!(child = self.name, %error, "cannot read the state of the child process")
+                    }
                     Some(Ok(None)) | None => {}
                 }
             }
@@ -323,13 +330,13 @@ impl Supervised {
                     GiveUpReason::WrongCommandLine => "its command line is wrong",
                     GiveUpReason::BadConfiguration => "the configuration is bad",
                 };
-                error!(child = self.name, "not started again: {why}");
+                error!(child = self.name, "not restarted: {why}");
                 State::GaveUp
             }
         };
     }
 
-    /// A stopped child reloads when it goes on.
+    /// Sends SIGHUP. A child in SIGSTOP reloads when it is continued.
     fn reload(&self) {
         if let Some(process) = &self.process
             && let Ok(pid) = i32::try_from(process.id())
@@ -338,11 +345,11 @@ impl Supervised {
         }
     }
 
+    /// Sends the signal, and continues a child in SIGSTOP so that it handles the signal.
     fn signal(&self, signal: Signal) {
         if let Some(process) = &self.process
             && let Ok(pid) = i32::try_from(process.id())
         {
-            // A stopped child has to be continued to see any signal but SIGKILL.
             let _ = kill(Pid::from_raw(pid), signal);
             let _ = kill(Pid::from_raw(pid), Signal::SIGCONT);
         }
@@ -366,9 +373,9 @@ fn exit_of(status: ExitStatus) -> ChildExit {
     }
 }
 
-/// Writes each line of a child's log to ours, with the child's name before it. One write for each line, so
-/// that lines of several children do not mix.
-fn pass_on(name: &str, log: impl io::Read) {
+/// Copies each line of a child's log to this process's log, with the child's name before it. Each line is one
+/// write, so that lines of several children do not mix.
+fn forward_log(name: &str, log: impl io::Read) {
     let mut lines = BufReader::new(log);
     let mut line = Vec::with_capacity(256);
     loop {
@@ -380,7 +387,7 @@ fn pass_on(name: &str, log: impl io::Read) {
                 if line.last() != Some(&b'\n') {
                     line.push(b'\n');
                 }
-                // Nobody can be told that stderr is gone.
+                // A closed stderr leaves no place to report the failure.
                 let _ = io::stderr().lock().write_all(&line);
             }
         }

@@ -1,13 +1,13 @@
-//! Drops in the log: each reason with its count, and not more often than an operator can read.
+//! Logs dropped samples by reason, rate-limited so that an operator can read the log.
 
 use tracing::warn;
 
 use crate::model::{DropCounts, DropReason, MonotonicNs};
 
-/// A reason is logged at once when it is new, and at most every 10 s while it goes on.
+/// Shortest interval between two log lines of the same reason. The first drop is logged at once.
 const REPEAT_MS: u64 = 10_000;
 
-/// Watches the drops of one route in one process.
+/// Logs the new drops of one route in one process.
 #[derive(Debug)]
 pub(super) struct DropWatch {
     logged: DropCounts,
@@ -15,13 +15,14 @@ pub(super) struct DropWatch {
 }
 
 impl DropWatch {
-    /// Begins at `counts`: what a former process dropped is not news.
+    /// Starts at `counts`, so that drops of a predecessor of this process are not logged again.
     pub fn new(counts: DropCounts) -> Self {
         Self { logged: counts, next_at: [MonotonicNs(0); DropReason::COUNT] }
     }
 
-    /// Logs what is new in `counts`. `expected` reasons are how the lane works and are not logged.
-    pub fn look(
+    /// Logs the drops in `counts` that were not logged yet. `expected` reasons are normal operation of the
+    /// lane and are not logged.
+    pub fn log_new(
         &mut self,
         counts: &DropCounts,
         route: &str,

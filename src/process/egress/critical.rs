@@ -1,4 +1,4 @@
-//! How a critical lane chooses: every sample, in order, at once.
+//! Critical lanes: forward every sample, in order, at once.
 
 use super::super::arena::CopyArena;
 use super::Turn;
@@ -7,10 +7,10 @@ use crate::dds::Participant;
 use crate::model::{LaneMode, MonotonicNs};
 use crate::policy::critical_drop;
 
-/// Samples taken of one route before the next route has its turn.
+/// Samples taken from one route before the next route is served.
 const SAMPLES_PER_TURN: usize = 32;
 
-/// Forwards what is there.
+/// Forwards the samples that wait in shared memory, or drops them if the mode requires it.
 pub(super) fn step(
     outputs: &mut [Output],
     participant: &mut Participant,

@@ -1,7 +1,8 @@
-//! Late joiners of a BEST_EFFORT, TRANSIENT_LOCAL output.
+//! Sends the history of a BEST_EFFORT, TRANSIENT_LOCAL output to late joiners.
 //!
-//! RTPS repairs a late joiner's history by acknowledgements, and a BEST_EFFORT reader sends none. So the lane
-//! keeps the last samples of such an output itself and writes them once more, to the late joiner only.
+//! RTPS sends a late joiner the history that its acknowledgements request, and a BEST_EFFORT reader sends
+//! none. So the lane keeps the last samples of such an output itself and writes them again, to the late
+//! joiner only.
 
 use std::collections::VecDeque;
 
@@ -9,31 +10,32 @@ use bytes::Bytes;
 
 use crate::model::{Encapsulation, Guid, MonotonicNs, SourceTimestamp};
 
-/// The writer learns of a reader before the reader learns of the writer, and what is sent in between is lost.
-/// Discovery of both directions takes some 100 ms on a local network; nothing says when it is over.
+/// How long the lane waits after a match before it sends the history. The writer matches a reader before the
+/// reader matches the writer, and samples sent in between are lost. Discovery of both directions takes some
+/// 100 ms on a local network, but DDS does not signal its end.
 const SETTLING_MS: u64 = 1_000;
 
-/// Late joiners that may be waiting at once; further ones are served as places become free.
+/// The most late joiners that may wait at once; further ones get no history.
 const MAX_WAITING: usize = 64;
 
-/// A sample as it was written.
+/// A sample of the history, as it was written.
 #[derive(Clone, Debug)]
-pub(super) struct Kept {
+pub(super) struct KeptSample {
     pub payload: Bytes,
     pub encapsulation: Encapsulation,
     pub timestamp: SourceTimestamp,
 }
 
-/// The history of one output, and who has yet to get it.
+/// The history of one output, and the readers that have not received it yet.
 #[derive(Debug)]
 pub(super) struct LateJoiners {
     depth: usize,
-    history: VecDeque<Kept>,
+    history: VecDeque<KeptSample>,
     waiting: VecDeque<(Guid, MonotonicNs)>,
 }
 
 impl LateJoiners {
-    /// For an output that keeps `depth` samples.
+    /// Creates an empty history of `depth` samples.
     pub fn new(depth: usize) -> Self {
         Self {
             depth: depth.max(1),
@@ -42,28 +44,28 @@ impl LateJoiners {
         }
     }
 
-    /// A sample was written.
-    pub fn keep(&mut self, sample: Kept) {
+    /// Adds a written sample, and removes the oldest one from a full history.
+    pub fn keep(&mut self, sample: KeptSample) {
         if self.history.len() == self.depth {
             self.history.pop_front();
         }
         self.history.push_back(sample);
     }
 
-    /// A reader was matched.
+    /// Adds a matched reader, which is due after the settling time.
     pub fn joined(&mut self, reader: Guid, now: MonotonicNs) {
         if self.waiting.len() < MAX_WAITING && !self.waiting.iter().any(|(waiting, _)| *waiting == reader) {
             self.waiting.push_back((reader, now.plus_ms(SETTLING_MS)));
         }
     }
 
-    /// A reader is gone.
+    /// Removes a reader that is no longer matched.
     pub fn left(&mut self, reader: Guid) {
         self.waiting.retain(|(waiting, _)| *waiting != reader);
     }
 
-    /// A reader that is to get the history now, and the history.
-    pub fn due(&mut self, now: MonotonicNs) -> Option<(Guid, &VecDeque<Kept>)> {
+    /// Removes and returns the next reader that is due, with the history to send to it.
+    pub fn next_due(&mut self, now: MonotonicNs) -> Option<(Guid, &VecDeque<KeptSample>)> {
         if self.waiting.front().is_none_or(|(_, at)| now < *at) {
             return None;
         }
@@ -76,8 +78,8 @@ impl LateJoiners {
 mod tests {
     use super::*;
 
-    fn kept(byte: u8) -> Kept {
-        Kept {
+    fn kept(byte: u8) -> KeptSample {
+        KeptSample {
             payload: Bytes::from(vec![byte]),
             encapsulation: Encapsulation::CDR_LE,
             timestamp: SourceTimestamp(1),
@@ -85,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn a_late_joiner_gets_the_last_samples_once_and_after_a_while() {
+    fn a_late_joiner_gets_the_history_once_after_the_settling_time() {
         let mut late = LateJoiners::new(2);
         for byte in 0..5 {
             late.keep(kept(byte));
@@ -93,20 +95,20 @@ mod tests {
         let (reader, start) = (Guid([1; 16]), MonotonicNs(0));
         late.joined(reader, start);
         late.joined(reader, start);
-        assert!(late.due(start).is_none());
+        assert!(late.next_due(start).is_none());
         let later = start.plus_ms(SETTLING_MS);
-        let (joiner, history) = late.due(later).unwrap();
+        let (joiner, history) = late.next_due(later).unwrap();
         let bytes: Vec<u8> = history.iter().map(|sample| sample.payload[0]).collect();
         assert_eq!((joiner, bytes), (reader, vec![3, 4]));
-        assert!(late.due(later).is_none());
+        assert!(late.next_due(later).is_none());
     }
 
     #[test]
-    fn one_who_left_gets_nothing_and_many_take_bounded_memory() {
+    fn a_reader_that_left_gets_no_history_and_the_waiting_list_is_bounded() {
         let mut late = LateJoiners::new(1);
         late.joined(Guid([1; 16]), MonotonicNs(0));
         late.left(Guid([1; 16]));
-        assert!(late.due(MonotonicNs(u64::MAX)).is_none());
+        assert!(late.next_due(MonotonicNs(u64::MAX)).is_none());
         for reader in 0..=255 {
             late.joined(Guid([reader; 16]), MonotonicNs(0));
         }

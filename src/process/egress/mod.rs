@@ -1,9 +1,9 @@
-//! Egress: one lane. Takes the samples of its routes out of shared memory and hands them to DDS writers of
-//! its own.
+//! Egress: the process of one lane. It takes the samples of the lane's routes from shared memory and writes
+//! them with its own DDS writers.
 //!
-//! The role runs once for each lane, critical or not; that the processes are separate is what isolates them,
-//! not that the code is. How a lane chooses what to send and when is [`critical`] and [`noncritical`]; how a
-//! sample is handed over and accounted for is [`output`].
+//! Each lane, critical or noncritical, is a process of this code; lanes are isolated because their processes
+//! are separate. [`critical`] and [`noncritical`] choose which samples to send and when; [`output`] writes
+//! samples and accounts for them.
 
 mod critical;
 mod late_joiners;
@@ -31,31 +31,31 @@ use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use noncritical::Noncritical;
 use output::Output;
 
-/// At a shutdown, how long a critical lane goes on forwarding what waits, and what still comes.
+/// At shutdown, how long a critical lane continues to forward samples that wait or still arrive.
 const LAST_SAMPLES_MS: u64 = 200;
 
-/// At a shutdown, how long a lane waits for its readers to acknowledge what it sent last. With housekeeping
-/// it stays well within the second that a role has to end.
+/// At shutdown, how long a lane waits for its readers to acknowledge the last samples. The sum of both times
+/// and one housekeeping interval is well below the second within which a process has to end.
 const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 
 /// How often a lane checks whether the DDS library has sent the samples that it accepted. The library's thread
 /// takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
 
-/// What a turn of a lane came to.
+/// What the lane does after a turn.
 enum Turn {
-    /// There was something to do; there may be more.
+    /// Take another turn at once: samples were handled, and more may wait.
     Busy,
-    /// Nothing there: sleep until a sample arrives, or at most until then.
+    /// Sleep until a sample arrives, at most until this time.
     UntilWoken(MonotonicNs),
-    /// Nothing may be sent before then, whatever arrives.
+    /// Sleep until this time: the lane may not send earlier, whatever arrives.
     Until(MonotonicNs),
 }
 
 /// Runs the egress of the lane called `name` until `stop` is requested.
 ///
 /// # Errors
-/// There is no such lane, it is served already, or shared memory or DDS cannot be had.
+/// There is no such lane, another process serves it, or shared memory or DDS cannot be opened.
 pub fn egress(
     settings: &Settings,
     name: &str,
@@ -83,7 +83,7 @@ pub fn egress(
 }
 
 struct Egress {
-    /// The lane's number.
+    /// The index of the lane.
     index: usize,
     /// Before the participant: the DDS library wants its readers and writers gone first.
     outputs: Vec<Output>,
@@ -98,14 +98,14 @@ struct Egress {
     meters: Meters,
 }
 
-/// What the lane does, as rates.
+/// Rates of the lane, for its status line.
 #[derive(Default)]
 struct Meters {
     offered: Meter,
     forwarded: Meter,
 }
 
-/// How the lane chooses what to send.
+/// Chooses which samples to send, and when.
 enum Forwarder {
     Critical,
     Noncritical(Noncritical),
@@ -146,7 +146,7 @@ impl Egress {
             applied_mode: LaneMode::Normal,
             meters: Meters::default(),
         };
-        egress.keep_house(now);
+        egress.housekeeping(now);
         egress.role.ready();
         Ok(egress)
     }
@@ -154,9 +154,9 @@ impl Egress {
     fn turn(&mut self) -> Turn {
         let now = clock::monotonic();
         if now >= self.housekeeping_at {
-            self.keep_house(now);
+            self.housekeeping(now);
         }
-        let mode = self.policy.look(&self.role.boards, now);
+        let mode = self.policy.update(&self.role.boards, now);
         if mode != self.applied_mode {
             for output in &mut self.outputs {
                 output.set_mode(mode);
@@ -195,7 +195,7 @@ impl Egress {
         }
     }
 
-    /// Counts the samples that the DDS library has sent by now; whether it has accepted more than that.
+    /// Counts the samples that the DDS library has sent by now, and returns whether some are still unsent.
     fn count_sent(&mut self) -> bool {
         let mut unsent = false;
         for output in &mut self.outputs {
@@ -204,11 +204,11 @@ impl Egress {
         unsent
     }
 
-    fn keep_house(&mut self, now: MonotonicNs) {
-        // Nothing in the lane needs to know who else is there; the list must be emptied all the same.
+    fn housekeeping(&mut self, now: MonotonicNs) {
+        // The lane uses no discovery events, but the list of them grows unless it is emptied.
         while self.participant.poll_discovery().is_some() {}
         for output in &mut self.outputs {
-            output.keep_house(&mut self.participant, &self.role.boards, now);
+            output.housekeeping(&mut self.participant, &self.role.boards, now);
         }
         self.reload(now);
         self.role.turned(self.policy.mode as u8, self.policy.epoch);
@@ -216,7 +216,7 @@ impl Egress {
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }
 
-    /// Applies what was reloaded.
+    /// Applies the settings of a reload.
     fn reload(&mut self, now: MonotonicNs) {
         let Some(Configuration { settings, .. }) = self.role.reload() else {
             return;
@@ -231,7 +231,7 @@ impl Egress {
         }
     }
 
-    /// Forwards what still waits, as far as the lane's mode allows, and accounts for the rest.
+    /// Forwards the samples that still wait, as far as the lane's mode allows, and accounts for the rest.
     fn shut_down(&mut self) {
         let began_at = clock::monotonic();
         match &mut self.forwarder {
@@ -246,8 +246,8 @@ impl Egress {
         }
         let give_up_at = began_at.plus_ms(LAST_SAMPLES_MS + LAST_ACKNOWLEDGEMENTS_MS);
         for output in &mut self.outputs {
-            let patience_ns = give_up_at.since(clock::monotonic());
-            if !output.wait_acknowledged(Duration::from_nanos(patience_ns)) {
+            let timeout_ns = give_up_at.since(clock::monotonic());
+            if !output.wait_acknowledged(Duration::from_nanos(timeout_ns)) {
                 warn!(
                     route = output.id(),
                     "a reader had not acknowledged the last samples when the lane shut down"
@@ -263,7 +263,7 @@ impl Egress {
     }
 }
 
-/// What the lane does, in a line for the service manager.
+/// Writes the status line of the lane for the service manager.
 fn describe(outputs: &[Output], mode: LaneMode, meters: &mut Meters, line: &mut String, now: MonotonicNs) {
     let sum = |count: fn(&LaneCounters) -> u64| outputs.iter().map(|output| count(output.counters())).sum();
     let offered_per_s = meters.offered.per_s(sum(LaneCounters::received), now);
@@ -272,10 +272,10 @@ fn describe(outputs: &[Output], mode: LaneMode, meters: &mut Meters, line: &mut 
     let _ = write!(line, "mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
     write_drops(line, outputs.iter().map(|output| &output.counters().drops));
     let without = outputs.iter().filter(|output| !output.has_writer());
-    write_list(line, "; type not known yet of route", without.map(Output::id));
+    write_list(line, "; type not known yet for route", without.map(Output::id));
 }
 
-/// What the policy board says to this lane.
+/// Follows this lane's policy on the policy board.
 struct PolicyWatch {
     lane: usize,
     name: LaneName,
@@ -299,8 +299,9 @@ impl PolicyWatch {
         }
     }
 
-    /// The mode that applies now. A policy that cannot be read at this instant is that of the last look.
-    fn look(&mut self, boards: &Boards, now: MonotonicNs) -> LaneMode {
+    /// Reads the policy board and returns the mode in force now. While the board cannot be read, the policy
+    /// of the last call applies.
+    fn update(&mut self, boards: &Boards, now: MonotonicNs) -> LaneMode {
         if let Some(policy) = boards.policy(self.lane) {
             self.policy = policy;
             self.epoch = policy.epoch;

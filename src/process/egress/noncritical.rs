@@ -1,4 +1,4 @@
-//! How a noncritical lane chooses: as many samples as its tokens allow, by the lane's drop policy.
+//! Noncritical lanes: forward as many samples as their tokens allow, chosen by the lane's drop policy.
 
 use super::super::arena::CopyArena;
 use super::Turn;
@@ -10,7 +10,7 @@ use crate::model::{DropReason, Durability, LaneMode, MonotonicNs};
 use crate::policy::{ByteBudget, Decision, RouteShaper, Stamps, TurnOrder};
 use crate::shm::ShmSample;
 
-/// A noncritical lane.
+/// Rate limits and queues of a noncritical lane.
 pub(super) struct Noncritical {
     rates: LaneRates,
     mode: LaneMode,
@@ -36,7 +36,7 @@ impl Noncritical {
         }
     }
 
-    /// Applies other rates. What waits goes on waiting, but for what has no place any more.
+    /// Applies other rates. Queued samples stay queued, except those beyond a new, shorter queue.
     pub fn set_rates(&mut self, rates: LaneRates, outputs: &mut [Output], now: MonotonicNs) {
         self.rates = rates;
         self.budget.set_mode(&rates, self.mode, now);
@@ -47,7 +47,7 @@ impl Noncritical {
         }
     }
 
-    /// Takes in what is there and forwards what the tokens allow.
+    /// Queues the samples that wait in shared memory and forwards as many as the tokens allow.
     pub fn step(
         &mut self,
         outputs: &mut [Output],
@@ -64,7 +64,7 @@ impl Noncritical {
             }
         }
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            take_in(shaper, output);
+            fill_queue(shaper, output);
         }
         let now = clock::monotonic();
         let now_wall = clock::wall();
@@ -97,7 +97,7 @@ impl Noncritical {
             output.set_queued(shaper.waiting());
         }
         if sent {
-            // More may have come meanwhile, for a token that is there.
+            // More samples may have arrived meanwhile, and tokens may be left.
             Turn::Busy
         } else if waits_for_sample {
             Turn::UntilWoken(token_at)
@@ -106,26 +106,26 @@ impl Noncritical {
         }
     }
 
-    /// Accounts for what still waits.
+    /// Drops and counts the samples that still wait.
     pub fn shut_down(&mut self, outputs: &mut [Output]) {
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            take_in(shaper, output);
+            fill_queue(shaper, output);
             shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(0);
         }
     }
 }
 
-/// Moves what waits in shared memory into the lane's own queue.
-fn take_in(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
+/// Moves the route's samples from the channel in shared memory to the lane's own queue.
+fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
     while let Some(sample) = output.take() {
         let stamps = Stamps::new(sample.header(), sample.payload().len() as u64);
         shaper.offer(sample, stamps, |dropped, _, reason| output.drop_sample(&dropped, reason));
     }
 }
 
-/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms), of which no
-/// sample is too old to matter and none replaces another: it is sent in order, at the lane's rate.
+/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms): its samples do
+/// not become stale and do not supersede each other, so they are sent in order, at the lane's rate.
 fn rates_of(lane: LaneRates, durability: Durability) -> LaneRates {
     let mut rates = lane;
     if durability == Durability::TransientLocal {

@@ -1,4 +1,4 @@
-//! One route on one lane: taking, handing over, accounting.
+//! One output: takes the samples of a route from shared memory, writes them to DDS, and accounts for them.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use tracing::{error, info, warn};
 use super::super::arena::CopyArena;
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
-use super::late_joiners::{Kept, LateJoiners};
+use super::late_joiners::{KeptSample, LateJoiners};
 use super::unsent::{Unsent, UnsentSamples};
 use crate::clock;
 use crate::config::{self, DropPolicy, Settings};
@@ -23,9 +23,9 @@ use crate::shm::{
     Stage, SubscriberRole, TakeError,
 };
 
-/// After a restart, how long the readers of the process before are waited for. A live one is matched again
-/// within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that is not back by
-/// then is taken to be gone.
+/// After a restart, how long the lane expects the readers of its predecessor to match again. A live one
+/// matches within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that has not
+/// matched by then counts as gone.
 const FORMER_READERS_MS: u64 = 5_000;
 
 /// What the account of a forwarded sample needs.
@@ -39,7 +39,7 @@ struct Forwarded {
     writer_sequence: i64,
 }
 
-/// One route on one lane.
+/// One output of a lane: the DDS writer of one route, and its account.
 pub(super) struct Output {
     id: String,
     lane: String,
@@ -49,12 +49,12 @@ pub(super) struct Output {
     qos: QosProfile,
     window_samples: usize,
     by_reference_min_bytes: usize,
-    /// What a gap in the sequence means while the lane forwards.
-    overwritten: DropReason,
-    /// What it means in the present mode.
+    /// The drop reason of a gap while the lane forwards.
+    overwrite_reason: DropReason,
+    /// The drop reason of a gap in the current mode.
     gap_reason: DropReason,
     mode: LaneMode,
-    /// Drops that are how the lane works.
+    /// Drop reasons that are normal operation of the lane and are not logged.
     expected_drops: &'static [DropReason],
     subscriber: SampleSubscriber,
     writer: Option<RawWriter>,
@@ -65,18 +65,19 @@ pub(super) struct Output {
     tracker: SequenceTracker,
     counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
-    /// Readers that the process before was matched with and this one is not yet. What is written meanwhile
-    /// does not reach them.
+    /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
+    /// receive the samples written until they match.
     former_readers: Vec<Guid>,
-    /// Samples published before this process came up were missed by its predecessor, not by it.
+    /// When this process opened the output. Samples published before were missed by its predecessor.
     started_at: MonotonicNs,
+    /// Whether a sample published since `started_at` has been taken.
     caught_up: bool,
-    /// Starts of ingress that this lane has seen.
+    /// Starts of ingress at the last housekeeping.
     ingress_starts: u64,
     shm: HistogramWriter,
     dds_out: HistogramWriter,
     age: HistogramWriter,
-    watch: DropWatch,
+    drop_watch: DropWatch,
     boards: Boards,
 }
 
@@ -93,7 +94,7 @@ impl Output {
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
         counters.update(|counters| {
-            // What waited in a process that was killed died with it.
+            // The samples that waited in a killed predecessor are lost with it.
             let accounted = counters.forwarded + counters.drops.total();
             counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
             counters.waiting = 0;
@@ -121,8 +122,8 @@ impl Output {
             qos: output.qos,
             window_samples: lane.window_samples,
             by_reference_min_bytes: lane.by_reference_min_bytes,
-            overwritten: overwritten(lane.class, lane.rates.normal.drop_policy),
-            gap_reason: overwritten(lane.class, lane.rates.normal.drop_policy),
+            overwrite_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
+            gap_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
             mode: LaneMode::Normal,
             expected_drops: expected_drops(lane.class),
             subscriber,
@@ -131,7 +132,7 @@ impl Output {
             queued: 0,
             late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
-            watch: DropWatch::new(former.drops),
+            drop_watch: DropWatch::new(former.drops),
             counters,
             readers,
             former_readers,
@@ -145,7 +146,7 @@ impl Output {
         };
         match &route.message_type {
             Some(message_type) => opened.make_writer(participant, &message_type.to_dds())?,
-            None => opened.find_type(participant),
+            None => opened.try_make_writer(participant),
         }
         Ok(opened)
     }
@@ -154,12 +155,12 @@ impl Output {
         &self.id
     }
 
-    /// What was done so far.
+    /// The counters so far.
     pub fn counters(&self) -> &LaneCounters {
         self.counters.get()
     }
 
-    /// Whether there is a DDS writer; there is none before the type is known.
+    /// Whether the DDS writer exists. It is created once the message type is known.
     pub fn has_writer(&self) -> bool {
         self.writer.is_some()
     }
@@ -168,21 +169,21 @@ impl Output {
         self.qos.durability
     }
 
-    /// The next sample that is not accounted for yet. What is missing before it is counted here; what was
-    /// forwarded before a restart is not returned, but for a TRANSIENT_LOCAL output it is written again,
-    /// because the new writer has to have it for late joiners.
+    /// Takes the next sample that is not accounted for yet, and counts the ones missing before it. Samples
+    /// that were forwarded before a restart are skipped; for a TRANSIENT_LOCAL output they are written again,
+    /// because the new writer needs them for late joiners.
     pub fn take(&mut self) -> Option<ShmSample> {
         loop {
             let sample = match self.subscriber.take() {
                 Ok(Some(sample)) => sample,
-                // At the limit nothing is lost: what waits goes on waiting.
+                // The borrow limit loses nothing: the samples stay in the channel.
                 Ok(None) | Err(TakeError::BorrowLimit) => return None,
                 Err(failure) => {
                     error!(
                         route = self.id,
                         lane = self.lane,
                         ?failure,
-                        "a sample in shared memory is unusable"
+                        "skipped an unusable sample in shared memory"
                     );
                     continue;
                 }
@@ -205,13 +206,13 @@ impl Output {
         }
     }
 
-    /// Hands a taken sample to DDS.
+    /// Writes a taken sample to DDS and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
         if self.writer.is_none() {
-            self.find_type(participant);
+            self.try_make_writer(participant);
         }
         if !self.former_readers.is_empty() {
-            // Between two housekeepings, readers may have been matched again.
+            // Former readers may have matched since the last housekeeping.
             self.follow_matching(clock::monotonic());
         }
         let Some(writer) = &self.writer else {
@@ -221,11 +222,11 @@ impl Output {
         let header = *sample.header();
         let bytes = sample.payload().len();
         let began_at = clock::monotonic();
-        // One borrow is left free, so that the next sample can be taken while all others are on their way.
+        // One borrow stays free, so that the next sample can be taken while DDS holds all others.
         let by_reference = bytes >= self.by_reference_min_bytes
             && self.subscriber.borrowed() < self.subscriber.max_borrowed();
         let payload = if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) };
-        let kept = self.late_joiners.as_ref().map(|_| Kept {
+        let kept = self.late_joiners.as_ref().map(|_| KeptSample {
             payload: Bytes::copy_from_slice(&payload),
             encapsulation: header.encapsulation,
             timestamp: header.source_timestamp,
@@ -248,7 +249,7 @@ impl Output {
             while let Some(sent) = unsent.pop_sent(sent_through) {
                 count_forwarded(counters, &sent);
             }
-            account(counters, &self.tracker);
+            record_sequence(counters, &self.tracker);
             match outcome {
                 Ok(written) if written.readers == 0 || !complete => {
                     counters.drops.add(DropReason::NoReader, 1);
@@ -276,32 +277,32 @@ impl Output {
         }
     }
 
-    /// Accounts for a taken sample that is not sent.
+    /// Counts a taken sample that is not sent.
     pub fn drop_sample(&mut self, _sample: &ShmSample, reason: DropReason) {
         self.counters.update(|counters| {
-            account(counters, &self.tracker);
+            record_sequence(counters, &self.tracker);
             counters.drops.add(reason, 1);
         });
     }
 
-    /// The lane applies another mode. One that forwards nothing takes samples at leisure, so most are
-    /// overwritten.
+    /// Applies another mode of the lane. A noncritical lane that forwards nothing takes samples only at
+    /// housekeeping, so most are overwritten in its channel queue; the mode is then the reason of these gaps.
     pub fn set_mode(&mut self, mode: LaneMode) {
         self.mode = mode;
         self.gap_reason = match (mode, self.class) {
             (LaneMode::Stopped, _) => DropReason::Stopped,
             (LaneMode::Suspended, TrafficClass::Noncritical) => DropReason::Suspended,
-            _ => self.overwritten,
+            _ => self.overwrite_reason,
         };
     }
 
-    /// The lane applies another drop policy.
+    /// Applies another drop policy of the lane.
     pub fn set_drop_policy(&mut self, policy: DropPolicy) {
-        self.overwritten = overwritten(self.class, policy);
+        self.overwrite_reason = overwrite_reason(self.class, policy);
         self.set_mode(self.mode);
     }
 
-    /// Counts what was sent since it was written; whether there is more to be sent.
+    /// Counts the samples that the DDS library has sent by now, and returns whether some are still unsent.
     pub fn count_sent(&mut self) -> bool {
         if self.unsent.len() == 0 {
             return false;
@@ -320,7 +321,7 @@ impl Output {
         self.unsent.len() > 0
     }
 
-    /// Counts what is still unsent when the lane ends.
+    /// Counts the unsent samples as dropped when the lane ends.
     pub fn drop_unsent(&mut self) {
         let unsent = self.unsent.clear() as u64;
         if unsent > 0 {
@@ -332,22 +333,23 @@ impl Output {
         }
     }
 
-    /// Shows how many taken samples wait in the lane for a token.
+    /// Records the number of taken samples that wait for a token.
     pub fn set_queued(&mut self, queued: usize) {
         self.queued = queued as u64;
         let waiting = self.queued + self.unsent.len() as u64;
         if self.counters.get().waiting != waiting || self.counters.get().last_sequence != self.tracker.last()
         {
             self.counters.update(|counters| {
-                account(counters, &self.tracker);
+                record_sequence(counters, &self.tracker);
                 counters.waiting = waiting;
             });
         }
     }
 
-    pub fn keep_house(&mut self, participant: &mut Participant, boards: &Boards, now: MonotonicNs) {
+    /// Creates the writer if its type is known by now, follows matching, serves late joiners, logs drops.
+    pub fn housekeeping(&mut self, participant: &mut Participant, boards: &Boards, now: MonotonicNs) {
         if self.writer.is_none() {
-            self.find_type(participant);
+            self.try_make_writer(participant);
         }
         if let Some(health) = boards.health(ProcessRole::Ingress) {
             self.ingress_starts = health.starts;
@@ -355,12 +357,13 @@ impl Output {
         self.follow_matching(now);
         self.record_readers(now);
         self.serve_late_joiners(now);
-        self.watch.look(&self.counters.get().drops, &self.id, &self.lane, self.expected_drops, now);
+        self.drop_watch.log_new(&self.counters.get().drops, &self.id, &self.lane, self.expected_drops, now);
     }
 
-    /// Whether all RELIABLE readers have acknowledged everything, or do within `patience`.
-    pub fn wait_acknowledged(&mut self, patience: Duration) -> bool {
-        self.writer.as_ref().is_none_or(|writer| writer.wait_acknowledged(patience))
+    /// Waits until all RELIABLE readers have acknowledged all samples, at most for `timeout`. Returns whether
+    /// they have.
+    pub fn wait_acknowledged(&mut self, timeout: Duration) -> bool {
+        self.writer.as_ref().is_none_or(|writer| writer.wait_acknowledged(timeout))
     }
 
     fn follow_matching(&mut self, now: MonotonicNs) {
@@ -389,15 +392,15 @@ impl Output {
                         lane = self.lane,
                         topic = self.dds_topic,
                         ?reader,
-                        "a reader asks for more than this lane offers and gets nothing: change its QoS or \
-                         the lane's"
+                        "a reader requests a stricter QoS than this lane offers and receives nothing: change \
+                         its QoS or the lane's"
                     );
                 }
             }
         }
     }
 
-    /// Shows the matched readers, and what single ones of them missed.
+    /// Writes the matched readers to their board, and counts the overruns of each.
     fn record_readers(&mut self, now: MonotonicNs) {
         if now >= self.started_at.plus_ms(FORMER_READERS_MS) {
             self.former_readers.clear();
@@ -405,9 +408,9 @@ impl Output {
         let Some(writer) = &self.writer else {
             return;
         };
-        let mut shown = OutputReaders::default();
+        let mut current = OutputReaders::default();
         let mut overrun = 0;
-        for (place, reader) in shown.records.iter_mut().zip(writer.matched_readers()) {
+        for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
             let former = self.readers.get().iter().find(|record| record.reader == reader.guid);
             overrun += reader.overrun.saturating_sub(former.map_or(0, |record| record.overrun));
             *place = ReaderRecord {
@@ -418,8 +421,8 @@ impl Output {
                 reliable: u64::from(reader.reliable),
             };
         }
-        if shown != *self.readers.get() {
-            self.readers.update(|readers| *readers = shown);
+        if current != *self.readers.get() {
+            self.readers.update(|readers| *readers = current);
         }
         if overrun > 0 {
             self.counters.update(|counters| counters.reader_overrun += overrun);
@@ -430,7 +433,7 @@ impl Output {
         let (Some(late_joiners), Some(writer)) = (&mut self.late_joiners, &self.writer) else {
             return;
         };
-        while let Some((reader, history)) = late_joiners.due(now) {
+        while let Some((reader, history)) = late_joiners.next_due(now) {
             for kept in history {
                 let written =
                     writer.write_to(reader, kept.payload.clone(), kept.encapsulation, kept.timestamp);
@@ -440,15 +443,15 @@ impl Output {
                         lane = self.lane,
                         ?reader,
                         %failure,
-                        "history not sent to a late joiner"
+                        "cannot send the history to a late joiner"
                     );
                 }
             }
         }
     }
 
-    /// Makes the writer if ingress knows the type by now.
-    fn find_type(&mut self, participant: &mut Participant) {
+    /// Creates the writer if ingress has recorded the type by now.
+    fn try_make_writer(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else {
             return;
         };
@@ -457,7 +460,7 @@ impl Output {
             return;
         }
         if let Err(failure) = self.make_writer(participant, dds_type) {
-            error!(route = self.id, lane = self.lane, dds_type, %failure, "no writer");
+            error!(route = self.id, lane = self.lane, dds_type, %failure, "cannot create the DDS writer");
         }
     }
 
@@ -470,13 +473,13 @@ impl Output {
             dds_type,
             reliability = ?self.qos.reliability,
             durability = ?self.qos.durability,
-            "writing"
+            "DDS writer created"
         );
         self.writer = Some(writer);
         Ok(())
     }
 
-    /// Counts samples that never came, by why they did not.
+    /// Counts the samples missing before `next`, by the reason why the lane did not get them.
     fn count_missing(&mut self, missing: u64, next: &SampleHeader) {
         let restarted = self.boards.health(ProcessRole::Ingress).is_some_and(|health| {
             health.starts != self.ingress_starts && next.published_at >= health.started_at
@@ -492,18 +495,18 @@ impl Output {
         };
         self.counters.update(|counters| {
             counters.first_sequence = self.tracker.first();
-            // The missing ones are accounted for with this; the one after them is not yet.
+            // This accounts for the missing samples, but not yet for `next`.
             counters.last_sequence = next.sequence - 1;
             counters.drops.add(reason, missing);
         });
     }
 
-    /// Writes what was forwarded before a restart once more, for late joiners.
+    /// Writes a sample that was forwarded before a restart again, for late joiners.
     fn restore(&mut self, sample: &ShmSample) {
         let header = sample.header();
         let payload = Bytes::copy_from_slice(sample.payload());
         if let Some(late_joiners) = &mut self.late_joiners {
-            late_joiners.keep(Kept {
+            late_joiners.keep(KeptSample {
                 payload,
                 encapsulation: header.encapsulation,
                 timestamp: header.source_timestamp,
@@ -511,7 +514,7 @@ impl Output {
         } else if let Some(writer) = &self.writer
             && let Err(failure) = writer.write(payload, header.encapsulation, header.source_timestamp)
         {
-            warn!(route = self.id, lane = self.lane, %failure, "history not restored after a restart");
+            warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
         }
     }
 }
@@ -527,15 +530,16 @@ fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
     counters.last_writer_sequence = sample.writer_sequence;
 }
 
-/// Brings the account up to the last sample taken.
-fn account(counters: &mut LaneCounters, tracker: &SequenceTracker) {
+/// Records the sequence numbers that are accounted for, up to the last sample taken.
+fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.first_sequence = tracker.first();
     counters.last_sequence = tracker.last();
 }
 
-/// A critical lane that misses samples was too slow. A noncritical one sleeps until it has a token, and what
-/// is overwritten meanwhile gave way as its drop policy has it.
-const fn overwritten(class: TrafficClass, policy: DropPolicy) -> DropReason {
+/// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too
+/// slow. A noncritical one sleeps until it has a token, and the drop policy decides which samples are lost
+/// meanwhile.
+const fn overwrite_reason(class: TrafficClass, policy: DropPolicy) -> DropReason {
     match (class, policy) {
         (TrafficClass::Critical, _) => DropReason::QueueOverflow,
         (TrafficClass::Noncritical, DropPolicy::DropOldest) => DropReason::Superseded,
@@ -543,6 +547,7 @@ const fn overwritten(class: TrafficClass, policy: DropPolicy) -> DropReason {
     }
 }
 
+/// The drop reasons that are normal operation of a lane of this class.
 const fn expected_drops(class: TrafficClass) -> &'static [DropReason] {
     match class {
         TrafficClass::Critical => &[DropReason::NoReader],

@@ -1,25 +1,25 @@
-//! The clocks of a route's publishers.
+//! Compares the clocks of a route's publishers with this computer's.
 
 use tracing::{info, warn};
 
 use crate::model::{AgeBasis, Guid, IngressCounters, MonotonicNs, SourceTimestamp, WallNs};
 use crate::policy::ClockOffset;
 
-/// Publishers whose clocks are held against ours on one route. With more, the one that has been silent
-/// longest is forgotten.
+/// The most publishers of one route whose clocks are compared. A further one replaces the one that has been
+/// silent longest.
 const PUBLISHERS: usize = 32;
 
-/// A publisher that has been silent for so long is no longer named.
-const NAMED_MS: u64 = 60_000;
+/// How long a silent publisher may still be reported as the one whose clock is off furthest.
+const REPORTED_MS: u64 = 60_000;
 
-/// How often a route logs that a clock disagrees.
+/// Shortest interval between two log lines of a route about its clocks.
 const LOG_MS: u64 = 30_000;
 
-/// The clock of each publisher of a route.
+/// The clock offset of each publisher of a route.
 pub(super) struct Clocks {
     route: String,
     publishers: Vec<(Guid, ClockOffset)>,
-    /// What was logged last.
+    /// The publisher that was logged last; `None` when all clocks agreed.
     logged: Option<Guid>,
     log_at: MonotonicNs,
 }
@@ -30,7 +30,7 @@ impl Clocks {
         Self { route: route.to_owned(), publishers, logged: None, log_at: MonotonicNs(0) }
     }
 
-    /// From when the age of a sample runs that arrived now. Allocates nothing.
+    /// Returns the basis of the age of a sample that arrived at `now`. Allocates nothing.
     pub fn observe(
         &mut self,
         writer: Guid,
@@ -58,11 +58,11 @@ impl Clocks {
         place
     }
 
-    /// Shows the publisher whose clock is off furthest, and logs it.
-    pub fn keep_house(&mut self, counters: &mut IngressCounters, now: MonotonicNs) {
+    /// Records the publisher whose clock is off furthest in `counters`, and logs a change.
+    pub fn housekeeping(&mut self, counters: &mut IngressCounters, now: MonotonicNs) {
         let off = self.publishers.iter().filter_map(|(writer, clock)| {
-            let is_named = clock.last_at().is_some_and(|at| now.since(at) < NAMED_MS * 1_000_000);
-            Some((*writer, clock.offset_ns().filter(|_| is_named)?))
+            let is_recent = clock.last_at().is_some_and(|at| now.since(at) < REPORTED_MS * 1_000_000);
+            Some((*writer, clock.offset_ns().filter(|_| is_recent)?))
         });
         let furthest = off.max_by_key(|(_, offset_ns)| offset_ns.unsigned_abs());
         (counters.clock_writer, counters.clock_offset_ns) = furthest.unwrap_or_default();
@@ -75,8 +75,8 @@ impl Clocks {
                     route = self.route,
                     %writer,
                     offset_s = -(offset_ns as f64) / 1e9,
-                    "a publisher's clock disagrees with this computer's: the age of its samples runs from their \
-                     arrival; synchronise the clocks (chrony, PTP)"
+                    "a publisher's clock disagrees with this computer's: the age of its samples runs from \
+                     their arrival; synchronise the clocks (chrony, PTP)"
                 ),
                 None => info!(route = self.route, "the clocks of all publishers agree with this computer's"),
             }
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn publishers_are_told_apart_and_their_number_is_bounded() {
+    fn each_publisher_has_its_own_offset_and_their_number_is_bounded() {
         let mut clocks = Clocks::new("scan");
         let at = |ms: u64| (MonotonicNs(0).plus_ms(ms), WallNs(1_763_000_000_000_000_000 + ms * 1_000_000));
         let mut observe = |writer: u8, ms: u64, behind_ms: u64| {
@@ -104,9 +104,9 @@ mod tests {
         assert_eq!(observe(1, 3_000, 1), AgeBasis::SOURCE);
         assert_eq!(observe(2, 3_000, 5_000).late_ns(), Some(0));
         let mut counters = IngressCounters::default();
-        clocks.keep_house(&mut counters, at(3_000).0);
+        clocks.housekeeping(&mut counters, at(3_000).0);
         assert_eq!((counters.clock_writer, counters.clock_offset_ns), (Guid([2; 16]), 5_000_000_000));
-        clocks.keep_house(&mut counters, at(63_001).0);
+        clocks.housekeeping(&mut counters, at(63_001).0);
         assert_eq!((counters.clock_writer, counters.clock_offset_ns), (Guid::default(), 0));
         for writer in 0..=255 {
             let (now, wall) = at(4_000 + u64::from(writer));

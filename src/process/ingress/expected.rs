@@ -1,16 +1,17 @@
-//! The sample that critical lanes get up for before it has been taken.
+//! Wakes critical lanes before ingress has finished receiving a sample, at most once for each sample.
 //!
-//! The thread that receives takes samples and counts its turns; it or the lookout tells of them.
+//! The receiving thread or the lookout wakes the lanes; the receiving thread takes the samples and counts its
+//! turns.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Of a sample in fragments, what may be yet to come when the lanes are told. A fragment of 64 KiB takes some
-/// 30 µs, about as long as a lane takes to get up; more would be longer than a lane that is told stays up.
+/// The most bytes of a fragmented sample that may be missing when the lanes are woken. A fragment of 64 KiB
+/// takes some 30 µs, about as long as a lane takes to wake up; a woken lane does not stay awake for more.
 const LEFT_BYTES: usize = 64 << 10;
-/// Turns until the rest of it must have come: one for each datagram, and the smallest fragments that
-/// publishers send by themselves have 1.3 KB.
+/// Turns within which the missing fragments must arrive: one for each datagram, and the smallest fragments
+/// that publishers choose by default have 1.3 KB.
 const TURNS: u64 = 64;
-/// The same for a whole sample: the turn of its own, and one that was under way when the lookout told of it.
+/// The same for a whole sample: its own turn, and one that was under way when the lookout woke the lanes.
 const TURNS_WHOLE: u64 = 1;
 
 const NONE: u64 = u64::MAX;
@@ -18,10 +19,10 @@ const IN_VAIN: u64 = u64::MAX - 1;
 /// Below the route's number are the turns that are left.
 const ROUTE_SHIFT: u32 = 32;
 
-/// Which route's lanes were told of a sample that is yet to be taken.
+/// The route whose lanes were woken for a sample that is not taken yet.
 pub(super) struct Expected {
-    /// The route and the turns that are left; [`NONE`], or [`IN_VAIN`] when no sample came of what they
-    /// were told. Anybody may put a route where there is none; only the receiving thread changes one.
+    /// The route and the turns that are left; [`NONE`]; or [`IN_VAIN`] if the lanes were woken and no sample
+    /// followed. Any thread may replace `NONE` with a route; only the receiving thread changes a route.
     told: AtomicU64,
 }
 
@@ -30,14 +31,14 @@ impl Expected {
         Self { told: AtomicU64::new(NONE) }
     }
 
-    /// Whether [`tell`](Self::tell) would say yes, unless somebody is faster.
+    /// Whether [`tell`](Self::tell) would return true, unless another thread calls it first.
     pub fn may_tell(&self, left_bytes: usize) -> bool {
         left_bytes <= LEFT_BYTES && self.told.load(Ordering::Relaxed) == NONE
     }
 
-    /// Whether the lanes of `route` may be told of a sample that misses `left_bytes` yet: then they were
-    /// told, and are not told again before a sample has come, of whatever critical route: datagrams that only
-    /// look like samples wake no lane again and again.
+    /// Claims the early wake-up of the lanes of `route`, for a sample of which `left_bytes` are missing.
+    /// Returns whether the caller may wake them. The next claim succeeds only after a sample of a critical
+    /// route was taken, so that datagrams that only look like samples do not wake lanes repeatedly.
     pub fn tell(&self, route: usize, left_bytes: usize) -> bool {
         if left_bytes > LEFT_BYTES {
             return false;
@@ -47,20 +48,20 @@ impl Expected {
         self.told.compare_exchange(NONE, told, Ordering::AcqRel, Ordering::Relaxed).is_ok()
     }
 
-    /// `route` has a sample to take; whether its lanes are yet to be told.
+    /// Ends the claim, as `route` has a sample to take. Returns whether its lanes still have to be woken.
     pub fn came(&self, route: usize) -> bool {
         self.told.swap(NONE, Ordering::AcqRel) >> ROUTE_SHIFT != route as u64
     }
 
-    /// What `route` had was taken; the lookout may have told of it after [`came`](Self::came).
+    /// Ends a claim that the lookout made after [`came`](Self::came) for a sample that has been taken by now.
     pub fn came_meanwhile(&self, route: usize) {
         if self.told.load(Ordering::Relaxed) >> ROUTE_SHIFT == route as u64 {
             self.told.store(NONE, Ordering::Release);
         }
     }
 
-    /// A turn has taken what there was. What has not come by now may never come, and the lanes, which sleep
-    /// again, are to be told when the next one is taken.
+    /// Counts a turn. If the sample does not arrive within the allowed turns, it may never arrive; the lanes,
+    /// which sleep again by then, are woken when the next sample is taken.
     pub fn turn_ends(&self) {
         let told = self.told.load(Ordering::Relaxed);
         if told == NONE || told == IN_VAIN {

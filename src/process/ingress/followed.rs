@@ -1,4 +1,4 @@
-//! The high-water marks of a route's publishers, for threads that do not have the route.
+//! The high-water marks of a route's publishers, readable without the lock of the route.
 
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
@@ -6,9 +6,9 @@ use crate::model::{Guid, MAX_PUBLISHERS};
 
 /// The highest sequence number taken of each publisher.
 ///
-/// The thread that has the route writes; any thread may read meanwhile, without a lock. One that reads in the
-/// instant in which a publisher takes the place of another may mistake it for a third: a lane wakes for
-/// nothing, or only when the sample is published.
+/// The thread that holds the route's lock writes; any thread may read meanwhile, without a lock. A read while
+/// a publisher replaces another may see a mix of both, so that a lane is woken in vain, or only when the
+/// sample is published.
 pub(super) struct Followed {
     marks: [Mark; MAX_PUBLISHERS],
 }

@@ -1,4 +1,4 @@
-//! One route in ingress: its readers, its pool, its counters.
+//! The input of one route in ingress: its DDS readers, its pool, its counters.
 
 use std::sync::Arc;
 
@@ -10,8 +10,8 @@ use super::super::watch::DropWatch;
 use super::clocks::Clocks;
 use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
-use super::publishers::{Publishers, Standing};
-use super::source::{Source, Wanted, label};
+use super::publishers::{Publishers, SequenceCheck};
+use super::source::{ReaderPlan, Source, label};
 use crate::clock;
 use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
@@ -21,10 +21,10 @@ use crate::model::{
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
-/// How often a route without a publisher says so.
+/// Interval at which a route without a publisher logs that it waits.
 const REMIND_MS: u64 = 30_000;
 
-/// One route in ingress.
+/// The input of one route: takes samples from its DDS readers and publishes them to shared memory.
 pub(super) struct Input {
     id: String,
     dds_topic: String,
@@ -33,12 +33,12 @@ pub(super) struct Input {
     source: Source,
     inbox: Inbox,
     /// The reader of the RELIABLE publishers, or of all where the configuration says RELIABLE.
-    reliable: Option<Reading>,
+    reliable: Option<ActiveReader>,
     /// The reader of the BEST_EFFORT publishers, or of all where the configuration says BEST_EFFORT.
-    best_effort: Option<Reading>,
-    /// The type that the lanes have writers for: once read, it stays.
+    best_effort: Option<ActiveReader>,
+    /// The type of the first reader. It never changes, because the lanes have writers of it.
     settled_type: Option<String>,
-    /// Whether the publishers have changed since the reader was last thought over.
+    /// Whether the publishers have changed since `connect` last chose the readers.
     source_changed: bool,
     pool: PoolOwner,
     counters: BoardWriter<IngressCounters>,
@@ -46,18 +46,19 @@ pub(super) struct Input {
     dds_in: HistogramWriter,
     clocks: Clocks,
     publishers: Publishers,
-    watch: DropWatch,
+    drop_watch: DropWatch,
     remind_at: MonotonicNs,
+    /// The type conflict that was logged last.
     conflict: Option<(String, String)>,
 }
 
-/// One reader of the inbox.
-struct Reading {
-    reader: Guid,
+/// A DDS reader in the inbox.
+struct ActiveReader {
+    guid: Guid,
     qos: ReaderQos,
-    /// Publishers matched.
+    /// The number of matched publishers.
     writers: u64,
-    /// Whether its last publisher is gone.
+    /// Whether all its publishers are gone.
     idle: bool,
 }
 
@@ -78,7 +79,7 @@ impl Input {
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
-            watch: DropWatch::new(counters.get().drops),
+            drop_watch: DropWatch::new(counters.get().drops),
             counters,
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
@@ -90,17 +91,18 @@ impl Input {
         })
     }
 
-    /// Whether a publisher was found and is read.
+    /// Whether there is a reader for at least one publisher.
     pub fn is_connected(&self) -> bool {
-        self.readings().any(|reading| !reading.idle)
+        self.readers().any(|reader| !reader.idle)
     }
 
-    /// Whether a sample has come of each publisher that wrote until the predecessor of this process died.
+    /// Whether each publisher that wrote until the predecessor of this process died has sent a sample to this
+    /// process, or is gone.
     pub fn has_resumed(&self) -> bool {
         self.publishers.have_resumed()
     }
 
-    /// What was done so far.
+    /// The counters so far.
     pub fn counters(&self) -> &IngressCounters {
         self.counters.get()
     }
@@ -110,8 +112,8 @@ impl Input {
         &self.route.input_topic
     }
 
-    /// Takes one sample and publishes it; whether there was one. `wake` wakes the lanes. When there was none
-    /// the bell is silent, and rings at the next arrival.
+    /// Takes one sample and publishes it; `wake` wakes the lanes. Returns whether there was a sample. If not,
+    /// the bell is silent until the next arrival.
     pub fn step(&mut self, wake: impl FnOnce()) -> bool {
         let pool = &self.pool;
         let mut received: Option<(Filled, Encapsulation)> = None;
@@ -124,7 +126,7 @@ impl Input {
                 Some((filled, encapsulation)) => {
                     self.publish(filled, encapsulation, origin, wake);
                 }
-                // The library says that there was a sample and gave none; it has no such path today.
+                // The library returned a sample without its payload; it has no such path today.
                 None => self.count_malformed(),
             },
             Take::Malformed => self.count_malformed(),
@@ -146,10 +148,10 @@ impl Input {
     ) {
         let taken_at = clock::monotonic();
         let taken_at_wall = clock::wall();
-        let place = match self.publishers.standing(origin.writer, origin.sequence, taken_at) {
-            Standing::Next(place) => Some(place),
-            Standing::Unmarked => None,
-            Standing::Repeated(place) => {
+        let place = match self.publishers.check(origin.writer, origin.sequence, taken_at) {
+            SequenceCheck::New(place) => Some(place),
+            SequenceCheck::Unmarked => None,
+            SequenceCheck::Repeated(place) => {
                 self.publishers.update(place, &mut self.counters, |counters, account| {
                     counters.repeated += 1;
                     account.repeated += 1;
@@ -177,8 +179,8 @@ impl Input {
             }
             counters.published
         };
-        // Counted before it is published: a process that dies in between leaves a hole in the sequence, which
-        // the lanes count, and neither two samples of one number nor one sample published twice.
+        // Counted before it is published: if the process dies in between, the lanes see a gap and count it.
+        // The other order could publish two samples with one sequence number, or one sample twice.
         let sequence = match place {
             Some(place) => self.publishers.update(place, &mut self.counters, |counters, account| {
                 let lost = account.take(origin.sequence, taken_at);
@@ -221,14 +223,14 @@ impl Input {
         });
     }
 
-    /// Discovery knows a writer; whatever its topic.
+    /// Handles a discovered writer. Ignores writers of other topics.
     pub fn writer_found(&mut self, writer: &Endpoint) {
         if writer.topic != self.dds_topic {
             return;
         }
         self.source_changed = true;
-        self.publishers.found(writer.guid);
-        if self.source.found(writer) {
+        self.publishers.writer_found(writer.guid);
+        if self.source.insert(writer) {
             info!(
                 route = self.id,
                 topic = self.dds_topic,
@@ -239,60 +241,61 @@ impl Input {
         }
     }
 
-    /// A participant is gone, and with it its writers.
+    /// Handles the loss of a participant, and with it of its writers.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
-        self.source_changed |= self.source.participant_gone(prefix);
+        self.source_changed |= self.source.remove_participant(prefix);
         self.publishers.participant_gone(prefix);
     }
 
-    /// A writer is gone; whatever its topic.
+    /// Handles the loss of a writer. The writer may be of any topic.
     pub fn writer_gone(&mut self, guid: Guid) {
-        self.source.gone(guid);
-        self.publishers.gone(guid);
+        self.source.remove(guid);
+        self.publishers.writer_gone(guid);
         self.source_changed = true;
     }
 
-    /// Connects to the publisher, attends to lanes that came, logs.
-    pub fn keep_house(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
+    /// Creates and removes readers, connects new lanes, updates the boards, and logs.
+    pub fn housekeeping(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
         self.connect(participant, now)?;
         self.follow_matching();
-        self.pool.attend();
+        self.pool.housekeeping();
         self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();
-        self.clocks.keep_house(&mut counters, now);
+        self.clocks.housekeeping(&mut counters, now);
         if counters != *self.counters.get() {
-            self.counters.update(|present| *present = counters);
+            self.counters.update(|current| *current = counters);
         }
-        self.watch.look(&self.counters.get().drops, &self.id, "ingress", &[], now);
+        self.drop_watch.log_new(&self.counters.get().drops, &self.id, "ingress", &[], now);
         Ok(())
     }
 
+    /// Creates the readers that the discovered publishers need, and removes the others.
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
         if self.is_connected() && !std::mem::take(&mut self.source_changed) {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
         if let Some(dds_type) = known_type
-            && let Some(other) = self.source.of_other_type(dds_type)
+            && let Some(other) = self.source.find_other_type(dds_type)
         {
             let conflict = (dds_type.to_owned(), other.dds_type.clone());
             self.report_conflict(conflict);
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
-        let wanted = self.source.wanted(known_type, &self.route.input_qos, self.route.max_sample_bytes);
-        match wanted {
-            Wanted::Readers { dds_type, reliable, best_effort } => {
-                // First this one: until it is there, the BEST_EFFORT reader takes what a RELIABLE publisher
-                // writes that has just joined BEST_EFFORT ones.
-                self.adapt(participant, Reliability::Reliable, &dds_type, reliable)?;
-                self.adapt(participant, Reliability::BestEffort, &dds_type, best_effort)
+        let plan = self.source.plan(known_type, &self.route.input_qos, self.route.max_sample_bytes);
+        match plan {
+            ReaderPlan::Readers { dds_type, reliable, best_effort } => {
+                // The RELIABLE reader first: until it exists, the BEST_EFFORT reader takes the samples of a
+                // RELIABLE publisher that has joined BEST_EFFORT ones.
+                self.update_reader(participant, Reliability::Reliable, &dds_type, reliable)?;
+                self.update_reader(participant, Reliability::BestEffort, &dds_type, best_effort)
             }
-            Wanted::TypeConflict(one, other) => {
+            ReaderPlan::TypeConflict(one, other) => {
                 self.report_conflict((one, other));
                 Ok(())
             }
-            Wanted::Unknown => {
+            ReaderPlan::Unknown => {
                 self.retire(participant, Reliability::Reliable);
                 self.retire(participant, Reliability::BestEffort);
                 if now >= self.remind_at {
@@ -309,58 +312,60 @@ impl Input {
         }
     }
 
-    /// Brings the reader of that reliability in line with what is wanted.
-    fn adapt(
+    /// Creates, replaces or retires the reader of this reliability, so that it matches `required`.
+    fn update_reader(
         &mut self,
         participant: &mut Participant,
         reliability: Reliability,
         dds_type: &str,
-        wanted: Option<ReaderQos>,
+        required: Option<ReaderQos>,
     ) -> Result<(), RoleError> {
-        let Some(qos) = wanted else {
+        let Some(qos) = required else {
             self.retire(participant, reliability);
             return Ok(());
         };
-        if let Some(current) = self.reading_mut(reliability) {
-            // A reader that asks for less than all publishers offer is matched with each of them, and to
-            // replace it would lose samples. But what a TRANSIENT_LOCAL publisher wrote before, it sends only
-            // to a reader that asks for it.
+        if let Some(current) = self.reader_mut(reliability) {
+            // A reader that requests less than all publishers offer matches each of them, and to replace it
+            // would lose samples. But a TRANSIENT_LOCAL publisher sends its history only to a reader that is
+            // TRANSIENT_LOCAL itself, so an idle VOLATILE reader is replaced.
             let idle = std::mem::take(&mut current.idle);
             if current.qos.durability <= qos.durability && !(idle && current.qos.durability < qos.durability)
             {
                 return Ok(());
             }
         }
-        self.read(participant, dds_type, qos)
+        self.create_reader(participant, dds_type, qos)
     }
 
-    /// The last publisher of the reader is gone. The next one begins as soon as it finds a reader, so a
-    /// RELIABLE reader stays for it. Behind a BEST_EFFORT one the first samples of a RELIABLE publisher would
-    /// not be repaired, and beside a RELIABLE one its publishers would send everything twice.
+    /// Makes the reader idle when it has no publisher any more. A RELIABLE reader stays, because the next
+    /// publisher sends as soon as it discovers a reader. A BEST_EFFORT one is removed: alone, it would not
+    /// recover lost first samples of a RELIABLE publisher; beside a RELIABLE reader, it would make that
+    /// publisher send each sample twice.
     fn retire(&mut self, participant: &mut Participant, reliability: Reliability) {
-        if let Some(reading) = self.reading_mut(reliability) {
-            reading.idle = true;
+        if let Some(reader) = self.reader_mut(reliability) {
+            reader.idle = true;
             if reliability == Reliability::BestEffort {
-                self.disconnect(participant, reliability);
+                self.remove_reader(participant, reliability);
             }
         }
     }
 
-    fn read(
+    /// Creates the reader of the reliability in `qos`, in place of the present one.
+    fn create_reader(
         &mut self,
         participant: &mut Participant,
         dds_type: &str,
         qos: ReaderQos,
     ) -> Result<(), RoleError> {
-        self.disconnect(participant, qos.reliability);
-        // Before the reader: a lane must be able to make its writer before the first sample reaches it.
+        self.remove_reader(participant, qos.reliability);
+        // Before the reader is created: a lane must be able to create its writer before it gets a sample.
         self.info.update(|info| info.dds_type = FixedText::new(dds_type));
         let topic = self.dds_topic.as_str();
         let reader = match qos.reliability {
             Reliability::Reliable => {
                 participant.create_reader_after(topic, dds_type, &qos, self.publishers.marks())?
             }
-            // A BEST_EFFORT reader takes by time, not by number.
+            // A BEST_EFFORT reader takes what arrives from now on; it cannot request earlier samples.
             Reliability::BestEffort if self.reliable.is_none() => {
                 participant.create_reader(topic, dds_type, &qos)?
             }
@@ -372,7 +377,7 @@ impl Input {
             dds_type,
             qos = label(qos.reliability, qos.durability),
             depth = qos.depth,
-            "reading"
+            "DDS reader created"
         );
         if qos.reliability == Reliability::Reliable {
             for other in self.inbox.readers() {
@@ -380,68 +385,70 @@ impl Input {
             }
         }
         self.settled_type = Some(dds_type.to_owned());
-        *self.place(qos.reliability) = Some(Reading { reader: reader.guid(), qos, writers: 0, idle: false });
+        *self.reader_of(qos.reliability) =
+            Some(ActiveReader { guid: reader.guid(), qos, writers: 0, idle: false });
         self.inbox.add(reader);
         self.lend_memory();
         Ok(())
     }
 
-    /// Lets go of the readers, which the DDS library wants gone before the participant.
+    /// Drops the readers, which the DDS library requires before the participant is dropped.
     pub fn close(&mut self) {
-        for reading in [self.reliable.take(), self.best_effort.take()].into_iter().flatten() {
-            drop(self.inbox.remove(reading.reader));
+        for reader in [self.reliable.take(), self.best_effort.take()].into_iter().flatten() {
+            drop(self.inbox.remove(reader.guid));
         }
     }
 
-    fn disconnect(&mut self, participant: &mut Participant, reliability: Reliability) {
-        if let Some(former) = self.place(reliability).take() {
-            drop(self.inbox.remove(former.reader));
-            participant.forget(former.reader);
+    fn remove_reader(&mut self, participant: &mut Participant, reliability: Reliability) {
+        if let Some(former) = self.reader_of(reliability).take() {
+            drop(self.inbox.remove(former.guid));
+            participant.forget(former.guid);
             self.lend_memory();
         }
     }
 
-    /// Lends the readers the pool's memory. It is lent by topic, and a reader that goes ends it.
+    /// Lends the pool's memory to the readers. The DDS library keeps one lender per topic and drops it with
+    /// any of the topic's readers, so this is done again after each change.
     fn lend_memory(&self) {
         for reader in self.inbox.readers() {
             reader.lend_memory(self.pool.lender());
         }
     }
 
-    fn place(&mut self, reliability: Reliability) -> &mut Option<Reading> {
+    fn reader_of(&mut self, reliability: Reliability) -> &mut Option<ActiveReader> {
         match reliability {
             Reliability::Reliable => &mut self.reliable,
             Reliability::BestEffort => &mut self.best_effort,
         }
     }
 
-    fn reading_mut(&mut self, reliability: Reliability) -> Option<&mut Reading> {
-        self.place(reliability).as_mut()
+    fn reader_mut(&mut self, reliability: Reliability) -> Option<&mut ActiveReader> {
+        self.reader_of(reliability).as_mut()
     }
 
-    fn readings(&self) -> impl Iterator<Item = &Reading> {
+    fn readers(&self) -> impl Iterator<Item = &ActiveReader> {
         [&self.reliable, &self.best_effort].into_iter().flatten()
     }
 
-    /// Publishers matched. A RELIABLE one that the BEST_EFFORT reader has matched before there was a RELIABLE
-    /// reader counts once.
+    /// The number of matched publishers. A RELIABLE one that the BEST_EFFORT reader matched before there was
+    /// a RELIABLE reader counts once.
     fn matched_writers(&self) -> u64 {
         match (&self.reliable, &self.best_effort) {
             (Some(reliable), Some(best_effort)) => {
                 reliable.writers + best_effort.writers.min(self.source.best_effort_writers())
             }
-            _ => self.readings().map(|reading| reading.writers).sum(),
+            _ => self.readers().map(|reader| reader.writers).sum(),
         }
     }
 
     fn follow_matching(&mut self) {
         for reader in self.inbox.readers() {
-            let mut readings = [&mut self.reliable, &mut self.best_effort].into_iter().flatten();
-            let Some(reading) = readings.find(|reading| reading.reader == reader.guid()) else { continue };
+            let mut active = [&mut self.reliable, &mut self.best_effort].into_iter().flatten();
+            let Some(active) = active.find(|active| active.guid == reader.guid()) else { continue };
             while let Some(event) = reader.poll_event() {
                 match event {
-                    ReaderEvent::Matched { writers } => reading.writers = writers,
-                    // The other reader has it.
+                    ReaderEvent::Matched { writers } => active.writers = writers,
+                    // The RELIABLE reader does not match a BEST_EFFORT publisher; the other reader does.
                     ReaderEvent::Incompatible { writer }
                         if self.route.input_qos.reliability.is_none()
                             && self.source.reliability_of(writer) != Some(Reliability::Reliable) => {}
@@ -449,8 +456,9 @@ impl Input {
                         warn!(
                             route = self.id,
                             ?writer,
-                            asked = label(reading.qos.reliability, reading.qos.durability),
-                            "a publisher offers less than the reader asks for: leave qos_overrides.input open"
+                            asked = label(active.qos.reliability, active.qos.durability),
+                            "a publisher offers a weaker QoS than the reader requests, so its samples are \
+                             not received: remove or relax qos_overrides.input of the topic"
                         );
                     }
                 }

@@ -1,8 +1,8 @@
-//! The lookout: a thread that sees datagrams as they come and gets the critical lanes up.
+//! The lookout: a thread that wakes critical lanes as soon as a datagram arrives.
 //!
-//! The kernel wakes it right after the thread that receives. A lane that it gets up has left its sleep by
-//! the time that the sample is in shared memory, and the receiving thread has no system call to make for it.
-//! It takes nothing and holds nothing up; what it misses is told by the receiving thread, as without it.
+//! The kernel wakes it right after the receiving thread. A lane that it wakes is awake by the time that the
+//! sample is in shared memory, and saves the receiving thread a system call. The lookout consumes no
+//! datagram and delays none; for datagrams that it misses, the receiving thread wakes the lanes.
 //! `docs/decisions/0013-lookout.md` has the measurements.
 
 use std::sync::Arc;
@@ -18,22 +18,22 @@ use crate::config::Settings;
 use crate::dds::{Arrival, Arrivals, ArrivalsCloser, Participant};
 use crate::model::TrafficClass;
 
-/// How long it looks away after a datagram that it told nobody of: heartbeats, parts of large samples, what
-/// no critical lane has. Twice as long after each further one, so that of a stream of them some 300 a second
-/// are looked at.
+/// How long the lookout sleeps after a datagram for which it woke no lane: a heartbeat, a part of a large
+/// sample, or a sample that no critical lane serves. The time doubles after each further one, so that the
+/// lookout checks some 300 of them per second.
 const LOOKS_AWAY: Duration = Duration::from_micros(200);
 const LOOKS_AWAY_AT_MOST: Duration = Duration::from_micros(3_200);
 
-/// The thread; it ends when this is dropped.
+/// Handle of the lookout thread, which ends when this is dropped.
 pub(super) struct Lookout {
     closer: ArrivalsCloser,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Lookout {
-    /// None unless ingress is pinned, and each critical lane to other CPUs. A lane that stays up for a sample
-    /// on the CPU on which the sample is to be received would only hold it up, and without pins on two CPUs
-    /// it did: the hop took 11 µs longer at 1 kHz.
+    /// Starts the thread if ingress is pinned, and each critical lane to other CPUs; else returns `None`. A
+    /// lane that waits awake on the CPU that receives the sample delays it: without pinning, on two CPUs, the
+    /// hop took 11 µs longer at 1 kHz.
     pub fn start(participant: &Participant, receiving: &Arc<Receiving>, settings: &Settings) -> Option<Self> {
         let cpus = apart(settings)?;
         let start = || {
@@ -48,7 +48,9 @@ impl Lookout {
             let thread = thread::Builder::new().name("lookout".to_owned()).spawn(look_out)?;
             Ok(Self { closer, thread: Some(thread) })
         };
-        start().inspect_err(|error: &RoleError| warn!(%error, "no lookout: critical lanes get up later")).ok()
+        start()
+            .inspect_err(|error: &RoleError| warn!(%error, "no lookout: critical lanes wake up later"))
+            .ok()
     }
 }
 
@@ -56,13 +58,13 @@ impl Drop for Lookout {
     fn drop(&mut self) {
         self.closer.close();
         if let Some(thread) = self.thread.take() {
-            // It has nothing that could be lost.
+            // The thread has no result, so a panic of it is ignored.
             let _ = thread.join();
         }
     }
 }
 
-/// The CPUs of the critical lanes, if ingress has none of them.
+/// The CPUs of the critical lanes, if ingress is pinned to others.
 fn apart(settings: &Settings) -> Option<Vec<usize>> {
     let ingress = &settings.ingress_scheduling.cpus;
     let mut cpus = Vec::new();
@@ -80,7 +82,8 @@ fn run(arrivals: &Arrivals, receiving: &Receiving) {
     let mut looks_away = LOOKS_AWAY;
     loop {
         let told = match arrivals.wait() {
-            // While more of it is to come its publisher sends, on this CPU perhaps, and is not to be held up.
+            // Only for the last fragment: until then the publisher still sends, perhaps on this CPU, and must
+            // not be preempted.
             Arrival::Sample { writer, sequence, left_bytes: 0 } => {
                 receiving.expect(writer, sequence, 0, receiving.cpu())
             }

@@ -1,8 +1,8 @@
-//! Ingress: takes every sample of every route from DDS and publishes it once into shared memory.
+//! Ingress: takes every sample of every route from DDS and publishes it once to shared memory.
 //!
-//! Nothing here waits for a lane: a full queue overwrites its oldest sample, and a wake-up is not waited for.
-//! Samples are taken on the DDS library's receiving thread ([`receiving`]); the main thread keeps house, and
-//! a third one gets the critical lanes up meanwhile ([`lookout`]).
+//! Ingress never waits for a lane: a full queue overwrites its oldest sample, and waking a lane does not
+//! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
+//! does the housekeeping; a third thread wakes critical lanes early ([`lookout`]).
 
 mod clocks;
 mod expected;
@@ -35,53 +35,54 @@ use input::Input;
 use lookout::Lookout;
 use receiving::{Receiving, ServedLane};
 
-/// At a shutdown, how long ingress goes on taking what DDS has received, and what still comes.
+/// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
 const LAST_SAMPLES_MS: u64 = 200;
 
-/// While a route still waits for its publisher, discovery is looked at this often: what the publisher sends
-/// before the reader exists is lost to a VOLATILE reader.
+/// Interval of housekeeping while a route has no publisher. It is short, because a VOLATILE reader loses the
+/// samples that the publisher sends before the reader exists.
 const SEARCHING_MS: u64 = 10;
 
-/// How long at most the publishers retain what they wrote while no ingress ran: the reader of a killed
-/// predecessor, which acknowledges nothing, also holds up a publisher whose history is full.
+/// After a restart, how long at most the participant of a killed predecessor is kept. Until it is disposed
+/// of, publishers retain the samples that they wrote while no ingress ran; but its reader, which acknowledges
+/// nothing, also blocks a publisher whose history is full.
 const RESUME_MS: u64 = 1_000;
 
-/// The same once the first of these samples has come of each publisher: as one request names 256 samples, the
-/// others may take two or three more.
+/// The same once each publisher has sent the first of these samples. One request names 256 samples, so the
+/// remaining ones may take two or three more requests.
 const RESUMED_MS: u64 = 200;
 
-/// Runs ingress until `stop` is requested. Of what a reload changes, nothing concerns ingress.
+/// Runs ingress until `stop` is requested. No reloadable setting concerns ingress.
 ///
 /// # Errors
-/// Ingress is served already, or shared memory or DDS cannot be had.
+/// Another process serves ingress, or shared memory or DDS cannot be opened.
 pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Result<(), RoleError> {
     let mut ingress = Ingress::open(settings, reloads)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     while !stop.is_requested() {
         ingress.sleep();
-        if let Err(error) = ingress.keep_house(clock::monotonic()) {
+        if let Err(error) = ingress.housekeeping(clock::monotonic()) {
             tracing::error!(%error, "housekeeping failed");
         }
     }
     ingress.role.stopping();
-    // What DDS has received by now still goes on its way; a publisher that goes on does not hold us up.
+    // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
-    while ingress.receiving.turn_patiently() && clock::monotonic() < give_up_at {}
+    while ingress.receiving.turn_blocking() && clock::monotonic() < give_up_at {}
     info!("ingress is done");
     Ok(())
 }
 
 struct Ingress {
-    /// Before the participant, whose ports it has, too.
+    /// Before the participant, whose sockets it watches.
     _lookout: Option<Lookout>,
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
     /// Turns of the receiving thread at the last housekeeping.
     turns_seen: u64,
-    /// Whether samples have come of each publisher that wrote until the predecessor died.
+    /// Whether each publisher that wrote until the predecessor died has sent a sample to this process.
     has_resumed: bool,
-    /// When the participant of a killed predecessor is disposed of at the latest.
+    /// The latest time to dispose of the participant of a killed predecessor.
     resume_until: MonotonicNs,
     housekeeping_at: MonotonicNs,
     received: Meter,
@@ -89,8 +90,9 @@ struct Ingress {
 
 impl Drop for Ingress {
     fn drop(&mut self) {
-        // Its thread has the routes, too, and the library wants readers gone before their participant.
-        let Ok(_) = self.receiving.visit::<std::convert::Infallible>(|input| {
+        // The participant's thread shares the inputs, and the library requires that readers are dropped
+        // before their participant.
+        let Ok(_) = self.receiving.for_each_input::<std::convert::Infallible>(|input| {
             input.close();
             Ok(())
         });
@@ -99,8 +101,8 @@ impl Drop for Ingress {
 
 impl Ingress {
     fn open(settings: &Settings, reloads: ReloadRequests) -> Result<Self, RoleError> {
-        let how = &settings.ingress_scheduling;
-        let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", how)?;
+        let scheduling = &settings.ingress_scheduling;
+        let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
             let bell = Arc::new(Bell::silent());
@@ -147,7 +149,7 @@ impl Ingress {
             housekeeping_at,
             received: Meter::default(),
         };
-        ingress.keep_house(housekeeping_at)?;
+        ingress.housekeeping(housekeeping_at)?;
         ingress.role.ready();
         Ok(ingress)
     }
@@ -158,23 +160,23 @@ impl Ingress {
         std::thread::sleep(Duration::from_nanos(wait_ns));
     }
 
-    fn keep_house(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
+    fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
         while let Some(change) = self.participant.poll_discovery() {
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
-                    self.visit(|input, _| {
+                    self.for_each_input(|input, _| {
                         input.writer_found(&writer);
                         Ok(())
                     })?;
                 }
                 Discovery::WriterGone(guid) => {
-                    self.visit(|input, _| {
+                    self.for_each_input(|input, _| {
                         input.writer_gone(guid);
                         Ok(())
                     })?;
                 }
                 Discovery::ParticipantGone { prefix, .. } => {
-                    self.visit(|input, _| {
+                    self.for_each_input(|input, _| {
                         input.participant_gone(prefix);
                         Ok(())
                     })?;
@@ -187,13 +189,13 @@ impl Ingress {
         }
         let mut searching = false;
         let mut resumed = true;
-        let kept = self.visit(|input, participant| {
-            let kept = input.keep_house(participant, now);
+        let outcome = self.for_each_input(|input, participant| {
+            let outcome = input.housekeeping(participant, now);
             searching |= !input.is_connected();
             resumed &= input.has_resumed();
-            kept
+            outcome
         });
-        // Not earlier: a publisher lets go of samples that no matched reader has yet to acknowledge, and the
+        // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
         // readers of this process have not requested them yet.
         if resumed && !std::mem::replace(&mut self.has_resumed, true) {
             self.resume_until = self.resume_until.min(now.plus_ms(RESUMED_MS));
@@ -201,8 +203,9 @@ impl Ingress {
         if self.role.has_former() && now >= self.resume_until {
             self.role.dispose_former(&self.participant);
         }
-        // What shows as alive is the thread that receives, not this one: it is shown when that thread has
-        // turned since, and asked to turn again, whether or not anything arrives.
+        // The health board shows that the receiving thread is alive, not this one. A turn is recorded only if
+        // the receiving thread has completed one since the last housekeeping; the ring below makes it take
+        // the next one, whether or not a sample arrives.
         let turns = self.receiving.turns();
         if turns != self.turns_seen {
             self.turns_seen = turns;
@@ -212,28 +215,29 @@ impl Ingress {
         self.role.status(now, |line| describe(&self.receiving, &mut self.received, line, now));
         self.participant.ring();
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
-        kept
+        outcome
     }
 
-    /// Lets `work` have each route, which the receiving thread has to do without meanwhile.
-    fn visit(
+    /// Calls `work` with each input, which the receiving thread cannot use meanwhile.
+    fn for_each_input(
         &mut self,
         mut work: impl FnMut(&mut Input, &mut Participant) -> Result<(), RoleError>,
     ) -> Result<(), RoleError> {
         let participant = &mut self.participant;
-        if self.receiving.visit(|input| work(input, participant))? {
+        if self.receiving.for_each_input(|input| work(input, participant))? {
             self.participant.ring();
         }
         Ok(())
     }
 }
 
-/// What ingress does, in a line for the service manager. The receiving thread is to be rung after it.
+/// Writes the status line of ingress for the service manager. The caller has to ring the receiving thread
+/// afterwards, because this locks the inputs.
 fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) {
     let (mut routes, mut connected, mut total) = (0, 0, 0);
     let mut drops = Vec::new();
     let mut without = Vec::new();
-    let Ok(_) = receiving.visit::<std::convert::Infallible>(|input| {
+    let Ok(_) = receiving.for_each_input::<std::convert::Infallible>(|input| {
         routes += 1;
         total += input.counters().received;
         drops.push(input.counters().drops);
@@ -248,5 +252,5 @@ fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now:
     let _ =
         write!(line, "reading {connected} of {routes} routes, {:.1} samples/s", received.per_s(total, now));
     write_drops(line, drops.iter());
-    write_list(line, "; no publisher found yet of", without.iter());
+    write_list(line, "; no publisher found yet for", without.iter());
 }

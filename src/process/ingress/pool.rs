@@ -1,7 +1,8 @@
-//! A route's pool: samples are copied into it, or put together in it by the DDS library.
+//! The pool of a route: ingress copies small samples into it, and the DDS library assembles fragmented
+//! samples in it.
 //!
-//! The library borrows slots and lets go of them on the thread that receives, which waits for nobody: not for
-//! the main thread either, which may be connecting a lane to the pool just then.
+//! The library borrows and drops slots on the receiving thread, which never waits, not even for the main
+//! thread while that connects a lane to the pool.
 
 use std::any::Any;
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -13,39 +14,41 @@ use crate::shm::{LentSlot, LoanError, SamplePublisher, Slot};
 /// The pool, as the main thread and the DDS library share it.
 pub(super) struct Pool {
     publisher: SamplePublisher,
-    /// Held while lanes are connected, which no borrower waits for.
-    attending: Mutex<()>,
+    /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
+    connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
 }
 
-/// A route's end of its pool.
+/// The pool, as the input of the route owns it.
 pub(super) struct PoolOwner {
     pool: Arc<Pool>,
+    /// Slots that the DDS library has dropped, for the main thread to free.
     abandoned: Receiver<LentSlot>,
 }
 
 impl PoolOwner {
     pub fn new(publisher: SamplePublisher) -> Self {
         let (sender, abandoned) = channel();
-        let pool = Arc::new(Pool { publisher, attending: Mutex::new(()), abandoned: sender });
+        let pool = Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender });
         Self { pool, abandoned }
     }
 
-    /// What the DDS library borrows from.
+    /// The pool, for the DDS library to borrow slots from.
     pub fn lender(&self) -> Arc<dyn SampleMemory> {
         self.pool.clone()
     }
 
-    /// Connects to lanes that came, and takes back what nobody needs any more; on the main thread.
-    pub fn attend(&self) {
-        let _attending = self.pool.attending.lock().unwrap_or_else(PoisonError::into_inner);
+    /// Connects new lanes, and frees the slots that the DDS library has dropped and those of lanes that have
+    /// ended; on the main thread.
+    pub fn housekeeping(&self) {
+        let _connecting = self.pool.connecting.lock().unwrap_or_else(PoisonError::into_inner);
         while let Ok(slot) = self.abandoned.try_recv() {
             drop(slot);
         }
         self.pool.publisher.attend();
     }
 
-    /// The slot that was lent for the payload, or one that it is copied into.
+    /// Returns the slot in which the DDS library assembled the payload, or copies the payload into a new one.
     pub fn fill(&self, payload: Payload<'_>) -> Filled {
         match payload {
             Payload::Bytes(bytes) => {
@@ -55,33 +58,33 @@ impl PoolOwner {
                 let bytes = memory.bytes().len();
                 let memory: Box<dyn Any> = memory;
                 let slot = memory.downcast::<Borrowed>().ok().and_then(|borrowed| borrowed.into_slot());
-                // Nobody else lends memory to this reader.
+                // Only this pool lends memory to the reader, so the error does not occur.
                 Filled { slot: slot.ok_or(LoanError::Failed("not of the pool")), bytes, in_place: true }
             }
         }
     }
 }
 
-/// A slot with a payload.
+/// A slot with a payload, or why there is none.
 pub(super) struct Filled {
     pub slot: Result<Slot, LoanError>,
     pub bytes: usize,
-    /// Whether the DDS library has put the payload there, so that it was not copied.
+    /// Whether the DDS library assembled the payload in the slot, so that it was not copied.
     pub in_place: bool,
 }
 
 impl SampleMemory for Pool {
     fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
-        let _not_attending = self.attending.try_lock().ok()?;
+        let _not_connecting = self.connecting.try_lock().ok()?;
         let slot = self.publisher.lend(len)?;
         Some(Box::new(Borrowed { slot: Some(slot), abandoned: self.abandoned.clone() }))
     }
 }
 
-/// A slot while the DDS library has it. One that it drops goes to the main thread: giving it back could have
-/// to wait.
+/// A slot while the DDS library holds it. If the library drops it, the main thread frees the slot, because
+/// that may have to wait for a lock.
 struct Borrowed {
-    /// There until it is taken out.
+    /// `Some` until `into_slot` takes it.
     slot: Option<LentSlot>,
     abandoned: Sender<LentSlot>,
 }
@@ -101,7 +104,7 @@ impl LentMemory for Borrowed {
 impl Drop for Borrowed {
     fn drop(&mut self) {
         if let Some(slot) = self.slot.take() {
-            // Without a route's end nobody waits for anything any more.
+            // Fails only after the owner is dropped; then the slot is dropped here.
             let _ = self.abandoned.send(slot);
         }
     }
@@ -113,7 +116,7 @@ mod tests {
     use crate::model::{InstanceName, RouteId};
     use crate::shm::{LaneQueue, RouteChannel, ShmNode};
 
-    /// The pool of a route for samples of 100 bytes; it goes with the folder and the node.
+    /// A pool for samples of 100 bytes, with the node and the folder that it needs.
     fn owner() -> (PoolOwner, ShmNode, tempfile::TempDir) {
         let root = tempfile::tempdir().unwrap();
         let node = ShmNode::open(root.path(), &InstanceName::try_from("pool").unwrap(), "test").unwrap();
@@ -124,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_lent_comes_back_filled_or_goes_to_the_main_thread() {
+    fn a_lent_slot_is_filled_or_freed_by_the_main_thread() {
         let (owner, _node, _root) = owner();
         let lender = owner.lender();
         assert!(lender.lend(101).is_none(), "longer than the route allows");
@@ -134,23 +137,23 @@ mod tests {
             let filled = owner.fill(Payload::Lent(memory));
             assert!(filled.slot.is_ok() && filled.in_place && filled.bytes == 100);
         }
-        // Two are out, and given up: they are had again when the main thread has looked.
-        let given_up = [lender.lend(10).unwrap(), lender.lend(10).unwrap()];
+        // Two lent slots that are dropped can be lent again only after the main thread has freed them.
+        let dropped = [lender.lend(10).unwrap(), lender.lend(10).unwrap()];
         assert!(lender.lend(10).is_none());
-        drop(given_up);
+        drop(dropped);
         assert!(lender.lend(10).is_none());
-        owner.attend();
+        owner.housekeeping();
         assert!(lender.lend(10).is_some());
         let filled = owner.fill(Payload::Bytes(&[1; 100]));
         assert!(filled.slot.is_ok() && !filled.in_place);
     }
 
     #[test]
-    fn nobody_waits_for_the_main_thread_to_connect_a_lane() {
+    fn lending_does_not_wait_while_a_lane_is_connected() {
         let (owner, _node, _root) = owner();
-        let attending = owner.pool.attending.lock().unwrap();
+        let connecting = owner.pool.connecting.lock().unwrap();
         assert!(owner.lender().lend(10).is_none());
-        drop(attending);
+        drop(connecting);
         assert!(owner.lender().lend(10).is_some());
     }
 }

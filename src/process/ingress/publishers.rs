@@ -1,4 +1,4 @@
-//! The publishers of a route, and the account of each in shared memory.
+//! The accounts of a route's publishers in shared memory: the high-water mark and counts of each.
 
 use std::sync::Arc;
 
@@ -7,38 +7,41 @@ use crate::model::{Guid, IngressCounters, MAX_PUBLISHERS, MonotonicNs, Publisher
 use crate::policy::publisher_place;
 use crate::shm::{BoardWriter, Boards};
 
-/// A publisher whose last sample came within so long before a restart is expected to go on.
+/// A publisher whose last sample is at most this old at a restart is expected to send more.
 const EXPECTED_MS: u64 = 5_000;
 
-/// The accounts of a route's publishers. They outlive the process: a successor of it takes no sample twice.
+/// The accounts of a route's publishers. They outlive the process, so that a successor publishes no sample
+/// twice.
 pub(super) struct Publishers {
     accounts: Vec<BoardWriter<PublisherAccount>>,
-    /// Of each account, whether discovery says that its writer is gone.
+    /// For each account, whether discovery has removed its writer.
     gone: [bool; MAX_PUBLISHERS],
-    /// Of each account, whether a next sample is expected and has not come since the process was started.
+    /// For each account, whether its publisher is expected to send more and has not since this process
+    /// started.
     expected: [bool; MAX_PUBLISHERS],
     followed: Arc<Followed>,
-    /// The place of the last sample's account: most routes have one publisher.
+    /// The place of the account of the last sample, which is looked up first: most routes have one publisher.
     last_place: usize,
 }
 
-/// Where a sample stands among those of its publisher.
+/// The result of comparing a sample's sequence number with its publisher's high-water mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Standing {
+pub(super) enum SequenceCheck {
     /// Above the high-water mark of the account at this place.
-    Next(usize),
-    /// At or below it.
+    New(usize),
+    /// At or below the mark: the sample was taken before, or is too late.
     Repeated(usize),
-    /// Its publisher has no account, and gets none: all places belong to publishers that write.
+    /// Not comparable: the publisher has no account, and active publishers use all places.
     Unmarked,
 }
 
 impl Publishers {
-    /// The accounts as the predecessor of this process left them.
+    /// Opens the accounts as the predecessor of this process left them.
     pub fn open(boards: &Boards, route: usize, counters: &IngressCounters, now: MonotonicNs) -> Self {
         let writer = |place| boards.publisher_writer(route, place);
         let mut accounts: Vec<_> = (0..MAX_PUBLISHERS).map(writer).collect();
-        // A process that was killed between the two writes of an account has written it with the counts only.
+        // `update` writes an account twice: with the counts, then in its place. If the predecessor was killed
+        // in between, the second write is made here.
         let changed = usize::try_from(counters.changed_place).ok().and_then(|place| accounts.get_mut(place));
         if let Some(account) = changed
             && !counters.changed_account.is_vacant()
@@ -62,41 +65,42 @@ impl Publishers {
         Arc::clone(&self.followed)
     }
 
-    /// The writers that have accounts, with their high-water marks.
+    /// Returns the writers that have accounts, with their high-water marks.
     pub fn marks(&self) -> impl Iterator<Item = (Guid, i64)> + '_ {
         let accounts = self.accounts.iter().map(BoardWriter::get);
         accounts.filter(|account| !account.is_vacant()).map(|account| (account.writer, account.last_sequence))
     }
 
-    /// Where a sample that has arrived stands. A new publisher gets an account.
-    pub fn standing(&mut self, writer: Guid, sequence: i64, now: MonotonicNs) -> Standing {
+    /// Compares the sequence number of an arrived sample with the mark of its publisher. A new publisher gets
+    /// an account.
+    pub fn check(&mut self, writer: Guid, sequence: i64, now: MonotonicNs) -> SequenceCheck {
         let is_of = |place: &usize| self.accounts[*place].get().writer == writer;
         let known = Some(self.last_place).filter(is_of).or_else(|| self.followed.place_of(writer));
         let Some(place) = known else {
-            return self.begin(writer, sequence, now);
+            return self.open_account(writer, sequence, now);
         };
         self.last_place = place;
         self.gone[place] = false;
         if sequence > self.accounts[place].get().last_sequence {
             self.expected[place] = false;
-            Standing::Next(place)
+            SequenceCheck::New(place)
         } else {
-            Standing::Repeated(place)
+            SequenceCheck::Repeated(place)
         }
     }
 
-    fn begin(&mut self, writer: Guid, sequence: i64, now: MonotonicNs) -> Standing {
+    fn open_account(&mut self, writer: Guid, sequence: i64, now: MonotonicNs) -> SequenceCheck {
         let accounts = self.accounts.iter().map(BoardWriter::get).zip(self.gone);
-        let Some(place) = publisher_place(accounts, now) else { return Standing::Unmarked };
+        let Some(place) = publisher_place(accounts, now) else { return SequenceCheck::Unmarked };
         self.accounts[place].update(|account| *account = PublisherAccount::new(writer, sequence));
         self.gone[place] = false;
         self.expected[place] = false;
         self.last_place = place;
-        Standing::Next(place)
+        SequenceCheck::New(place)
     }
 
-    /// Records what each publisher offers; `reliability_of` yields `None` for one that discovery does not
-    /// know.
+    /// Records the reliability that each publisher offers; `reliability_of` returns `None` for one that
+    /// discovery does not know.
     pub fn set_reliabilities(&mut self, reliability_of: impl Fn(Guid) -> Option<Reliability>) {
         for account in &mut self.accounts {
             let present = *account.get();
@@ -114,13 +118,14 @@ impl Publishers {
         }
     }
 
-    /// Whether each publisher that wrote until the predecessor of this process died has gone on or is gone.
+    /// Whether each publisher that wrote until the predecessor of this process died has sent a sample to this
+    /// process, or is gone.
     pub fn have_resumed(&self) -> bool {
         !self.expected.iter().zip(self.gone).any(|(is_expected, is_gone)| *is_expected && !is_gone)
     }
 
-    /// Changes the counts of the route and the account at `place` in one step: a process that dies within
-    /// leaves both or none.
+    /// Changes the counts of the route and the account at `place` atomically: a process that dies meanwhile
+    /// has changed both or neither.
     pub fn update<R>(
         &mut self,
         place: usize,
@@ -139,24 +144,24 @@ impl Publishers {
         result
     }
 
-    /// Discovery knows the writer.
-    pub fn found(&mut self, writer: Guid) {
+    /// Notes that discovery has found the writer.
+    pub fn writer_found(&mut self, writer: Guid) {
         self.mark_gone(|known| known == writer, false);
     }
 
-    /// The writer is gone. Its account stays, for it may come back.
-    pub fn gone(&mut self, writer: Guid) {
+    /// Notes that the writer is gone. Its account stays, because the writer may return.
+    pub fn writer_gone(&mut self, writer: Guid) {
         self.mark_gone(|known| known == writer, true);
     }
 
-    /// A participant is gone, and with it its writers.
+    /// Notes that a participant and its writers are gone.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
         self.mark_gone(|known| known.prefix() == prefix, true);
     }
 
-    fn mark_gone(&mut self, is_meant: impl Fn(Guid) -> bool, is_gone: bool) {
+    fn mark_gone(&mut self, matches: impl Fn(Guid) -> bool, is_gone: bool) {
         for (account, gone) in self.accounts.iter().zip(&mut self.gone) {
-            if is_meant(account.get().writer) {
+            if matches(account.get().writer) {
                 *gone = is_gone;
             }
         }
@@ -172,13 +177,13 @@ mod tests {
     const ONE: Guid = Guid([1; 16]);
     const TWO: Guid = Guid([2; 16]);
 
-    struct Bench {
+    struct Fixture {
         boards: Boards,
         _node: ShmNode,
         _root: tempfile::TempDir,
     }
 
-    impl Bench {
+    impl Fixture {
         fn new(name: &str) -> Self {
             let root = tempfile::tempdir().unwrap();
             let instance = InstanceName::try_from(format!("{name}_{}", std::process::id()).as_str()).unwrap();
@@ -199,32 +204,32 @@ mod tests {
         MonotonicNs(0).plus_ms(ms)
     }
 
-    /// Takes the sample if it is the next; yields whether it was, and how many are missing before it.
+    /// Takes the sample if it is new, and returns the number of samples missing before it.
     fn take(
         (counters, publishers): &mut (BoardWriter<IngressCounters>, Publishers),
         writer: Guid,
         sequence: i64,
         now: MonotonicNs,
     ) -> Option<u64> {
-        match publishers.standing(writer, sequence, now) {
-            Standing::Next(place) => {
+        match publishers.check(writer, sequence, now) {
+            SequenceCheck::New(place) => {
                 Some(publishers.update(place, counters, |_, account| account.take(sequence, now)))
             }
-            Standing::Repeated(_) | Standing::Unmarked => None,
+            SequenceCheck::Repeated(_) | SequenceCheck::Unmarked => None,
         }
     }
 
     #[test]
-    fn a_successor_takes_nothing_twice_and_counts_what_is_missing() {
-        let bench = Bench::new("successor");
-        let mut former = bench.open(at(0));
+    fn a_successor_takes_no_sample_twice_and_counts_the_missing_ones() {
+        let fixture = Fixture::new("successor");
+        let mut former = fixture.open(at(0));
         assert_eq!(take(&mut former, ONE, 10, at(1)), Some(0));
         assert_eq!(take(&mut former, TWO, 500, at(1)), Some(0));
         assert_eq!(take(&mut former, ONE, 14, at(2)), Some(3));
         assert_eq!(take(&mut former, ONE, 12, at(2)), None);
         drop(former);
 
-        let mut successor = bench.open(at(100));
+        let mut successor = fixture.open(at(100));
         assert!(!successor.1.have_resumed());
         assert_eq!(successor.1.marks().collect::<Vec<_>>(), [(ONE, 14), (TWO, 500)]);
         assert_eq!(take(&mut successor, ONE, 14, at(101)), None);
@@ -232,41 +237,41 @@ mod tests {
         assert!(!successor.1.have_resumed());
         successor.1.participant_gone(TWO.prefix());
         assert!(successor.1.have_resumed());
-        let account = bench.boards.publisher(0, 0).unwrap();
+        let account = fixture.boards.publisher(0, 0).unwrap();
         assert_eq!((account.first_sequence, account.last_sequence), (10, 20));
         assert_eq!((account.received, account.lost_upstream), (3, 8));
         assert!(successor.1.followed().awaits(ONE, 21) && !successor.1.followed().awaits(ONE, 20));
     }
 
     #[test]
-    fn an_account_that_was_written_with_the_counts_only_is_completed() {
-        let bench = Bench::new("completed");
-        let mut former = bench.open(at(0));
+    fn the_second_write_of_an_account_is_made_up_for_after_a_kill() {
+        let fixture = Fixture::new("completed");
+        let mut former = fixture.open(at(0));
         assert_eq!(take(&mut former, ONE, 1, at(1)), Some(0));
-        // A process that is killed after the first of the two writes of sample 2.
+        // The process is killed after the first of the two writes for sample 2.
         former.0.update(|counters| {
             counters.changed_account.take(2, at(2));
         });
         drop(former);
-        let mut successor = bench.open(at(100));
+        let mut successor = fixture.open(at(100));
         assert_eq!(take(&mut successor, ONE, 2, at(101)), None);
         assert_eq!(take(&mut successor, ONE, 3, at(101)), Some(0));
-        assert_eq!(bench.boards.publisher(0, 0).unwrap().received, 3);
+        assert_eq!(fixture.boards.publisher(0, 0).unwrap().received, 3);
     }
 
     #[test]
-    fn a_flood_of_publishers_pushes_out_none_that_writes() {
-        let bench = Bench::new("flood");
-        let mut route = bench.open(at(0));
+    fn a_flood_of_publishers_does_not_replace_active_ones() {
+        let fixture = Fixture::new("flood");
+        let mut route = fixture.open(at(0));
         let flood = |number: u64| Guid((u128::from(number) + 1_000).to_ne_bytes());
         assert_eq!(take(&mut route, ONE, 1, at(0)), Some(0));
         for number in 0..1_000 {
             take(&mut route, flood(number), 1, at(number));
         }
-        assert_eq!(take(&mut route, ONE, 1, at(1_000)), None, "the first publisher has its mark");
-        assert_eq!(route.1.standing(flood(999), 2, at(1_000)), Standing::Unmarked);
-        // One that is gone gives way at once.
-        route.1.gone(flood(5));
+        assert_eq!(take(&mut route, ONE, 1, at(1_000)), None, "the first publisher still has its mark");
+        assert_eq!(route.1.check(flood(999), 2, at(1_000)), SequenceCheck::Unmarked);
+        // A publisher that is gone is replaced at once.
+        route.1.writer_gone(flood(5));
         assert_eq!(take(&mut route, TWO, 1, at(1_000)), Some(0));
         assert_eq!(route.1.followed().place_of(flood(5)), None);
         assert_eq!(take(&mut route, ONE, 1, at(1_000)), None);

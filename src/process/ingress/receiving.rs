@@ -1,9 +1,9 @@
-//! What ingress does on the DDS library's receiving thread: taking samples and publishing them.
+//! Takes samples and publishes them on the DDS library's receiving thread.
 //!
-//! A sample that is taken where it is received costs one wake-up less than one that is handed to a thread of
-//! ours first; `docs/decisions/0006-hand-overs.md` has the measurements. What need not happen for each sample
-//! is done by the main thread, which holds a route's lock meanwhile. The receiving thread waits for no lock:
-//! it leaves the route alone, and is rung when the lock is free.
+//! Taking a sample on the thread that receives it saves one wake-up, compared with handing it to a thread of
+//! ingress first; `docs/decisions/0006-hand-overs.md` has the measurements. The main thread does the work
+//! that is not needed for each sample, and locks a route meanwhile. The receiving thread never waits for a
+//! lock: it skips a locked route, and is rung when the lock is free.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
@@ -15,16 +15,17 @@ use super::input::Input;
 use crate::model::{Guid, TrafficClass};
 use crate::shm::{LaneWaker, this_cpu};
 
-/// Samples taken of one route before the next route, and the DDS library, have their turn.
+/// Samples taken from one route before the next route, and then the DDS library, is served.
 const SAMPLES_PER_TURN: usize = 32;
 
-/// A route, its bell, and whether somebody came while its lock was held.
-struct Served {
+/// One route, as the receiving thread and the main thread share it.
+struct SharedRoute {
     input: Mutex<Input>,
     bell: Arc<Bell>,
-    missed: AtomicBool,
+    /// Whether the receiving thread has skipped the route because the main thread had locked it.
+    skipped: AtomicBool,
     followed: Arc<Followed>,
-    /// Whether a critical lane has it.
+    /// Whether a critical lane serves the route.
     is_critical: bool,
 }
 
@@ -32,18 +33,18 @@ struct Served {
 pub(super) struct ServedLane {
     pub waker: LaneWaker,
     pub class: TrafficClass,
-    /// Of each route.
+    /// For each route, whether the lane serves it.
     pub serves: Vec<bool>,
 }
 
-/// All routes, as the receiving thread and the main thread share them.
+/// All routes and lanes, as the receiving thread and the main thread share them.
 pub(super) struct Receiving {
-    routes: Vec<Served>,
-    /// The critical ones first.
+    routes: Vec<SharedRoute>,
+    /// Critical lanes first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
     expected: Expected,
-    /// Where the receiving thread ran last.
+    /// The CPU on which the receiving thread ran last.
     cpu: AtomicU32,
 }
 
@@ -52,15 +53,15 @@ impl Receiving {
         let is_critical = |route: usize| {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
         };
-        let served = |(route, (input, bell)): (usize, (Input, _))| Served {
+        let shared = |(route, (input, bell)): (usize, (Input, _))| SharedRoute {
             followed: input.followed(),
             input: Mutex::new(input),
             bell,
-            missed: AtomicBool::new(false),
+            skipped: AtomicBool::new(false),
             is_critical: is_critical(route),
         };
         Self {
-            routes: inputs.into_iter().enumerate().map(served).collect(),
+            routes: inputs.into_iter().enumerate().map(shared).collect(),
             lanes,
             turns: AtomicU64::new(0),
             expected: Expected::new(),
@@ -68,15 +69,16 @@ impl Receiving {
         }
     }
 
-    /// A datagram has come that seems to hold a sample of `writer`, or a part of one that `left_bytes` are
-    /// missing of behind it. Lets the critical lanes of its route get up while `cpu` receives it, unless that
-    /// sample came before: many publishers send each one to all our addresses. Whether it did.
+    /// Wakes the critical lanes of a route early. A datagram has arrived that seems to hold a sample of
+    /// `writer`, or a part of one of which `left_bytes` are missing, and `cpu` receives it. A sample that was
+    /// received before wakes no lane: many publishers send each one to all addresses of this host. Returns
+    /// whether the lanes were woken.
     pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
-        // Before the search, which this would be in vain for all but the last of many fragments.
+        // Checked before the search, which would find nothing to do for all but the last of many fragments.
         if !self.expected.may_tell(left_bytes) {
             return false;
         }
-        let awaits = |served: &Served| served.is_critical && served.followed.awaits(writer, sequence);
+        let awaits = |shared: &SharedRoute| shared.is_critical && shared.followed.awaits(writer, sequence);
         let Some(route) = self.routes.iter().position(awaits) else {
             return false;
         };
@@ -87,21 +89,22 @@ impl Receiving {
         tells
     }
 
-    /// Where the receiving thread ran last.
+    /// The CPU on which the receiving thread ran last.
     pub fn cpu(&self) -> u32 {
         self.cpu.load(Ordering::Relaxed)
     }
 
-    /// Takes and publishes what has arrived; on the receiving thread. Whether there may be more.
+    /// Takes and publishes the samples that have arrived; on the receiving thread. Returns whether more may
+    /// wait.
     pub fn turn(&self) -> bool {
         let cpu = this_cpu();
         self.cpu.store(cpu, Ordering::Relaxed);
         let mut more = false;
-        for (route, served) in self.routes.iter().enumerate() {
-            if served.bell.is_rung()
-                && let Some(mut input) = served.try_enter()
+        for (route, shared) in self.routes.iter().enumerate() {
+            if shared.bell.is_rung()
+                && let Some(mut input) = shared.try_lock()
             {
-                if served.is_critical && self.expected.came(route) {
+                if shared.is_critical && self.expected.came(route) {
                     self.announce(route, cpu);
                 }
                 more |= self.drain(route, &mut input);
@@ -113,37 +116,38 @@ impl Receiving {
         more
     }
 
-    /// Like [`turn`](Self::turn), on any thread.
-    pub fn turn_patiently(&self) -> bool {
+    /// Like [`turn`](Self::turn), but on any thread: waits for the locks, and wakes no lane early.
+    pub fn turn_blocking(&self) -> bool {
         let mut more = false;
-        for (route, served) in self.routes.iter().enumerate() {
-            if served.bell.is_rung() {
-                more |= self.drain(route, &mut served.enter());
+        for (route, shared) in self.routes.iter().enumerate() {
+            if shared.bell.is_rung() {
+                more |= self.drain(route, &mut shared.lock());
             }
         }
         more
     }
 
-    /// Turns of the receiving thread so far.
+    /// The number of turns that the receiving thread has completed.
     pub fn turns(&self) -> u64 {
         self.turns.load(Ordering::Acquire)
     }
 
-    /// Lets `work` have each route; whether the receiving thread has to be rung, because it came meanwhile,
-    /// or because a route has a new reader.
+    /// Locks each input in turn and calls `work` with it. Returns whether the caller has to ring the
+    /// receiving thread, because that has skipped a locked route, or because a route has a new reader.
     ///
     /// # Errors
-    /// The first one of `work`, after all routes had their turn.
-    pub fn visit<E>(&self, mut work: impl FnMut(&mut Input) -> Result<(), E>) -> Result<bool, E> {
+    /// The first error of `work`, after `work` was called with all inputs.
+    pub fn for_each_input<E>(&self, mut work: impl FnMut(&mut Input) -> Result<(), E>) -> Result<bool, E> {
         let mut ring = false;
         let mut outcome = Ok(());
-        for served in &self.routes {
-            outcome = outcome.and(work(&mut served.enter()));
-            ring |= served.was_missed() || served.bell.is_rung();
+        for shared in &self.routes {
+            outcome = outcome.and(work(&mut shared.lock()));
+            ring |= shared.take_skipped() || shared.bell.is_rung();
         }
         outcome.map(|()| ring)
     }
 
+    /// Takes and publishes up to `SAMPLES_PER_TURN` samples. Returns whether more may wait.
     fn drain(&self, route: usize, input: &mut Input) -> bool {
         for _ in 0..SAMPLES_PER_TURN {
             if !input.step(|| self.wake(route)) {
@@ -153,8 +157,8 @@ impl Receiving {
         true
     }
 
-    /// Lets the critical lanes that serve the route get up while its sample is taken on `cpu`. A noncritical
-    /// one has time.
+    /// Wakes the critical lanes that serve the route while its sample is being taken on `cpu`. A noncritical
+    /// lane needs no early wake-up.
     fn announce(&self, route: usize, cpu: u32) {
         for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
             if lane.serves[route] {
@@ -173,29 +177,30 @@ impl Receiving {
     }
 }
 
-impl Served {
-    fn enter(&self) -> MutexGuard<'_, Input> {
+impl SharedRoute {
+    fn lock(&self) -> MutexGuard<'_, Input> {
         self.input.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The route, unless the main thread has it; then it is told.
-    fn try_enter(&self) -> Option<MutexGuard<'_, Input>> {
+    /// Locks the input, unless the main thread has locked it; then sets `skipped`.
+    fn try_lock(&self) -> Option<MutexGuard<'_, Input>> {
         let attempt = || match self.input.try_lock() {
             Ok(input) => Some(input),
             Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
             Err(TryLockError::WouldBlock) => None,
         };
         attempt().or_else(|| {
-            // Either the main thread sees this when it has let go, or it has by now.
-            self.missed.store(true, Ordering::SeqCst);
+            // Either the main thread sees this flag after it has unlocked the input, or it has unlocked it by
+            // now and the second attempt succeeds.
+            self.skipped.store(true, Ordering::SeqCst);
             fence(Ordering::SeqCst);
             attempt()
         })
     }
 
-    /// After the lock was let go of.
-    fn was_missed(&self) -> bool {
+    /// Resets `skipped` and returns its value. To be called after the lock is released.
+    fn take_skipped(&self) -> bool {
         fence(Ordering::SeqCst);
-        self.missed.swap(false, Ordering::SeqCst)
+        self.skipped.swap(false, Ordering::SeqCst)
     }
 }

@@ -1,11 +1,11 @@
-//! What the publishers of a route offer, and what to ask of them therefore. Pure.
+//! The discovered publishers of a route, and the readers that match them. Pure: no I/O.
 
 use crate::config::InputQos;
 use crate::dds::{Endpoint, ReaderQos};
 use crate::model::{Durability, Guid, History, Reliability};
 
-/// Bytes that may wait between the DDS library and ingress on one route. The library counts samples, so the
-/// depth follows from the largest sample allowed.
+/// Bytes that may wait in the DDS library for ingress on one route. The library limits the number of samples,
+/// so the history depth is this divided by the size of the largest sample allowed.
 const WAITING_BYTES: usize = 32 << 20;
 
 /// The publishers of one route, as discovery knows them.
@@ -14,15 +14,16 @@ pub(super) struct Source {
     writers: Vec<Endpoint>,
 }
 
-/// What a route's readers should be.
+/// The readers that a route needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Wanted {
-    /// No publisher is known, and the configuration does not say enough to do without one.
+pub(super) enum ReaderPlan {
+    /// Not decidable yet: no publisher is known, and the configuration does not set type, reliability and
+    /// durability.
     Unknown,
-    /// Two publishers claim the topic with different types, and the configuration does not decide.
+    /// Two publishers use the topic with different types, and the configuration sets none.
     TypeConflict(String, String),
-    /// At least one of these readers. A RELIABLE reader matches no BEST_EFFORT publisher, and a BEST_EFFORT
-    /// one repairs nothing, so publishers of both kinds take both readers.
+    /// At least one of these readers. A RELIABLE reader does not match BEST_EFFORT publishers, and a
+    /// BEST_EFFORT one does not recover lost samples, so publishers of both kinds need both readers.
     Readers {
         /// DDS type.
         dds_type: String,
@@ -34,8 +35,8 @@ pub(super) enum Wanted {
 }
 
 impl Source {
-    /// Takes in a publisher, new or changed; whether it was unknown.
-    pub fn found(&mut self, writer: &Endpoint) -> bool {
+    /// Adds a publisher, or replaces its entry. Returns whether it is new.
+    pub fn insert(&mut self, writer: &Endpoint) -> bool {
         match self.writers.iter_mut().find(|known| known.guid == writer.guid) {
             Some(known) => {
                 *known = writer.clone();
@@ -48,52 +49,57 @@ impl Source {
         }
     }
 
-    /// A publisher is gone.
-    pub fn gone(&mut self, guid: Guid) {
+    /// Removes a publisher.
+    pub fn remove(&mut self, guid: Guid) {
         self.writers.retain(|writer| writer.guid != guid);
     }
 
-    /// A participant is gone; whether it had publishers of the route.
-    pub fn participant_gone(&mut self, prefix: [u8; 12]) -> bool {
+    /// Removes the publishers of a participant. Returns whether there were any.
+    pub fn remove_participant(&mut self, prefix: [u8; 12]) -> bool {
         let before = self.writers.len();
         self.writers.retain(|writer| writer.guid.prefix() != prefix);
         self.writers.len() < before
     }
 
-    /// A publisher of another type than `dds_type`.
-    pub fn of_other_type(&self, dds_type: &str) -> Option<&Endpoint> {
+    /// Returns a publisher of another type than `dds_type`, if there is one.
+    pub fn find_other_type(&self, dds_type: &str) -> Option<&Endpoint> {
         self.writers.iter().find(|writer| writer.dds_type != dds_type)
     }
 
-    /// What the publisher offers, if it is known.
+    /// The reliability that the publisher offers, if it is known.
     pub fn reliability_of(&self, writer: Guid) -> Option<Reliability> {
         self.writers.iter().find(|known| known.guid == writer).map(|known| known.reliability)
     }
 
-    /// How many publishers offer BEST_EFFORT.
+    /// The number of publishers that offer BEST_EFFORT.
     pub fn best_effort_writers(&self) -> u64 {
         let offers = |writer: &&Endpoint| writer.reliability == Reliability::BestEffort;
         self.writers.iter().filter(offers).count() as u64
     }
 
-    /// The readers that suit the publishers: one for the RELIABLE ones, one for the BEST_EFFORT ones, and
-    /// each TRANSIENT_LOCAL if each of its publishers offers that. Where the configuration fixes the
-    /// reliability, one reader is for all. A reader that asks for more than a publisher offers is not
-    /// matched.
-    pub fn wanted(&self, configured_type: Option<&str>, input: &InputQos, max_sample_bytes: usize) -> Wanted {
+    /// Chooses the readers for the known publishers: one for the RELIABLE ones and one for the BEST_EFFORT
+    /// ones, each of them TRANSIENT_LOCAL if all its publishers offer that. If the configuration sets the
+    /// reliability, one reader is for all publishers. A reader that requests more than a publisher offers
+    /// does not match it.
+    pub fn plan(
+        &self,
+        configured_type: Option<&str>,
+        input: &InputQos,
+        max_sample_bytes: usize,
+    ) -> ReaderPlan {
         let dds_type = match (configured_type, self.writers.first()) {
             (Some(configured), _) => configured,
-            (None, Some(first)) => match self.of_other_type(&first.dds_type) {
+            (None, Some(first)) => match self.find_other_type(&first.dds_type) {
                 Some(other) => {
-                    return Wanted::TypeConflict(first.dds_type.clone(), other.dds_type.clone());
+                    return ReaderPlan::TypeConflict(first.dds_type.clone(), other.dds_type.clone());
                 }
                 None => &first.dds_type,
             },
-            (None, None) => return Wanted::Unknown,
+            (None, None) => return ReaderPlan::Unknown,
         };
         let depth = match input.history {
             Some(History::KeepLast { depth }) => depth,
-            _ => waiting_depth(max_sample_bytes),
+            _ => history_depth(max_sample_bytes),
         };
         let is_for = |reader: Reliability, writer: &Endpoint| match input.reliability {
             Some(configured) => reader == configured,
@@ -104,26 +110,27 @@ impl Source {
             let writers = writers.filter(|writer| is_for(reliability, writer));
             let durability = match writers.map(|writer| writer.durability).min() {
                 Some(offered) => input.durability.unwrap_or(offered),
-                // Without a publisher only where the configuration says it all.
+                // Without a publisher there is a reader only if the configuration sets the complete QoS.
                 None => input.durability.filter(|_| input.reliability == Some(reliability))?,
             };
             Some(ReaderQos { reliability, durability, depth, deadline_ms: input.deadline_ms })
         };
         let [reliable, best_effort] = [Reliability::Reliable, Reliability::BestEffort].map(reader);
         if reliable.is_none() && best_effort.is_none() {
-            return Wanted::Unknown;
+            return ReaderPlan::Unknown;
         }
-        Wanted::Readers { dds_type: dds_type.to_owned(), reliable, best_effort }
+        ReaderPlan::Readers { dds_type: dds_type.to_owned(), reliable, best_effort }
     }
 }
 
-/// 1,024 samples at most: a fifth of a second at 5 kHz, far more than ingress is ever away. 16 at least.
-fn waiting_depth(max_sample_bytes: usize) -> u32 {
+/// The history depth of a reader. At most 1,024 samples: 0.2 s at 5 kHz, far longer than ingress ever takes
+/// to come back to a route. At least 16.
+fn history_depth(max_sample_bytes: usize) -> u32 {
     let depth = (WAITING_BYTES / max_sample_bytes.max(1)).clamp(16, 1024);
     depth as u32
 }
 
-/// How a policy is called in the log.
+/// The name of a QoS in the log.
 pub(super) const fn label(reliability: Reliability, durability: Durability) -> &'static str {
     match (reliability, durability) {
         (Reliability::BestEffort, Durability::Volatile) => "BEST_EFFORT, VOLATILE",
@@ -149,19 +156,19 @@ mod tests {
         }
     }
 
-    fn wanted(source: &Source, configured_type: Option<&str>) -> Wanted {
-        source.wanted(configured_type, &InputQos::default(), 1 << 20)
+    fn plan(source: &Source, configured_type: Option<&str>) -> ReaderPlan {
+        source.plan(configured_type, &InputQos::default(), 1 << 20)
     }
 
     #[test]
-    fn nothing_is_wanted_before_a_publisher_is_known() {
-        assert_eq!(wanted(&Source::default(), None), Wanted::Unknown);
-        assert_eq!(wanted(&Source::default(), Some("T")), Wanted::Unknown);
+    fn no_reader_is_planned_before_a_publisher_is_known() {
+        assert_eq!(plan(&Source::default(), None), ReaderPlan::Unknown);
+        assert_eq!(plan(&Source::default(), Some("T")), ReaderPlan::Unknown);
     }
 
     /// Durability of the RELIABLE and of the BEST_EFFORT reader.
-    fn durabilities(wanted: Wanted) -> [Option<Durability>; 2] {
-        let Wanted::Readers { reliable, best_effort, .. } = wanted else { panic!("{wanted:?}") };
+    fn durabilities(plan: ReaderPlan) -> [Option<Durability>; 2] {
+        let ReaderPlan::Readers { reliable, best_effort, .. } = plan else { panic!("{plan:?}") };
         for (qos, reliability) in [(reliable, Reliability::Reliable), (best_effort, Reliability::BestEffort)]
         {
             assert!(qos.is_none_or(|qos| qos.reliability == reliability));
@@ -170,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_that_says_all_needs_no_publisher() {
+    fn a_complete_input_qos_needs_no_publisher() {
         let input = InputQos {
             reliability: Some(Reliability::Reliable),
             durability: Some(Durability::Volatile),
@@ -178,66 +185,66 @@ mod tests {
         };
         let mut source = Source::default();
         let one = [Some(Durability::Volatile), None];
-        assert_eq!(durabilities(source.wanted(Some("T"), &input, 1 << 20)), one);
-        // And is obeyed, also where it leaves a publisher without a reader.
-        source.found(&writer(1, "T", Reliability::BestEffort, Durability::TransientLocal));
-        assert_eq!(durabilities(source.wanted(Some("T"), &input, 1 << 20)), one);
+        assert_eq!(durabilities(source.plan(Some("T"), &input, 1 << 20)), one);
+        // It also applies when a publisher does not match it.
+        source.insert(&writer(1, "T", Reliability::BestEffort, Durability::TransientLocal));
+        assert_eq!(durabilities(source.plan(Some("T"), &input, 1 << 20)), one);
     }
 
     #[test]
-    fn one_best_effort_reader_is_for_all_where_the_configuration_says_so() {
+    fn a_configured_best_effort_reliability_gives_one_reader_for_all_publishers() {
         let input = InputQos { reliability: Some(Reliability::BestEffort), ..InputQos::default() };
         let mut source = Source::default();
-        assert_eq!(source.wanted(Some("T"), &input, 1 << 20), Wanted::Unknown);
-        source.found(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
-        source.found(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
-        let wanted = source.wanted(Some("T"), &input, 1 << 20);
-        assert_eq!(durabilities(wanted), [None, Some(Durability::Volatile)]);
+        assert_eq!(source.plan(Some("T"), &input, 1 << 20), ReaderPlan::Unknown);
+        source.insert(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
+        source.insert(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
+        let plan = source.plan(Some("T"), &input, 1 << 20);
+        assert_eq!(durabilities(plan), [None, Some(Durability::Volatile)]);
     }
 
     #[test]
-    fn publishers_of_each_reliability_have_a_reader_of_their_own() {
+    fn publishers_of_each_reliability_get_a_reader_of_their_own() {
         let mut source = Source::default();
-        source.found(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
-        let [reliable, best_effort] = durabilities(wanted(&source, None));
+        source.insert(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
+        let [reliable, best_effort] = durabilities(plan(&source, None));
         assert_eq!((reliable, best_effort), (Some(Durability::TransientLocal), None));
-        source.found(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
+        source.insert(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
         let both = [Some(Durability::TransientLocal), Some(Durability::Volatile)];
-        assert_eq!(durabilities(wanted(&source, None)), both);
+        assert_eq!(durabilities(plan(&source, None)), both);
         assert_eq!(source.reliability_of(Guid([2; 16])), Some(Reliability::BestEffort));
-        // It asks for what the weakest of its publishers offers.
-        source.found(&writer(3, "T", Reliability::Reliable, Durability::Volatile));
-        assert_eq!(durabilities(wanted(&source, None)), [Some(Durability::Volatile); 2]);
-        source.gone(Guid([1; 16]));
-        source.gone(Guid([3; 16]));
-        assert_eq!(durabilities(wanted(&source, None)), [None, Some(Durability::Volatile)]);
+        // A reader requests the weakest durability that its publishers offer.
+        source.insert(&writer(3, "T", Reliability::Reliable, Durability::Volatile));
+        assert_eq!(durabilities(plan(&source, None)), [Some(Durability::Volatile); 2]);
+        source.remove(Guid([1; 16]));
+        source.remove(Guid([3; 16]));
+        assert_eq!(durabilities(plan(&source, None)), [None, Some(Durability::Volatile)]);
     }
 
     #[test]
-    fn publishers_leave_with_their_participant() {
+    fn removing_a_participant_removes_its_publishers() {
         let mut source = Source::default();
-        source.found(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
-        source.found(&writer(2, "U", Reliability::Reliable, Durability::Volatile));
-        assert!(!source.participant_gone([3; 12]));
-        assert!(source.participant_gone([1; 12]));
-        assert!(source.of_other_type("U").is_none());
+        source.insert(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
+        source.insert(&writer(2, "U", Reliability::Reliable, Durability::Volatile));
+        assert!(!source.remove_participant([3; 12]));
+        assert!(source.remove_participant([1; 12]));
+        assert!(source.find_other_type("U").is_none());
     }
 
     #[test]
-    fn two_types_are_a_conflict_unless_the_configuration_decides() {
+    fn two_types_are_a_conflict_unless_the_configuration_sets_one() {
         let mut source = Source::default();
-        source.found(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
-        source.found(&writer(2, "U", Reliability::BestEffort, Durability::Volatile));
-        assert_eq!(wanted(&source, None), Wanted::TypeConflict("T".into(), "U".into()));
-        let decided = wanted(&source, Some("T"));
-        assert!(matches!(&decided, Wanted::Readers { dds_type, .. } if dds_type == "T"), "{decided:?}");
+        source.insert(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
+        source.insert(&writer(2, "U", Reliability::BestEffort, Durability::Volatile));
+        assert_eq!(plan(&source, None), ReaderPlan::TypeConflict("T".into(), "U".into()));
+        let decided = plan(&source, Some("T"));
+        assert!(matches!(&decided, ReaderPlan::Readers { dds_type, .. } if dds_type == "T"), "{decided:?}");
         assert_eq!(durabilities(decided), [Some(Durability::Volatile), None]);
     }
 
     #[test]
-    fn what_may_wait_is_bounded_in_bytes() {
-        assert_eq!(waiting_depth(1), 1024);
-        assert_eq!(waiting_depth(1 << 20), 32);
-        assert_eq!(waiting_depth(64 << 20), 16);
+    fn the_history_is_bounded_in_bytes() {
+        assert_eq!(history_depth(1), 1024);
+        assert_eq!(history_depth(1 << 20), 32);
+        assert_eq!(history_depth(64 << 20), 16);
     }
 }
