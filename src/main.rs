@@ -1,4 +1,4 @@
-//! The `adaptive-bridge` program: parses, dispatches, exits.
+//! The `adaptive-bridge` program: runs its command line.
 
 use std::process::ExitCode;
 

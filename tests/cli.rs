@@ -525,7 +525,7 @@ fn a_tap_that_cannot_be_says_why() {
     let unknown = bridge.run("tap /imu");
     assert_eq!(unknown.status.code(), Some(1));
     let said = text(&unknown.stderr);
-    assert!(said.contains("/imu; the configuration has: /scan (front_laser)"), "{said}");
+    assert!(said.contains("/imu; the routes are: /scan (front_laser)"), "{said}");
     assert_eq!(bridge.run("tap /scan --hz --raw").status.code(), Some(2));
 
     let mut first = bridge.start("tap /scan");

@@ -214,7 +214,7 @@ fn ctrl_c_in_either_phase_ends_at_once_with_0_and_leaves_nothing_behind() {
         kill(demo.pid(), Signal::SIGINT).unwrap();
         let (code, stdout, stderr) = demo.end();
         assert_eq!(code, Some(0), "{stderr}");
-        assert!(stdout.ends_with("Stopped. Nothing is left behind.\n"), "{stdout}");
+        assert!(stdout.ends_with("Stopped. All processes and files of the demo are removed.\n"), "{stdout}");
         assert_eq!(stdout.contains("Phase 2"), with_bridge, "{stdout}");
         assert_eq!(stderr, "");
         demo.assert_nothing_is_left();
@@ -241,7 +241,7 @@ fn a_process_of_the_demo_that_dies_is_named_with_its_log_and_the_rest_is_cleared
     kill(Pid::from_raw(stopped.0), Signal::SIGKILL).unwrap();
     let (code, _, stderr) = demo.end();
     assert_eq!(code, Some(1));
-    assert!(stderr.contains("the remote-subscriber ended unasked (signal: 9 (SIGKILL))"), "{stderr}");
+    assert!(stderr.contains("the remote-subscriber exited unexpectedly (signal: 9 (SIGKILL))"), "{stderr}");
     demo.assert_nothing_is_left();
 }
 

@@ -484,7 +484,7 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
     bed.stop();
     bed.machine.wait_property(rviz, "ActiveState", "inactive");
     let written = bed.machine.run(&["adaptive-bridge", "units", "--write"]);
-    assert_eq!(written, "everything is as the configuration needs it\n");
+    assert_eq!(written, "the drop-ins already match the configuration\n");
 }
 
 /// Makes the package of the program under test, with that version.

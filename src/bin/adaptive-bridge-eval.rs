@@ -1,4 +1,4 @@
-//! The `adaptive-bridge-eval` program: parses, dispatches, exits.
+//! The `adaptive-bridge-eval` program: runs its command line.
 
 use std::process::ExitCode;
 

@@ -1,4 +1,4 @@
-//! `check`: is this configuration good, and what does it take?
+//! `check`: checks a configuration file and shows the shared memory that it needs.
 
 use std::fmt::{self, Write as _};
 use std::io::{self, Write as _};
@@ -13,10 +13,10 @@ use crate::config::{ConfigError, Place, Settings};
 use crate::process::InForce;
 use crate::shm::RouteChannel;
 
-/// What `check` is asked.
+/// The arguments of `check`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
-    /// Print JSON, the problems too
+    /// Print JSON, for the problems of a bad file too
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -48,7 +48,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     }
 }
 
-/// What a good configuration comes to.
+/// The lanes, routes and shared memory of a good configuration.
 #[derive(Serialize)]
 struct Summary {
     instance: String,
@@ -112,7 +112,7 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "instance {}: {} routes, {} lanes", self.instance, self.routes.len(), self.lanes.len())?;
         for route in &self.routes {
-            let message_type = route.message_type.as_deref().unwrap_or("type found by discovery");
+            let message_type = route.message_type.as_deref().unwrap_or("type from DDS discovery");
             writeln!(f, "\nroute {}: {} ({message_type})", route.id, route.input_topic)?;
             for output in &route.outputs {
                 writeln!(f, "  {} -> {}", output.lane, output.topic)?;
@@ -125,11 +125,11 @@ impl fmt::Display for Summary {
                 bytes(route.shared_memory_bytes)
             )?;
         }
-        writeln!(f, "\nshared memory in all: {}", bytes(self.shared_memory_bytes))
+        writeln!(f, "\ntotal shared memory: {}", bytes(self.shared_memory_bytes))
     }
 }
 
-/// How the file differs from what the running bridge has in force.
+/// Lists the differences between the configuration in force and the file.
 fn differences(running: &Settings, file: Settings) -> String {
     let (_, reload) = running.reloaded(file);
     let mut text = String::new();
@@ -143,10 +143,11 @@ fn differences(running: &Settings, file: Settings) -> String {
     if text.is_empty() {
         text
     } else {
-        format!("\nthe running bridge has another configuration in force:\n{text}")
+        format!("\nthe configuration in force in the running bridge differs from this file:\n{text}")
     }
 }
 
+/// The problems of a bad file as JSON.
 fn problems(error: &ConfigError) -> serde_json::Value {
     let problems: Vec<_> = error
         .problems()
@@ -170,7 +171,7 @@ fn problems(error: &ConfigError) -> serde_json::Value {
     json!({ "file": error.file(), "problems": problems })
 }
 
-/// A size as people read it.
+/// A size with a unit, such as `12.0 KiB`.
 fn bytes(count: u64) -> String {
     const KIB: f64 = 1024.0;
     let size = count as f64;

@@ -1,4 +1,4 @@
-//! `completions`: what a shell needs to complete command lines of this program.
+//! `completions`: prints the script with which a shell completes command lines of this program.
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -8,7 +8,7 @@ use clap_complete::Shell;
 
 use super::{Cli, output_ended};
 
-/// What `completions` is asked.
+/// The arguments of `completions`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The shell
@@ -18,7 +18,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
     let mut command = Cli::command();
     let name = command.get_name().to_owned();
-    // Into memory first: the generator panics where it cannot write.
+    // Generated in memory first, because the generator panics when a write fails.
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut command, name, &mut script);
     match io::stdout().write_all(&script) {

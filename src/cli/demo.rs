@@ -1,16 +1,17 @@
-//! `demo`: why the bridge exists, on this machine, in under a minute, with neither ROS 2 nor root.
+//! `demo`: demonstrates the bridge on this machine in under a minute, without ROS 2 and without root.
 //!
-//! A laser publishes to a critical and to a remote subscriber. The remote one's link dies now and then: its
-//! process is stopped (SIGSTOP), so that it acknowledges nothing. In the first phase both read from the
-//! publisher's writer, in the second each from a lane of the bridge, which runs as on a robot. All are real
-//! processes with real DDS writers; nothing but the stop signal is made up, and all figures are measured.
+//! A laser publishes to a critical and to a remote subscriber. The link of the remote subscriber fails
+//! periodically: SIGSTOP stops its process, so that it acknowledges nothing. In the first phase both
+//! subscribers match the publisher's writer, in the second each matches the writer of a lane of the bridge,
+//! which runs as on a robot. All processes and DDS writers are real: only the failing link is simulated, and
+//! all figures are measured.
 
 mod children;
 mod outcome;
 mod peers;
 mod phase;
-mod place;
 mod report;
+mod sandbox;
 mod scan;
 mod screen;
 mod tally;
@@ -27,46 +28,47 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::model::MonotonicNs;
 use crate::shm::ShmError;
 use outcome::{Outcome, wrapped};
-use phase::Way;
-use place::Place;
+use phase::Setup;
+use sandbox::Sandbox;
 use screen::Screen;
 
 pub(super) use peers::{PublisherArguments, SubscriberArguments, publisher, subscriber};
 
-/// Scans per second.
+/// Scans that the laser publishes per second.
 const RATE_HZ: u64 = 30;
-/// Scans that the publisher's writer keeps while they are unacknowledged. So few that a stall of 3 s, 90
-/// scans, fills it; with 200 it would take 7 s.
+/// Unacknowledged scans that the publisher's writer keeps. A stall of 3 s, 90 scans, fills this history; with
+/// 200 it would take 7 s.
 const HISTORY_SCANS: usize = 50;
-/// How long a publish call waits for room: the default of ROS 2's publishers (DDS 1.4 clause 2.2.3.14).
+/// How long a publish call waits for space in the history: the default of ROS 2's publishers (DDS 1.4 clause
+/// 2.2.3.14).
 const MAX_BLOCKING_MS: u64 = 100;
-/// The remote subscriber's link dies once in this time,
+/// The period of the stalls of the remote subscriber.
 const STALL_EVERY_MS: u64 = 6_000;
-/// this long after the time began,
+/// The time from the start of a period to its stall.
 const STALL_AFTER_MS: u64 = 2_000;
-/// and for so long.
+/// The duration of a stall.
 const STALL_MS: u64 = 3_000;
 /// The laser's topic, in the demo's own DDS domain.
 const INPUT_TOPIC: &str = "/scan";
 
-/// What `demo` is asked.
+/// The arguments of `demo`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
-    /// Seconds of each of the two phases
+    /// Duration of each of the two phases, in seconds
     #[arg(long, value_name = "N", default_value_t = 18)]
     #[arg(value_parser = clap::value_parser!(u64).range(6..=600))]
     seconds: u64,
-    /// Print the result as JSON, and nothing else
+    /// Print only the result, as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// When a scan is due.
+/// The instant at which a scan is due.
 const fn due_at(began_at: MonotonicNs, number: u64) -> MonotonicNs {
     began_at.plus_ns(number * 1_000_000_000 / RATE_HZ)
 }
 
-/// The first scan that is due at an instant or later.
+/// The number of the first scan that is due at an instant or later.
 fn first_due_after(began_at: MonotonicNs, instant: MonotonicNs) -> u64 {
     let mut number = instant.since(began_at) * RATE_HZ / 1_000_000_000;
     while due_at(began_at, number) < instant {
@@ -78,27 +80,27 @@ fn first_due_after(began_at: MonotonicNs, instant: MonotonicNs) -> u64 {
 /// Why a demo ended early.
 #[derive(Debug)]
 enum DemoError {
-    /// The user wants it to.
+    /// The user stopped it.
     Interrupted,
     /// No DDS domain is free.
     NoDomain { from: u16, to: u16 },
     /// A process could not be started.
     Start { name: &'static str, error: io::Error },
-    /// A process ended, which none should.
-    Ended { who: &'static str, status: ExitStatus },
-    /// Somebody gets no scans.
-    NothingArrives { who: &'static str, patience_ms: u64 },
-    /// The bridge refuses what the demo configured.
+    /// A process exited during the demo.
+    Ended { name: &'static str, status: ExitStatus },
+    /// A subscriber receives no scans, or the publisher publishes none.
+    NothingArrives { name: &'static str, timeout_ms: u64 },
+    /// The bridge refused the demo's configuration.
     Config(String),
-    /// Shared memory.
+    /// An access to shared memory failed.
     Shm(ShmError),
-    /// The operating system refused something else.
-    Os { what: &'static str, error: io::Error },
+    /// Another system call failed.
+    Os { action: &'static str, error: io::Error },
 }
 
 impl DemoError {
-    fn os(what: &'static str, error: io::Error) -> Self {
-        Self::Os { what, error }
+    fn os(action: &'static str, error: io::Error) -> Self {
+        Self::Os { action, error }
     }
 }
 
@@ -113,24 +115,24 @@ impl fmt::Display for DemoError {
         match self {
             Self::Interrupted => f.write_str("stopped"),
             Self::NoDomain { from, to } => {
-                write!(f, "the DDS domains {from} to {to} are all in use, by other demos perhaps")
+                write!(f, "the DDS domains {from} to {to} are all in use, perhaps by other demos")
             }
             Self::Start { name, error } => write!(f, "cannot start the {name}: {error}"),
-            Self::Ended { who, status } => write!(f, "the {who} ended unasked ({status})"),
-            Self::NothingArrives { who, patience_ms } => write!(
+            Self::Ended { name, status } => write!(f, "the {name} exited unexpectedly ({status})"),
+            Self::NothingArrives { name, timeout_ms } => write!(
                 f,
-                "nothing comes from or to the {who} for {} s; if no log above says why: DDS discovery needs \
-                 UDP multicast on the loopback interface, which a firewall may block",
-                patience_ms / 1_000
+                "the {name} exchanged no scans for {} s; if the logs above show no cause, check that no firewall \
+                 blocks UDP multicast on the loopback interface, which DDS discovery needs",
+                timeout_ms / 1_000
             ),
-            Self::Config(what) => write!(f, "the demo's configuration: {what}"),
+            Self::Config(problem) => write!(f, "the demo's configuration: {problem}"),
             Self::Shm(error) => error.fmt(f),
-            Self::Os { what, error } => write!(f, "{what}: {error}"),
+            Self::Os { action, error } => write!(f, "{action}: {error}"),
         }
     }
 }
 
-/// The wish to stop: Ctrl-C, SIGTERM, or a terminal that was closed.
+/// Set when the user stops the demo: by Ctrl-C, SIGTERM, or closing the terminal.
 struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
@@ -153,11 +155,11 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     match show(arguments, &mut screen) {
         Ok(outcome) if arguments.json => print_json(&outcome),
         Ok(outcome) => {
-            screen.say(&outcome.text());
+            screen.print(&outcome.text());
             ExitCode::SUCCESS
         }
         Err(DemoError::Interrupted) => {
-            screen.say("\nStopped. Nothing is left behind.");
+            screen.print("\nStopped. All processes and files of the demo are removed.");
             ExitCode::SUCCESS
         }
         Err(error) => super::failed(&error),
@@ -166,44 +168,44 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
 
 fn show(arguments: &Arguments, screen: &mut Screen) -> Result<Outcome, DemoError> {
     let interrupt = Interrupt::on_signals()?;
-    let place = Place::find()?;
-    screen.say(&introduction(arguments.seconds, place.domain()));
-    let mut phase = |way, title: &str| {
-        screen.say(title);
-        let figures = phase::run(&place, way, arguments.seconds, &interrupt, screen);
+    let sandbox = Sandbox::create()?;
+    screen.print(&introduction(arguments.seconds, sandbox.domain()));
+    let mut phase = |setup, title: &str| {
+        screen.print(title);
+        let figures = phase::run(&sandbox, setup, arguments.seconds, &interrupt, screen);
         if let Err(error) = &figures
             && !matches!(error, DemoError::Interrupted)
         {
-            eprint!("{}", children::last_log_lines(&place));
+            eprint!("{}", children::last_log_lines(&sandbox));
         }
         figures
     };
     let without_bridge = phase(
-        Way::Direct,
+        Setup::Direct,
         "\nPhase 1: both subscribers read the publisher's topic (RELIABLE, the default)\n",
     )?;
     let with_bridge =
-        phase(Way::Bridge, "\nPhase 2: the same stalls through the bridge (remote: BEST_EFFORT, 10 Hz)\n")?;
-    screen.say("");
+        phase(Setup::Bridge, "\nPhase 2: the same stalls through the bridge (remote: BEST_EFFORT, 10 Hz)\n")?;
+    screen.print("");
     Ok(Outcome::new(arguments.seconds, without_bridge, with_bridge))
 }
 
 fn introduction(seconds: u64, domain: u16) -> String {
-    let what = format!(
+    let scenario = format!(
         "A laser publishes {RATE_HZ} scans a second to two subscribers: a critical one on the robot, and a \
-         remote one whose link dies for {} s in every {}. For that its process is stopped (SIGSTOP): to the \
-         publisher's DDS writer that is a dead Wi-Fi link, no acknowledgements.",
+         remote one whose link fails for {} s in every {}. The demo simulates that by stopping its process \
+         (SIGSTOP): the publisher's DDS writer gets no acknowledgements, as over a dead Wi-Fi link.",
         STALL_MS / 1_000,
         STALL_EVERY_MS / 1_000,
     );
-    let how = format!(
-        "The publisher is an ordinary one: RELIABLE, a history of {HISTORY_SCANS} unacknowledged scans (so \
-         small that {} s fill it; 200 would take {:.0} s), and a publish call waits {MAX_BLOCKING_MS} ms for \
-         room at most. Each of the two phases takes {seconds} s, on loopback, in DDS domain {domain}.",
+    let publisher = format!(
+        "The publisher is an ordinary one: it is RELIABLE, its history keeps {HISTORY_SCANS} unacknowledged scans \
+         ({} s fill it; 200 scans would take {:.0} s), and a publish call waits at most {MAX_BLOCKING_MS} ms for \
+         space in it. Each of the two phases takes {seconds} s, on loopback, in DDS domain {domain}.",
         STALL_MS / 1_000,
         200.0 / RATE_HZ as f64,
     );
-    format!("{}\n\n{}", wrapped(&what), wrapped(&how))
+    format!("{}\n\n{}", wrapped(&scenario), wrapped(&publisher))
 }
 
 fn print_json(outcome: &Outcome) -> ExitCode {
@@ -222,7 +224,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scans_are_due_at_their_rate_for_ever() {
+    fn scans_are_due_at_a_constant_rate() {
         let began_at = MonotonicNs(123_456_789);
         assert_eq!(due_at(began_at, 18_000), began_at.plus_ms(600_000));
         for number in [0, 1, 2, 29, 30, 31, 17_999] {

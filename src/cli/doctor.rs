@@ -1,4 +1,4 @@
-//! `doctor`: what on this machine will hurt, what that means, and the command that mends it.
+//! `doctor`: checks this machine for conditions that impair the bridge and shows how to fix them.
 
 mod limits;
 mod memory;
@@ -17,9 +17,9 @@ use serde::Serialize;
 use super::{ConfigArguments, failed, output_ended};
 use crate::config::{self, Settings};
 
-/// What `doctor` is asked.
+/// The arguments of `doctor`.
 ///
-/// Exit codes: 0 nothing that hurts, 3 warnings, 4 errors: the bridge will not run, or not do its work.
+/// Exit codes: 0 no warning, 3 warnings, 4 errors: the bridge will not start or not work.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Print JSON: one object with all findings
@@ -29,17 +29,17 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-/// How much a finding matters.
+/// The severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Severity {
-    /// As it should be.
+    /// No problem.
     Ok,
-    /// Worth to know.
+    /// A fact to know.
     Note,
-    /// It will hurt under load, or after a while.
+    /// It impairs the bridge under load, or after some time.
     Warning,
-    /// The bridge will not run, or not do its work.
+    /// The bridge will not start or not work.
     Error,
 }
 
@@ -62,17 +62,17 @@ impl Severity {
     }
 }
 
-/// What one check found.
+/// The result of one check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct Finding {
-    /// The check, by a name that stays the same.
+    /// The stable name of the check.
     check: &'static str,
     severity: Severity,
-    /// What was found.
+    /// The state that the check found.
     found: String,
-    /// What it means for the bridge; empty where all is well.
+    /// The consequence for the bridge; empty without a problem.
     meaning: &'static str,
-    /// What to type.
+    /// The command that fixes it.
     command: Option<String>,
 }
 
@@ -85,16 +85,16 @@ impl Finding {
         Self { check, severity, found: found.into(), meaning, command: None }
     }
 
-    fn mended_by(mut self, command: impl Into<String>) -> Self {
+    fn with_command(mut self, command: impl Into<String>) -> Self {
         self.command = Some(command.into());
         self
     }
 }
 
-/// All findings.
+/// All findings, with the worst severity.
 #[derive(Debug, Serialize)]
 struct Diagnosis {
-    /// The worst of them.
+    /// The worst severity of the findings.
     severity: Severity,
     findings: Vec<Finding>,
 }
@@ -136,9 +136,9 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
                     "configuration",
                     Severity::Error,
                     format!("{}: {problems} problems", file.display()),
-                    "No process of the bridge starts. What follows is judged by the defaults.",
+                    "No process of the bridge starts. The following checks use the default settings.",
                 )
-                .mended_by(format!("adaptive-bridge check --config {}", file.display())),
+                .with_command(format!("adaptive-bridge check --config {}", file.display())),
             );
             match config::parse("topics: [{id: none, input_topic: /none}]", "the defaults", &|_| None) {
                 Ok(settings) => settings,
@@ -171,18 +171,18 @@ fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
     findings
 }
 
-/// A number that the kernel shows in a file.
+/// Reads a file of the kernel that holds one number.
 fn number(path: &str) -> Option<i64> {
     fs::read_to_string(path).ok()?.trim().parse().ok()
 }
 
-/// What a program prints, whatever its exit code; `None` when there is no such program.
+/// Runs a program and returns its stdout, whatever its exit code; `None` when the program cannot be started.
 fn output(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).output().ok()?;
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-/// Items with commas between.
+/// The items separated by commas.
 fn list<T: fmt::Display>(items: impl IntoIterator<Item = T>) -> String {
     let mut text = String::new();
     for item in items {
@@ -210,8 +210,8 @@ mod tests {
     }
 
     #[test]
-    fn a_finding_says_what_it_means_and_what_to_type() {
-        let finding = Finding::new("clock", Severity::Warning, "hpet", "Slow.").mended_by("fix it");
+    fn a_finding_is_shown_with_its_meaning_and_its_command() {
+        let finding = Finding::new("clock", Severity::Warning, "hpet", "Slow.").with_command("fix it");
         let shown = Diagnosis::of(vec![finding]).to_string();
         assert_eq!(
             shown,

@@ -1,4 +1,4 @@
-//! `man`: writes the manual pages, for those who make packages.
+//! `man`: writes the manual pages, for building packages.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -7,7 +7,7 @@ use clap::{Args, CommandFactory};
 
 use super::{Cli, failed};
 
-/// What `man` is asked.
+/// The arguments of `man`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The folder to write to, which must exist
@@ -19,7 +19,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let folder = arguments.directory.display();
-            failed(&format!("no manual pages written to {folder}: {error}"))
+            failed(&format!("cannot write the manual pages to {folder}: {error}"))
         }
     }
 }

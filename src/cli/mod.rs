@@ -1,8 +1,8 @@
-//! The command line: one file for each subcommand.
+//! The command line of `adaptive-bridge`: one file for each subcommand.
 //!
-//! Exit codes: 0 done, 1 failed while running, 2 wrong command line, 78 bad configuration (`EX_CONFIG` of
-//! sysexits.h); 3 and 4 are `doctor`'s, 5 is `reload`'s. Logs go to stderr; what a program may want to read
-//! goes to stdout, and nothing else does.
+//! Exit codes: 0 success, 1 failed while running, 2 wrong command line, 78 bad configuration (`EX_CONFIG` of
+//! sysexits.h); `doctor` also uses 3 and 4, `reload` also 5. Logs go to stderr; only output that another
+//! program may read goes to stdout.
 
 mod check;
 mod completions;
@@ -30,14 +30,14 @@ use crate::process::{InForce, Stop};
 use crate::shm::{self, ShmError};
 use crate::telemetry::{self, Snapshot};
 
-/// A reload applied what it could, and the rest of the file waits for a restart of the whole bridge.
+/// Exit code of `reload` when some changes of the file wait for a restart of the whole bridge.
 const EXIT_WAITS: u8 = 5;
 
-/// Bad configuration (`EX_CONFIG`, sysexits.h).
+/// Exit code for a bad configuration (`EX_CONFIG` of sysexits.h).
 const EXIT_CONFIG: u8 = 78;
 
 /// A proxy between a robot's ROS 2 publishers and its subscribers: a slow subscriber behind bad Wi-Fi cannot
-/// stall the publisher, nor the critical subscribers beside it.
+/// stall the publisher or the critical subscribers.
 #[derive(Debug, Parser)]
 #[command(name = "adaptive-bridge", version, max_term_width = 100)]
 struct Cli {
@@ -47,39 +47,39 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Check a configuration file: every problem at once, and the shared memory it takes
+    /// Check a configuration file: list all its problems, or the shared memory that it needs
     Check(check::Arguments),
-    /// Run ingress: take every topic in from DDS, once, into shared memory
+    /// Run ingress: receive each input topic once from DDS and publish it in shared memory
     Ingress(ConfigArguments),
-    /// Run the egress of one lane: out of shared memory to its own DDS writers
+    /// Run the egress of one lane: forward samples from shared memory with the lane's own DDS writers
     Egress(roles::EgressArguments),
-    /// Answer a bridge's probes, beside a remote subscriber; needs no bridge on its machine
+    /// Run a responder beside a remote subscriber: answer probe requests; needs no bridge on its machine
     Responder(responder::Arguments),
-    /// Run control: probe and classify subscribers, decide the lanes' modes, watch over the bridge
+    /// Run control: probe and classify subscribers, set the lanes' modes, supervise the bridge
     Control(ConfigArguments),
-    /// Run the whole bridge, all processes as children of this one
+    /// Run the whole bridge: a supervisor with all other processes as its children
     Up(ConfigArguments),
-    /// Show what the running bridge does: processes, rates, drops, latencies, and what is wrong
+    /// Show the state of the running bridge: problems, processes, rates, drops, latencies
     Status(status::Arguments),
-    /// Read the samples of a route straight from shared memory
+    /// Read the samples of a route directly from shared memory
     Tap(tap::Arguments),
-    /// Set the mode of a lane by hand
+    /// Override the mode of a lane by hand
     Mode(mode::Arguments),
-    /// Let the running bridge take over what was changed in its configuration file, without a restart
+    /// Apply the changes of the configuration file to the running bridge, without a restart
     ///
-    /// Exit codes: 0 all applied, 5 the rest of the file waits for a restart of the whole bridge, 1 a process
-    /// refused the file or did not answer, 78 the file is bad.
+    /// Exit codes: 0 all changes are applied, 5 some changes wait for a restart of the whole bridge, 1 a
+    /// process refused the file or did not answer, 78 the file is bad.
     Reload(ConfigArguments),
-    /// Say what on this machine will hurt the bridge, and the command that mends it
+    /// Check this machine for conditions that impair the bridge, and print the command that fixes each
     Doctor(doctor::Arguments),
-    /// Show, or write, what a configuration needs of systemd beyond the installed units
+    /// Print or write the systemd drop-ins that a configuration needs beside the installed units
     Units(units::Arguments),
-    /// Print what a shell needs to complete command lines
+    /// Print the script with which a shell completes command lines
     Completions(completions::Arguments),
     /// Write the manual pages to a folder
     #[command(hide = true)]
     Man(man::Arguments),
-    /// Show what the bridge is for: publisher, subscribers and bridge on this machine, without ROS 2
+    /// Demonstrate the bridge with a publisher and two subscribers on this machine, without ROS 2
     Demo(demo::Arguments),
     #[command(hide = true)]
     DemoPublisher(demo::PublisherArguments),
@@ -87,7 +87,7 @@ enum Command {
     DemoSubscriber(demo::SubscriberArguments),
 }
 
-/// Which configuration.
+/// The option that names the configuration file.
 #[derive(Args, Clone, Debug)]
 struct ConfigArguments {
     /// Configuration file [default: $ADAPTIVE_BRIDGE_CONFIG, then /etc/adaptive-bridge/config.yaml]
@@ -100,15 +100,15 @@ impl ConfigArguments {
         self.config.as_deref()
     }
 
-    /// The file, with its whole path, that is read when it exists.
+    /// The absolute path of the configuration file, which may not exist.
     fn file(&self) -> PathBuf {
-        let named = || std::env::var_os(config::PATH_VARIABLE).filter(|path| !path.is_empty());
-        let path = self.config.clone().or_else(|| named().map(PathBuf::from));
+        let from_environment = || std::env::var_os(config::PATH_VARIABLE).filter(|path| !path.is_empty());
+        let path = self.config.clone().or_else(|| from_environment().map(PathBuf::from));
         let path = path.unwrap_or_else(|| config::DEFAULT_PATH.into());
         std::path::absolute(&path).unwrap_or(path)
     }
 
-    /// The settings, or the exit code after the problems were printed.
+    /// Reads the settings; if the file is bad, prints its problems and returns the exit code.
     fn load(&self) -> Result<Settings, ExitCode> {
         self.try_load().map_err(|error| bad_configuration(&error))
     }
@@ -121,13 +121,13 @@ impl ConfigArguments {
         config::load_configuration(self.path(), &|name| std::env::var(name).ok())
     }
 
-    /// The settings that the running bridge has in force; `None` when no bridge runs.
+    /// The settings in force in the running bridge; `None` when no bridge runs.
     fn running(&self) -> Option<Settings> {
         InForce::find(&self.file(), self.try_load().ok().as_ref())
     }
 
-    /// The settings that the running bridge has in force, whatever the file says by now; those of the file
-    /// when no bridge runs.
+    /// The settings in force in the running bridge, even if the file has changed since; without a running
+    /// bridge, the settings of the file.
     fn in_force(&self) -> Result<Settings, ExitCode> {
         let loaded = self.try_load();
         match InForce::find(&self.file(), loaded.as_ref().ok()) {
@@ -137,15 +137,15 @@ impl ConfigArguments {
     }
 }
 
-/// Prints every problem of a configuration file, and gives the exit code.
+/// Prints every problem of a configuration file and returns the exit code.
 fn bad_configuration(error: &ConfigError) -> ExitCode {
     eprintln!("{error}");
     ExitCode::from(EXIT_CONFIG)
 }
 
-/// Runs the program.
+/// Runs the subcommand that the command line names.
 pub fn main() -> ExitCode {
-    // clap prints help and errors itself, and exits with 0 or 2.
+    // clap prints help and errors itself and exits with 0 or 2.
     let cli = Cli::parse();
     telemetry::start_logs();
     match cli.command {
@@ -169,17 +169,17 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Prints why a command failed, and gives its exit code.
+/// Prints why a command failed and returns its exit code.
 fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     eprintln!("adaptive-bridge: {error}");
     ExitCode::FAILURE
 }
 
-/// A reading of the bridge that runs with these settings.
+/// Takes a snapshot of the bridge that runs with these settings; `None` when no bridge runs.
 fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, String> {
     Snapshot::take(root, settings).map_err(|error| match error {
         ShmError::Incompatible { .. } => format!(
-            "the bridge that runs as instance {} is of another version than this program; restart the whole \
+            "the running bridge (instance {}) has a different version than this program; restart the whole \
              bridge",
             settings.instance
         ),
@@ -187,12 +187,12 @@ fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, Str
     })
 }
 
-/// Prints that there is no bridge to look at, and gives the exit code.
+/// Prints that no bridge runs with these settings and returns the exit code.
 fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
     let services = Path::new("/run/adaptive-bridge");
     let hint = match std::fs::metadata(services) {
         Ok(_) if services != root => {
-            "look at that of the services with `sudo -u adaptive-bridge adaptive-bridge …`, or start one"
+            "reach the bridge of the systemd services with `sudo -u adaptive-bridge adaptive-bridge …`, or start one"
         }
         _ => "start it",
     };
@@ -203,8 +203,8 @@ fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
     ))
 }
 
-/// The exit code after stdout could not be written to. Who reads only the beginning, as `head` does, has what
-/// it wants: that is no failure.
+/// The exit code after a write to stdout failed. A reader that closes the pipe early, as `head` does, is no
+/// failure.
 fn output_ended(error: &io::Error) -> ExitCode {
     match error.kind() {
         ErrorKind::BrokenPipe => ExitCode::SUCCESS,
@@ -212,20 +212,20 @@ fn output_ended(error: &io::Error) -> ExitCode {
     }
 }
 
-/// The folder of the bridge's shared files, for these settings and this environment.
+/// The root folder of the bridge's shared-memory files, from these settings and the environment.
 fn root(settings: &Settings) -> PathBuf {
     shm::default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
 }
 
-/// Waits; `false` as soon as the process is asked to stop.
+/// Sleeps for `ms` and returns `true`; returns `false` as soon as a stop is requested.
 fn pause(ms: u64, stop: &Stop) -> bool {
-    const LOOK_MS: u64 = 20;
+    const POLL_MS: u64 = 20;
     let end = clock::monotonic().plus_ms(ms);
     loop {
         let left_ns = end.since(clock::monotonic());
         if left_ns == 0 || stop.is_requested() {
             return !stop.is_requested();
         }
-        std::thread::sleep(Duration::from_nanos(left_ns.min(LOOK_MS * 1_000_000)));
+        std::thread::sleep(Duration::from_nanos(left_ns.min(POLL_MS * 1_000_000)));
     }
 }

@@ -9,16 +9,17 @@ use super::{ConfigArguments, failed};
 use crate::model::LaneMode;
 use crate::process;
 
-/// What `mode` is asked.
+/// The arguments of `mode`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The lane
     lane: String,
-    /// The mode that it is to be in, whatever the control process decides
+    /// The mode to set, which overrides the control process
     mode: Mode,
-    /// How long: such as 90s, 10m, 2h, or `forever`. A safety mode holds against it
-    #[arg(long = "for", value_name = "TIME", default_value = "1h", value_parser = how_long)]
-    duration: HowLong,
+    /// How long the override lasts: such as 90s, 10m, 2h, or `forever`. The safety supervisor takes
+    /// precedence over it
+    #[arg(long = "for", value_name = "TIME", default_value = "1h", value_parser = override_duration)]
+    duration: OverrideDuration,
     #[command(flatten)]
     config: ConfigArguments,
 }
@@ -26,20 +27,21 @@ pub(super) struct Arguments {
 /// The modes that can be set by hand.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Mode {
-    /// The configured rate
+    /// Forward at the configured rate
     Normal,
-    /// The reduced rate
+    /// Forward at the degraded rate
     Degraded,
-    /// Nothing on a noncritical lane
+    /// Forward nothing on a noncritical lane
     Suspended,
-    /// Nothing on any lane
+    /// Forward nothing, on a critical lane either
     Stopped,
-    /// End the override: the control process decides again
+    /// End the override: the control process sets the mode again
     Auto,
 }
 
 impl Mode {
-    const fn override_by_hand(self) -> Option<LaneMode> {
+    /// The mode of the override; `None` to end it.
+    const fn override_mode(self) -> Option<LaneMode> {
         match self {
             Self::Normal => Some(LaneMode::Normal),
             Self::Degraded => Some(LaneMode::Degraded),
@@ -50,19 +52,19 @@ impl Mode {
     }
 }
 
-/// How long an override lasts; without an end when `None`.
+/// The time after which an override expires; `None` when it never does.
 #[derive(Clone, Copy, Debug)]
-struct HowLong(Option<Duration>);
+struct OverrideDuration(Option<Duration>);
 
-fn how_long(text: &str) -> Result<HowLong, String> {
+fn override_duration(text: &str) -> Result<OverrideDuration, String> {
     if text == "forever" {
-        return Ok(HowLong(None));
+        return Ok(OverrideDuration(None));
     }
     let duration = humantime::parse_duration(text).map_err(|error| error.to_string())?;
     if duration.is_zero() {
-        Err("must be longer than nothing".to_owned())
+        Err("must be longer than 0 s".to_owned())
     } else {
-        Ok(HowLong(Some(duration)))
+        Ok(OverrideDuration(Some(duration)))
     }
 }
 
@@ -71,13 +73,13 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(settings) => settings,
         Err(code) => return code,
     };
-    let mode = arguments.mode.override_by_hand();
+    let mode = arguments.mode.override_mode();
     match process::set_mode(&settings, &arguments.lane, mode, arguments.duration.0) {
         Ok(epoch) => {
             let lane = &arguments.lane;
             match (mode, arguments.duration.0) {
                 (None, _) => println!("lane {lane}: no override (epoch {epoch})"),
-                (Some(mode), None) => println!("lane {lane}: {mode} until it is changed (epoch {epoch})"),
+                (Some(mode), None) => println!("lane {lane}: {mode} until the next override (epoch {epoch})"),
                 (Some(mode), Some(duration)) => {
                     println!(
                         "lane {lane}: {mode} for {} (epoch {epoch})",

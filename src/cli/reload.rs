@@ -1,4 +1,4 @@
-//! `reload`: lets the running bridge take over what was changed in its configuration file.
+//! `reload`: applies the changes of the configuration file to the running bridge.
 
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
@@ -9,12 +9,12 @@ use crate::config::Reload;
 use crate::process::{InForce, ReloadAnswer, ReloadResult, reload_all};
 
 pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
-    // A bad file is shown here with all its problems, and no process is asked to read it.
+    // A bad file is refused here with all its problems, before any process of the bridge reads it.
     let file = match arguments.load() {
         Ok(settings) => settings,
         Err(code) => return code,
     };
-    // The file may name another instance than the bridge that was started with it.
+    // The file may have a new instance name since the bridge was started with it.
     let settings = InForce::find(&arguments.file(), Some(&file)).unwrap_or_else(|| file.clone());
     let root = root(&settings);
     let answers = match reload_all(&root, &settings.instance) {
@@ -22,7 +22,7 @@ pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
         Ok(answers) => answers,
         Err(error) => return failed(&error),
     };
-    let text = tell(&answers, file.fingerprint());
+    let text = summary(&answers, file.fingerprint());
     if let Err(error) = io::stdout().write_all(text.as_bytes()) {
         return output_ended(&error);
     }
@@ -41,13 +41,13 @@ fn exit_code(answers: &[ReloadAnswer]) -> ExitCode {
     code
 }
 
-/// What changed, what waits for a restart, then each process. `fingerprint` is that of the file as it was
-/// read here.
-fn tell(answers: &[ReloadAnswer], fingerprint: u64) -> String {
+/// Lists the applied changes, the changes that wait for a restart, and the outcome of each process.
+/// `fingerprint` is that of the file as this command read it.
+fn summary(answers: &[ReloadAnswer], fingerprint: u64) -> String {
     let mut text = String::new();
-    let mut say = |line: String| {
-        // The processes agree on most of it: each thing is said once.
-        if !text.lines().any(|said| said == line) {
+    let mut add = |line: String| {
+        // Processes report the same changes: each line is printed once.
+        if !text.lines().any(|printed| printed == line) {
             let _ = writeln!(text, "{line}");
         }
     };
@@ -56,24 +56,24 @@ fn tell(answers: &[ReloadAnswer], fingerprint: u64) -> String {
         _ => None,
     });
     for reload in accepted.clone() {
-        reload.changed.iter().for_each(|change| say(format!("changed: {change}")));
+        reload.changed.iter().for_each(|change| add(format!("changed: {change}")));
     }
     for reload in accepted {
         for change in &reload.waits {
-            say(format!("waits for a restart of the whole bridge: {change}"));
+            add(format!("waits for a restart of the whole bridge: {change}"));
         }
     }
     for ReloadAnswer { role, pid, result } in answers {
-        say(format!("{role} (pid {pid}): {}", outcome(result.as_ref(), fingerprint)));
+        add(format!("{role} (pid {pid}): {}", outcome(result.as_ref(), fingerprint)));
     }
     text
 }
 
 fn outcome(result: Option<&ReloadResult>, fingerprint: u64) -> String {
     match result {
-        None => "no answer: it is stopped, or has ended".to_owned(),
+        None => "no answer: it is stopped or has exited".to_owned(),
         Some(ReloadResult::Refused { problems }) => {
-            format!("refused, and nothing changed in it:\n{problems}")
+            format!("refused; its settings are unchanged:\n{problems}")
         }
         Some(ReloadResult::Accepted { file_fingerprint, reload }) => {
             let what = match reload {
@@ -84,7 +84,7 @@ fn outcome(result: Option<&ReloadResult>, fingerprint: u64) -> String {
             if *file_fingerprint == fingerprint {
                 what.to_owned()
             } else {
-                format!("{what}; it reads another file than this one, or has another environment")
+                format!("{what}; it reads a different file or has different environment variables")
             }
         }
     }
@@ -96,7 +96,7 @@ mod tests {
     use crate::config::Change;
 
     #[test]
-    fn what_all_processes_say_is_told_once_and_each_outcome_for_itself() {
+    fn a_change_of_all_processes_is_listed_once_and_the_outcome_of_each_process() {
         let change = |key: &str| Change { key: key.to_owned(), old: "1".to_owned(), new: "2".to_owned() };
         let reload = Reload { changed: vec![change("policy_hold_s")], waits: vec![change("ros.domain_id")] };
         let answer = |role: &str, result| ReloadAnswer { role: role.to_owned(), pid: 7, result };
@@ -111,14 +111,14 @@ mod tests {
             answer("ingress", None),
         ];
         assert_eq!(
-            tell(&answers, 1),
+            summary(&answers, 1),
             "changed: policy_hold_s: 1 -> 2\n\
              waits for a restart of the whole bridge: ros.domain_id: 1 -> 2\n\
              egress-a (pid 7): reloaded\n\
-             egress-b (pid 7): reloaded; it reads another file than this one, or has another environment\n\
+             egress-b (pid 7): reloaded; it reads a different file or has different environment variables\n\
              egress-c (pid 7): nothing differs\n\
-             egress-d (pid 7): refused, and nothing changed in it:\nf.yaml:1: x: must be y\n\
-             ingress (pid 7): no answer: it is stopped, or has ended\n"
+             egress-d (pid 7): refused; its settings are unchanged:\nf.yaml:1: x: must be y\n\
+             ingress (pid 7): no answer: it is stopped or has exited\n"
         );
     }
 }

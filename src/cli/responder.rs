@@ -1,4 +1,4 @@
-//! `responder`: answers probes, beside a remote subscriber.
+//! `responder`: answers probe requests beside a remote subscriber.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -12,28 +12,28 @@ use crate::process::probes::Trust;
 use crate::process::{self, ResponderOptions};
 use crate::telemetry;
 
-/// What `responder` is asked.
+/// The arguments of `responder`.
 ///
-/// It needs no configuration file: without one there are the defaults, ROS_DOMAIN_ID and these options. With
-/// the bridge's own file it is in the domain of the subscriber's lane.
+/// It needs no configuration file: without one it uses the defaults, ROS_DOMAIN_ID and these options. With
+/// the bridge's own file it uses the DDS domain of the subscriber's lane.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
-    /// The subscriber's name, as `subscribers:` of the bridge's configuration has it
+    /// The subscriber's name in `subscribers:` of the bridge's configuration
     #[arg(long, value_name = "ID", value_parser = id)]
     id: String,
-    /// DDS domain [default: that of the subscriber's lane, else $ROS_DOMAIN_ID, else 0]
+    /// DDS domain [default: the domain of the subscriber's lane, else $ROS_DOMAIN_ID, else 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     domain: Option<u16>,
     /// A network interface to use, by name or IPv4 address; repeatable [default: as configured, else all]
     #[arg(long = "network", value_name = "INTERFACE", value_parser = network)]
     networks: Vec<NetworkSelector>,
-    /// Topic of the requests [default: as configured, else /adaptive_bridge/probe_req]
+    /// Topic of the probe requests [default: as configured, else /adaptive_bridge/probe_req]
     #[arg(long, value_name = "TOPIC", value_parser = topic)]
     request_topic: Option<TopicName>,
-    /// Topic of the responses [default: as configured, else /adaptive_bridge/probe_resp]
+    /// Topic of the probe responses [default: as configured, else /adaptive_bridge/probe_resp]
     #[arg(long, value_name = "TOPIC", value_parser = topic)]
     response_topic: Option<TopicName>,
-    /// A file whose first line is the bridge's secret; sign, and answer signed probes only
+    /// A file whose first line is the bridge's secret: sign responses, and answer signed requests only
     #[arg(long, value_name = "FILE")]
     secret_file: Option<PathBuf>,
     #[command(flatten)]
@@ -53,7 +53,9 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     let request_topic = arguments.request_topic.as_ref().unwrap_or(&settings.probes.request_topic);
     let response_topic = arguments.response_topic.as_ref().unwrap_or(&settings.probes.response_topic);
     if request_topic == response_topic {
-        failed(&format!("requests and responses cannot be on the same topic, {request_topic}"));
+        failed(&format!(
+            "probe requests and responses must be on different topics; both are on {request_topic}"
+        ));
         return ExitCode::from(EXIT_CONFIG);
     }
     let mut security = settings.security.clone();
@@ -82,7 +84,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
 }
 
 impl Arguments {
-    /// Where the subscriber is: on the network of its lane, unless the command line says otherwise.
+    /// The DDS network of the subscriber's lane, with the values of the command line in place of its own.
     fn network(&self, settings: &Settings) -> DdsNetwork {
         let lane = settings.subscribers.get(&self.id).cloned().unwrap_or_else(LaneName::noncritical);
         let configured = settings.lane(&lane).map_or(&settings.input, |lane| &lane.network);

@@ -1,4 +1,4 @@
-//! `ingress`, `egress`, `control` and `up`.
+//! `ingress`, `egress`, `control` and `up`: run one process of the bridge, or the supervisor.
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -10,12 +10,11 @@ use crate::config::Configuration;
 use crate::process::{self, HangUp, InForce, InForceError, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
 
-/// A service manager restarts a process that died at once, so that samples flow again; one that cannot start,
-/// for want of a network interface say, does not come sooner for being tried more often. It waits before it
-/// ends.
+/// How long a service process that cannot start waits before it exits. systemd restarts an exited process
+/// after 100 ms; a process that lacks, say, a network interface gains nothing from being started that often.
 const FAILED_START_MS: u64 = 2_000;
 
-/// What `egress` is asked.
+/// The arguments of `egress`.
 #[derive(Args, Debug)]
 pub(super) struct EgressArguments {
     /// The lane to serve
@@ -46,25 +45,26 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
         Ok(hang_up) => hang_up,
         Err(error) => return failed(&error),
     };
-    // A start of the whole bridge: here the file counts.
+    // `up` starts the whole bridge, so it reads the file and not the configuration in force.
     let configuration = match arguments.try_load_configuration() {
         Ok(configuration) => configuration,
         Err(error) => return bad_configuration(&error),
     };
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
-    let passed_on: Vec<OsString> = match arguments.path() {
+    let child_arguments: Vec<OsString> = match arguments.path() {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
     };
-    run(|stop| process::up(configuration, &arguments.file(), &passed_on, &hang_up, stop))
+    run(|stop| process::up(configuration, &arguments.file(), &child_arguments, &hang_up, stop))
 }
 
+/// Runs one process of the bridge with the configuration in force.
 fn role(
     arguments: &ConfigArguments,
     role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
 ) -> ExitCode {
-    let again = arguments.clone();
-    let reloads = match ReloadRequests::on_signal(move || again.try_load_configuration()) {
+    let reload_arguments = arguments.clone();
+    let reloads = match ReloadRequests::on_signal(move || reload_arguments.try_load_configuration()) {
         Ok(reloads) => reloads,
         Err(error) => return failed(&error),
     };
@@ -79,6 +79,7 @@ fn role(
     run(|stop| role(&configuration, reloads.kept_in(in_force), stop))
 }
 
+/// Runs `role` until it returns or a signal stops it, and returns the exit code of the process.
 pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,

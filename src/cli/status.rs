@@ -1,4 +1,4 @@
-//! `status`: what the bridge does at present, from its boards in shared memory.
+//! `status`: shows the state of the running bridge, read from its boards in shared memory.
 
 use std::io::{self, IsTerminal, Write};
 use std::ops::RangeInclusive;
@@ -13,23 +13,23 @@ use crate::process::Stop;
 use crate::shm::ShmError;
 use crate::telemetry::{ProcessState, Report, Snapshot};
 
-/// From what tells a rate of 100 Hz to an hour.
+/// Allowed values of `--interval-ms`: from 10 ms, one period of 100 Hz, to an hour.
 const INTERVALS_MS: RangeInclusive<u64> = 10..=3_600_000;
 
-/// What `status` is asked.
+/// The arguments of `status`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
-    /// Print JSON (docs/status-json.md): one object; with --watch one on each line
+    /// Print JSON (docs/status-json.md): one object; with --watch one object per line
     #[arg(long)]
     json: bool,
-    /// Go on until Ctrl-C; on a terminal in place
+    /// Repeat until Ctrl-C; on a terminal, redraw in place
     #[arg(long, short)]
     watch: bool,
-    /// The time over which rates and latencies are measured, and between two outputs
+    /// The time over which rates and latencies are measured, and with --watch the time between two reports
     #[arg(long, value_name = "N", default_value_t = 1_000)]
     #[arg(value_parser = value_parser!(u64).range(INTERVALS_MS))]
     interval_ms: u64,
-    /// Print nothing, and exit with 0 only if that process runs and turns: `ingress`, `control`,
+    /// Print no report; exit with 0 if the process runs and does not hang: `ingress`, `control`,
     /// `egress-LANE`
     #[arg(long, value_name = "PROCESS", conflicts_with_all = ["json", "watch"])]
     require: Option<String>,
@@ -65,20 +65,20 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     }
 }
 
-/// Whether a process is as it should be, for a health check.
+/// Checks that a process runs, for health checks.
 fn require(bridge: &Snapshot, process: &str) -> ExitCode {
     match bridge.processes.iter().find(|reading| reading.name == process) {
         Some(reading) if reading.state == ProcessState::Running => ExitCode::SUCCESS,
         Some(reading) => failed(&format!("{process} is {}", reading.state.label())),
         None => {
             let names: Vec<&str> = bridge.processes.iter().map(|reading| reading.name.as_str()).collect();
-            failed(&format!("there is no process {process}; there are: {}", names.join(", ")))
+            failed(&format!("the bridge has no process {process}; it has: {}", names.join(", ")))
         }
     }
 }
 
-/// Shows one report after the other. A bridge that ends meanwhile is waited for: it may be restarted, with
-/// other settings perhaps.
+/// Shows one report after the other. Waits for a bridge that has ended: it may be restarted, perhaps with
+/// other settings.
 fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first: Snapshot) -> ExitCode {
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,
@@ -93,7 +93,7 @@ fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first
             settings = restarted;
             root = super::root(&settings);
         }
-        // A bridge that was restarted as a whole since the last look may have other lanes or routes.
+        // A bridge that was restarted as a whole since the last snapshot may have other lanes or routes.
         let next = match Snapshot::take(&root, &settings) {
             Ok(next) => next,
             Err(ShmError::Incompatible { .. }) if arguments.config.running().is_some() => None,
@@ -138,8 +138,9 @@ fn redraw(text: &str) -> io::Result<()> {
     stdout.flush()
 }
 
-/// Draws over what was drawn before: from the upper left corner, each line cleared behind its text, then all
-/// that is below. Cut to the terminal, because a line that wraps or scrolls would spoil the next frame.
+/// The escape sequences and text that overwrite the previous report: from the upper left corner, each line is
+/// cleared behind its text, then everything below. The text is cut to the terminal, because a line that wraps
+/// or scrolls would displace the next frame.
 fn frame(text: &str, columns: usize, lines: usize) -> String {
     let mut frame = String::from("\x1b[H");
     // The cursor needs the last line.
@@ -156,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_frame_fits_the_terminal_and_clears_what_was_there() {
+    fn a_frame_fits_the_terminal_and_clears_the_previous_one() {
         assert_eq!(frame("one\ntwo µs\nthree", 5, 10), "\x1b[Hone\x1b[K\ntwo µ\x1b[K\nthree\x1b[K\n\x1b[J");
         assert_eq!(frame("one\ntwo\nthree", 80, 3), "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J");
         assert_eq!(frame("one", 0, 0), "\x1b[H\x1b[J");

@@ -1,7 +1,8 @@
-//! `tap`: the samples of a route, straight from shared memory.
+//! `tap`: shows the samples of a route, read directly from shared memory.
 //!
-//! A tap is a subscriber of its own with a short queue. Nobody wakes it and nobody waits for it: it looks,
-//! and what it does not look at in time is overwritten. Ingress and the lanes do not notice it.
+//! A tap is another subscriber of the route's channel, with a short queue. It polls; ingress neither wakes it
+//! nor waits for it, and a sample that it does not take in time is overwritten. Ingress and the lanes are
+//! unaffected.
 
 use std::fmt::Write as _;
 use std::io::{self, BufWriter, StdoutLock, Write};
@@ -19,28 +20,28 @@ use crate::process::Stop;
 use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError};
 use crate::telemetry::Intervals;
 
-/// How often `--hz` says something.
+/// The period of the lines of `--hz`.
 const REPORT_MS: u64 = 1_000;
-/// How often a tap looks whether the bridge is still there. A tap that stayed would keep the shared memory of
-/// a bridge that has ended, and one with other routes could not start.
-const BRIDGE_LOOK_MS: u64 = 200;
+/// How often a tap checks that the bridge still runs. A tap that stayed would keep the shared memory of a
+/// bridge that has ended, and a bridge with other routes could not start.
+const BRIDGE_CHECK_MS: u64 = 200;
 
-/// What `tap` is asked.
+/// The arguments of `tap`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The input topic, such as /scan, or the id of the route
     topic: String,
-    /// Show rate and regularity each second, as `ros2 topic hz` does
+    /// Show the rate and the spread of the intervals each second, as `ros2 topic hz` does
     #[arg(long, conflicts_with = "raw")]
     hz: bool,
-    /// Write the payloads to stdout and nothing else. Of each sample: the number of bytes that follow (u32,
-    /// little endian), the encapsulation header (4 bytes), the serialized message
+    /// Write only the payloads to stdout. For each sample: the number of bytes that follow (u32, little
+    /// endian), the encapsulation header (4 bytes), the serialized message
     #[arg(long)]
     raw: bool,
-    /// Begin with the samples that the bridge retains, such as the last map
+    /// Begin with the samples that the bridge retains for late subscribers, such as the last map
     #[arg(long, conflicts_with = "hz")]
     retained: bool,
-    /// End after so many samples
+    /// Exit after N samples
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
     #[command(flatten)]
@@ -55,7 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     let Some(route) = find_route(&settings, &arguments.topic) else {
         return failed(&unknown_topic(&settings, &arguments.topic));
     };
-    // First of all, because joining would set up the shared memory of a bridge that does not run.
+    // Checked first, because opening a node would create the shared memory of a bridge that does not run.
     let root = root(&settings);
     match read_bridge(&root, &settings) {
         Ok(Some(_)) => {}
@@ -91,7 +92,7 @@ fn find_route(settings: &Settings, topic: &str) -> Option<usize> {
 fn unknown_topic(settings: &Settings, topic: &str) -> String {
     let known: Vec<String> =
         settings.routes.iter().map(|route| format!("{} ({})", route.input_topic, route.id)).collect();
-    format!("no route has the input topic or id {topic}; the configuration has: {}", known.join(", "))
+    format!("no route has the input topic or id {topic}; the routes are: {}", known.join(", "))
 }
 
 /// Why a tap ended.
@@ -100,15 +101,17 @@ enum End {
     BridgeGone,
 }
 
-/// What is shown of the samples.
+/// The output format of a tap.
 enum Format {
     Lines,
     Raw,
     Hz { intervals: Intervals, lost: u64, new: u64, report_at: MonotonicNs },
 }
 
+/// Shows the samples of one route on stdout.
 struct Tap {
     format: Format,
+    /// Samples to show until the end; `None` without a limit.
     left: Option<u64>,
     tracker: SequenceTracker,
     output: BufWriter<StdoutLock<'static>>,
@@ -132,15 +135,15 @@ impl Tap {
         }
     }
 
-    /// Shows samples until `stop`, the last one, or the end of the bridge.
+    /// Shows samples until a stop is requested, the last wanted sample is shown, or the bridge ends.
     fn follow(
         &mut self,
         subscriber: &SampleSubscriber,
         stop: &Stop,
         bridge_runs: impl Fn() -> bool,
     ) -> io::Result<End> {
-        let mut pace = Pace::default();
-        let mut look_at = clock::monotonic().plus_ms(BRIDGE_LOOK_MS);
+        let mut interval = PollInterval::default();
+        let mut check_at = clock::monotonic().plus_ms(BRIDGE_CHECK_MS);
         while !stop.is_requested() {
             let mut taken = 0;
             loop {
@@ -166,13 +169,13 @@ impl Tap {
             let now = clock::monotonic();
             self.report(now)?;
             self.output.flush()?;
-            if now >= look_at {
+            if now >= check_at {
                 if !bridge_runs() {
                     return Ok(End::BridgeGone);
                 }
-                look_at = now.plus_ms(BRIDGE_LOOK_MS);
+                check_at = now.plus_ms(BRIDGE_CHECK_MS);
             }
-            std::thread::sleep(pace.after(taken));
+            std::thread::sleep(interval.after(taken));
         }
         self.finish()?;
         Ok(End::Done)
@@ -204,7 +207,7 @@ impl Tap {
         }
     }
 
-    /// The line of `--hz`, when it is time for one.
+    /// Prints the line of `--hz` when it is due.
     fn report(&mut self, now: MonotonicNs) -> io::Result<()> {
         match &mut self.format {
             Format::Hz { report_at, .. } if now >= *report_at => {
@@ -239,7 +242,7 @@ impl Tap {
     }
 }
 
-/// One sample as text; fields that scripts can cut out.
+/// One sample as a line of `key=value` fields, which scripts can parse.
 fn line(sample: &ShmSample) -> String {
     let header = sample.header();
     let age = match header.source_timestamp.to_wall() {
@@ -265,7 +268,7 @@ fn hex(bytes: &[u8]) -> String {
     })
 }
 
-/// The name of a representation (RTPS 2.5 clause 10.2, XTypes 1.3 clause 7.6.3.1.2), or its number.
+/// The name of the data representation (RTPS 2.5 clause 10.2, XTypes 1.3 clause 7.6.3.1.2), or its number.
 fn representation(encapsulation: Encapsulation) -> String {
     let name = match encapsulation.representation() {
         [0, 0] => "CDR_BE",
@@ -284,7 +287,7 @@ fn representation(encapsulation: Encapsulation) -> String {
     name.to_owned()
 }
 
-/// One sample of `--raw`.
+/// Writes one sample in the format of `--raw`.
 fn write_frame(output: &mut impl Write, encapsulation: Encapsulation, payload: &[u8]) -> io::Result<()> {
     // At most 64 MiB, the limit of `max_sample_bytes`, so it always fits.
     let length = u32::try_from(payload.len() + encapsulation.0.len()).map_err(io::Error::other)?;
@@ -293,19 +296,19 @@ fn write_frame(output: &mut impl Write, encapsulation: Encapsulation, payload: &
     output.write_all(payload)
 }
 
-/// How long to wait before the next look: 1 ms while samples come, less when more than one had come at once,
-/// because the queue has room for four, and longer and longer when none come.
-struct Pace {
+/// The time between two polls of a tap: 1 ms while samples arrive, down to 0.1 ms when a poll takes several,
+/// because the queue has room for four, and doubled up to 20 ms while none arrive.
+struct PollInterval {
     pause_us: u64,
 }
 
-impl Default for Pace {
+impl Default for PollInterval {
     fn default() -> Self {
         Self { pause_us: Self::USUAL_US }
     }
 }
 
-impl Pace {
+impl PollInterval {
     const SHORTEST_US: u64 = 100;
     const USUAL_US: u64 = 1_000;
     const LONGEST_US: u64 = 20_000;
@@ -333,18 +336,18 @@ mod tests {
     }
 
     #[test]
-    fn a_tap_looks_often_while_samples_come_and_seldom_while_none_do() {
-        let mut pace = Pace::default();
+    fn a_tap_polls_more_often_while_samples_arrive() {
+        let mut interval = PollInterval::default();
         for _ in 0..10 {
-            pace.after(0);
+            interval.after(0);
         }
-        assert_eq!(pace.after(0), Duration::from_millis(20));
-        assert_eq!(pace.after(1), Duration::from_millis(1));
+        assert_eq!(interval.after(0), Duration::from_millis(20));
+        assert_eq!(interval.after(1), Duration::from_millis(1));
         for _ in 0..10 {
-            pace.after(4);
+            interval.after(4);
         }
-        assert_eq!(pace.after(2), Duration::from_micros(100));
-        assert_eq!(pace.after(1), Duration::from_micros(100));
+        assert_eq!(interval.after(2), Duration::from_micros(100));
+        assert_eq!(interval.after(1), Duration::from_micros(100));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `units`: what a configuration needs of systemd beyond the units that are installed.
+//! `units`: prints or writes the systemd drop-ins that a configuration needs beside the installed units.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -13,27 +13,27 @@ use super::{ConfigArguments, failed, output_ended};
 use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
 use crate::model::TrafficClass;
 
-/// Where an administrator's units are.
+/// The folder of the administrator's units (systemd.unit(5)).
 pub(super) const FOLDER: &str = "/etc/systemd/system";
 
-/// With what each file begins, and by which a former one is known.
+/// The first line of each written drop-in, by which a later run recognises it.
 const HEADER: &str =
     "# Written by `adaptive-bridge units`, and to be written anew after a change of the configuration.\n";
 
-/// The name of each file, after those of the package (10 and 50), so that it has the last word among them.
+/// The file name of each drop-in. It sorts after those of the package (10 and 50), so that it overrides them.
 const FILE: &str = "60-configuration.conf";
 
 /// The highest real-time priority that the installed units of the critical path allow.
 const MAX_PRIORITY: u8 = 50;
 
-/// What `units` is asked.
+/// The arguments of `units`.
 ///
 /// The installed units run ingress, the lanes critical and noncritical, and control, with
-/// /etc/adaptive-bridge/config.yaml. What a configuration needs beyond that goes into drop-ins, which this
-/// prints: the lanes of your own, and what scheduling, paths and another file take.
+/// /etc/adaptive-bridge/config.yaml. Drop-ins add what a configuration needs beside them: further lanes, and
+/// settings for scheduling, paths and another configuration file.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
-    /// Write the drop-ins, and remove former ones that are not needed any more
+    /// Write the drop-ins, and remove obsolete ones of an earlier configuration
     #[arg(long)]
     write: bool,
     /// The folder of the drop-ins
@@ -63,12 +63,12 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     }
 }
 
-/// The drop-ins of a configuration, by the unit that each belongs to.
+/// The drop-ins that a configuration needs, by unit.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct DropIns(BTreeMap<String, String>);
 
 impl DropIns {
-    /// Those that `settings` take, which are those of the file `config`.
+    /// The drop-ins that `settings`, read from the file `config`, need.
     pub fn of(settings: &Settings, config: &Path) -> Self {
         let mut drop_ins = BTreeMap::new();
         let mut add = |unit: String, section: &str, lines: Vec<String>| {
@@ -76,14 +76,14 @@ impl DropIns {
                 drop_ins.insert(unit, format!("{HEADER}[{section}]\n{}\n", lines.join("\n")));
             }
         };
-        let of_the_target = ["critical", "noncritical"];
-        let lanes = settings.lanes.iter().filter(|lane| !of_the_target.contains(&lane.name.as_str()));
+        let installed = ["critical", "noncritical"];
+        let lanes = settings.lanes.iter().filter(|lane| !installed.contains(&lane.name.as_str()));
         let wants = lanes.map(|lane| format!("Wants={}", egress(lane.name.as_str())));
         add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
 
         let common = common(settings, config);
-        let mut service = |unit: String, how: &Scheduling, critical: bool, own: Vec<String>| {
-            add(unit, "Service", [common.clone(), scheduling(how, critical), own].concat());
+        let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Vec<String>| {
+            add(unit, "Service", [common.clone(), scheduling(configured, critical), own].concat());
         };
         service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, Vec::new());
         for lane in &settings.lanes {
@@ -98,13 +98,13 @@ impl DropIns {
         Self(drop_ins)
     }
 
-    /// Whether `folder` has exactly these.
-    pub fn are_in(&self, folder: &Path) -> bool {
-        let there = self
+    /// Whether `folder` has exactly these drop-ins.
+    pub fn match_folder(&self, folder: &Path) -> bool {
+        let written = self
             .0
             .iter()
             .all(|(unit, text)| fs::read_to_string(path(folder, unit)).is_ok_and(|present| present == *text));
-        there && self.former(folder).is_ok_and(|former| former.is_empty())
+        written && self.obsolete(folder).is_ok_and(|obsolete| obsolete.is_empty())
     }
 
     fn print(&self, folder: &Path) -> String {
@@ -114,21 +114,21 @@ impl DropIns {
             let _ = writeln!(text, "# {}\n{drop_in}", path(folder, unit).display());
         }
         if self.0.is_empty() {
-            text.push_str("# The installed units are all that this configuration needs.\n");
+            text.push_str("# This configuration needs no drop-ins: the installed units suffice.\n");
         }
         text
     }
 
-    /// Writes them and removes former ones; yields what was done and what is to be done next.
+    /// Writes the drop-ins and removes obsolete ones; returns a report of it with the command to run next.
     fn write(&self, folder: &Path) -> Result<String, String> {
         let at = |path: &Path, error: io::Error| format!("{}: {error}", path.display());
         let mut text = String::new();
         let mut done = |what: &str, path: &Path| {
             let _ = writeln!(text, "{what} {}", path.display());
         };
-        for path in self.former(folder).map_err(|error| at(folder, error))? {
+        for path in self.obsolete(folder).map_err(|error| at(folder, error))? {
             fs::remove_file(&path).map_err(|error| at(&path, error))?;
-            // Fails while the administrator has something there.
+            // Fails while the folder has drop-ins of the administrator.
             let _ = path.parent().map(fs::remove_dir);
             done("removed", &path);
         }
@@ -142,32 +142,32 @@ impl DropIns {
             done("written", &path);
         }
         text.push_str(if text.is_empty() {
-            "everything is as the configuration needs it\n"
+            "the drop-ins already match the configuration\n"
         } else {
-            "now: systemctl daemon-reload && systemctl restart adaptive-bridge.target\n"
+            "next: systemctl daemon-reload && systemctl restart adaptive-bridge.target\n"
         });
         Ok(text)
     }
 
-    /// Drop-ins that were written for a former configuration.
-    fn former(&self, folder: &Path) -> io::Result<Vec<PathBuf>> {
+    /// Drop-ins that were written for an earlier configuration and are no longer needed.
+    fn obsolete(&self, folder: &Path) -> io::Result<Vec<PathBuf>> {
         let entries = match fs::read_dir(folder) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
             entries => entries?,
         };
-        let mut former = Vec::new();
+        let mut obsolete = Vec::new();
         for entry in entries {
             let entry = entry?;
             let name = entry.file_name();
             let Some(unit) = name.to_str().and_then(|name| name.strip_suffix(".d")) else { continue };
             let path = entry.path().join(FILE);
-            let ours = || fs::read_to_string(&path).is_ok_and(|text| text.starts_with(HEADER));
-            if unit.starts_with("adaptive-bridge") && !self.0.contains_key(unit) && ours() {
-                former.push(path);
+            let is_ours = || fs::read_to_string(&path).is_ok_and(|text| text.starts_with(HEADER));
+            if unit.starts_with("adaptive-bridge") && !self.0.contains_key(unit) && is_ours() {
+                obsolete.push(path);
             }
         }
-        former.sort();
-        Ok(former)
+        obsolete.sort();
+        Ok(obsolete)
     }
 }
 
@@ -179,13 +179,13 @@ fn egress(lane: &str) -> String {
     format!("adaptive-bridge-egress@{lane}.service")
 }
 
-/// What every process needs.
+/// The lines that every service needs.
 fn common(settings: &Settings, config: &Path) -> Vec<String> {
     let mut lines = Vec::new();
     let mut read = vec![config];
     if config != Path::new(config::DEFAULT_PATH) {
-        let named = format!("{}={}", config::PATH_VARIABLE, config.display());
-        lines.push(format!("Environment={}", quoted(Path::new(&named))));
+        let variable = format!("{}={}", config::PATH_VARIABLE, config.display());
+        lines.push(format!("Environment={}", quoted(Path::new(&variable))));
     }
     if let Some(SecretSource::File(secret)) = &settings.security.secret {
         read.push(secret);
@@ -200,23 +200,23 @@ fn common(settings: &Settings, config: &Path) -> Vec<String> {
     lines
 }
 
-/// A word of a unit file, with whatever characters (systemd.syntax(7)).
+/// A quoted word of a unit file, with special characters escaped (systemd.syntax(7)).
 fn quoted(word: &Path) -> String {
     let escaped = word.display().to_string().replace('\\', r"\\").replace('"', "\\\"").replace('%', "%%");
     format!("\"{escaped}\"")
 }
 
-/// What the configured scheduling needs that the installed unit does not allow.
-fn scheduling(how: &Scheduling, critical: bool) -> Vec<String> {
+/// The lines that allow the configured scheduling where the installed unit does not.
+fn scheduling(configured: &Scheduling, critical: bool) -> Vec<String> {
     let mut lines = Vec::new();
-    let is_real_time = how.policy != SchedulingPolicy::Other;
-    if is_real_time && (!critical || how.priority > MAX_PRIORITY) {
-        lines.push(format!("LimitRTPRIO={}", how.priority));
+    let is_real_time = configured.policy != SchedulingPolicy::Other;
+    if is_real_time && (!critical || configured.priority > MAX_PRIORITY) {
+        lines.push(format!("LimitRTPRIO={}", configured.priority));
     }
     if is_real_time && !critical {
         lines.extend(["RestrictRealtime=no", "LimitRTTIME=500ms:1s"].map(str::to_owned));
     }
-    if how.lock_memory && !critical {
+    if configured.lock_memory && !critical {
         lines.push("LimitMEMLOCK=infinity".to_owned());
     }
     lines
@@ -243,11 +243,11 @@ mod tests {
     fn the_installed_units_are_enough_for_a_plain_configuration() {
         let drop_ins = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
         assert_eq!(drop_ins, DropIns(BTreeMap::new()));
-        assert!(drop_ins.print(Path::new("/x")).contains("all that this configuration needs"));
+        assert!(drop_ins.print(Path::new("/x")).contains("needs no drop-ins"));
     }
 
     #[test]
-    fn a_configuration_gets_the_lanes_rights_and_paths_that_it_needs() {
+    fn drop_ins_add_the_lanes_rights_and_paths_of_a_configuration() {
         let drop_ins = DropIns::of(&settings(LANES), Path::new("/home/robot/100% \"bridge\".yaml"));
         let lines = |unit: &str| drop_ins.0[unit].lines().skip(1).map(str::to_owned).collect::<Vec<_>>();
         assert_eq!(lines("adaptive-bridge.target"), ["[Unit]", "Wants=adaptive-bridge-egress@rviz.service"]);
@@ -267,18 +267,18 @@ mod tests {
     }
 
     #[test]
-    fn what_a_former_configuration_needed_is_removed_and_nothing_else() {
+    fn only_drop_ins_of_an_earlier_configuration_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let rich = DropIns::of(&settings(LANES), Path::new(config::DEFAULT_PATH));
         let plain = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
-        assert!(plain.are_in(folder.path()) && !rich.are_in(folder.path()));
+        assert!(plain.match_folder(folder.path()) && !rich.match_folder(folder.path()));
         assert!(rich.write(folder.path()).unwrap().contains("daemon-reload"));
-        assert!(!plain.are_in(folder.path()) && rich.are_in(folder.path()));
-        assert_eq!(rich.write(folder.path()).unwrap(), "everything is as the configuration needs it\n");
+        assert!(!plain.match_folder(folder.path()) && rich.match_folder(folder.path()));
+        assert_eq!(rich.write(folder.path()).unwrap(), "the drop-ins already match the configuration\n");
         let own = folder.path().join("adaptive-bridge.target.d/mine.conf");
         fs::write(&own, "").unwrap();
         plain.write(folder.path()).unwrap();
-        assert!(plain.are_in(folder.path()) && own.exists());
+        assert!(plain.match_folder(folder.path()) && own.exists());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 }

@@ -1,4 +1,4 @@
-//! The processes of a demo: all are children of it, and none outlives it, however it ends.
+//! The processes of a demo: all are its children, and none outlives it, however it ends.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader};
@@ -13,15 +13,16 @@ use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, getppid};
 
 use super::DemoError;
-use super::place::Place;
 use super::report::Report;
+use super::sandbox::Sandbox;
 use crate::clock;
 
-/// The bridge has a second to end, of which its processes have 900 ms; then it is killed.
+/// How long the bridge has to exit before it is killed. It needs a second, of which its processes have 900
+/// ms.
 const BRIDGE_GRACE_MS: u64 = 3_000;
 
-/// Variables that would change what the demo's processes do.
-const FOREIGN_VARIABLES: [&str; 6] = [
+/// Environment variables that would change the behaviour of the demo's processes, and so are removed.
+const REMOVED_VARIABLES: [&str; 6] = [
     "ROS_DOMAIN_ID",
     "ROS_LOCALHOST_ONLY",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
@@ -30,16 +31,16 @@ const FOREIGN_VARIABLES: [&str; 6] = [
     "ADAPTIVE_BRIDGE_CONFIG",
 ];
 
-/// A process of the demo.
+/// The role of a process of the demo.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Who {
+pub(super) enum Role {
     Publisher,
     Critical,
     Remote,
     Bridge,
 }
 
-impl Who {
+impl Role {
     pub const ALL: [Self; 4] = [Self::Publisher, Self::Critical, Self::Remote, Self::Bridge];
 
     pub const fn name(self) -> &'static str {
@@ -52,48 +53,48 @@ impl Who {
     }
 }
 
-/// The processes of one phase. Dropping them ends them.
+/// The processes of one phase, which end when this is dropped.
 pub(super) struct Children<'a> {
-    place: &'a Place,
-    children: Vec<(Who, Child)>,
-    sender: Sender<(Who, Report)>,
-    reports: Receiver<(Who, Report)>,
+    sandbox: &'a Sandbox,
+    children: Vec<(Role, Child)>,
+    sender: Sender<(Role, Report)>,
+    reports: Receiver<(Role, Report)>,
 }
 
 impl<'a> Children<'a> {
-    pub fn new(place: &'a Place) -> Self {
+    pub fn new(sandbox: &'a Sandbox) -> Self {
         let (sender, reports) = channel();
-        Self { place, children: Vec::with_capacity(4), sender, reports }
+        Self { sandbox, children: Vec::with_capacity(4), sender, reports }
     }
 
-    /// Starts a process of this program. To be called by a thread that lives as long as the demo: the kernel
-    /// takes its death for that of the parent.
-    pub fn start(&mut self, who: Who, arguments: &[&str]) -> Result<(), DemoError> {
+    /// Starts a process that runs this program. The calling thread must live as long as the demo: when it
+    /// ends, the kernel sends the parent-death signal (PR_SET_PDEATHSIG).
+    pub fn start(&mut self, role: Role, arguments: &[&str]) -> Result<(), DemoError> {
         let mut child =
-            self.spawn(who, arguments).map_err(|error| DemoError::Start { name: who.name(), error })?;
+            self.spawn(role, arguments).map_err(|error| DemoError::Start { name: role.name(), error })?;
         if let Some(stdout) = child.stdout.take() {
             let sender = self.sender.clone();
-            thread::spawn(move || pass_on(who, stdout, &sender));
+            thread::spawn(move || forward_reports(role, stdout, &sender));
         }
-        self.children.push((who, child));
+        self.children.push((role, child));
         Ok(())
     }
 
-    fn spawn(&self, who: Who, arguments: &[&str]) -> io::Result<Child> {
-        let log = OpenOptions::new().create(true).append(true).open(self.place.log(who.name()))?;
-        let at_our_death = match who {
-            // So that it ends its own processes and clears up.
-            Who::Bridge => Signal::SIGTERM,
-            // The only one that a stopped process obeys.
+    fn spawn(&self, role: Role, arguments: &[&str]) -> io::Result<Child> {
+        let log = OpenOptions::new().create(true).append(true).open(self.sandbox.log(role.name()))?;
+        let parent_death_signal = match role {
+            // Lets it stop its own processes and remove its files.
+            Role::Bridge => Signal::SIGTERM,
+            // The only signal that also ends a stopped process.
             _ => Signal::SIGKILL,
         };
         let demo = Pid::this();
         let mut command = Command::new(std::env::current_exe()?);
         command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
-        for variable in FOREIGN_VARIABLES {
+        for variable in REMOVED_VARIABLES {
             command.env_remove(variable);
         }
-        // A process group of its own: Ctrl-C in the terminal is for the demo alone, which then ends the
+        // A process group of its own: Ctrl-C in the terminal signals only the demo, which then ends the
         // others.
         command.process_group(0);
         // SAFETY: between fork and exec only async-signal-safe functions may be called and no memory may be
@@ -101,46 +102,48 @@ impl<'a> Children<'a> {
         // without an allocation.
         unsafe {
             command.pre_exec(move || {
-                set_pdeathsig(at_our_death)?;
+                set_pdeathsig(parent_death_signal)?;
                 if getppid() == demo { Ok(()) } else { Err(io::ErrorKind::BrokenPipe.into()) }
             });
         }
         command.spawn()
     }
 
-    /// The next report, waited for at most that long.
-    pub fn next_report(&self, patience: Duration) -> Option<(Who, Report)> {
-        // We hold a sender ourselves, so that this can only time out.
-        self.reports.recv_timeout(patience).ok()
+    /// The next report of a process; `None` after the timeout.
+    pub fn next_report(&self, timeout: Duration) -> Option<(Role, Report)> {
+        // `self` holds a sender too, so the only possible error is the timeout.
+        self.reports.recv_timeout(timeout).ok()
     }
 
-    /// Stops a process where it is, or lets it go on.
-    pub fn set_stopped(&self, who: Who, stopped: bool) {
+    /// Stops a process with SIGSTOP, or continues it with SIGCONT.
+    pub fn set_stopped(&self, role: Role, stopped: bool) {
         let signal = if stopped { Signal::SIGSTOP } else { Signal::SIGCONT };
-        for (_, child) in self.children.iter().filter(|(other, _)| *other == who) {
+        for (_, child) in self.children.iter().filter(|(other, _)| *other == role) {
             let _ = kill(pid_of(child), signal);
         }
     }
 
-    /// A process that has ended by itself, which none should.
-    pub fn ended(&mut self) -> Option<(Who, ExitStatus)> {
-        self.children.iter_mut().find_map(|(who, child)| Some((*who, child.try_wait().ok()??)))
+    /// The first process found that has exited, which none should.
+    pub fn exited(&mut self) -> Option<(Role, ExitStatus)> {
+        self.children.iter_mut().find_map(|(role, child)| Some((*role, child.try_wait().ok()??)))
     }
 }
 
 impl Drop for Children<'_> {
     fn drop(&mut self) {
-        for (who, child) in &mut self.children {
-            if *who == Who::Bridge {
+        for (role, child) in &mut self.children {
+            if *role == Role::Bridge {
                 let _ = kill(pid_of(child), Signal::SIGTERM);
             } else {
-                // They have nothing to clear up, and this one is obeyed by a stopped process too.
+                // They have nothing to clean up, and SIGKILL also ends a stopped process.
                 let _ = child.kill();
             }
         }
         let deadline = clock::monotonic().plus_ms(BRIDGE_GRACE_MS);
-        for (who, child) in &mut self.children {
-            while *who == Who::Bridge && matches!(child.try_wait(), Ok(None)) && clock::monotonic() < deadline
+        for (role, child) in &mut self.children {
+            while *role == Role::Bridge
+                && matches!(child.try_wait(), Ok(None))
+                && clock::monotonic() < deadline
             {
                 thread::sleep(Duration::from_millis(5));
             }
@@ -153,31 +156,32 @@ impl Drop for Children<'_> {
     }
 }
 
-/// Linux process ids are below 2^22.
+/// The process id of a child; Linux process ids are below 2^22.
 fn pid_of(child: &Child) -> Pid {
     Pid::from_raw(i32::try_from(child.id()).unwrap_or(i32::MAX))
 }
 
-fn pass_on(who: Who, stdout: ChildStdout, sender: &Sender<(Who, Report)>) {
+/// Sends each report that a process prints on its stdout to the channel.
+fn forward_reports(role: Role, stdout: ChildStdout, sender: &Sender<(Role, Report)>) {
     for line in BufReader::new(stdout).lines() {
         let Ok(line) = line else { return };
         if let Some(report) = Report::parse(&line)
-            && sender.send((who, report)).is_err()
+            && sender.send((role, report)).is_err()
         {
             return;
         }
     }
 }
 
-/// The last lines of each process' log, for a demo that failed.
-pub(super) fn last_log_lines(place: &Place) -> String {
+/// The last lines of the log of each process, to print when a demo failed.
+pub(super) fn last_log_lines(sandbox: &Sandbox) -> String {
     const LINES: usize = 12;
     let mut text = String::new();
-    for who in Who::ALL {
-        let Ok(log) = File::open(place.log(who.name())) else { continue };
+    for role in Role::ALL {
+        let Ok(log) = File::open(sandbox.log(role.name())) else { continue };
         let lines: Vec<String> = BufReader::new(log).lines().map_while(Result::ok).collect();
         if !lines.is_empty() {
-            text.push_str(&format!("--- the last lines of the {}'s log\n", who.name()));
+            text.push_str(&format!("--- the last lines of the {}'s log\n", role.name()));
         }
         for line in &lines[lines.len().saturating_sub(LINES)..] {
             text.push_str(line);

@@ -1,4 +1,4 @@
-//! Both phases side by side: as text, and as JSON.
+//! The comparison of both phases, as text and as JSON.
 
 use std::fmt::Write;
 
@@ -9,11 +9,11 @@ use super::tally::{Figures, Quantiles};
 use super::{HISTORY_SCANS, MAX_BLOCKING_MS, RATE_HZ, STALL_EVERY_MS, STALL_MS};
 use crate::model::DropReason;
 
-/// The remote lane's work, so that nobody takes it for a fault.
-const SUPERSEDED: &str = "Superseded: when the remote lane was due to send, 10 times a second, there was a \
-                          fresher scan, and it sent that one.";
+/// The explanation of the drop reason `superseded`, which is intended on a rate-limited lane.
+const SUPERSEDED: &str = "Superseded: the remote lane forwards 10 scans a second, each time the latest one, \
+                          and drops the older ones.";
 
-/// What the demo found.
+/// The result of a demo.
 #[derive(Debug, Serialize)]
 pub(super) struct Outcome {
     pub seconds_per_phase: u64,
@@ -25,9 +25,9 @@ pub(super) struct Outcome {
     pub stall_every_ms: u64,
     pub without_bridge: Figures,
     pub with_bridge: Figures,
-    /// Whether the run showed what the bridge is for.
+    /// Whether the stalls impaired the critical subscriber without the bridge and not with it.
     pub shown: bool,
-    /// The run in a sentence.
+    /// The result in a sentence.
     pub summary: String,
 }
 
@@ -41,7 +41,7 @@ impl Outcome {
             max_blocking_ms: MAX_BLOCKING_MS,
             stall_ms: STALL_MS,
             stall_every_ms: STALL_EVERY_MS,
-            shown: hurt(&without_bridge) && !hurt(&with_bridge),
+            shown: is_impaired(&without_bridge) && !is_impaired(&with_bridge),
             summary: summary(&without_bridge, &with_bridge),
             without_bridge,
             with_bridge,
@@ -99,27 +99,27 @@ impl Outcome {
     }
 }
 
-/// Whether the critical subscriber was made to suffer: more than one scan in a hundred is missing.
-fn hurt(figures: &Figures) -> bool {
+/// Whether the critical subscriber was impaired: it missed more than one scan in a hundred.
+fn is_impaired(figures: &Figures) -> bool {
     figures.critical.lost * 100 > figures.publisher.due
 }
 
 fn summary(without: &Figures, with: &Figures) -> String {
     let silence_s = |figures: &Figures| figures.critical.silence_max_ms / 1e3;
     let bridge = format!(
-        "the publisher wrote {:.1} Hz, no publish call took longer than {}, and the critical subscriber got \
-         {} of {} scans",
+        "the publisher wrote {:.1} scans a second, no publish call took longer than {}, and the critical \
+         subscriber received {} of {} scans",
         with.publisher.rate_hz,
         latency(with.publisher.call_max_ms),
         with.critical.received,
         with.publisher.due,
     );
-    match (hurt(without), hurt(with)) {
+    match (is_impaired(without), is_impaired(with)) {
         (true, false) => format!(
-            "Shown: the remote subscriber's dead link filled the writer that both share, so that publish \
-             calls waited up to {} and the publisher fell to {:.1} Hz; the critical subscriber, whose own \
-             link was fine, missed {} of {} scans and once heard nothing for {:.1} s. Through the bridge, \
-             under the same stalls, {bridge}.",
+            "Shown: without the bridge, the failed link of the remote subscriber filled the history of the \
+             writer that both subscribers share. Publish calls waited up to {}, and the publisher fell to \
+             {:.1} Hz; the critical subscriber, whose own link worked, missed {} of {} scans and once received \
+             nothing for {:.1} s. With the bridge, under the same stalls, {bridge}.",
             latency(without.publisher.call_max_ms),
             without.publisher.rate_hz,
             without.critical.lost,
@@ -127,16 +127,17 @@ fn summary(without: &Figures, with: &Figures) -> String {
             silence_s(without),
         ),
         (true, true) => format!(
-            "Not shown: the critical subscriber missed {} scans without the bridge, and {} with it. The \
+            "Not shown: the critical subscriber missed {} scans without the bridge and {} with it. The \
              bridge should lose none: this machine may be too busy for 30 scans a second.",
             without.critical.lost, with.critical.lost,
         ),
         (false, false) => format!(
-            "Not shown: in this run the stalls did not fill the writer that both subscribers share, so there \
-             was nothing to protect the critical one from. Through the bridge {bridge}."
+            "Not shown: in this run the stalls did not fill the history of the writer that both subscribers \
+             share, so the critical subscriber was not impaired without the bridge either. With the bridge, \
+             {bridge}."
         ),
         (false, true) => format!(
-            "Not shown: the critical subscriber missed {} scans through the bridge, and {} without it. This \
+            "Not shown: the critical subscriber missed {} scans with the bridge and {} without it. This \
              machine may be too busy for 30 scans a second.",
             with.critical.lost, without.critical.lost,
         ),
@@ -151,7 +152,7 @@ fn quantile(figures: &Figures, which: impl Fn(&Quantiles) -> f64) -> String {
     figures.critical.latency_ms.as_ref().map_or("-".to_owned(), |all| latency(which(all)))
 }
 
-/// The text in lines of at most 79 columns.
+/// Wraps the text into lines of at most 79 columns.
 pub(super) fn wrapped(text: &str) -> String {
     let mut wrapped = String::new();
     let mut columns = 0;

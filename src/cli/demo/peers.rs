@@ -1,5 +1,5 @@
-//! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own, which know nothing
-//! of the bridge.
+//! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own and independent of
+//! the bridge.
 
 use std::io::{self, Write};
 use std::net::Ipv4Addr;
@@ -22,11 +22,10 @@ use crate::config::{DdsNetwork, NetworkSelector};
 use crate::dds::{DdsError, Participant, ParticipantOptions, ReaderQos, Take};
 use crate::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp, TopicName};
 
-/// Scans that may wait between the DDS library and a subscriber. More than a second of them, so that a
-/// subscriber loses nothing by itself.
+/// History depth of the subscribers' readers: more than two seconds of scans, so that none is lost there.
 const READER_DEPTH: u32 = 64;
 
-/// The publisher's: nothing unacknowledged may be lost, within the limit of [`HISTORY_SCANS`].
+/// QoS of the publisher: it keeps unacknowledged scans, up to [`HISTORY_SCANS`].
 const PUBLISHER_QOS: QosProfile = QosProfile {
     reliability: Reliability::Reliable,
     history: History::KeepAll,
@@ -35,7 +34,7 @@ const PUBLISHER_QOS: QosProfile = QosProfile {
     deadline_ms: None,
 };
 
-/// What the demo's publisher is told.
+/// The arguments of the demo's publisher.
 #[derive(Args, Debug)]
 pub(in crate::cli) struct PublisherArguments {
     /// DDS domain
@@ -46,7 +45,7 @@ pub(in crate::cli) struct PublisherArguments {
     topic: TopicName,
 }
 
-/// What a subscriber of the demo is told.
+/// The arguments of a subscriber of the demo.
 #[derive(Args, Debug)]
 pub(in crate::cli) struct SubscriberArguments {
     /// DDS domain
@@ -58,7 +57,7 @@ pub(in crate::cli) struct SubscriberArguments {
     /// Name of the node
     #[arg(long)]
     name: String,
-    /// RELIABILITY that it asks for
+    /// Requested reliability
     #[arg(long)]
     reliability: ReliabilityArgument,
 }
@@ -73,11 +72,11 @@ fn topic(text: &str) -> Result<TopicName, String> {
     TopicName::try_from(text).map_err(|error| error.to_string())
 }
 
-/// Why a publisher or subscriber had to end.
+/// Why a publisher or subscriber ended.
 enum PeerError {
     Dds(DdsError),
-    /// Nobody reads the reports any more.
-    Unread(io::Error),
+    /// The demo no longer reads the reports on stdout.
+    PipeClosed(io::Error),
 }
 
 impl From<DdsError> for PeerError {
@@ -88,14 +87,14 @@ impl From<DdsError> for PeerError {
 
 impl From<io::Error> for PeerError {
     fn from(error: io::Error) -> Self {
-        Self::Unread(error)
+        Self::PipeClosed(error)
     }
 }
 
 fn exit(error: &PeerError) -> ExitCode {
     match error {
         PeerError::Dds(error) => failed(error),
-        PeerError::Unread(error) => failed(error),
+        PeerError::PipeClosed(error) => failed(error),
     }
 }
 
@@ -111,8 +110,7 @@ pub(in crate::cli) fn subscriber(arguments: &SubscriberArguments) -> ExitCode {
     exit(&error)
 }
 
-/// A timer as rclcpp's: a publish call that takes longer than a period costs the scans that are due
-/// meanwhile.
+/// Publishes scans like a timer of rclcpp: scans that become due during a publish call are skipped.
 fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, PeerError> {
     let mut participant = join(arguments.domain, "publisher")?;
     let writer = participant.create_blocking_writer(
@@ -134,8 +132,8 @@ fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, P
         let returned_at = clock::monotonic();
         report(Report::Published { number, call_ns: returned_at.since(taken_at), written })?;
         number += 1;
-        // A scan that was due before the call is late because this process was not scheduled; it is not
-        // skipped.
+        // A scan that was already due before the call is late because this process was not scheduled: it is
+        // published late, not skipped.
         if due_at(began_at, number) >= taken_at {
             number = first_due_after(began_at, returned_at).max(number);
         }
@@ -154,8 +152,8 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible
         deadline_ms: None,
     };
     let reader = participant.create_reader(&arguments.topic.to_dds(), DDS_TYPE, &qos)?;
-    let bell = Arc::new(Bell { rung: AtomicBool::new(false), thread: thread::current() });
-    let waker = Waker::from(Arc::clone(&bell));
+    let wake_flag = Arc::new(WakeFlag { is_set: AtomicBool::new(false), thread: thread::current() });
+    let waker = Waker::from(Arc::clone(&wake_flag));
     loop {
         reader.arm(&waker);
         loop {
@@ -169,21 +167,21 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible
                 break;
             }
         }
-        while !bell.rung.swap(false, Ordering::AcqRel) {
+        while !wake_flag.is_set.swap(false, Ordering::AcqRel) {
             thread::park();
         }
     }
 }
 
-/// Rung by the DDS library's thread when a sample arrives.
-struct Bell {
-    rung: AtomicBool,
+/// The waker of a subscriber's reader: the DDS library wakes it when a sample arrives.
+struct WakeFlag {
+    is_set: AtomicBool,
     thread: Thread,
 }
 
-impl Wake for Bell {
+impl Wake for WakeFlag {
     fn wake(self: Arc<Self>) {
-        self.rung.store(true, Ordering::Release);
+        self.is_set.store(true, Ordering::Release);
         self.thread.unpark();
     }
 }
@@ -197,6 +195,7 @@ fn join(domain_id: u16, name: &str) -> Result<Participant, DdsError> {
     })
 }
 
+/// Prints a report on stdout, where the demo reads it.
 fn report(report: Report) -> io::Result<()> {
     writeln!(io::stdout().lock(), "{report}")
 }

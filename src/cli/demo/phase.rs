@@ -1,9 +1,9 @@
-//! One phase: starts its processes, stops the remote subscriber now and then, and measures.
+//! One phase of a demo: starts its processes, periodically stops the remote subscriber, and measures.
 
 use std::time::Duration;
 
-use super::children::{Children, Who};
-use super::place::Place;
+use super::children::{Children, Role};
+use super::sandbox::Sandbox;
 use super::screen::Screen;
 use super::tally::{BridgeDrops, Figures, Stalls, Tally, Window, drops_between, scans_in_s};
 use super::{DemoError, INPUT_TOPIC, Interrupt, STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, first_due_after};
@@ -12,51 +12,51 @@ use crate::config::Settings;
 use crate::model::{DropCounts, LaneName, MonotonicNs};
 use crate::shm::{Boards, BridgeShape};
 
-/// How the subscribers get the scans.
+/// How the subscribers receive the scans.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Way {
-    /// Both from the publisher's writer.
+pub(super) enum Setup {
+    /// Both directly from the publisher's writer.
     Direct,
     /// Each from a lane of the bridge.
     Bridge,
 }
 
-/// Discovery takes a second or two; on a slow machine more.
-const READY_PATIENCE_MS: u64 = 20_000;
-/// What has to arrive before the measurement begins: half a second at the full rate, and at the 10 Hz of the
-/// bridge's remote lane.
-const READY_SCANS: [(Who, usize); 2] = [(Who::Critical, 15), (Who::Remote, 5)];
-/// How long scans may still be on their way when the phase is over.
+/// How long to wait for the first scans. Discovery takes a second or two, more on a slow machine.
+const READY_TIMEOUT_MS: u64 = 20_000;
+/// Scans that must arrive before the measurement begins: half a second's at the full rate and at the 10 Hz of
+/// the bridge's remote lane.
+const READY_SCANS: [(Role, usize); 2] = [(Role::Critical, 15), (Role::Remote, 5)];
+/// How long to wait for the last scans after the phase.
 const DRAIN_MS: u64 = 1_000;
-/// How often what goes on is looked at.
-const LOOK: Duration = Duration::from_millis(10);
+/// The longest wait for a report before stalls, exits and the screen are handled again.
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
 const DRAW_EVERY_MS: u64 = 200;
 
-/// Runs a phase of `seconds`.
+/// Runs a phase of `seconds` and returns its figures.
 pub(super) fn run(
-    place: &Place,
-    way: Way,
+    sandbox: &Sandbox,
+    setup: Setup,
     seconds: u64,
     interrupt: &Interrupt,
     screen: &mut Screen,
 ) -> Result<Figures, DemoError> {
     let mut phase = Phase {
-        children: Children::new(place),
+        children: Children::new(sandbox),
         tally: Tally::default(),
         interrupt,
         stalls: Stalls::default(),
         stalled_since: None,
     };
-    phase.start(place, way)?;
+    phase.start(sandbox, setup)?;
     let window = phase.wait_until_ready(seconds)?;
-    // The boards are there: scans have come through them.
-    let watch = match way {
-        Way::Direct => None,
-        Way::Bridge => Some(DropWatch::begin(place)?),
+    // The boards exist by now, because scans have passed the bridge.
+    let drops = match setup {
+        Setup::Direct => None,
+        Setup::Bridge => Some(DropMeter::begin(sandbox)?),
     };
-    phase.measure(way, &window, screen)?;
+    phase.measure(setup, &window, screen)?;
     let mut figures = phase.tally.figures(&window, phase.stalls, window.end());
-    figures.drops = watch.as_ref().map(DropWatch::end);
+    figures.drops = drops.as_ref().map(DropMeter::end);
     Ok(figures)
 }
 
@@ -69,14 +69,14 @@ struct Phase<'a> {
 }
 
 impl Phase<'_> {
-    fn start(&mut self, place: &Place, way: Way) -> Result<(), DemoError> {
-        let domain = place.domain().to_string();
-        let config_file = place.config_file();
-        let settings = place.settings();
-        let (critical_topic, remote_topic, remote_reliability) = match way {
-            Way::Direct => (INPUT_TOPIC, INPUT_TOPIC, "reliable"),
-            Way::Bridge => {
-                self.children.start(Who::Bridge, &["up", "--config", &config_file.to_string_lossy()])?;
+    fn start(&mut self, sandbox: &Sandbox, setup: Setup) -> Result<(), DemoError> {
+        let domain = sandbox.domain().to_string();
+        let config_file = sandbox.config_file();
+        let settings = sandbox.settings();
+        let (critical_topic, remote_topic, remote_reliability) = match setup {
+            Setup::Direct => (INPUT_TOPIC, INPUT_TOPIC, "reliable"),
+            Setup::Bridge => {
+                self.children.start(Role::Bridge, &["up", "--config", &config_file.to_string_lossy()])?;
                 let [critical, remote] = lane_topics(settings)?;
                 (critical, remote, "best-effort")
             }
@@ -90,29 +90,29 @@ impl Phase<'_> {
             ];
             arguments
         };
-        self.children.start(Who::Critical, &subscriber(critical_topic, "critical", "reliable"))?;
-        self.children.start(Who::Remote, &subscriber(remote_topic, "remote", remote_reliability))?;
-        self.children.start(Who::Publisher, &["demo-publisher", "--domain", &domain, "--topic", INPUT_TOPIC])
+        self.children.start(Role::Critical, &subscriber(critical_topic, "critical", "reliable"))?;
+        self.children.start(Role::Remote, &subscriber(remote_topic, "remote", remote_reliability))?;
+        self.children.start(Role::Publisher, &["demo-publisher", "--domain", &domain, "--topic", INPUT_TOPIC])
     }
 
-    /// Waits until scans flow to both subscribers, and says which ones are to be measured.
+    /// Waits until scans arrive at both subscribers and returns the window to measure.
     fn wait_until_ready(&mut self, seconds: u64) -> Result<Window, DemoError> {
-        let deadline = clock::monotonic().plus_ms(READY_PATIENCE_MS);
+        let deadline = clock::monotonic().plus_ms(READY_TIMEOUT_MS);
         loop {
-            self.look()?;
+            self.poll()?;
             let now = clock::monotonic();
-            let late = READY_SCANS.iter().find(|(who, scans)| self.tally.arrived(*who) < *scans);
+            let late = READY_SCANS.iter().find(|(role, scans)| self.tally.arrived(*role) < *scans);
             match (late, self.tally.began_at()) {
                 (None, Some(began_at)) => {
-                    // In a tenth of a second, so that the first scan is not one that was published already.
+                    // A tenth of a second later, so that the first scan of the window is not published yet.
                     let first = first_due_after(began_at, now.plus_ms(100));
                     return Ok(Window { began_at, numbers: first..first + scans_in_s(seconds) });
                 }
                 (late, _) if now >= deadline => {
-                    let who = late.map_or(Who::Publisher, |(who, _)| *who);
+                    let role = late.map_or(Role::Publisher, |(role, _)| *role);
                     return Err(DemoError::NothingArrives {
-                        who: who.name(),
-                        patience_ms: READY_PATIENCE_MS,
+                        name: role.name(),
+                        timeout_ms: READY_TIMEOUT_MS,
                     });
                 }
                 _ => {}
@@ -120,10 +120,10 @@ impl Phase<'_> {
         }
     }
 
-    fn measure(&mut self, way: Way, window: &Window, screen: &mut Screen) -> Result<(), DemoError> {
+    fn measure(&mut self, setup: Setup, window: &Window, screen: &mut Screen) -> Result<(), DemoError> {
         let mut draw_at = window.start();
         loop {
-            self.look()?;
+            self.poll()?;
             let now = clock::monotonic();
             if now >= window.end() {
                 break;
@@ -131,8 +131,8 @@ impl Phase<'_> {
             self.set_stalled(is_stalled(window, now), now);
             if now >= draw_at {
                 draw_at = now.plus_ms(DRAW_EVERY_MS);
-                screen.draw(way, &self.tally, window, self.stalls_until(now), self.stalled_since, now);
-                if screen.is_gone() {
+                screen.draw(setup, &self.tally, window, self.stalls_until(now), self.stalled_since, now);
+                if screen.is_closed() {
                     return Err(DemoError::Interrupted);
                 }
             }
@@ -140,31 +140,33 @@ impl Phase<'_> {
         self.set_stalled(false, window.end());
         let deadline = window.end().plus_ms(DRAIN_MS);
         while clock::monotonic() < deadline {
-            self.look()?;
+            self.poll()?;
         }
-        screen.draw(way, &self.tally, window, self.stalls, None, window.end());
+        screen.draw(setup, &self.tally, window, self.stalls, None, window.end());
         Ok(())
     }
 
-    /// Takes in what was reported, and sees to it that all is well.
-    fn look(&mut self) -> Result<(), DemoError> {
-        if let Some((who, report)) = self.children.next_report(LOOK) {
-            self.tally.add(who, report);
+    /// Waits for the next report and adds it to the tally; fails on an interrupt or when a process has
+    /// exited.
+    fn poll(&mut self) -> Result<(), DemoError> {
+        if let Some((role, report)) = self.children.next_report(POLL_INTERVAL) {
+            self.tally.add(role, report);
         }
         if self.interrupt.is_requested() {
             return Err(DemoError::Interrupted);
         }
-        match self.children.ended() {
-            Some((who, status)) => Err(DemoError::Ended { who: who.name(), status }),
+        match self.children.exited() {
+            Some((role, status)) => Err(DemoError::Ended { name: role.name(), status }),
             None => Ok(()),
         }
     }
 
+    /// Stops or continues the remote subscriber if that changes its state, and accounts for the stall.
     fn set_stalled(&mut self, stalled: bool, now: MonotonicNs) {
         if stalled == self.stalled_since.is_some() {
             return;
         }
-        self.children.set_stopped(Who::Remote, stalled);
+        self.children.set_stopped(Role::Remote, stalled);
         if stalled {
             self.stalls.count += 1;
             self.stalled_since = Some(now);
@@ -174,53 +176,54 @@ impl Phase<'_> {
         }
     }
 
-    /// The stalls, with that of the moment as far as it has lasted.
+    /// The stalls so far, including the elapsed part of a stall that still lasts.
     fn stalls_until(&self, now: MonotonicNs) -> Stalls {
-        let present_ns = self.stalled_since.map_or(0, |since| now.since(since));
-        Stalls { ns: self.stalls.ns + present_ns, ..self.stalls }
+        let current_ns = self.stalled_since.map_or(0, |since| now.since(since));
+        Stalls { ns: self.stalls.ns + current_ns, ..self.stalls }
     }
 }
 
-/// Whether the remote subscriber is to be stopped at an instant of the window.
+/// Whether an instant of the window is within a stall of the remote subscriber.
 pub(super) fn is_stalled(window: &Window, instant: MonotonicNs) -> bool {
     let in_cycle_ms = instant.since(window.start()) / 1_000_000 % STALL_EVERY_MS;
     (STALL_AFTER_MS..STALL_AFTER_MS + STALL_MS).contains(&in_cycle_ms)
 }
 
-/// What the critical and the noncritical lane publish to.
+/// The output topics of the critical and the noncritical lane.
 fn lane_topics(settings: &Settings) -> Result<[&str; 2], DemoError> {
     let topic = |index: usize| {
         let output = settings.lanes.get(index)?.outputs.first()?;
         Some(output.topic.as_str())
     };
-    let [critical, noncritical] = lane_numbers(settings)?;
+    let [critical, noncritical] = lane_indices(settings)?;
     topic(critical)
         .zip(topic(noncritical))
         .map(|(critical, noncritical)| [critical, noncritical])
         .ok_or_else(|| DemoError::Config("the demo's lanes have no outputs".to_owned()))
 }
 
-fn lane_numbers(settings: &Settings) -> Result<[usize; 2], DemoError> {
-    let number = |name: &LaneName| settings.lanes.iter().position(|lane| lane.name == *name);
-    number(&LaneName::critical())
-        .zip(number(&LaneName::noncritical()))
+/// The indices of the critical and the noncritical lane in the settings.
+fn lane_indices(settings: &Settings) -> Result<[usize; 2], DemoError> {
+    let index = |name: &LaneName| settings.lanes.iter().position(|lane| lane.name == *name);
+    index(&LaneName::critical())
+        .zip(index(&LaneName::noncritical()))
         .map(|(critical, noncritical)| [critical, noncritical])
         .ok_or_else(|| DemoError::Config("the demo's lanes are missing".to_owned()))
 }
 
-/// What the bridge drops while it is measured: the difference of two readings of its boards.
-struct DropWatch {
+/// Counts the samples that the bridge drops during the measurement, from two readings of its boards.
+struct DropMeter {
     boards: Boards,
     lanes: [usize; 2],
     before: [DropCounts; 3],
 }
 
-impl DropWatch {
-    fn begin(place: &Place) -> Result<Self, DemoError> {
-        let settings = place.settings();
-        let found = Boards::find(&place.shm_root(), &settings.instance, &BridgeShape::of(settings))?;
+impl DropMeter {
+    fn begin(sandbox: &Sandbox) -> Result<Self, DemoError> {
+        let settings = sandbox.settings();
+        let found = Boards::find(&sandbox.shm_root(), &settings.instance, &BridgeShape::of(settings))?;
         let boards = found.ok_or_else(|| DemoError::Config("the bridge has no boards".to_owned()))?;
-        let lanes = lane_numbers(settings)?;
+        let lanes = lane_indices(settings)?;
         let before = Self::read(&boards, lanes);
         Ok(Self { boards, lanes, before })
     }
@@ -232,7 +235,7 @@ impl DropWatch {
         BridgeDrops { ingress, critical, noncritical }
     }
 
-    /// The demo's one route in ingress and in the two lanes.
+    /// The drop counts of the demo's one route in ingress and in the two lanes.
     fn read(boards: &Boards, lanes: [usize; 2]) -> [DropCounts; 3] {
         let lane = |lane| boards.lane(lane, 0).map(|counters| counters.drops).unwrap_or_default();
         let ingress = boards.ingress(0).map(|counters| counters.drops).unwrap_or_default();

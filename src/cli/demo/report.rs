@@ -1,33 +1,33 @@
-//! What the demo's publisher and subscribers tell the demo: a line of text on their stdout for each scan.
+//! The reports of the demo's publisher and subscribers to the demo: a line on their stdout for each scan.
 
 use std::fmt;
 
 use crate::model::MonotonicNs;
 
-/// One line.
+/// One line on the stdout of a publisher or subscriber.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Report {
-    /// The publisher's timer began; scan `n` is due `n` periods later.
+    /// The publisher has started its timer; scan `n` is due `n` periods later.
     Began {
-        /// When scan 0 was due.
+        /// The instant at which scan 0 is due.
         at: MonotonicNs,
     },
-    /// The publisher's publish call for a scan has returned.
+    /// The publish call for a scan has returned.
     Published {
-        /// The scan.
+        /// The number of the scan.
         number: u64,
-        /// How long the call took.
+        /// The duration of the call.
         call_ns: u64,
-        /// Whether the writer took the scan.
+        /// Whether the writer accepted the scan.
         written: bool,
     },
-    /// A subscriber has got a scan.
+    /// A subscriber has received a scan.
     Arrived {
-        /// The scan.
+        /// The number of the scan.
         number: u64,
-        /// When the publisher took it.
+        /// The instant before the publish call.
         taken_at: MonotonicNs,
-        /// When the subscriber had it.
+        /// The instant at which the subscriber took the scan from its reader.
         arrived_at: MonotonicNs,
     },
 }
@@ -47,7 +47,7 @@ impl fmt::Display for Report {
 }
 
 impl Report {
-    /// The report in a line; `None` when it is none.
+    /// Parses a line; `None` when it is not a report.
     pub fn parse(line: &str) -> Option<Self> {
         let mut words = line.split_ascii_whitespace();
         let kind = words.next()?;
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_survives_the_round_trip() {
+    fn a_printed_report_is_parsed_to_the_same_report() {
         let reports = [
             Report::Began { at: MonotonicNs(u64::MAX) },
             Report::Published { number: 7, call_ns: 100_123_456, written: false },

@@ -3,40 +3,40 @@
 
 use crate::model::MonotonicNs;
 
-/// ROS 2 message type.
+/// The ROS 2 message type.
 pub(super) const TYPE: &str = "sensor_msgs/msg/LaserScan";
 
-/// The same as DDS names it.
+/// The DDS type name of the message.
 pub(super) const DDS_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
 
-/// Bytes of one serialized scan, without the four of the encapsulation header.
+/// The size of one serialized scan, without the 4-byte encapsulation header.
 pub(super) const SCAN_BYTES: usize = 2_948;
 
 const BEAMS: u32 = 360;
-/// With its terminating zero 20 bytes, so that what follows needs no padding.
+/// The frame id. With its terminating zero it has 20 bytes, so that the next field needs no padding.
 const FRAME_ID: &[u8] = b"demo/base_scan_link\0";
-/// Where `ranges` begins, with its length: behind the stamp, the frame id and seven parameters of the scan.
+/// Offset of the length of `ranges`, behind the stamp, the frame id and seven parameters of the scan.
 const RANGES_AT: usize = 8 + 4 + FRAME_ID.len() + 7 * 4;
-/// Where the first of `intensities` is.
+/// Offset of the first of `intensities`.
 const NUMBER_AT: usize = RANGES_AT + 4 + BEAMS as usize * 4 + 4;
 
-/// An `f32` holds whole numbers of 24 bits: 155 hours of scans.
+/// The count of scan numbers that an `f32` represents exactly (24 bits): 155 hours of scans.
 const NUMBERS: u64 = 1 << 24;
 
-/// What the demo's subscribers look at.
+/// The fields of a scan that the demo's subscribers read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Scan {
-    /// Its number with the publisher; the intensity of the first beam.
+    /// The number that the publisher gave it, in the intensity of the first beam.
     pub number: u64,
-    /// When it was taken, `CLOCK_MONOTONIC`; `header.stamp`.
+    /// The `CLOCK_MONOTONIC` time before the publish call, in `header.stamp`.
     pub taken_at: MonotonicNs,
 }
 
 impl Scan {
-    /// The serialized scan, without the encapsulation header.
+    /// Serializes the scan, without the encapsulation header.
     pub fn encode(self) -> Vec<u8> {
         let mut cdr = Vec::with_capacity(SCAN_BYTES);
-        // A machine would have to be up for 68 years for its seconds to exceed 31 bits.
+        // The uptime in seconds exceeds 31 bits after 68 years.
         let seconds = (self.taken_at.0 / 1_000_000_000) as u32;
         let nanos = (self.taken_at.0 % 1_000_000_000) as u32;
         cdr.extend_from_slice(&seconds.to_le_bytes());
@@ -56,7 +56,7 @@ impl Scan {
         cdr
     }
 
-    /// The scan in a payload; `None` when it is not one of the demo's.
+    /// Reads the scan in a payload; `None` when it is not one of the demo's.
     pub fn decode(payload: &[u8]) -> Option<Self> {
         let word = |at: usize| Some(u32::from_le_bytes(*payload.get(at..)?.first_chunk::<4>()?));
         if payload.len() != SCAN_BYTES || payload.get(12..12 + FRAME_ID.len())? != FRAME_ID {
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_scan_survives_the_round_trip_and_has_the_size_it_says() {
+    fn an_encoded_scan_has_the_declared_size_and_is_decoded_to_the_same_scan() {
         for number in [0, 1, 17_999, NUMBERS - 1] {
             let scan = Scan { number, taken_at: MonotonicNs(86_400_123_456_789 + number) };
             let cdr = scan.encode();
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_scan_of_the_demo_is_not_taken_for_one() {
+    fn other_payloads_are_not_decoded_as_scans() {
         let cdr = Scan { number: 1, taken_at: MonotonicNs(1) }.encode();
         assert_eq!(Scan::decode(&cdr[..SCAN_BYTES - 1]), None);
         assert_eq!(Scan::decode(&[]), None);

@@ -1,22 +1,23 @@
-//! What the demo shows while it runs: a table that is redrawn in place on a terminal, a line now and then
-//! elsewhere, nothing with `--json`. 80 columns wide.
+//! The display of a running demo: on a terminal a table that is redrawn in place, elsewhere a line every two
+//! seconds, nothing with `--json`. 80 columns wide.
 
 use std::io::{self, IsTerminal, Write};
 
 use super::RATE_HZ;
-use super::children::Who;
-use super::phase::{Way, is_stalled};
+use super::children::Role;
+use super::phase::{Setup, is_stalled};
 use super::tally::{Stalls, Tally, Window};
 use crate::model::MonotonicNs;
 
-/// In lines, how often there is one.
+/// The period of lines when stdout is no terminal.
 const LINE_EVERY_MS: u64 = 2_000;
-/// A rate is that of the last second.
+/// The time over which a displayed rate is measured.
 const RATE_OVER_MS: u64 = 1_000;
-/// What takes no longer than this to arrive is not called lost meanwhile.
-const ON_THE_WAY_MS: u64 = 100;
-/// Characters of a timeline, each of half a second or more.
+/// During a phase, a scan counts as missed only when it has not arrived this long after it was due.
+const ARRIVAL_GRACE_MS: u64 = 100;
+/// The highest number of characters of a timeline.
 const TIMELINE_CELLS: u64 = 40;
+/// The shortest time that a character of a timeline covers.
 const CELL_MIN_MS: u64 = 500;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,14 +27,14 @@ enum Style {
     Quiet,
 }
 
-/// The terminal, or whatever stdout is.
+/// The display on stdout.
 #[derive(Debug)]
 pub(super) struct Screen {
     style: Style,
-    /// Lines of the table that is on the terminal.
+    /// The number of lines of the table on the terminal.
     table_lines: usize,
     next_line_at: MonotonicNs,
-    gone: bool,
+    closed: bool,
 }
 
 impl Screen {
@@ -44,16 +45,16 @@ impl Screen {
             false if io::stdout().is_terminal() && !dumb => Style::InPlace,
             false => Style::Lines,
         };
-        Self { style, table_lines: 0, next_line_at: MonotonicNs(0), gone: false }
+        Self { style, table_lines: 0, next_line_at: MonotonicNs(0), closed: false }
     }
 
-    /// Whether nobody can see what is shown any more.
-    pub fn is_gone(&self) -> bool {
-        self.gone
+    /// Whether a write to stdout has failed.
+    pub fn is_closed(&self) -> bool {
+        self.closed
     }
 
-    /// Shows text that stays.
-    pub fn say(&mut self, text: &str) {
+    /// Prints text that later updates do not overwrite.
+    pub fn print(&mut self, text: &str) {
         self.table_lines = 0;
         self.next_line_at = MonotonicNs(0);
         if self.style != Style::Quiet {
@@ -61,10 +62,10 @@ impl Screen {
         }
     }
 
-    /// Shows how a phase goes.
+    /// Shows the progress of a phase.
     pub fn draw(
         &mut self,
-        way: Way,
+        setup: Setup,
         tally: &Tally,
         window: &Window,
         stalls: Stalls,
@@ -76,9 +77,9 @@ impl Screen {
             Style::Quiet => {}
             Style::InPlace => {
                 let view = View::of(tally, window, stalls, stalled_since, now);
-                let lines = view.table(way, tally, window, now);
-                // Up to where the table begins; without wrapping, so that a line stays one on a narrow
-                // terminal.
+                let lines = view.table(setup, tally, window, now);
+                // Moves the cursor up to the start of the table. Wrapping is off, so that a line of the table
+                // stays one line on a narrow terminal.
                 let mut text = String::from("\x1b[?7l");
                 if self.table_lines > 0 {
                     text.push_str(&format!("\x1b[{}A", self.table_lines));
@@ -103,7 +104,7 @@ impl Screen {
 
     fn write(&mut self, text: &str) {
         let mut stdout = io::stdout().lock();
-        self.gone |= stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).is_err();
+        self.closed |= stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).is_err();
     }
 }
 
@@ -130,18 +131,18 @@ impl View {
         stalled_since: Option<MonotonicNs>,
         now: MonotonicNs,
     ) -> Self {
-        // At the end all is counted, and what is on its way has had its time.
+        // At the end of a phase every scan counts, because the last ones had time to arrive.
         let settled = if now >= window.end() {
             now
         } else {
-            MonotonicNs(now.0.saturating_sub(ON_THE_WAY_MS * 1_000_000))
+            MonotonicNs(now.0.saturating_sub(ARRIVAL_GRACE_MS * 1_000_000))
         };
         let second = MonotonicNs(settled.0.saturating_sub(RATE_OVER_MS * 1_000_000))..settled;
         let figures = tally.figures(window, stalls, settled);
         Self {
             publisher_hz: tally.written_in(window, second.clone()),
-            critical_hz: tally.arrived_in(Who::Critical, window, second.clone()),
-            remote_hz: tally.arrived_in(Who::Remote, window, second),
+            critical_hz: tally.arrived_in(Role::Critical, window, second.clone()),
+            remote_hz: tally.arrived_in(Role::Remote, window, second),
             due: figures.publisher.due,
             written: figures.publisher.written,
             call_max_ms: figures.publisher.call_max_ms,
@@ -153,10 +154,10 @@ impl View {
         }
     }
 
-    fn table(&self, way: Way, tally: &Tally, window: &Window, now: MonotonicNs) -> Vec<String> {
+    fn table(&self, setup: Setup, tally: &Tally, window: &Window, now: MonotonicNs) -> Vec<String> {
         let seconds = window.end().since(window.start()) / 1_000_000_000;
         let elapsed = (now.since(window.start()) / 1_000_000_000).min(seconds);
-        let missed = |got: u64| self.due.saturating_sub(got);
+        let missed = |received: u64| self.due.saturating_sub(received);
         let silence = if self.silent_s > 0.3 {
             format!("silent for {:.1} s!", self.silent_s)
         } else {
@@ -166,13 +167,13 @@ impl View {
             Some(stalled_s) => format!("link down for {stalled_s:.1} s"),
             None => "link up".to_owned(),
         };
-        let remote_missed = match way {
-            Way::Direct => missed(self.remote_received).to_string(),
-            // It is not to get all of them.
-            Way::Bridge => "-".to_owned(),
+        let remote_missed = match setup {
+            Setup::Direct => missed(self.remote_received).to_string(),
+            // The remote lane is rate-limited, so the remote subscriber does not receive every scan.
+            Setup::Bridge => "-".to_owned(),
         };
-        let row = |name: &str, hz: usize, got: u64, missed: String, note: String| {
-            format!("  {name:<12}{hz:>6} Hz {got:>8} {missed:>9}   {note}")
+        let row = |name: &str, hz: usize, scans: u64, missed: String, note: String| {
+            format!("  {name:<12}{hz:>6} Hz {scans:>8} {missed:>9}   {note}")
         };
         let mut lines = vec![
             format!(
@@ -218,7 +219,7 @@ impl View {
     }
 }
 
-/// What happened when, a character for each half second.
+/// The timelines of link, publisher and critical subscriber, a character for each half second or more.
 fn timelines(tally: &Tally, window: &Window, now: MonotonicNs) -> [String; 3] {
     let seconds = window.end().since(window.start()) / 1_000_000_000;
     let cell_ms = (seconds * 1_000).div_ceil(TIMELINE_CELLS).next_multiple_of(CELL_MIN_MS);
@@ -232,17 +233,18 @@ fn timelines(tally: &Tally, window: &Window, now: MonotonicNs) -> [String; 3] {
         if to > now || to > window.end() {
             break;
         }
-        // Stalls begin and end with a half second.
+        // Stalls begin and end at multiples of half a second.
         let halves = (0..cell_ms / CELL_MIN_MS).map(|half| from.plus_ms(half * CELL_MIN_MS));
         let up = halves.filter(|half| !is_stalled(window, *half)).count();
         link.push(shade(up, (cell_ms / CELL_MIN_MS) as usize));
         publisher.push(shade(tally.written_in(window, from..to), in_cell));
-        critical.push(shade(tally.arrived_in(Who::Critical, window, from..to), in_cell));
+        critical.push(shade(tally.arrived_in(Role::Critical, window, from..to), in_cell));
     }
     link = format!("{link:<55}# all   + some   . none");
     [link, publisher, critical]
 }
 
+/// The character of a timeline cell: all, some or none of the expected scans.
 fn shade(scans: usize, expected: usize) -> char {
     match scans {
         0 => '.',
@@ -258,21 +260,21 @@ mod tests {
     use crate::cli::demo::report::Report;
 
     #[test]
-    fn no_line_is_wider_than_a_terminal_of_80_columns() {
+    fn every_line_fits_a_terminal_of_80_columns() {
         for seconds in [6, 18, 600] {
             let began_at = MonotonicNs(5_000_000_000);
             let window = Window { began_at, numbers: 30..30 + seconds * RATE_HZ };
             let mut tally = Tally::default();
             for number in window.numbers.clone() {
                 let taken_at = due_at(began_at, number);
-                tally.add(Who::Publisher, Report::Published { number, call_ns: 100_123_456, written: true });
-                for who in [Who::Critical, Who::Remote] {
-                    tally.add(who, Report::Arrived { number, taken_at, arrived_at: taken_at });
+                tally.add(Role::Publisher, Report::Published { number, call_ns: 100_123_456, written: true });
+                for role in [Role::Critical, Role::Remote] {
+                    tally.add(role, Report::Arrived { number, taken_at, arrived_at: taken_at });
                 }
             }
             for stalled_since in [None, Some(window.start())] {
                 let view = View::of(&tally, &window, Stalls::default(), stalled_since, window.end());
-                let mut lines = view.table(Way::Direct, &tally, &window, window.end());
+                let mut lines = view.table(Setup::Direct, &tally, &window, window.end());
                 lines.push(view.line(&window, window.end()));
                 for line in lines {
                     assert!(line.chars().count() < 80, "{} columns: {line}", line.chars().count());

@@ -1,22 +1,23 @@
-//! What was measured in one phase. Pure: reports go in, figures come out.
+//! The measurements of one phase: computes its figures from the reports of its processes. Pure.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 
 use serde::Serialize;
 
-use super::children::Who;
+use super::children::Role;
 use super::report::Report;
 use super::{RATE_HZ, due_at};
 use crate::model::{DropCounts, MonotonicNs};
 
-/// A scan that arrived.
+/// The arrival of a scan at a subscriber.
 #[derive(Clone, Copy, Debug)]
 struct Arrival {
     taken_at: MonotonicNs,
     arrived_at: MonotonicNs,
 }
 
+/// The publish call of a scan.
 #[derive(Clone, Copy, Debug)]
 struct Published {
     call_ns: u64,
@@ -33,56 +34,56 @@ pub(super) struct Tally {
 }
 
 impl Tally {
-    /// Takes a report in. The first arrival of a scan counts.
-    pub fn add(&mut self, who: Who, report: Report) {
-        match (who, report) {
-            (Who::Publisher, Report::Began { at }) => self.began_at = Some(at),
-            (Who::Publisher, Report::Published { number, call_ns, written }) => {
+    /// Adds a report. Only the first arrival of a scan counts.
+    pub fn add(&mut self, role: Role, report: Report) {
+        match (role, report) {
+            (Role::Publisher, Report::Began { at }) => self.began_at = Some(at),
+            (Role::Publisher, Report::Published { number, call_ns, written }) => {
                 self.published.insert(number, Published { call_ns, written });
             }
-            (Who::Critical, Report::Arrived { number, taken_at, arrived_at }) => {
+            (Role::Critical, Report::Arrived { number, taken_at, arrived_at }) => {
                 self.critical.entry(number).or_insert(Arrival { taken_at, arrived_at });
             }
-            (Who::Remote, Report::Arrived { number, taken_at, arrived_at }) => {
+            (Role::Remote, Report::Arrived { number, taken_at, arrived_at }) => {
                 self.remote.entry(number).or_insert(Arrival { taken_at, arrived_at });
             }
             _ => {}
         }
     }
 
-    /// When the publisher's timer began.
+    /// The instant at which scan 0 was due; `None` until the publisher has started its timer.
     pub fn began_at(&self) -> Option<MonotonicNs> {
         self.began_at
     }
 
-    /// Scans that have arrived at a subscriber.
-    pub fn arrived(&self, who: Who) -> usize {
-        match who {
-            Who::Critical => self.critical.len(),
-            Who::Remote => self.remote.len(),
-            Who::Publisher | Who::Bridge => 0,
+    /// The number of scans that have arrived at a subscriber.
+    pub fn arrived(&self, role: Role) -> usize {
+        match role {
+            Role::Critical => self.critical.len(),
+            Role::Remote => self.remote.len(),
+            Role::Publisher | Role::Bridge => 0,
         }
     }
 
-    /// Scans due in an interval that were written.
+    /// The number of written scans that were due in an interval.
     pub fn written_in(&self, window: &Window, interval: Range<MonotonicNs>) -> usize {
         let written = self.published.range(window.numbers.clone()).filter(|(_, one)| one.written);
         written.filter(|(number, _)| interval.contains(&due_at(window.began_at, **number))).count()
     }
 
-    /// Scans of the window that arrived in an interval.
-    pub fn arrived_in(&self, who: Who, window: &Window, interval: Range<MonotonicNs>) -> usize {
-        let arrivals = if who == Who::Remote { &self.remote } else { &self.critical };
+    /// The number of scans of the window that arrived in an interval.
+    pub fn arrived_in(&self, role: Role, window: &Window, interval: Range<MonotonicNs>) -> usize {
+        let arrivals = if role == Role::Remote { &self.remote } else { &self.critical };
         arrivals.range(window.numbers.clone()).filter(|(_, one)| interval.contains(&one.arrived_at)).count()
     }
 
-    /// How long the critical subscriber has been without a scan.
+    /// The time since the last arrival at the critical subscriber.
     pub fn silent_ns(&self, window: &Window, now: MonotonicNs) -> u64 {
         let last = self.critical.range(window.numbers.clone()).next_back();
         now.since(last.map_or(window.start(), |(_, one)| one.arrived_at))
     }
 
-    /// The figures of a window; `until` cuts it short while the phase goes on.
+    /// The figures of a window up to `until`.
     pub fn figures(&self, window: &Window, stalls: Stalls, until: MonotonicNs) -> Figures {
         let until = until.min(window.end());
         let numbers = window.numbers.start..window.numbers_before(until);
@@ -132,12 +133,12 @@ impl Tally {
     }
 }
 
-/// The part of a phase that is measured: the scans that are due in it.
+/// The measured part of a phase, as a range of scan numbers.
 #[derive(Clone, Debug)]
 pub(super) struct Window {
-    /// When scan 0 was due.
+    /// The instant at which scan 0 was due.
     pub began_at: MonotonicNs,
-    /// The scans.
+    /// The numbers of the measured scans.
     pub numbers: Range<u64>,
 }
 
@@ -150,7 +151,7 @@ impl Window {
         due_at(self.began_at, self.numbers.end)
     }
 
-    /// One more than the last scan of the window that is due before then.
+    /// The end of the range of scans of the window that are due before an instant.
     fn numbers_before(&self, instant: MonotonicNs) -> u64 {
         if instant >= self.end() {
             return self.numbers.end;
@@ -160,7 +161,7 @@ impl Window {
     }
 }
 
-/// How often and how long the remote subscriber was stopped.
+/// The number and the total duration of the stalls of the remote subscriber.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Stalls {
     pub count: u64,
@@ -173,26 +174,26 @@ pub(super) struct Figures {
     pub publisher: PublisherFigures,
     pub critical: CriticalFigures,
     pub remote: RemoteFigures,
-    /// What the bridge dropped, by process and name; none without a bridge.
+    /// The samples that the bridge dropped, by process and drop reason; `None` without a bridge.
     pub drops: Option<BridgeDrops>,
 }
 
-/// `due = written + timed_out + skipped`.
+/// The figures of the publisher: `due = written + timed_out + skipped`.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct PublisherFigures {
-    /// Scans that the laser had to publish.
+    /// Scans that were due in the window.
     pub due: u64,
-    /// Scans that the DDS writer took.
+    /// Scans that the DDS writer accepted.
     pub written: u64,
-    /// Scans that it refused after the blocking time.
+    /// Scans whose publish call timed out.
     pub timed_out: u64,
-    /// Scans whose time came while a publish call was still waiting.
+    /// Scans that became due while an earlier publish call was blocked.
     pub skipped: u64,
     pub rate_hz: f64,
     pub call_max_ms: f64,
 }
 
-/// `due = received + lost`, `lost = never_written + lost_on_the_way`.
+/// The figures of the critical subscriber: `due = received + lost`, `lost = never_written + lost_on_the_way`.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct CriticalFigures {
     pub received: u64,
@@ -201,10 +202,11 @@ pub(super) struct CriticalFigures {
     pub lost_on_the_way: u64,
     /// The longest time without an arrival.
     pub silence_max_ms: f64,
-    /// From before the publish call to the subscriber; none when nothing arrived.
+    /// From before the publish call to the arrival; `None` when nothing arrived.
     pub latency_ms: Option<Quantiles>,
 }
 
+/// The figures of the remote subscriber.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct RemoteFigures {
     pub received: u64,
@@ -212,6 +214,7 @@ pub(super) struct RemoteFigures {
     pub stalled_s: f64,
 }
 
+/// Quantiles of a latency in milliseconds.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Quantiles {
     pub p50: f64,
@@ -221,7 +224,7 @@ pub(super) struct Quantiles {
 }
 
 impl Quantiles {
-    /// Nearest-rank quantiles in milliseconds.
+    /// The quantiles of sorted values by nearest rank; `None` without values.
     fn of(sorted_ns: &[u64]) -> Option<Self> {
         let max = *sorted_ns.last()?;
         let at = |quantile: f64| {
@@ -232,7 +235,7 @@ impl Quantiles {
     }
 }
 
-/// What the bridge dropped while it was measured.
+/// Samples that the bridge dropped during the measurement, by drop reason, for each process.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct BridgeDrops {
     pub ingress: BTreeMap<&'static str, u64>,
@@ -240,7 +243,7 @@ pub(super) struct BridgeDrops {
     pub noncritical: BTreeMap<&'static str, u64>,
 }
 
-/// By name, what was dropped between two readings.
+/// The samples dropped between two readings of a board, by drop reason.
 pub(super) fn drops_between(before: &DropCounts, after: &DropCounts) -> BTreeMap<&'static str, u64> {
     after
         .iter()
@@ -253,7 +256,7 @@ fn ms(ns: u64) -> f64 {
     ns as f64 / 1e6
 }
 
-/// Scans of so many seconds.
+/// The number of scans that are due in `seconds`.
 pub(super) const fn scans_in_s(seconds: u64) -> u64 {
     seconds * RATE_HZ
 }
@@ -266,15 +269,15 @@ mod tests {
 
     fn tally(published: &[(u64, bool)], arrived: &[u64], latency_ns: u64) -> Tally {
         let mut tally = Tally::default();
-        tally.add(Who::Publisher, Report::Began { at: BEGAN });
+        tally.add(Role::Publisher, Report::Began { at: BEGAN });
         for &(number, written) in published {
             let call_ns = if written { 50_000 } else { 100_000_000 };
-            tally.add(Who::Publisher, Report::Published { number, call_ns, written });
+            tally.add(Role::Publisher, Report::Published { number, call_ns, written });
         }
         for &number in arrived {
             let taken_at = due_at(BEGAN, number);
             let arrived_at = taken_at.plus_ns(latency_ns);
-            tally.add(Who::Critical, Report::Arrived { number, taken_at, arrived_at });
+            tally.add(Role::Critical, Report::Arrived { number, taken_at, arrived_at });
         }
         tally
     }
@@ -284,8 +287,9 @@ mod tests {
     }
 
     #[test]
-    fn every_scan_that_was_due_is_accounted_for() {
-        // 30 to 39 written; 40 refused, 41 to 43 skipped; 44 to 59 written, of which 50 does not arrive.
+    fn every_due_scan_is_accounted_for() {
+        // 30 to 39 are written, 40 times out, 41 to 43 are skipped, 44 to 59 are written, but 50 does not
+        // arrive.
         let mut published: Vec<_> = (0..90).map(|number| (number, true)).collect();
         published.retain(|(number, _)| !(41..44).contains(number));
         published[40].1 = false;
@@ -300,7 +304,7 @@ mod tests {
         let critical = &figures.critical;
         assert_eq!((critical.received, critical.lost), (25, 5));
         assert_eq!((critical.never_written, critical.lost_on_the_way), (4, 1));
-        // From 39 to 44.
+        // Between the arrivals of 39 and 44.
         assert!((critical.silence_max_ms - 5.0 * 100.0 / 3.0).abs() < 0.01, "{}", critical.silence_max_ms);
         let latency_ms = critical.latency_ms.as_ref().unwrap();
         assert_eq!((latency_ms.p50, latency_ms.max), (0.25, 0.25));

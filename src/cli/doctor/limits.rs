@@ -1,4 +1,4 @@
-//! What this user may ask of the kernel, and what the kernel has.
+//! Checks of resource limits and rights, scheduling, CPUs, idle states and the clock source.
 
 use std::fs;
 use std::path::Path;
@@ -9,14 +9,16 @@ use nix::unistd::geteuid;
 use super::{Finding, Severity, list, number};
 use crate::config::{Scheduling, SchedulingPolicy, Settings};
 
-/// Sockets, shared memory and pipes of a process with some hundred routes.
+/// Open files that a process with some hundred routes needs: sockets, shared memory, pipes.
 const OPEN_FILES: u64 = 1024;
 
-/// What leaving an idle state may take without being noticed: about what a wake-up takes anyway.
-const SLEEP_US: i64 = 10;
+/// Exit latency of an idle state that is negligible beside the wake-up of a thread, which takes about as
+/// long.
+const NEGLIGIBLE_EXIT_US: i64 = 10;
 
-/// CAP_SYS_NICE and CAP_IPC_LOCK, as bits of `CapEff` (capabilities(7)).
+/// Bit of CAP_IPC_LOCK in `CapEff` (capabilities(7)).
 const CAP_IPC_LOCK: u32 = 14;
+/// Bit of CAP_SYS_NICE in `CapEff`.
 const CAP_SYS_NICE: u32 = 23;
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
@@ -39,11 +41,11 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
         real_time(&configured, &rights),
         memory_lock(&configured, &rights),
     ];
-    // Of the machine, and not of the CPUs that this process was left with.
+    // The CPUs of the machine, not only those in the affinity mask of this process.
     let online = fs::read_to_string("/sys/devices/system/cpu/online").ok();
     findings.extend(online.map(|online| cpus(&configured, online.trim())));
     findings.extend(number("/proc/sys/kernel/sched_rt_runtime_us").map(throttling));
-    findings.extend(sleep(Path::new("/sys/devices/system/cpu")));
+    findings.extend(idle_states(Path::new("/sys/devices/system/cpu")));
     let source = "/sys/devices/system/clocksource/clocksource0";
     let read = |name: &str| fs::read_to_string(format!("{source}/{name}")).ok();
     if let (Some(current), Some(available)) = (read("current_clocksource"), read("available_clocksource")) {
@@ -52,14 +54,17 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     findings
 }
 
-/// What this process may do; services have rights of their own.
+/// The rights of this process to real-time scheduling and locked memory. The systemd services have their own.
 struct Rights {
+    /// CAP_SYS_NICE.
     nice: bool,
+    /// CAP_IPC_LOCK.
     lock: bool,
     rtprio: u64,
     memlock: u64,
 }
 
+/// The effective capabilities of this process.
 fn capabilities() -> u64 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -67,15 +72,15 @@ fn capabilities() -> u64 {
 }
 
 fn open_files(limit: u64) -> Finding {
-    let found = format!("{limit} open files for each process");
+    let found = format!("a process may open {limit} files");
     if limit >= OPEN_FILES {
         return Finding::ok("open files", found);
     }
-    Finding::new("open files", Severity::Warning, found, "Many routes may not fit.")
-        .mended_by(format!("ulimit -n {OPEN_FILES}"))
+    Finding::new("open files", Severity::Warning, found, "Too few for many routes.")
+        .with_command(format!("ulimit -n {OPEN_FILES}"))
 }
 
-/// A line for limits.conf(5), for this user.
+/// The command that adds a line for this user to limits.conf(5).
 fn limits_line(item: &str, value: &str) -> String {
     let user = match geteuid() {
         uid if uid.is_root() => "root".to_owned(),
@@ -89,8 +94,8 @@ fn limits_line(item: &str, value: &str) -> String {
 
 fn real_time(configured: &[&Scheduling], rights: &Rights) -> Finding {
     let check = "real time";
-    let wanted = configured.iter().filter(|how| how.policy != SchedulingPolicy::Other);
-    match wanted.map(|how| u64::from(how.priority)).max() {
+    let real_time = configured.iter().filter(|scheduling| scheduling.policy != SchedulingPolicy::Other);
+    match real_time.map(|scheduling| u64::from(scheduling.priority)).max() {
         None => Finding::ok(check, "no real-time policy is configured"),
         Some(priority) if rights.nice || rights.rtprio >= priority => {
             Finding::ok(check, format!("priority {priority} is allowed"))
@@ -98,33 +103,32 @@ fn real_time(configured: &[&Scheduling], rights: &Rights) -> Finding {
         Some(priority) => Finding::new(
             check,
             Severity::Warning,
-            format!("priority {priority} is configured and this user may have {}", rights.rtprio),
-            "Processes that this user starts run with the usual policy. The installed services may have up to 50.",
+            format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
+            "Processes that this user starts run without a real-time policy. The installed services are allowed 50.",
         )
-        .mended_by(limits_line("rtprio", &priority.to_string())),
+        .with_command(limits_line("rtprio", &priority.to_string())),
     }
 }
 
 fn memory_lock(configured: &[&Scheduling], rights: &Rights) -> Finding {
     let check = "memory lock";
-    let wanted = configured.iter().any(|how| how.lock_memory);
-    if !wanted {
+    if !configured.iter().any(|scheduling| scheduling.lock_memory) {
         return Finding::ok(check, "not configured");
     }
     if rights.lock || rights.memlock == u64::MAX {
         return Finding::ok(check, "is allowed");
     }
-    let found = format!("lock_memory is configured and this user may lock {} KiB", rights.memlock / 1024);
+    let found = format!("lock_memory is configured, and this user may lock {} KiB", rights.memlock / 1024);
     Finding::new(
         check,
         Severity::Warning,
         found,
-        "Processes that this user starts may wait for a page. The installed services of the critical path may lock.",
+        "Page faults may delay processes that this user starts. The installed critical services may lock memory.",
     )
-    .mended_by(limits_line("memlock", "unlimited"))
+    .with_command(limits_line("memlock", "unlimited"))
 }
 
-/// `online` as the kernel lists CPUs, such as `0-3,8`.
+/// Checks that the configured CPUs exist. `online` is the kernel's list of CPUs, such as `0-3,8`.
 fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
     let is_online = |cpu: usize| {
         online.split(',').any(|range| {
@@ -133,18 +137,19 @@ fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
             bound(first).is_some_and(|first| first <= cpu) && bound(last).is_some_and(|last| cpu <= last)
         })
     };
-    let mut lacking: Vec<usize> = configured.iter().flat_map(|how| how.cpus.iter().copied()).collect();
-    lacking.retain(|&cpu| !is_online(cpu));
-    lacking.sort_unstable();
-    lacking.dedup();
-    if lacking.is_empty() {
-        return Finding::ok("CPUs", format!("this machine has {online}"));
+    let mut missing: Vec<usize> =
+        configured.iter().flat_map(|scheduling| scheduling.cpus.iter().copied()).collect();
+    missing.retain(|&cpu| !is_online(cpu));
+    missing.sort_unstable();
+    missing.dedup();
+    if missing.is_empty() {
+        return Finding::ok("CPUs", format!("{online} are online"));
     }
     Finding::new(
         "CPUs",
         Severity::Warning,
-        format!("CPUs {} are configured, and this machine has {online}", list(lacking)),
-        "A process that may run on none of its CPUs runs on all.",
+        format!("CPUs {} are configured, and only {online} are online", list(missing)),
+        "A process whose configured CPUs are all offline runs on every CPU.",
     )
 }
 
@@ -157,20 +162,20 @@ fn throttling(runtime_us: i64) -> Finding {
             "kernel.sched_rt_runtime_us is 0",
             "No process may have a real-time policy.",
         )
-        .mended_by("sudo sysctl -w kernel.sched_rt_runtime_us=950000"),
+        .with_command("sudo sysctl -w kernel.sched_rt_runtime_us=950000"),
         runtime_us if runtime_us < 0 => Finding::new(
             check,
             Severity::Note,
             "kernel.sched_rt_runtime_us is -1",
-            "A real-time process that spins takes its CPU for good; the services have LimitRTTIME against that.",
+            "A real-time process in an endless loop blocks its CPU; LimitRTTIME of the services prevents that.",
         ),
         runtime_us => Finding::ok(check, format!("{runtime_us} us of each second")),
     }
 }
 
-/// The enabled idle state of any CPU that takes longest to leave, and how long, as `sysfs` says
-/// (the kernel's cpuidle).
-fn deepest_sleep(cpus: &Path) -> Option<(String, i64)> {
+/// The enabled idle state with the highest exit latency of all CPUs, and that latency in µs (cpuidle in
+/// sysfs).
+fn deepest_idle_state(cpus: &Path) -> Option<(String, i64)> {
     let entries = |directory: &Path| fs::read_dir(directory).into_iter().flatten().flatten();
     let states = entries(cpus).flat_map(|cpu| entries(&cpu.path().join("cpuidle")));
     let enabled = states.filter_map(|state| {
@@ -181,30 +186,30 @@ fn deepest_sleep(cpus: &Path) -> Option<(String, i64)> {
     enabled.max_by_key(|(_, latency_us)| *latency_us)
 }
 
-/// `None` where the kernel has no idle states to choose from.
-fn sleep(cpus: &Path) -> Option<Finding> {
-    let (name, latency_us) = deepest_sleep(cpus)?;
+/// Checks how long an idle CPU takes to wake up; `None` where the kernel has no cpuidle.
+fn idle_states(cpus: &Path) -> Option<Finding> {
+    let (name, latency_us) = deepest_idle_state(cpus)?;
     let driver = fs::read_to_string(cpus.join("cpuidle/current_driver")).unwrap_or_default();
     let found = match driver.trim() {
-        // A guest's driver. It says 1 us, and the hypervisor takes 40 to 70.
+        // The driver of a virtual machine. It reports 1 us; the hypervisor takes 40 to 70.
         "haltpoll" => {
-            "idle CPUs of this virtual machine go to its hypervisor, which takes tens of us".to_owned()
+            "idle CPUs of this virtual machine halt in the hypervisor; a wake-up takes tens of us".to_owned()
         }
-        _ => format!("{name}, the deepest idle state, takes {latency_us} us to leave"),
+        _ => format!("{name}, the deepest idle state, has an exit latency of {latency_us} us"),
     };
-    if latency_us <= SLEEP_US && driver.trim() != "haltpoll" {
+    if latency_us <= NEGLIGIBLE_EXIT_US && driver.trim() != "haltpoll" {
         return Some(Finding::ok("idle CPUs", found));
     }
     let meaning =
-        "A sample waits for it at up to three hand-overs, where samples are rare enough for CPUs to sleep.";
+        "At low rates, when CPUs go idle between samples, a sample waits for up to three such wake-ups.";
     let command = "sudo sh -c 'exec 3>/dev/cpu_dma_latency && echo 0 >&3 && exec sleep infinity' \
-                   # none sleeps while this runs; takes power";
-    Some(Finding::new("idle CPUs", Severity::Note, found, meaning).mended_by(command))
+                   # keeps CPUs awake while it runs; draws more power";
+    Some(Finding::new("idle CPUs", Severity::Note, found, meaning).with_command(command))
 }
 
 fn clock_source(current: &str, available: &str) -> Finding {
     let check = "clock source";
-    // Read in user space, in nanoseconds; the others take a system call or a slow device.
+    // These are read in user space within nanoseconds; others need a system call or a slow device access.
     const FAST: [&str; 4] = ["tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page"];
     if FAST.contains(&current) {
         return Finding::ok(check, current);
@@ -214,10 +219,10 @@ fn clock_source(current: &str, available: &str) -> Finding {
         check,
         if better.is_some() { Severity::Warning } else { Severity::Note },
         current,
-        "Each reading of the clock costs microseconds, and each sample takes several.",
+        "Each reading of the clock takes microseconds, and each sample needs several readings.",
     );
     match better {
-        Some(better) => finding.mended_by(format!(
+        Some(better) => finding.with_command(format!(
             "echo {better} | sudo tee /sys/devices/system/clocksource/clocksource0/current_clocksource"
         )),
         None => finding,
@@ -231,7 +236,7 @@ mod tests {
     const NONE: Rights = Rights { nice: false, lock: false, rtprio: 0, memlock: 65_536 };
 
     #[test]
-    fn what_is_configured_must_be_allowed() {
+    fn configured_scheduling_must_be_allowed_and_its_cpus_online() {
         let plain = Scheduling::default();
         let fifo = Scheduling {
             policy: SchedulingPolicy::Fifo,
@@ -272,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn the_deepest_sleep_of_any_cpu_counts_if_it_is_enabled() {
+    fn the_deepest_enabled_idle_state_of_any_cpu_counts() {
         let cpus = tempfile::tempdir().unwrap();
         let write = |cpu: &str, state: u32, [name, latency_us, disable]: [&str; 3]| {
             let state = cpus.path().join(cpu).join("cpuidle").join(format!("state{state}"));
@@ -281,16 +286,16 @@ mod tests {
                 fs::write(state.join(file), format!("{text}\n")).unwrap();
             }
         };
-        let found = || sleep(cpus.path()).map(|finding| (finding.severity, finding.found));
+        let found = || idle_states(cpus.path()).map(|finding| (finding.severity, finding.found));
         assert_eq!(found(), None, "no cpuidle");
         write("cpu0", 0, ["POLL", "0", "0"]);
         write("cpu0", 1, ["C1", "2", "0"]);
         write("cpu0", 2, ["C10", "1048", "1"]);
-        let shallow = "C1, the deepest idle state, takes 2 us to leave";
+        let shallow = "C1, the deepest idle state, has an exit latency of 2 us";
         assert_eq!(found(), Some((Severity::Ok, shallow.to_owned())));
         write("cpu1", 1, ["C6", "133", "0"]);
         write("cpu1", 2, ["broken", "", "0"]);
-        let deep = "C6, the deepest idle state, takes 133 us to leave";
+        let deep = "C6, the deepest idle state, has an exit latency of 133 us";
         assert_eq!(found(), Some((Severity::Note, deep.to_owned())));
         write("cpu1", 1, ["C6", "133", "1"]);
         fs::create_dir(cpus.path().join("cpuidle")).unwrap();

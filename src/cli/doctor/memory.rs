@@ -1,4 +1,4 @@
-//! Shared memory: room for it, and who might take it away.
+//! Checks of shared memory: free space, files left by a killed bridge, removal by logind.
 
 use std::fs;
 use std::path::Path;
@@ -13,41 +13,41 @@ use crate::shm::{RoleHolder, RouteChannel, instance_files};
 
 const SHM: &str = "/dev/shm";
 
-/// Beside the pools: boards, connections, what iceoryx2 keeps of each.
-const BESIDE_BYTES: u64 = 4 << 20;
+/// Shared memory beside the pools: boards, and iceoryx2's data of services and connections.
+const OTHER_BYTES: u64 = 4 << 20;
 
-/// Up to here a user is one of the system's, whose shared memory logind leaves alone.
+/// The highest user id of system users, whose shared memory logind does not remove.
 const SYSTEM_UID_MAX: u32 = 999;
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
-    let needed = pools.sum::<u64>() + BESIDE_BYTES;
+    let needed = pools.sum::<u64>() + OTHER_BYTES;
     let root = root(settings);
     let holders = RoleHolder::all(&root, &settings.instance).unwrap_or_default();
     let mut findings = Vec::new();
     match statvfs(SHM) {
         Ok(found) => {
             let block = found.fragment_size();
-            let room = Room {
+            let space = Space {
                 size: found.blocks() * block,
                 free: found.blocks_available() * block,
-                taken: !holders.is_empty(),
+                is_allocated: !holders.is_empty(),
             };
-            findings.push(size(needed, &room));
+            findings.push(free_space(needed, &space));
         }
         Err(error) => findings.push(
             Finding::new(
                 "shared memory",
                 Severity::Error,
                 format!("{SHM}: {error}"),
-                "Nothing starts without it.",
+                "The bridge cannot start without it.",
             )
-            .mended_by(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
+            .with_command(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
         ),
     }
     let files = instance_files(&root, &settings.instance);
     let bytes: u64 = files.iter().filter_map(|file| Some(fs::metadata(file).ok()?.len())).sum();
-    findings.push(stale(holders.len(), files.len(), bytes));
+    findings.push(leftover_files(holders.len(), files.len(), bytes));
     findings.push(remove_ipc(
         geteuid().as_raw(),
         Path::new("/run/systemd/system").exists(),
@@ -56,51 +56,52 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     findings
 }
 
-struct Room {
+/// The size of /dev/shm, in bytes.
+struct Space {
     size: u64,
     free: u64,
-    /// Whether the bridge runs, and has what it needs already.
-    taken: bool,
+    /// Whether the bridge runs and so has already allocated its pools.
+    is_allocated: bool,
 }
 
-fn size(needed: u64, room: &Room) -> Finding {
+fn free_space(needed: u64, space: &Space) -> Finding {
     let check = "shared memory";
     let mib = |bytes: u64| bytes.div_ceil(1 << 20);
     let found =
-        format!("needs {} MiB; {SHM} has {} MiB, {} free", mib(needed), mib(room.size), mib(room.free));
-    let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(needed) + mib(room.size)).max(64));
-    if room.taken {
-        Finding::ok(check, format!("{found}; the bridge runs and has what it needs"))
-    } else if room.free < needed {
+        format!("needs {} MiB; {SHM} has {} MiB, {} free", mib(needed), mib(space.size), mib(space.free));
+    let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(needed) + mib(space.size)).max(64));
+    if space.is_allocated {
+        Finding::ok(check, format!("{found}; the running bridge has already allocated it"))
+    } else if space.free < needed {
         Finding::new(
             check,
             Severity::Error,
             found,
-            "The bridge does not start: its pools are allocated at once.",
+            "The bridge does not start, because it allocates all its pools at the start.",
         )
-        .mended_by(command)
-    } else if room.free < needed + needed / 2 {
+        .with_command(command)
+    } else if space.free < needed + needed / 2 {
         Finding::new(
             check,
             Severity::Warning,
             found,
-            "Another program that fills it up keeps the bridge from being restarted.",
+            "If another program uses the rest, the bridge cannot be restarted.",
         )
-        .mended_by(command)
+        .with_command(command)
     } else {
         Finding::ok(check, found)
     }
 }
 
-fn stale(processes: usize, files: usize, bytes: u64) -> Finding {
+fn leftover_files(processes: usize, files: usize, bytes: u64) -> Finding {
     let check = "left behind";
     match (processes, files) {
-        (0, 0) => Finding::ok(check, "nothing of a former bridge is left"),
+        (0, 0) => Finding::ok(check, "no files of an earlier bridge"),
         (0, files) => Finding::new(
             check,
             Severity::Note,
-            format!("{files} files of {} KiB in {SHM}, and no process of the bridge", bytes.div_ceil(1024)),
-            "A bridge was killed as a whole. The next start removes them.",
+            format!("{files} files ({} KiB) in {SHM}, and no process of the bridge", bytes.div_ceil(1024)),
+            "All processes of a bridge were killed. The next start removes these files.",
         ),
         (processes, files) => {
             Finding::ok(check, format!("{processes} processes of the bridge use {files} files"))
@@ -108,7 +109,7 @@ fn stale(processes: usize, files: usize, bytes: u64) -> Finding {
     }
 }
 
-/// The settings of logind, in the order in which they are read.
+/// The configuration files of logind joined in the order in which it reads them.
 fn logind_settings() -> String {
     let mut texts = vec![fs::read_to_string("/etc/systemd/logind.conf").unwrap_or_default()];
     for folder in
@@ -125,7 +126,7 @@ fn logind_settings() -> String {
 fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
     let check = "RemoveIPC";
     if uid <= SYSTEM_UID_MAX {
-        return Finding::ok(check, "does not concern a user of the system's");
+        return Finding::ok(check, "does not apply to a system user");
     }
     if !with_logind {
         return Finding::ok(check, "no systemd runs here");
@@ -138,11 +139,11 @@ fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
     Finding::new(
         check,
         Severity::Warning,
-        "is on, and this is the user of a person",
-        "When you log out, logind removes your shared memory, and with it a bridge that you left running. The \
-         installed services have a user of their own.",
+        "is on, and this is not a system user",
+        "When you log out, logind removes your shared memory, also that of a bridge that still runs. The installed \
+         services run as a system user.",
     )
-    .mended_by(
+    .with_command(
         "sudo mkdir -p /etc/systemd/logind.conf.d && printf '[Login]\\nRemoveIPC=no\\n' | \
          sudo tee /etc/systemd/logind.conf.d/60-adaptive-bridge.conf && sudo systemctl restart systemd-logind",
     )
@@ -153,26 +154,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shared_memory_must_have_room_unless_the_bridge_has_taken_its_own() {
-        let room = |free: u64, taken| Room { size: 64 << 20, free: free << 20, taken };
+    fn shared_memory_must_be_free_unless_the_bridge_has_allocated_it() {
+        let space = |free: u64, is_allocated| Space { size: 64 << 20, free: free << 20, is_allocated };
         let needed = 40 << 20;
-        assert_eq!(size(needed, &room(64, false)).severity, Severity::Ok);
-        assert_eq!(size(needed, &room(50, false)).severity, Severity::Warning);
-        let lacking = size(needed, &room(39, false));
-        assert_eq!(lacking.severity, Severity::Error);
-        assert_eq!(lacking.command.unwrap(), "sudo mount -o remount,size=104M /dev/shm");
-        assert_eq!(size(needed, &room(3, true)).severity, Severity::Ok);
+        assert_eq!(free_space(needed, &space(64, false)).severity, Severity::Ok);
+        assert_eq!(free_space(needed, &space(50, false)).severity, Severity::Warning);
+        let too_small = free_space(needed, &space(39, false));
+        assert_eq!(too_small.severity, Severity::Error);
+        assert_eq!(too_small.command.unwrap(), "sudo mount -o remount,size=104M /dev/shm");
+        assert_eq!(free_space(needed, &space(3, true)).severity, Severity::Ok);
     }
 
     #[test]
-    fn files_are_stale_when_nobody_is_there_to_use_them() {
-        assert_eq!(stale(0, 0, 0).severity, Severity::Ok);
-        assert_eq!(stale(4, 9, 1).severity, Severity::Ok);
-        assert_eq!(stale(0, 9, 1).severity, Severity::Note);
+    fn files_without_a_process_that_uses_them_are_reported() {
+        assert_eq!(leftover_files(0, 0, 0).severity, Severity::Ok);
+        assert_eq!(leftover_files(4, 9, 1).severity, Severity::Ok);
+        assert_eq!(leftover_files(0, 9, 1).severity, Severity::Note);
     }
 
     #[test]
-    fn the_last_word_on_remove_ipc_counts() {
+    fn the_last_value_of_remove_ipc_counts() {
         assert_eq!(remove_ipc(0, true, "").severity, Severity::Ok);
         assert_eq!(remove_ipc(1000, false, "").severity, Severity::Ok);
         assert_eq!(

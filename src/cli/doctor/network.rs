@@ -1,4 +1,4 @@
-//! Socket buffers, interfaces, multicast.
+//! Checks of socket buffers, network interfaces and multicast.
 
 use std::net::{Ipv4Addr, UdpSocket};
 
@@ -8,14 +8,14 @@ use nix::net::if_::InterfaceFlags;
 use super::{Finding, Severity, list, number};
 use crate::config::{NetworkSelector, Settings};
 
-/// What a burst of one large sample takes: 1 MiB in fragments came through with this and was repaired for
-/// milliseconds with the kernel's usual 208 KiB.
+/// Socket buffer for a burst of one large sample. The fragments of a 1 MiB sample all arrive with this size;
+/// with the kernel's default of 208 KiB, DDS needed milliseconds to retransmit dropped ones.
 const BUFFER_BYTES: i64 = 4 << 20;
 
-/// Samples below this go through the kernel's usual buffers at any rate that a robot has.
+/// The largest sample for which the kernel's default buffers suffice at the rates of a robot.
 const SMALL_SAMPLE_BYTES: usize = 64 << 10;
 
-/// Where RTPS participants announce themselves.
+/// The multicast address and port on which RTPS participants announce themselves.
 const SPDP: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
@@ -47,9 +47,9 @@ fn buffer(name: &'static str, bytes: i64, largest_sample: usize) -> Finding {
         name,
         severity,
         found,
-        "The kernel drops fragments of large samples in a burst; repairing them takes milliseconds.",
+        "The kernel drops fragments of large samples in a burst; their retransmission takes milliseconds.",
     )
-    .mended_by(format!(
+    .with_command(format!(
         "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf \
          && sudo sysctl --system"
     ))
@@ -79,6 +79,7 @@ fn interfaces() -> Vec<Interface> {
     interfaces.collect()
 }
 
+/// Checks an interface that the configuration names.
 fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
     let (name, found): (String, Option<&Interface>) = match selector {
         NetworkSelector::Name(name) => {
@@ -95,26 +96,29 @@ fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
         None => Finding::new(
             check,
             Severity::Error,
-            format!("there is no interface {name}; there are: {}", names(interfaces)),
-            "A process that is to use it does not start.",
+            format!("no interface {name}; this machine has: {}", names(interfaces)),
+            "A process that is configured to use it does not start.",
         ),
-        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => {
-            Finding::new(check, Severity::Error, format!("{name} is down"), "Nobody is found there.")
-                .mended_by(format!("sudo ip link set {} up", interface.name))
-        }
+        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => Finding::new(
+            check,
+            Severity::Error,
+            format!("{name} is down"),
+            "No DDS participants are discovered on it.",
+        )
+        .with_command(format!("sudo ip link set {} up", interface.name)),
         Some(interface) if interface.address.is_none() => Finding::new(
             check,
             Severity::Error,
             format!("{name} has no IPv4 address"),
-            "Nobody is found there.",
+            "No DDS participants are discovered on it.",
         ),
         Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_MULTICAST) => Finding::new(
             check,
             Severity::Error,
             format!("{name} carries no multicast"),
-            "Participants announce themselves by multicast: nobody is found there.",
+            "DDS participants announce themselves by multicast, so none are discovered there.",
         )
-        .mended_by(format!("sudo ip link set {} multicast on", interface.name)),
+        .with_command(format!("sudo ip link set {} multicast on", interface.name)),
         Some(_) => Finding::ok(check, format!("{name} is up")),
     }
 }
@@ -126,6 +130,7 @@ fn names(interfaces: &[Interface]) -> String {
     list(names)
 }
 
+/// Checks that at least one interface carries multicast.
 fn any_multicast(interfaces: &[Interface]) -> Finding {
     let carrying = interfaces.iter().filter(|found| found.carries_multicast() && found.address.is_some());
     let carrying: Vec<Interface> = carrying.cloned().collect();
@@ -134,16 +139,17 @@ fn any_multicast(interfaces: &[Interface]) -> Finding {
             "multicast",
             Severity::Warning,
             "no interface that is up and has an address carries multicast",
-            "Participants on other machines are not found.",
+            "DDS participants on other machines are not discovered.",
         )
-        .mended_by("sudo ip link set lo multicast on");
+        .with_command("sudo ip link set lo multicast on");
     }
     Finding::ok("multicast", format!("carried by {}", names(&carrying)))
 }
 
+/// Checks that the routing table has a route for announcements.
 fn multicast_route(routed: bool, interfaces: &[Interface]) -> Finding {
     if routed {
-        return Finding::ok("multicast route", format!("{} can be reached", SPDP.0));
+        return Finding::ok("multicast route", format!("there is a route to {}", SPDP.0));
     }
     let carrying = interfaces.iter().find(|found| found.carries_multicast() && found.address.is_some());
     let through = carrying.map_or("eth0", |interface| interface.name.as_str());
@@ -151,9 +157,9 @@ fn multicast_route(routed: bool, interfaces: &[Interface]) -> Finding {
         "multicast route",
         Severity::Warning,
         format!("there is no route to {}", SPDP.0),
-        "Announcements that do not name an interface go nowhere, and nobody is found.",
+        "Announcements that are not bound to an interface are not sent, so no DDS participants are discovered.",
     )
-    .mended_by(format!("sudo ip route add 239.0.0.0/8 dev {through}"))
+    .with_command(format!("sudo ip route add 239.0.0.0/8 dev {through}"))
 }
 
 #[cfg(test)]

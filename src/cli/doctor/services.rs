@@ -1,4 +1,4 @@
-//! Versions, and the services of systemd.
+//! Checks of versions and of the systemd services.
 
 use std::fs;
 use std::path::Path;
@@ -11,9 +11,10 @@ use crate::shm::RoleHolder;
 
 const TARGET: &str = "adaptive-bridge.target";
 
-/// The oldest Linux that the libraries are used with (ROS 2 Humble's time).
+/// The oldest supported Linux, from the time of ROS 2 Humble.
 const OLDEST_KERNEL: (u32, u32) = (5, 4);
 
+/// Shows the versions of the bridge, Linux and ROS 2, and checks that of Linux.
 pub(super) fn versions() -> Vec<Finding> {
     let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
     let ros = std::env::var("ROS_DISTRO").ok().filter(|name| !name.is_empty());
@@ -28,52 +29,48 @@ fn kernel_version(release: &str, found: String) -> Finding {
     if version >= OLDEST_KERNEL {
         return Finding::ok("versions", found);
     }
-    Finding::new(
-        "versions",
-        Severity::Warning,
-        found,
-        "This kernel is older than any that the bridge is tested with.",
-    )
+    Finding::new("versions", Severity::Warning, found, "The bridge is not tested with a kernel this old.")
 }
 
 pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
     let holders = RoleHolder::all(&root(settings), &settings.instance).unwrap_or_default();
-    let mut findings = vec![programs(&holders)];
+    let mut findings = vec![executables(&holders)];
     if !Path::new("/run/systemd/system").exists() {
-        let text = "no systemd runs here; `adaptive-bridge up` supervises the processes";
+        let text = "systemd does not run here; `adaptive-bridge up` supervises the processes";
         findings.push(Finding::ok("services", text));
         return findings;
     }
     let enabled = output("systemctl", &["is-enabled", TARGET]).unwrap_or_default();
     findings.push(services(&enabled));
     if !["", "not-found"].contains(&enabled.as_str()) {
-        let fits = DropIns::of(settings, file).are_in(Path::new(units::FOLDER));
-        findings.push(lanes(fits, file));
+        let match_configuration = DropIns::of(settings, file).match_folder(Path::new(units::FOLDER));
+        findings.push(drop_ins(match_configuration, file));
         let list = ["list-units", "--plain", "--no-legend", "--state=failed", "adaptive-bridge-*"];
         findings.push(failed(&output("systemctl", &list).unwrap_or_default()));
     }
     findings
 }
 
-/// Whether all processes run the program that is installed.
-fn programs(holders: &[RoleHolder]) -> Finding {
+/// Checks that all processes run the installed executable.
+fn executables(holders: &[RoleHolder]) -> Finding {
     let is_replaced = |holder: &&RoleHolder| {
         fs::read_link(format!("/proc/{}/exe", holder.pid))
             .is_ok_and(|path| path.as_os_str().as_encoded_bytes().ends_with(b" (deleted)"))
     };
     let old: Vec<&str> = holders.iter().filter(is_replaced).map(|holder| holder.role.as_str()).collect();
     if old.is_empty() {
-        return Finding::ok("processes", format!("{} of the bridge run", holders.len()));
+        return Finding::ok("processes", format!("{} processes of the bridge run", holders.len()));
     }
     Finding::new(
         "processes",
         Severity::Warning,
-        format!("{} still run a program that was replaced", list(old)),
-        "An upgrade takes effect with a restart.",
+        format!("{} still run an executable that was replaced", list(old)),
+        "An upgrade takes effect after a restart.",
     )
-    .mended_by(format!("sudo systemctl restart {TARGET}"))
+    .with_command(format!("sudo systemctl restart {TARGET}"))
 }
 
+/// Checks the state that `systemctl is-enabled` prints for the target.
 fn services(enabled: &str) -> Finding {
     match enabled {
         "enabled" | "enabled-runtime" => Finding::ok("services", format!("{TARGET} is enabled")),
@@ -81,31 +78,33 @@ fn services(enabled: &str) -> Finding {
             "services",
             Severity::Note,
             "the service units are not installed",
-            "Nothing starts the bridge with the machine.",
+            "The bridge does not start when the machine boots.",
         ),
         state => Finding::new(
             "services",
             Severity::Warning,
             format!("{TARGET} is {state}"),
-            "The bridge does not start with the machine.",
+            "The bridge does not start when the machine boots.",
         )
-        .mended_by(format!("sudo systemctl enable --now {TARGET}")),
+        .with_command(format!("sudo systemctl enable --now {TARGET}")),
     }
 }
 
-fn lanes(fits: bool, file: &Path) -> Finding {
-    if fits {
-        return Finding::ok("units", "are those that the configuration needs");
+/// Checks that the drop-ins of the units match the configuration.
+fn drop_ins(match_configuration: bool, file: &Path) -> Finding {
+    if match_configuration {
+        return Finding::ok("units", "match the configuration");
     }
     Finding::new(
         "units",
         Severity::Warning,
-        "are not those that the configuration needs",
-        "A lane of your own has no process, or lacks a right that the configuration takes.",
+        "do not match the configuration",
+        "A lane has no service, or a service lacks a right that the configuration needs.",
     )
-    .mended_by(format!("sudo adaptive-bridge units --write --config {}", file.display()))
+    .with_command(format!("sudo adaptive-bridge units --write --config {}", file.display()))
 }
 
+/// Checks the services that `systemctl list-units --state=failed` lists.
 fn failed(units: &str) -> Finding {
     let names: Vec<&str> = units.lines().filter_map(|line| line.split_whitespace().next()).collect();
     let Some(first) = names.first().copied() else {
@@ -115,9 +114,9 @@ fn failed(units: &str) -> Finding {
         "failed",
         Severity::Error,
         list(&names),
-        "They were given up: the configuration is bad, or they died again and again.",
+        "systemd no longer restarts them: the configuration is bad, or they exited too often.",
     )
-    .mended_by(format!("journalctl -u {first} -n 50"))
+    .with_command(format!("journalctl -u {first} -n 50"))
 }
 
 #[cfg(test)]
@@ -133,15 +132,15 @@ mod tests {
         assert_eq!(services("enabled").severity, Severity::Ok);
         assert_eq!(services("disabled").severity, Severity::Warning);
         assert_eq!(services("not-found").severity, Severity::Note);
-        assert_eq!(lanes(false, Path::new("/x")).severity, Severity::Warning);
+        assert_eq!(drop_ins(false, Path::new("/x")).severity, Severity::Warning);
         assert_eq!(failed("").severity, Severity::Ok);
         let found = failed("adaptive-bridge-control.service loaded failed failed Adaptive Bridge: control\n");
         assert_eq!(found.command.unwrap(), "journalctl -u adaptive-bridge-control.service -n 50");
     }
 
     #[test]
-    fn a_process_of_the_installed_program_needs_no_restart() {
+    fn a_process_of_the_installed_executable_needs_no_restart() {
         let holder = RoleHolder { role: "ingress".into(), pid: std::process::id(), note: "/x".into() };
-        assert_eq!(programs(&[holder]).severity, Severity::Ok);
+        assert_eq!(executables(&[holder]).severity, Severity::Ok);
     }
 }

@@ -1,5 +1,5 @@
-//! Where a demo runs: a folder, a DDS domain and an instance of its own, so that neither a robot nor another
-//! demo on this machine notices it.
+//! The folder, DDS domain and instance that a demo has for itself, so that it does not disturb a robot or
+//! another demo on this machine.
 
 use std::fs::{self, DirBuilder};
 use std::io::{self, ErrorKind};
@@ -12,36 +12,37 @@ use super::{DemoError, INPUT_TOPIC};
 use crate::config::{self, Settings};
 use crate::shm::ShmNode;
 
-/// DDS domains of demos. Robots are on low ones, and from 101 on the ports are those that Linux hands out.
+/// DDS domains of demos. Robots use low ones, and from 101 on the ports of a domain are in Linux's ephemeral
+/// range.
 const DOMAINS: std::ops::RangeInclusive<u16> = 90..=99;
 
-/// Port of a domain's discovery (RTPS 2.5 clause 9.6.1.1, with its defaults PB 7400 and DG 250).
+/// The discovery port of a domain (RTPS 2.5 clause 9.6.1.1, with its defaults PB 7400 and DG 250).
 const fn discovery_port(domain: u16) -> u16 {
     7400 + 250 * domain
 }
 
-/// Between the two multicast ports of a domain (offsets 0 and 1) and the unicast ones (10 and above) are
-/// ports that no DDS program uses. Whoever has bound this one has the domain.
+/// The port that a demo binds to claim a domain. DDS programs do not use it: it lies between the domain's two
+/// multicast ports (offsets 0 and 1) and its unicast ports (10 and above).
 const fn claim_port(domain: u16) -> u16 {
     discovery_port(domain) + 5
 }
 
-/// A shared-memory slot for one scan.
+/// The size of a slot in shared memory, which holds one scan.
 const MAX_SAMPLE_BYTES: usize = 4096;
 const _: () = assert!(SCAN_BYTES <= MAX_SAMPLE_BYTES);
 
-/// The folder and domain of one demo. Both are given back when it is dropped, and nothing is left behind.
+/// The folder, DDS domain and settings of one demo. Dropping it removes the folder and releases the domain.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct Sandbox {
     folder: PathBuf,
     domain: u16,
     settings: Settings,
-    /// Bound while the domain is ours.
+    /// Bound to the claim port as long as the demo uses the domain.
     _claim: UdpSocket,
 }
 
-impl Place {
-    pub fn find() -> Result<Self, DemoError> {
+impl Sandbox {
+    pub fn create() -> Result<Self, DemoError> {
         let (domain, claim) = claim_domain()?;
         let folder = make_folder().map_err(|error| DemoError::os("cannot make a temporary folder", error))?;
         match write_config(&folder, domain) {
@@ -69,16 +70,16 @@ impl Place {
         shm_root(&self.folder)
     }
 
-    /// The log of the process called `name`.
+    /// The path of the log of the process called `name`.
     pub fn log(&self, name: &str) -> PathBuf {
         self.folder.join(format!("{name}.log"))
     }
 }
 
-impl Drop for Place {
+impl Drop for Sandbox {
     fn drop(&mut self) {
-        // The bridge's last process clears its shared memory away. If that one was killed, something is left,
-        // and whoever joins and leaves next clears it away instead.
+        // The last process of a bridge removes its shared memory. If it was killed, the memory remains until
+        // another process opens and closes the instance, as this does.
         if self.shm_root().join(self.settings.instance.as_str()).exists() {
             drop(ShmNode::open(&self.shm_root(), &self.settings.instance, "demo"));
         }
@@ -88,11 +89,12 @@ impl Drop for Place {
     }
 }
 
-/// A domain that nobody uses.
+/// Finds an unused domain and claims it.
 fn claim_domain() -> Result<(u16, UdpSocket), DemoError> {
     for domain in DOMAINS {
         let Ok(claim) = UdpSocket::bind((Ipv4Addr::LOCALHOST, claim_port(domain))) else { continue };
-        // DDS programs share this port among themselves, but not with somebody who does not ask to share.
+        // DDS programs bind this port with SO_REUSEADDR. This bind does not, so it fails if one uses the
+        // domain.
         if UdpSocket::bind((Ipv4Addr::UNSPECIFIED, discovery_port(domain))).is_ok() {
             return Ok((domain, claim));
         }
@@ -108,7 +110,7 @@ fn make_folder() -> io::Result<PathBuf> {
         let folder = parent.join(format!("adaptive-bridge-demo-{}-{attempt}", std::process::id()));
         match DirBuilder::new().mode(0o700).create(&folder) {
             Ok(()) => return Ok(folder),
-            // Left by a demo of the same process id that was killed with -9.
+            // Left by a demo with the same process id that was killed with SIGKILL.
             Err(error) if error.kind() == ErrorKind::AlreadyExists && attempt < 100 => attempt += 1,
             Err(error) => return Err(error),
         }
@@ -123,6 +125,7 @@ fn shm_root(folder: &Path) -> PathBuf {
     folder.join("shm")
 }
 
+/// Writes the configuration file of the bridge and returns its settings.
 fn write_config(folder: &Path, domain: u16) -> Result<Settings, DemoError> {
     let file = config_file(folder);
     let text = config_text(domain, &shm_root(folder));
@@ -131,9 +134,9 @@ fn write_config(folder: &Path, domain: u16) -> Result<Settings, DemoError> {
         .map_err(|error| DemoError::Config(error.to_string()))
 }
 
-/// All but the topic is there to keep the demo to itself.
+/// The configuration of the demo's bridge. Everything but the topic keeps it separate from other bridges.
 fn config_text(domain: u16, shm_root: &Path) -> String {
-    // As JSON, which YAML understands, whatever characters the path has.
+    // Written as a JSON string, which is valid YAML with any characters in the path.
     let shm_root = serde_json::Value::from(shm_root.to_string_lossy());
     let instance = format!("demo_{}", std::process::id());
     format!(
@@ -156,7 +159,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configuration_is_a_good_one_whatever_the_folder_is_called() {
+    fn the_configuration_is_valid_with_any_folder_name() {
         for root in ["/tmp/x/shm", "/tmp/it's \"odd\" # {yes}: no/shm", "/tmp/größer\\n"] {
             let text = config_text(91, Path::new(root));
             let settings = config::parse(text.into_bytes(), "demo", &|_| None).unwrap();
@@ -167,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn two_demos_get_two_domains() {
+    fn two_demos_claim_different_domains() {
         let (first, _first_claim) = claim_domain().unwrap();
         let (second, _second_claim) = claim_domain().unwrap();
         assert_ne!(first, second);
