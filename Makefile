@@ -1,4 +1,4 @@
-# The commands of this project; `make test` is what must pass.
+# The commands of this project. `make test` must pass before a change is merged.
 FUZZ_SECONDS ?= 20
 
 build:
@@ -21,7 +21,7 @@ lint:
 	cargo clippy --locked --all-targets --all-features -- -D warnings
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --no-deps --all-features
 
-# A publisher, a critical and a slow subscriber, first without and then with the bridge. No ROS 2, no root.
+# Runs a publisher, a critical and a slow subscriber, first without and then with the bridge. Needs no ROS 2 and no root.
 demo: build
 	target/release/adaptive-bridge demo
 
@@ -29,8 +29,8 @@ demo: build
 package:
 	scripts/package.sh
 
-# What the bridge costs, beside the same without it: an hour, kept in benches/runs. One that is quick, or a
-# part: cargo bench -- --quick, cargo bench -- --only isolation (benches/README.md).
+# Measures the latency and CPU time that the bridge adds. Takes an hour and saves the run in benches/runs. Shorter:
+# cargo bench -- --quick, or cargo bench -- --only isolation (benches/README.md).
 bench:
 	cargo bench --locked -- --save
 

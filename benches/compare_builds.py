@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Hop and CPU of two builds of the bridge, beside each other, between independent Cyclone DDS programs.
+"""Compares hop and CPU time of two builds of the bridge, between independent Cyclone DDS programs.
 
     make peers && cargo build --release
     benches/compare_builds.py OLD/adaptive-bridge target/release/adaptive-bridge
 
-Both builds run all the time, each in a DDS domain of its own; only one of them, or a direct flow, is sent to at a
-time, and each round begins with another one. A hop is the median latency of a round through a build, less that of
-the direct flow in the same round. Printed are the medians over the rounds, and of their ratio the interval at 95 %
-(bootstrap over the rounds). Nothing is pinned, and scheduling is normal.
+Both builds run during the whole comparison, each in a DDS domain of its own. They and a direct flow without a bridge
+take turns: only one receives samples at a time, and each round begins with another one. The hop of a build in a round
+is its median latency minus that of the direct flow. The output has the medians over the rounds, and their ratio
+with its 95 % confidence interval (bootstrap over the rounds). No CPU affinity is set, and scheduling is normal.
 """
 
 import argparse
@@ -24,13 +24,13 @@ from pathlib import Path
 PEER = Path(__file__).resolve().parent.parent / "tests/peers/build/cyclone_peer"
 OUTPUT = "rt/adaptive_bridge/critical/scan"
 INPUT = "rt/scan"
-# Rate in Hz and bytes of a sample.
+# The rate in Hz and the sample size in bytes of each case.
 CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20)}
 DIRECT_DOMAIN = 63
 
 
 class Build:
-    """A running bridge."""
+    """A running bridge of one build."""
 
     def __init__(self, name, program, domain, folder):
         self.name, self.domain = name, domain
@@ -49,14 +49,14 @@ class Build:
         deadline = time.monotonic() + 30
         while self.log.read_text().count("egress is up") < 2 or "ingress is up" not in self.log.read_text():
             if self.process.poll() is not None or time.monotonic() > deadline:
-                sys.exit(f"{program} does not come up:\n{self.log.read_text()}")
+                sys.exit(f"{program} did not start within 30 s:\n{self.log.read_text()}")
             time.sleep(0.1)
         started = [line for line in self.log.read_text().splitlines() if "started child=" in line]
-        on_the_way = [line for line in started if '"ingress"' in line or '"egress-critical"' in line]
-        self.pids = [int(line.split("pid=")[1].split()[0]) for line in on_the_way]
+        critical_path = [line for line in started if '"ingress"' in line or '"egress-critical"' in line]
+        self.pids = [int(line.split("pid=")[1].split()[0]) for line in critical_path]
 
     def cpu_s(self):
-        """CPU time of ingress and the critical lane so far, of all threads."""
+        """CPU time of all threads of ingress and the critical lane so far."""
         tasks = [task for pid in self.pids for task in Path(f"/proc/{pid}/task").iterdir()]
         return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
@@ -72,12 +72,15 @@ def summary(process):
 
 
 def measure(build, rate_hz, size, seconds):
-    """Median latency in us, CPU in us a sample, and samples missing; of the direct flow without a build."""
+    """Returns the median latency in us, the CPU time per sample in us, and the number of missing samples.
+
+    Without a build it measures the direct flow.
+    """
     domain = build.domain if build else DIRECT_DOMAIN
     common = ["--domain", str(domain), "--size", str(size), "--summary", "--history", "1000"]
     subscriber = subprocess.Popen(
         [PEER, "--role", "sub", "--topic", OUTPUT if build else INPUT, *common], stdout=subprocess.PIPE, text=True)
-    # Matched on both sides by then.
+    # Time for the endpoints to match on both sides.
     time.sleep(1.0)
     before_s = build.cpu_s() if build else 0
     publisher = subprocess.Popen(
@@ -97,7 +100,7 @@ def ratio_of_medians(pairs):
 
 
 def interval(pairs):
-    """The middle 95 % of the ratio over 2,000 resamplings of the rounds."""
+    """The 95 % confidence interval of the ratio, from 2,000 resamplings of the rounds."""
     source = random.Random(1)
     values = sorted(ratio_of_medians([source.choice(pairs) for _ in pairs]) for _ in range(2_000))
     return values[50], values[-51]
@@ -108,7 +111,7 @@ def show(case, rows):
     print(f"{case}: missing {missing}")
     hops = [(row["old"][0] - row["direct"][0], row["new"][0] - row["direct"][0]) for row in rows]
     cpus = [(row["old"][1], row["new"][1]) for row in rows]
-    for what, pairs in (("hop", hops), ("CPU a sample", cpus)):
+    for what, pairs in (("hop", hops), ("CPU per sample", cpus)):
         low, high = interval(pairs)
         old, new = (statistics.median(values) for values in zip(*pairs))
         print(f"  {what}: old {old:.1f} us, new {new:.1f} us, new/old {ratio_of_medians(pairs):.3f} "
@@ -118,11 +121,11 @@ def show(case, rows):
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("old", help="a build of adaptive-bridge")
-    parser.add_argument("new", help="the other")
+    parser.add_argument("old", help="the adaptive-bridge executable of the old build")
+    parser.add_argument("new", help="the adaptive-bridge executable of the new build")
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=4.0, help="of each flow in each round")
-    parser.add_argument("--case", choices=CASES, action="append", help="all unless given")
+    parser.add_argument("--seconds", type=float, default=4.0, help="duration of each flow in each round")
+    parser.add_argument("--case", choices=CASES, action="append", help="repeatable; default: all cases")
     parser.add_argument("--json", help="also write every round to this file")
     options = parser.parse_args()
     if not PEER.exists():

@@ -1,8 +1,8 @@
 #!/bin/sh
-# Runs each fuzz target for so many seconds, 20 unless told: scripts/fuzz.sh [SECONDS [TARGET…]]
+# Runs each fuzz target for a number of seconds, 20 by default: scripts/fuzz.sh [SECONDS [TARGET…]]
 #
-# A run begins with fuzz/seeds and fuzz/regressions, which tests/regressions.rs also runs, and with what former runs
-# have found (fuzz/corpus, on this machine only).
+# A run begins with the inputs in fuzz/seeds and fuzz/regressions, which tests/regressions.rs also runs, and with the
+# inputs that earlier runs on this machine found (fuzz/corpus).
 set -eu
 cd "$(dirname "$0")/.."
 PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
@@ -13,14 +13,14 @@ if ! cargo fuzz --version >/dev/null 2>&1; then
     cargo install cargo-fuzz --locked
 fi
 
-# The sanitizers are nightly's; this lets a stable toolchain have them. Only cargo-fuzz' own target directory is
-# built with it: to change it between builds makes cargo build everything anew.
+# Lets a stable toolchain use the sanitizers, which are features of nightly. It is set only for builds in cargo-fuzz'
+# own target directory, because cargo rebuilds everything when it changes.
 export RUSTC_BOOTSTRAP=1
-# Link-time optimisation takes minutes and finds nothing.
+# Link-time optimisation takes minutes and does not help to find bugs.
 export CARGO_PROFILE_RELEASE_LTO=off
 all=$(cargo fuzz list)
 if [ $# -eq 0 ]; then
-    # The list is words.
+    # Word splitting is intended: the list has one target per word.
     # shellcheck disable=SC2086
     set -- $all
 fi
@@ -36,14 +36,15 @@ trap 'rm -f "$log"' EXIT
 for target in "$@"; do
     corpus=fuzz/corpus/$target
     mkdir -p "$corpus" "fuzz/regressions/$target"
-    # The default file of the configuration has 5 KiB. An input that takes longer than 10 s counts as a crash.
+    # The default configuration file has 5 KiB, so inputs may have 8 KiB. An input that takes longer than 10 s counts
+    # as a crash.
     if ! cargo fuzz run "$target" "$corpus" "fuzz/seeds/$target" "fuzz/regressions/$target" -- \
         -max_total_time="$seconds" -max_len=8192 -timeout=10 -rss_limit_mb=2048 \
         -print_final_stats=1 -verbosity=0 >"$log" 2>&1; then
         cat "$log"
         input=$(sed -n 's/.*Test unit written to \.*\/*//p' "$log" | tail -n 1)
-        echo "fuzz: $target FAILED. Again: RUSTC_BOOTSTRAP=1 cargo fuzz run $target ${input:-INPUT}"
-        echo "fuzz: once it is fixed, keep the input: mv ${input:-INPUT} fuzz/regressions/$target/"
+        echo "fuzz: $target FAILED. To reproduce: RUSTC_BOOTSTRAP=1 cargo fuzz run $target ${input:-INPUT}"
+        echo "fuzz: after the fix, keep the input: mv ${input:-INPUT} fuzz/regressions/$target/"
         exit 1
     fi
     executions=$(sed -n 's/^stat::number_of_executed_units: *//p' "$log")

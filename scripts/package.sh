@@ -1,7 +1,7 @@
 #!/bin/sh
 # Makes the Debian package, with manual pages and completions: scripts/package.sh [OPTIONS OF CARGO DEB…]
 #
-# PROGRAM: the program to package, where it is not to be built.
+# PROGRAM: an executable to package; without it, the script builds one.
 set -eu
 cd "$(dirname "$0")/.."
 PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
@@ -22,5 +22,5 @@ $made/release/adaptive-bridge man $made/man
 for shell in bash fish zsh; do
     $made/release/adaptive-bridge completions $shell >$made/completions/$shell
 done
-# For cargo-deb the program is in the folder of a build.
+# cargo-deb expects the executable in a target directory.
 CARGO_TARGET_DIR=$made cargo deb --locked --no-build --output target/debian/ "$@"

@@ -1,18 +1,18 @@
 #!/bin/sh
-# Installs what building and testing need and this machine lacks (Debian and Ubuntu). Safe to run again.
+# Installs missing packages and tools for building and testing (Debian and Ubuntu). Safe to run again.
 #
-# It asks for root by sudo only when a package is missing. Without root it says what will not run, and goes on.
+# It uses sudo only when a package is missing. Without root it lists what will not run, and continues.
 set -eu
 
 say() { echo "setup: $*"; }
 has() { command -v "$1" >/dev/null 2>&1; }
 
-# Where Debian keeps ip and iptables, which is not in every user's path, and where rustup keeps cargo.
+# Adds the folders of ip and iptables, which are not in every user's path, and of cargo.
 PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin:${CARGO_HOME:-$HOME/.cargo}/bin"
 
 has_header() { [ -e "/usr/include/$1" ] || [ -e "/usr/local/include/$1" ]; }
 
-# In the Python of the system, which is not always the first in the path.
+# Whether a Python has a module: the first in the path or that of the system.
 has_python() {
     for python in python3 /usr/bin/python3; do
         if "$python" -c "import $1" >/dev/null 2>&1; then return 0; fi
@@ -20,7 +20,7 @@ has_python() {
     return 1
 }
 
-# CPython 3.11 on x86-64 that can make a virtual environment: the only one that PyPI has wheels of ROS 2 Jazzy for.
+# Finds a CPython 3.11 on x86-64 that can make a virtual environment. PyPI has wheels of ROS 2 Jazzy only for it.
 python_of_ros() {
     for python in python3.11 /usr/bin/python3.11 python3 /usr/bin/python3; do
         if "$python" -c 'import platform, sys, venv, ensurepip
@@ -35,18 +35,19 @@ sys.exit(found != ("CPython", (3, 11), "x86_64", "linux"))' >/dev/null 2>&1; the
 
 has_faketime() { ls /usr/lib/*/faketime/libfaketimeMT.so.1 >/dev/null 2>&1; }
 
-# Each line: whether it is there, the packages that bring it (the first that exists is taken), what needs it.
+# need CHECK PACKAGES PURPOSE: adds the packages to the missing ones if the check fails. Of 'a|b' the first package
+# that exists is installed.
 missing=""
-lacking=""
+purposes=""
 need() {
     check=$1 packages=$2 purpose=$3
     if eval "$check"; then return 0; fi
     missing="$missing $packages"
-    lacking="$lacking
+    purposes="$purposes
   $packages: $purpose"
 }
 check_all() {
-    missing="" lacking=""
+    missing="" purposes=""
     need "has cc" build-essential "to link Rust programs"
     need "has g++" build-essential "the DDS peers of the tests, fuzzing"
     need "has make" build-essential "make"
@@ -65,24 +66,26 @@ check_all() {
     if has docker; then
         need "docker compose version >/dev/null 2>&1 || has docker-compose" "docker-compose-v2|docker-compose" \
             "tests of the deployment in containers"
-        need "has debootstrap" debootstrap "the same, where no registry is in reach"
+        need "has debootstrap" debootstrap "tests of the deployment in containers, without access to a registry"
     fi
     need "has dpkg-shlibdeps" dpkg-dev "the Debian package, and its tests"
-    need "has systemd-nspawn" systemd-container "tests of the services (a systemd of their own)"
+    need "has systemd-nspawn" systemd-container "tests of the services (in a container with systemd)"
     need "has systemd-analyze" systemd "tests of the service units"
-    need "has_python prometheus_client" python3-prometheus-client "reading the metrics page as Prometheus does"
+    need "has_python prometheus_client" python3-prometheus-client "tests of the metrics page with Prometheus' parser"
     need "has cmake" cmake "tests of the package in a ROS 2 workspace"
-    need "has colcon" "colcon|python3-colcon-core" "the same"
+    need "has colcon" "colcon|python3-colcon-core" "tests of the package in a ROS 2 workspace"
     if [ "$(uname -m)" = x86_64 ]; then
         need "python_of_ros >/dev/null" "python3.11-venv|python3-venv" "tests with ROS 2 nodes (rclpy)"
     fi
-    need "has_python colcon_ros" python3-colcon-ros "the same"
-    need "has_python colcon_metadata" python3-colcon-metadata "the same"
-    need "has_python colcon_package_information" python3-colcon-package-information "the same"
-    need "has_python ament_index_python" "python3-ament-index|python3-ament-index-python" "the same"
+    need "has_python colcon_ros" python3-colcon-ros "tests of the package in a ROS 2 workspace"
+    need "has_python colcon_metadata" python3-colcon-metadata "tests of the package in a ROS 2 workspace"
+    need "has_python colcon_package_information" python3-colcon-package-information \
+        "tests of the package in a ROS 2 workspace"
+    need "has_python ament_index_python" "python3-ament-index|python3-ament-index-python" \
+        "tests of the package in a ROS 2 workspace"
 }
 
-# The first of 'a|b' that the package lists know.
+# Prints the first package of 'a|b' that is in the package lists.
 existing() {
     for package in $(echo "$1" | tr '|' ' '); do
         if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; return 0; fi
@@ -91,7 +94,7 @@ existing() {
 
 install_missing() {
     if ! has apt-get; then
-        say "this is not Debian or Ubuntu; these have to be installed by hand:$lacking"
+        say "this is not Debian or Ubuntu; install these by hand:$purposes"
         return 0
     fi
     as_root=""
@@ -102,9 +105,9 @@ install_missing() {
             return 0
         fi
     fi
-    say "missing:$lacking"
-    say "apt-get update${as_root:+ (by sudo)}"
-    $as_root apt-get update -qq || say "apt-get update failed; trying with the package lists of before"
+    say "missing:$purposes"
+    say "apt-get update${as_root:+ (with sudo)}"
+    $as_root apt-get update -qq || say "apt-get update failed; continuing with the old package lists"
     packages=""
     for names in $(echo "$missing" | tr ' ' '\n' | sort -u); do
         package=$(existing "$names")
@@ -112,7 +115,7 @@ install_missing() {
     done
     if [ -z "$packages" ]; then return 0; fi
     say "apt-get install$packages"
-    # The list is words.
+    # Word splitting is intended: the list has one package per word.
     # shellcheck disable=SC2086
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $packages \
         || say "apt-get install failed"
@@ -124,14 +127,14 @@ if [ -n "$missing" ]; then
     check_all
 fi
 if [ -n "$missing" ]; then
-    say "******** not installed (no root, or not in this system's packages); what needs it will not run:$lacking"
+    say "******** not installed (no root, or no such package); these parts will not run:$purposes"
 fi
 if ! has cc; then
     say "error: a C compiler is needed to link Rust programs: apt-get install build-essential"
     exit 1
 fi
 
-# rclpy for the tests with ROS 2 nodes, in exactly the versions of the list. Without it these tests do not run.
+# Installs rclpy for the tests with ROS 2 nodes, in the exact versions of the list. Without it these tests do not run.
 ros=$(dirname "$0")/../target/ros/jazzy
 ros_list=$(dirname "$0")/../tests/ros/requirements.txt
 if ! cmp -s "$ros_list" "$ros/requirements.txt"; then
@@ -140,13 +143,13 @@ if ! cmp -s "$ros_list" "$ros/requirements.txt"; then
     else
         say "pip install -r tests/ros/requirements.txt (250 MB in target/ros/jazzy)"
         rm -rf "$ros"
-        # The copy of the list says that the installation is complete.
+        # The copy of the list marks a complete installation.
         if "$python" -m venv "$ros" \
             && "$ros/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: -r "$ros_list" \
             && "$ros/bin/python" -c "import rclpy, sensor_msgs.msg, std_msgs.msg"; then
             cp "$ros_list" "$ros/requirements.txt"
         else
-            say "******** rclpy can't be installed: the tests with ROS 2 nodes will not run"
+            say "******** the installation of rclpy failed: the tests with ROS 2 nodes will not run"
         fi
     fi
 fi
@@ -163,7 +166,7 @@ for component in clippy rustfmt; do
         say "rustup component add $component"
         rustup component add $component
     else
-        say "error: cargo $tool is missing; install $component of your Rust toolchain"
+        say "error: cargo $tool is missing; install the component $component of your Rust toolchain"
         exit 1
     fi
 done

@@ -1,7 +1,7 @@
 #!/bin/sh
-# Everything that must be right before a change goes in: set-up, lints, tests, fuzzing.
+# Runs all checks that must pass before a change is merged: set-up, lints, tests, fuzzing.
 #
-# FUZZ_SECONDS: how long each fuzz target runs (20). With CI set nothing may be skipped.
+# FUZZ_SECONDS: how long each fuzz target runs (default 20). With CI set, skipped tests are failures.
 set -eu
 cd "$(dirname "$0")/.."
 PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
@@ -17,7 +17,7 @@ list_skipped() {
         sort "$skipped"
         echo "********"
     fi
-    if [ "$result" -eq 0 ]; then echo "test: all that was run passed"; else echo "test: FAILED"; fi
+    if [ "$result" -eq 0 ]; then echo "test: passed"; else echo "test: FAILED"; fi
 }
 trap list_skipped EXIT
 
@@ -31,9 +31,9 @@ begin=$(date +%s)
 step scripts/setup.sh
 step make --no-print-directory peers
 step make --no-print-directory lint
-# Tests that load the machine or use network namespaces wait for each other (tests/support), so plain
-# parallel tests are right.
+# Tests that load the machine or use network namespaces exclude each other with a lock (tests/support), so the test
+# programs may run their tests in parallel.
 step cargo test --locked --all-features --no-fail-fast
-# The patched DDS library's own ones; a package of its own, so its development dependencies are not ours.
+# The tests of the patched DDS library, a separate package with its own development dependencies.
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds
 step scripts/fuzz.sh "${FUZZ_SECONDS:-20}"

@@ -245,9 +245,9 @@ fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
         readme.contains("samples, missing: 7 (critical queue_overflow 7)."),
         "what became of them: {readme}"
     );
-    let held_up = "Held up within 100 ms, the CPU that was most: 84.2 ms by 72 s, when 7 went missing; up to 12.3 ms \
-                   when none did.";
-    assert!(readme.contains(held_up), "when they did: {readme}");
+    let delays = "Longest delay of a CPU within 100 ms: 84.2 ms in the period until 72 s, in which 7 samples are \
+                  missing; up to 12.3 ms in periods without missing samples.";
+    assert!(readme.contains(delays), "the CPU delays: {readme}");
 }
 
 #[test]
@@ -415,7 +415,7 @@ fn the_page_keeps_its_words_and_gets_the_figures() {
 #[test]
 fn a_page_that_cannot_be_filled_is_refused() {
     for (page, what) in [
-        ("<!-- figures:thruput -->\n<!-- end -->\n", "thruput is no section"),
+        ("<!-- figures:thruput -->\n<!-- end -->\n", "thruput is not a section"),
         ("<!-- figures:loss -->\n", "loss has no end"),
         ("<!-- figures:loss -->\n<!-- figures:soak -->\n<!-- end -->\n", "loss has no end"),
     ] {

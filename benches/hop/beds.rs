@@ -1,4 +1,4 @@
-//! The test beds: direct, relay and bridge, each a set of child processes on a DDS domain of its own.
+//! The test beds direct, relay and bridge: each is a set of child processes in a DDS domain of its own.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -19,19 +19,20 @@ use super::link::{self, INPUT, OUTPUT, Record, Route};
 use super::options::{Case, Options};
 use super::system::{self, FIFO_PRIORITY, Place, Scheduling};
 
-/// The first domain of the beds: below the ephemeral ports, and none that the tests use.
+/// The domain of the first bed. Its ports are below the ephemeral range, and the tests do not use it.
 const FIRST_DOMAIN: u16 = 94;
 
-/// Beds that may be up at once: their domains are 94 to 99.
-const MOST_BEDS: usize = 6;
+/// The highest number of beds at a time, in the domains 94 to 99.
+const MAX_BEDS: usize = 6;
 
-/// The critical lane is the first one of every bridge.
+/// The index of the critical lane, which is the first lane of every bridge.
 const CRITICAL: usize = 0;
 
-/// What stands for the slices of the services, whose CPUWeight is 1000 and 20: this nice value has a 46th of
-/// the share of CPU that 0 has.
+/// The nice value of noncritical processes. It gives a 46th of the CPU share of nice 0, about the ratio of
+/// the CPUWeight values 1000 and 20 of the services' slices.
 pub const NONCRITICAL_NICE: &str = "17";
 
+/// The kind of a bed: what is between its publisher and its subscriber.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     Direct,
@@ -51,27 +52,28 @@ impl Kind {
     }
 }
 
-/// What a bed is made of.
+/// The configuration of a bed.
 #[derive(Clone, Debug)]
 pub struct Plan {
     pub kind: Kind,
     pub scheduling: Scheduling,
     /// The largest sample of each route.
     pub routes: Vec<usize>,
-    /// The noncritical lanes of a bridge, all routes on each.
+    /// The number of noncritical lanes of a bridge, each with all routes.
     pub lanes: usize,
-    /// Whether these lanes run, with a subscriber, or are only offered samples.
+    /// Whether the processes of these lanes run, with a subscriber.
     pub lanes_run: bool,
     /// Whether control runs.
     pub control: bool,
-    /// Rate of the noncritical lanes.
+    /// The rate limit of the noncritical lanes.
     pub noncritical_rate_hz: u64,
-    /// Samples of each route that may wait for the critical lane; `None`: what a user has who names no depth.
+    /// `queue_depth` of the critical lane; `None` for the default.
     pub queue_depth: Option<usize>,
 }
 
 impl Plan {
-    /// Ingress and the critical lane of a bridge as users have it, whose noncritical lane does not run.
+    /// With kind bridge: ingress and the critical lane in the default configuration; the noncritical lane
+    /// does not run.
     pub fn new(kind: Kind, scheduling: Scheduling, routes: &[usize]) -> Self {
         Self {
             kind,
@@ -97,29 +99,31 @@ impl Plan {
     }
 }
 
-/// What one repetition of one case gave.
+/// The result of one repetition of one case.
 pub struct Run {
     pub kind: Kind,
+    /// Samples that the publisher's writer accepted.
     pub accepted: u64,
-    /// Refused by the publisher's own writer.
+    /// Samples that the publisher's writer refused.
     pub refused: u64,
+    /// The received samples.
     pub records: Vec<Record>,
-    /// Samples whose content was not what was sent.
+    /// Received samples whose content differs from the sent content.
     pub damaged: u64,
-    /// Refused by the relay's writer.
+    /// Samples that the relay's writer refused.
     pub relay_refused: u64,
-    /// What each process between publisher and subscriber had of the CPUs meanwhile.
+    /// The CPU time of each process between publisher and subscriber during the run.
     pub cpu_ns: BTreeMap<String, u64>,
     pub bridge: Option<BridgeRun>,
 }
 
 impl Run {
-    /// Sent and not received.
+    /// The number of samples that were sent and not received.
     pub fn missing(&self) -> u64 {
         (self.accepted + self.refused).saturating_sub(self.records.len() as u64)
     }
 
-    /// What relay and bridge did not forward, by name.
+    /// The samples that relay or bridge did not forward, by process and reason.
     pub fn drops(&self) -> BTreeMap<String, u64> {
         let mut drops = BTreeMap::from([("relay window_full".to_owned(), self.relay_refused)]);
         if let Some(bridge) = &self.bridge {
@@ -130,7 +134,7 @@ impl Run {
         drops
     }
 
-    /// What became of those that are missing, as far as anybody said so.
+    /// The known reasons of missing samples: drops, and refusals of the publisher's writer.
     pub fn reasons(&self) -> BTreeMap<String, u64> {
         let mut reasons = self.drops();
         if self.refused > 0 {
@@ -140,54 +144,55 @@ impl Run {
     }
 }
 
-/// Adds counts to those of the same names.
+/// Adds counts by name to `sum`.
 pub fn add_up(sum: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
     for (name, count) in more {
         *sum.entry(name).or_default() += count;
     }
 }
 
-/// What the bridge counted meanwhile.
+/// The counters of the bridge's boards for one run.
 pub struct BridgeRun {
     pub lost_upstream: u64,
     pub forwarded: u64,
+    /// Samples that the lane forwarded without a copy out of shared memory.
     pub by_reference: u64,
-    /// Published without a copy into shared memory.
+    /// Samples that ingress assembled in shared memory, without a copy into it.
     pub in_place: u64,
-    /// Drops by ingress and by the critical lane, by name.
+    /// Drops of ingress and of the critical lane, by process and reason.
     pub drops: Vec<(String, u64)>,
-    /// `received = forwarded + every named drop`.
+    /// Whether every sample is accounted for: `received = forwarded + every named drop`.
     pub whole: bool,
-    /// From ingress' publishing to the lane having taken the sample.
+    /// The time from ingress publishing a sample to the lane taking it.
     pub shm: Buckets,
-    /// What the lane takes to hand a sample to its DDS writer.
+    /// The time that the lane needs to hand a sample to its DDS writer.
     pub hand_over: Buckets,
-    /// What the first noncritical lane forwarded.
+    /// Samples that the first noncritical lane forwarded.
     pub noncritical_forwarded: u64,
 }
 
-/// A program of ours that takes orders.
+/// A process of this binary that reads commands from its stdin and answers on its stdout.
 pub struct Program {
     child: Child,
-    orders: ChildStdin,
+    commands: ChildStdin,
     answers: BufReader<ChildStdout>,
 }
 
 impl Program {
     pub fn start(role: &str, domain: u16, place: Place, more: &[&str]) -> Result<Self, String> {
         let executable = std::env::current_exe().map_err(|error| error.to_string())?;
-        // Programs on the noncritical side have as little of the CPUs as its lanes.
+        // Noncritical programs get the nice value of noncritical lanes.
         let mut command = program(&executable, ["__drain", "__spinner"].contains(&role));
         command.arg(role).arg(domain.to_string()).arg(place.to_argument()).args(more);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = spawn(&mut command)?;
-        let (Some(orders), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
+        let (Some(commands), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
             return Err(format!("{role} has no pipes"));
         };
-        Ok(Self { child, orders, answers: BufReader::new(answers) })
+        Ok(Self { child, commands, answers: BufReader::new(answers) })
     }
 
-    /// A program that burns every CPU until it is dropped, with no more right to them than a noncritical
+    /// Starts a program that uses every CPU fully until it is dropped, with the scheduling of a noncritical
     /// lane.
     pub fn spinner() -> Result<Self, String> {
         let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
@@ -200,25 +205,26 @@ impl Program {
         let _ = kill(Pid::from_raw(self.child.id().cast_signed()), signal);
     }
 
-    fn order(&mut self, line: &str) -> Result<(), String> {
-        writeln!(self.orders, "{line}").map_err(|error| format!("a program of the bench died: {error}"))
+    fn send(&mut self, command: &str) -> Result<(), String> {
+        writeln!(self.commands, "{command}")
+            .map_err(|error| format!("a program of the bench exited: {error}"))
     }
 
     fn answer(&mut self) -> Result<String, String> {
         let mut line = String::new();
         match self.answers.read_line(&mut line) {
-            Ok(0) => Err("a program of the bench ended unasked; see above".to_owned()),
+            Ok(0) => Err("a program of the bench exited unexpectedly; its error is above".to_owned()),
             Ok(_) => Ok(line.trim_end().to_owned()),
             Err(error) => Err(error.to_string()),
         }
     }
 
-    /// The numbers of an answer that begins with `word`.
+    /// Reads an answer that begins with `word` and returns its numbers.
     pub fn numbers(&mut self, word: &str) -> Result<Vec<u64>, String> {
         let answer = self.answer()?;
         let mut words = answer.split(' ');
         if words.next() != Some(word) {
-            return Err(format!("not an answer: {answer}"));
+            return Err(format!("expected an answer that begins with {word}: {answer}"));
         }
         Ok(words.filter_map(|number| number.parse().ok()).collect())
     }
@@ -231,7 +237,7 @@ impl Drop for Program {
     }
 }
 
-/// A program, with the nice value of its side.
+/// The command that runs an executable, with the noncritical nice value if it is noncritical.
 fn program(executable: &Path, is_noncritical: bool) -> Command {
     if !is_noncritical {
         return Command::new(executable);
@@ -241,7 +247,7 @@ fn program(executable: &Path, is_noncritical: bool) -> Command {
     command
 }
 
-/// Starts a child that does not outlive this process.
+/// Starts a child that the kernel kills when this process ends.
 fn spawn(command: &mut Command) -> Result<Child, String> {
     for variable in [
         "ROS_DOMAIN_ID",
@@ -259,20 +265,20 @@ fn spawn(command: &mut Command) -> Result<Child, String> {
     command.spawn().map_err(|error| format!("{:?}: {error}", command.get_program()))
 }
 
-/// One of direct, relay, bridge.
+/// A running bed: publisher, subscriber, and the relay or bridge between them.
 pub struct Bed {
     kind: Kind,
     routes: usize,
     publisher: Program,
     subscriber: Program,
-    /// Subscribes to the noncritical lanes as long as the bed is up.
+    /// The subscriber of the noncritical lanes.
     _drain: Option<Program>,
     relay: Option<Program>,
     pub bridge: Option<Bridge>,
     next_number: u64,
 }
 
-/// The processes of a bridge.
+/// A running bridge.
 pub struct Bridge {
     processes: Vec<Process>,
     boards: Boards,
@@ -285,7 +291,7 @@ pub struct Bridge {
     places: [Place; 2],
 }
 
-/// A process of a bridge and the role that it has.
+/// A process of a bridge, with its role.
 pub struct Process {
     pub role: String,
     pub child: Child,
@@ -329,7 +335,7 @@ impl Bridge {
         for role in roles {
             processes.push(Process::start(executable, &role, &config)?);
         }
-        // Ingress sets up the pools, some ms for each route of some MB.
+        // Ingress creates the pools, which takes some ms for each route of some MB.
         std::thread::sleep(Duration::from_millis(700));
         let (boards, _node) = link::boards(&config)?;
         let executable = executable.to_owned();
@@ -339,24 +345,24 @@ impl Bridge {
     fn check(&mut self) -> Result<(), String> {
         for process in &mut self.processes {
             if let Ok(Some(status)) = process.child.try_wait() {
-                return Err(format!("{} of the bridge ended unasked: {status}", process.role));
+                return Err(format!("{} of the bridge exited unexpectedly: {status}", process.role));
             }
         }
         Ok(())
     }
 
-    /// Takes the process of a role away, for somebody who kills it.
+    /// Removes the process of a role, for a caller that kills and restarts it.
     pub fn take(&mut self, role: &str) -> Option<Process> {
         let at = self.processes.iter().position(|process| process.role == role)?;
         Some(self.processes.remove(at))
     }
 
-    /// Gives a process back.
-    pub fn give(&mut self, process: Process) {
+    /// Adds a process again that was removed with `take`.
+    pub fn put_back(&mut self, process: Process) {
         self.processes.push(process);
     }
 
-    /// What starts another process of a role, from another thread.
+    /// A function that starts a process of a role, for another thread.
     pub fn starter(&self, role: &str) -> impl Fn() -> Result<Process, String> + Send + use<> {
         let (executable, role, config) = (self.executable.clone(), role.to_owned(), self.config.clone());
         move || Process::start(&executable, &role, &config)
@@ -368,7 +374,7 @@ impl Bridge {
         }
     }
 
-    /// Sets the rate of the noncritical lanes as a user does: file and reload.
+    /// Sets the rate limit of the noncritical lanes by changing the configuration file and reloading it.
     pub fn set_noncritical_rate(&mut self, rate_hz: u64) -> Result<(), String> {
         self.plan.noncritical_rate_hz = rate_hz;
         let text = configuration(self.domain, &self.folder, &self.plan, self.places);
@@ -385,7 +391,8 @@ impl Bridge {
 
 impl Drop for Bridge {
     fn drop(&mut self) {
-        // Asked to, the last of them removes their shared memory, up to 1 GB of it; one that is killed can't.
+        // SIGTERM first: the last process that exits removes the shared memory, up to 1 GB; a killed one
+        // cannot.
         for process in &self.processes {
             process.signal(Signal::SIGCONT);
             process.signal(Signal::SIGTERM);
@@ -402,12 +409,12 @@ impl Drop for Bridge {
     }
 }
 
-/// Some beds, up at the same time.
+/// Beds that run at the same time.
 pub struct Beds(pub Vec<Bed>);
 
 impl Beds {
     pub fn start(plans: &[Plan], options: &Options) -> Result<Self, String> {
-        assert!(plans.len() <= MOST_BEDS, "a domain for each");
+        assert!(plans.len() <= MAX_BEDS, "each bed needs a domain");
         let mut beds = Vec::new();
         for (plan, domain) in plans.iter().zip(FIRST_DOMAIN..) {
             eprintln!(
@@ -418,17 +425,17 @@ impl Beds {
             );
             beds.push(Bed::start(plan, domain, options)?);
         }
-        // Discovery goes on for a while after the endpoints have found each other.
+        // Discovery traffic continues for some time after the endpoints have matched.
         std::thread::sleep(Duration::from_secs(2));
         Ok(Self(beds))
     }
 
-    /// Direct, relay and bridge with these routes.
+    /// Starts direct, relay and bridge with these routes.
     pub fn three(scheduling: Scheduling, routes: &[usize], options: &Options) -> Result<Self, String> {
         Self::three_with_queues(None, scheduling, routes, options)
     }
 
-    /// Likewise, with room for so many samples of each route in front of the critical lane.
+    /// Starts direct, relay and bridge with a `queue_depth` of the critical lane.
     pub fn three_with_queues(
         queue_depth: Option<usize>,
         scheduling: Scheduling,
@@ -487,7 +494,7 @@ impl Bed {
         Ok(bed)
     }
 
-    /// One more subscriber of the bridge's critical lane.
+    /// Starts another subscriber of the bridge's critical lane.
     pub fn second_subscriber(&self) -> Result<Program, String> {
         let bridge = self.bridge.as_ref().ok_or("no bridge")?;
         let routes = Route::to_argument(&Route::all(&bridge.plan.routes));
@@ -507,13 +514,13 @@ impl Bed {
         self.kind
     }
 
-    /// Sends until everything arrives on every route: the writers in the middle are matched a little later
-    /// than the first one.
+    /// Sends samples until a run loses none, because the writers of relay or bridge match their readers a
+    /// little later than the publisher does.
     fn warm_up(&mut self) -> Result<(), String> {
         let routes = self.routes;
         let case = Case { rate_hz: 100, bytes: 64, samples: 25.max(2 * routes), first_route: 0, routes };
         for _ in 0..20 {
-            let run = self.measure_with_patience(&case, 500)?;
+            let run = self.measure_with_timeout(&case, 500)?;
             if run.records.len() == case.samples {
                 return Ok(());
             }
@@ -521,41 +528,42 @@ impl Bed {
         Err(format!("{}: samples do not arrive", self.kind.label()))
     }
 
-    /// Every process with its id: publisher, subscriber, and those between them.
+    /// Names and process ids of publisher, subscriber and the processes between them.
     pub fn processes(&self) -> Vec<(String, u32)> {
         let program = |name: &str, program: &Program| (name.to_owned(), program.child.id());
         let mut all = vec![program("publisher", &self.publisher), program("subscriber", &self.subscriber)];
-        all.extend(self.between());
+        all.extend(self.middle_processes());
         all
     }
 
-    /// Those between publisher and subscriber.
-    pub fn between(&self) -> Vec<(String, u32)> {
+    /// Names and process ids of the processes between publisher and subscriber.
+    pub fn middle_processes(&self) -> Vec<(String, u32)> {
         let relay = self.relay.iter().map(|relay| ("relay".to_owned(), relay.child.id()));
         let bridge = self.bridge.iter().flat_map(|bridge| &bridge.processes);
         relay.chain(bridge.map(|process| (process.role.clone(), process.child.id()))).collect()
     }
 
     fn cpu_ns(&self) -> BTreeMap<String, u64> {
-        self.between().into_iter().map(|(name, pid)| (name, system::cpu_ns(pid))).collect()
+        self.middle_processes().into_iter().map(|(name, pid)| (name, system::cpu_ns(pid))).collect()
     }
 
+    /// Sends the samples of a case and returns the result.
     pub fn measure(&mut self, case: &Case) -> Result<Run, String> {
-        // A RELIABLE writer repairs within a heartbeat period, a second at most.
-        self.measure_with_patience(case, 3_000)
+        // A RELIABLE writer retransmits within a heartbeat period, at most a second.
+        self.measure_with_timeout(case, 3_000)
     }
 
-    /// Gives up on missing samples when none has come for so long.
-    pub fn measure_with_patience(&mut self, case: &Case, patience_ms: u64) -> Result<Run, String> {
+    /// As `measure`; the subscriber stops waiting for missing samples when none has arrived for `timeout_ms`.
+    pub fn measure_with_timeout(&mut self, case: &Case, timeout_ms: u64) -> Result<Run, String> {
         let routes = case.first_route..case.first_route + case.routes;
         if let Some(bridge) = &mut self.bridge {
             bridge.check()?;
         }
-        let before = self.bridge.as_ref().map(|bridge| Counted::read(&bridge.boards, routes.clone()));
-        self.subscriber.order("begin")?;
+        let before = self.bridge.as_ref().map(|bridge| Counters::read(&bridge.boards, routes.clone()));
+        self.subscriber.send("begin")?;
         std::thread::sleep(Duration::from_millis(150));
         let cpu_before = self.cpu_ns();
-        self.publisher.order(&format!(
+        self.publisher.send(&format!(
             "send {} {} {} {} {} {}",
             case.first_route, case.routes, case.rate_hz, case.samples, case.bytes, self.next_number
         ))?;
@@ -566,10 +574,10 @@ impl Bed {
             .into_iter()
             .map(|(name, ns)| (name.clone(), ns.saturating_sub(earlier(&name))))
             .collect();
-        let [accepted, refused] = sent[..] else { return Err("the publisher does not say".to_owned()) };
-        self.subscriber.order(&format!("end {accepted} {patience_ms}"))?;
+        let [accepted, refused] = sent[..] else { return Err(format!("answer of the publisher: {sent:?}")) };
+        self.subscriber.send(&format!("end {accepted} {timeout_ms}"))?;
         let head = self.subscriber.numbers("samples")?;
-        let [count, damaged] = head[..] else { return Err("the subscriber does not say".to_owned()) };
+        let [count, damaged] = head[..] else { return Err(format!("answer of the subscriber: {head:?}")) };
         let mut records = Vec::with_capacity(count as usize);
         for _ in 0..count {
             let line = self.subscriber.answer()?;
@@ -583,7 +591,7 @@ impl Bed {
                 taken_at: word(),
                 handed_at: word(),
             };
-            // What came late from the repetition before is not of this one.
+            // A late sample of the previous repetition does not count.
             if record.number >= self.next_number {
                 records.push(record);
             }
@@ -591,19 +599,20 @@ impl Bed {
         self.next_number += case.samples as u64;
         let relay_refused = match &mut self.relay {
             Some(relay) => {
-                relay.order("refused")?;
+                relay.send("refused")?;
                 relay.numbers("refused")?.first().copied().unwrap_or(0)
             }
             None => 0,
         };
         let bridge = match (&self.bridge, before) {
-            (Some(bridge), Some(before)) => Some(Counted::read(&bridge.boards, routes).since(&before)),
+            (Some(bridge), Some(before)) => Some(Counters::read(&bridge.boards, routes).since(&before)),
             _ => None,
         };
         Ok(Run { kind: self.kind, accepted, refused, records, damaged, relay_refused, cpu_ns, bridge })
     }
 }
 
+/// The configuration file of the bridge of a plan.
 fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Place; 2]) -> String {
     let scheduling = |place: Place| {
         let cpus = place.cpu.map_or(String::new(), |cpu| cpu.to_string());
@@ -645,8 +654,8 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
     text
 }
 
-/// The counters and latencies of some routes at one instant.
-struct Counted {
+/// The counters and latencies of some routes, read from the boards at one instant.
+struct Counters {
     lost_upstream: u64,
     forwarded: u64,
     by_reference: u64,
@@ -658,9 +667,9 @@ struct Counted {
     hand_over: Buckets,
 }
 
-impl Counted {
+impl Counters {
     fn read(boards: &Boards, routes: std::ops::Range<usize>) -> Self {
-        let mut counted = Self {
+        let mut counters = Self {
             lost_upstream: 0,
             forwarded: 0,
             by_reference: 0,
@@ -674,24 +683,24 @@ impl Counted {
         for route in routes {
             let ingress = boards.ingress(route).unwrap_or_default();
             let lane = boards.lane(CRITICAL, route).unwrap_or_default();
-            counted.lost_upstream += ingress.lost_upstream;
-            counted.forwarded += lane.forwarded;
-            counted.by_reference += lane.by_reference;
-            counted.in_place += ingress.in_place;
-            counted.noncritical_forwarded += noncritical(boards, route);
-            counted.whole &= lane.is_whole();
-            counted.shm.add(&boards.histogram(Stage::Shm(CRITICAL), route));
-            counted.hand_over.add(&boards.histogram(Stage::DdsOut(CRITICAL), route));
+            counters.lost_upstream += ingress.lost_upstream;
+            counters.forwarded += lane.forwarded;
+            counters.by_reference += lane.by_reference;
+            counters.in_place += ingress.in_place;
+            counters.noncritical_forwarded += noncritical(boards, route);
+            counters.whole &= lane.is_whole();
+            counters.shm.add(&boards.histogram(Stage::Shm(CRITICAL), route));
+            counters.hand_over.add(&boards.histogram(Stage::DdsOut(CRITICAL), route));
             let mut add = |process: &str, drops: &DropCounts| {
                 for &reason in DropReason::ALL {
-                    *counted.drops.entry(format!("{process} {}", reason.label())).or_default() +=
+                    *counters.drops.entry(format!("{process} {}", reason.label())).or_default() +=
                         drops.get(reason);
                 }
             };
             add("ingress", &ingress.drops);
             add("critical", &lane.drops);
         }
-        counted
+        counters
     }
 
     fn since(&self, before: &Self) -> BridgeRun {
@@ -712,7 +721,7 @@ impl Counted {
     }
 }
 
-/// What the first noncritical lane has forwarded; a bridge without one has no board for it.
+/// The samples that the first noncritical lane has forwarded; 0 without one.
 fn noncritical(boards: &Boards, route: usize) -> u64 {
     boards.lane(CRITICAL + 1, route).map_or(0, |lane| lane.forwarded)
 }

@@ -1,4 +1,4 @@
-//! Latencies that the bridge counted itself, in buckets.
+//! Sums and quantiles of the latency histograms on the bridge's boards.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use adaptive_bridge::model::LatencyHistogram;
 
 use super::report::Quantiles;
 
-/// Upper edges in nanoseconds, and counts; several histograms may be added up.
+/// The sum of one or more histograms: the count of each bucket by its upper bound in nanoseconds.
 #[derive(Clone, Debug, Default)]
 pub struct Buckets(BTreeMap<u64, u64>);
 
@@ -28,7 +28,7 @@ impl Buckets {
         Self(self.0.iter().map(|(upper, count)| (*upper, count.saturating_sub(earlier(upper)))).collect())
     }
 
-    /// In µs, interpolated within its bucket, whose width is 1/16 of its value.
+    /// A quantile in µs, interpolated within its bucket, whose width is 1/16 of its value.
     pub fn quantile_us(&self, quantile: f64) -> f64 {
         let total: u64 = self.0.values().sum();
         let rank = quantile * total as f64;

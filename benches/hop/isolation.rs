@@ -1,10 +1,10 @@
-//! The critical lane while something is wrong with the noncritical one, or with one of its own subscribers.
-//! There is no control process that could come to the rescue: what holds is the processes alone. The
-//! noncritical egress and its subscriber have a nice value that stands for the weights of the services'
-//! slices, and run on any CPU.
+//! Section `isolation`: the latency of the critical lane under faults of the noncritical lane or of one of
+//! the critical lane's own subscribers. Control does not run, so only the separation of the processes
+//! protects the critical lane. The noncritical egress and its subscriber run on any CPU, with a nice value
+//! that corresponds to the weights of the services' slices.
 //!
-//! Conditions take turns. `repeat` is `undisturbed` once more: what those two differ by is what any two
-//! conditions may differ by for no reason.
+//! Conditions take turns. `repeat` is the same as `undisturbed`: their difference is the noise of the
+//! comparison.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -17,33 +17,34 @@ use nix::sys::signal::Signal;
 use super::beds::{Bed, Beds, Plan, Process, Program, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
-use super::out::{Of, Output};
+use super::out::{Output, RowKey};
 use super::report::{Isolation, Quantiles};
 use super::scale::latencies_us;
 use super::system::Scheduling;
 
 const LANE: &str = "noncritical";
 
-/// What the noncritical lane does, or a second subscriber of the critical lane.
+/// The state of the noncritical lane, or of a second subscriber of the critical lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Condition {
-    /// Its 10 Hz of 1 kHz.
+    /// The noncritical lane forwards 10 Hz of the 1 kHz.
     Undisturbed,
-    /// SIGSTOP.
+    /// The noncritical egress is stopped (SIGSTOP).
     Stopped,
-    /// Beside it, a program with its nice value and time slice burns every CPU, as the egress would if all of
-    /// its threads span. The egress has no switch for that, and gets none.
+    /// A program with the nice value and time slice of the noncritical egress uses every CPU fully, as the
+    /// egress would if all its threads were in endless loops. The egress itself has no switch for that.
     Spinning,
-    /// `kill -9` and started again, every 300 ms.
+    /// The noncritical egress is killed and started again every 300 ms.
     Killed,
+    /// The same as `Undisturbed`.
     Repeat,
     /// A second RELIABLE subscriber of the critical lane is stopped (SIGSTOP) and acknowledges nothing.
     ReaderStopped,
     /// A second RELIABLE subscriber of the critical lane was killed; its lease has not expired.
     ReaderKilled,
-    /// Its 10 Hz of 5 kHz.
+    /// The noncritical lane forwards 10 Hz of 5 kHz.
     Fast,
-    /// All of 5 kHz: no rate limit.
+    /// The noncritical lane forwards all of 5 kHz, without a rate limit.
     Flooding,
 }
 
@@ -74,8 +75,8 @@ impl Condition {
         }
     }
 
-    /// What it is compared with: the same load, undisturbed.
-    const fn against(self) -> Self {
+    /// The condition that it is compared with: the same load, undisturbed.
+    const fn baseline(self) -> Self {
         match self {
             Self::Fast | Self::Flooding => Self::Fast,
             _ => Self::Undisturbed,
@@ -90,21 +91,25 @@ impl Condition {
     }
 }
 
-/// Its default, and one that never limits.
+/// The default rate limit of the noncritical lane.
 const LIMITED_HZ: u64 = 10;
+/// A rate limit that no load of the bench reaches.
 const UNLIMITED_HZ: u64 = 100_000;
 
-/// More than a restart of the services takes, and a start never gets beyond discovery.
+/// The period of kills: longer than a restart by systemd takes, and too short for the lane to complete
+/// discovery.
 const KILL_EVERY: Duration = Duration::from_millis(300);
 
-/// More than the 15 s for which the others know of a participant that was killed.
+/// Longer than the 15 s lease after which the others remove a killed participant.
 const LEASE: Duration = Duration::from_secs(16);
 
-/// Fewer than six rounds tell nothing, a dozen a third, and forty a tenth or two.
+/// Rounds of each repetition. Fewer than six rounds give no interval for the median ratio; a dozen resolve a
+/// difference of a third, forty one of 10 to 20 %.
 const ROUNDS_PER_REPETITION: usize = 4;
 
+/// The measurements of one condition, of one or more rounds.
 #[derive(Default)]
-struct Seen {
+struct Measured {
     records: Vec<Record>,
     latency_us: Vec<f64>,
     rounds_p999_us: Vec<f64>,
@@ -119,10 +124,10 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         let wanted: Vec<Condition> = Condition::ALL
             .into_iter()
             .filter(|condition| {
-                // One that is compared with another needs that one.
+                // The baseline of a selected condition is measured too.
                 options.wants("isolation", condition.label())
                     || Condition::ALL.iter().any(|other| {
-                        other.against() == *condition && options.wants("isolation", other.label())
+                        other.baseline() == *condition && options.wants("isolation", other.label())
                     })
             })
             .collect();
@@ -131,32 +136,32 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         }
         let plan = Plan { control: false, ..Plan::whole(scheduling, &[4096]) };
         let mut beds = Beds::start(&[plan], options)?;
-        let mut seen: BTreeMap<Condition, Seen> = BTreeMap::new();
+        let mut measured: BTreeMap<Condition, Measured> = BTreeMap::new();
         let rounds = options.repetitions * if options.quick { 1 } else { ROUNDS_PER_REPETITION };
         for round in 0..rounds {
-            // Each round begins with another one: what comes first, after 5 kHz, or after what left traces
-            // would be the same each time.
+            // Each round begins with another condition. Otherwise the same condition would always be the
+            // first one after 5 kHz or after a disturbance with lasting effects.
             for condition in wanted.iter().cycle().skip(round).take(wanted.len()) {
                 eprintln!("isolation: round {}, {}, {}", round + 1, condition.label(), scheduling.label());
-                // Of fewer than 1,000 samples there is no p99.9.
+                // A p99.9 needs at least 1,000 samples.
                 let seconds = options.seconds(4.0).max(1.1);
                 let case = Case::lasting(condition.rate_hz(), SCAN, seconds, 0);
                 let one = measure_one(*condition, &case, &mut beds.0[0])?;
-                let of = Of {
+                let key = RowKey {
                     section: "isolation",
                     scheduling: scheduling.label(),
                     case: condition.label(),
                     program: "bridge",
                     repetition: round,
                 };
-                output.raw_quantiles(of, "latency", &Quantiles::of(&one.latency_us));
+                output.raw_quantiles(key, "latency", &Quantiles::of(&one.latency_us));
                 for record in &one.records {
-                    output.sample(of, record);
+                    output.sample(key, record);
                 }
-                output.raw_missing(of, one.missing, &one.reasons);
-                output.raw(of, "noncritical forwarded", one.noncritical_forwarded as f64);
-                output.raw(of, "kills", one.kills as f64);
-                let sum = seen.entry(*condition).or_default();
+                output.raw_missing(key, one.missing, &one.reasons);
+                output.raw(key, "noncritical forwarded", one.noncritical_forwarded as f64);
+                output.raw(key, "kills", one.kills as f64);
+                let sum = measured.entry(*condition).or_default();
                 sum.rounds_p999_us.extend(Quantiles::of(&one.latency_us).p999_us);
                 sum.latency_us.extend(one.latency_us);
                 sum.missing += one.missing;
@@ -165,38 +170,39 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
                 sum.kills += one.kills;
             }
         }
-        for (condition, seen) in seen {
-            output.summary.isolation.push(row(scheduling, condition, seen));
+        for (condition, measured) in measured {
+            output.summary.isolation.push(row(scheduling, condition, measured));
         }
     }
     Ok(())
 }
 
-fn row(scheduling: Scheduling, condition: Condition, seen: Seen) -> Isolation {
+fn row(scheduling: Scheduling, condition: Condition, measured: Measured) -> Isolation {
     Isolation {
         scheduling: scheduling.label().to_owned(),
         condition: condition.label().to_owned(),
-        against: condition.against().label().to_owned(),
+        against: condition.baseline().label().to_owned(),
         rate_hz: condition.rate_hz(),
-        missing: seen.missing,
-        reasons: seen.reasons,
-        latency: Quantiles::of(&seen.latency_us),
-        rounds_p999_us: seen.rounds_p999_us,
-        noncritical_forwarded: seen.noncritical_forwarded,
-        kills: seen.kills,
+        missing: measured.missing,
+        reasons: measured.reasons,
+        latency: Quantiles::of(&measured.latency_us),
+        rounds_p999_us: measured.rounds_p999_us,
+        noncritical_forwarded: measured.noncritical_forwarded,
+        kills: measured.kills,
     }
 }
 
-fn measure_one(condition: Condition, case: &Case, bed: &mut Bed) -> Result<Seen, String> {
+/// Measures one condition in one round.
+fn measure_one(condition: Condition, case: &Case, bed: &mut Bed) -> Result<Measured, String> {
     let disturbance = Disturbance::begin(condition, bed)?;
     std::thread::sleep(Duration::from_millis(300));
     let run = bed.measure(case);
     let kills = disturbance.end(bed)?;
-    // What waited for the lane is behind it, those that were killed are forgotten, and the next condition
-    // begins as the first one did.
+    // By the end of this sleep the noncritical lane has handled its queued samples and the lease of killed
+    // participants has expired, so that the next condition begins undisturbed.
     std::thread::sleep(if kills > 0 { LEASE } else { Duration::from_millis(700) });
     let run = run?;
-    Ok(Seen {
+    Ok(Measured {
         latency_us: latencies_us(&run),
         rounds_p999_us: Vec::new(),
         missing: run.missing(),
@@ -207,7 +213,7 @@ fn measure_one(condition: Condition, case: &Case, bed: &mut Bed) -> Result<Seen,
     })
 }
 
-/// What goes on while the critical lane is measured.
+/// A disturbance that lasts while the critical lane is measured.
 enum Disturbance {
     None,
     Stopped,
@@ -221,7 +227,7 @@ impl Disturbance {
     fn begin(condition: Condition, bed: &mut Bed) -> Result<Self, String> {
         if let Condition::ReaderStopped | Condition::ReaderKilled = condition {
             let reader = bed.second_subscriber()?;
-            // Matched on both sides by then.
+            // Time for the endpoints to match on both sides.
             std::thread::sleep(Duration::from_secs(1));
             let is_stopped = condition == Condition::ReaderStopped;
             reader.signal(if is_stopped { Signal::SIGSTOP } else { Signal::SIGKILL });
@@ -242,8 +248,8 @@ impl Disturbance {
             Condition::Killed => {
                 let process = bridge.take(LANE).ok_or("no noncritical lane")?;
                 let (stop, start) = (Arc::new(AtomicBool::new(false)), bridge.starter(LANE));
-                let told = Arc::clone(&stop);
-                let killer = std::thread::spawn(move || kill_again_and_again(process, &start, &told));
+                let stop_requested = Arc::clone(&stop);
+                let killer = std::thread::spawn(move || kill_repeatedly(process, &start, &stop_requested));
                 Self::Killed { stop, killer }
             }
             Condition::Flooding => {
@@ -253,23 +259,24 @@ impl Disturbance {
         })
     }
 
-    /// Undoes it; how often the lane was killed.
+    /// Ends the disturbance and returns the number of killed processes.
     fn end(self, bed: &mut Bed) -> Result<u64, String> {
         let bridge = bed.bridge.as_mut().ok_or("no bridge")?;
         match self {
             Self::None => {}
-            // Dropping it kills it.
+            // The drop kills the subscriber.
             Self::Reader(_) => return Ok(1),
             Self::Spinning(spinner) => drop(spinner),
             Self::Stopped => bridge.signal(LANE, Signal::SIGCONT),
             Self::Killed { stop, killer } => {
                 stop.store(true, Ordering::Relaxed);
-                let (mut last, kills) = killer.join().map_err(|_| "the killing thread died".to_owned())??;
-                // A child does not outlive the thread that started it: this one needs another.
+                let (mut last, kills) =
+                    killer.join().map_err(|_| "the killing thread panicked".to_owned())??;
+                // The kernel kills the last child, whose starting thread has ended, so it is replaced here.
                 let _ = last.child.kill();
                 last.child.wait().map_err(|error| error.to_string())?;
                 let start = bridge.starter(LANE);
-                bridge.give(start()?);
+                bridge.put_back(start()?);
                 return Ok(kills);
             }
             Self::Flooding => bridge.set_noncritical_rate(LIMITED_HZ)?,
@@ -278,7 +285,8 @@ impl Disturbance {
     }
 }
 
-fn kill_again_and_again(
+/// Kills and restarts a process until a stop is requested; returns the last process and the number of kills.
+fn kill_repeatedly(
     mut process: Process,
     start: &dyn Fn() -> Result<Process, String>,
     stop: &AtomicBool,

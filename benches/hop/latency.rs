@@ -1,30 +1,31 @@
-//! The sweep over rates and payloads, and the runs that must lose nothing. Wake-up, direct, relay and bridge
-//! take turns.
+//! Sections `latency` and `loss`: the sweep over rates and payloads, and the runs in which no sample may be
+//! lost. Wake-up, direct, relay and bridge take turns.
 
 use std::collections::BTreeMap;
 
 use super::beds::{Beds, Kind, Run, add_up};
 use super::histogram::Buckets;
 use super::options::{Case, Options, SCAN, SWEEP_ROUTES};
-use super::out::{Of, Output};
+use super::out::{Output, RowKey};
 use super::report::statistics::median;
 use super::report::{Latency, Loss, Quantiles, targets};
 use super::system::Scheduling;
 use super::throughput;
 use super::wakeup;
 
-/// Payloads up to this size come at thousands of Hz.
+/// The largest payload that is sent at thousands of Hz.
 const SMALL_BYTES: usize = 64 << 10;
 
-/// What is to be set for such a rate: a fifth of a second at 5 kHz, where the default of 64 is 13 ms.
+/// `queue_depth` of the critical lane for such rates: a fifth of a second at 5 kHz, where the default of 64
+/// holds 13 ms.
 const FAST_QUEUE_DEPTH: usize = 1024;
 
-/// Latencies of one program in one case, over the repetitions.
+/// The latencies and counts of one program in one case, over its repetitions.
 #[derive(Default)]
 struct Program {
     latency: Vec<f64>,
     from_due: Vec<f64>,
-    /// Of each repetition.
+    /// The latency quantiles of each repetition.
     each: Vec<Quantiles>,
     missing: u64,
     reasons: BTreeMap<String, u64>,
@@ -34,6 +35,7 @@ struct Program {
     dds_out: Vec<f64>,
     shm: Buckets,
     hand_over: Buckets,
+    /// Forwarded samples, and the copies that in-place assembly and forwarding by reference avoided.
     copies: Option<(u64, u64)>,
 }
 
@@ -49,19 +51,19 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
         if !fast.is_empty() || !small.is_empty() {
             let routes = SWEEP_ROUTES.into_iter().filter(|bytes| is_small(*bytes)).collect::<Vec<_>>();
             let mut beds = Beds::three_with_queues(Some(FAST_QUEUE_DEPTH), scheduling, &routes, options)?;
-            drive(fast, small, scheduling, &mut beds, options, output)?;
+            measure_limits(fast, small, scheduling, &mut beds, options, output)?;
         }
         if !cases.is_empty() || !heavy.is_empty() || !large.is_empty() {
             let mut beds = Beds::three(scheduling, &SWEEP_ROUTES, options)?;
             sweep(&cases, scheduling, &mut beds, options, output)?;
-            drive(heavy, large, scheduling, &mut beds, options, output)?;
+            measure_limits(heavy, large, scheduling, &mut beds, options, output)?;
         }
     }
     Ok(())
 }
 
-/// Drives the beds to their limits: the rates that must lose nothing, then the search for the highest one.
-fn drive(
+/// Measures at high rates: first those at which no sample may be lost, then the search for the highest rate.
+fn measure_limits(
     losses: Vec<Case>,
     searches: Vec<usize>,
     scheduling: Scheduling,
@@ -82,6 +84,7 @@ fn drive(
     Ok(())
 }
 
+/// Measures the cases of the sweep, repetition by repetition.
 fn sweep(
     cases: &[Case],
     scheduling: Scheduling,
@@ -91,30 +94,30 @@ fn sweep(
 ) -> Result<(), String> {
     let mut programs: BTreeMap<(usize, &'static str), Program> = BTreeMap::new();
     let repetitions = |case: &Case| {
-        let is_judged =
+        let has_target =
             targets::HOPS.iter().any(|hop| (hop.rate_hz, hop.bytes) == (case.rate_hz, case.bytes));
-        if is_judged { options.judged_repetitions() } else { options.repetitions }
+        if has_target { options.target_repetitions() } else { options.repetitions }
     };
     for repetition in 0..cases.iter().map(repetitions).max().unwrap_or(0) {
         for (index, case) in cases.iter().enumerate().filter(|(_, case)| repetition < repetitions(case)) {
             let name = case.name();
             eprintln!("latency {} of {}: {name}, {}", repetition + 1, repetitions(case), scheduling.label());
-            let of = |program| Of {
+            let key = |program| RowKey {
                 section: "latency",
                 scheduling: scheduling.label(),
                 case: &name,
                 program,
                 repetition,
             };
-            // A wake-up carries nothing: once for each rate is enough.
-            if is_first_of_rate(cases, index) {
+            // A wake-up has no payload, so it is measured once for each rate.
+            if has_wakeup(cases, index) {
                 let us: Vec<f64> = wakeup::eventfd(case, options, scheduling)?
                     .iter()
                     .map(|ns| *ns as f64 / 1_000.0)
                     .collect();
                 let program = programs.entry((index, "wake-up")).or_default();
                 program.each.push(Quantiles::of(&us));
-                output.raw_quantiles(of("wake-up"), "wake-up", &Quantiles::of(&us));
+                output.raw_quantiles(key("wake-up"), "wake-up", &Quantiles::of(&us));
                 program.latency.extend(us);
             }
             // Each repetition begins with another program.
@@ -123,7 +126,7 @@ fn sweep(
                 let bed = &mut beds.0[bed];
                 let run = bed.measure(case)?;
                 let program = programs.entry((index, bed.name())).or_default();
-                add(program, &run, of(bed.name()), output);
+                add(program, &run, key(bed.name()), output);
             }
         }
     }
@@ -144,35 +147,36 @@ fn sweep(
     Ok(())
 }
 
-/// Whether no earlier case of the sweep has the rate; of equals, the laser scan has it, as it has most
-/// samples.
-fn is_first_of_rate(cases: &[Case], index: usize) -> bool {
+/// Whether a case is the one of its rate with which the wake-up is measured: the laser scan, which has the
+/// most samples, else the first case of the rate.
+fn has_wakeup(cases: &[Case], index: usize) -> bool {
     let rate_hz = cases[index].rate_hz;
     let mut same = cases.iter().enumerate().filter(|(_, case)| case.rate_hz == rate_hz);
     let scan = same.clone().find(|(_, case)| case.bytes == SCAN);
     scan.or_else(|| same.next()).is_some_and(|(first, _)| first == index)
 }
 
-fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
+/// Adds one repetition to the figures of a program and writes its raw data.
+fn add(program: &mut Program, run: &Run, key: RowKey, output: &mut Output) {
     let (mut latency, mut from_due) = (Vec::new(), Vec::new());
     for record in &run.records {
         latency.push(record.latency_us());
         from_due.push(record.since_due_us());
         program.dds_in.push(record.dds_in_us());
         program.dds_out.push(record.dds_out_us());
-        output.sample(of, record);
+        output.sample(key, record);
     }
     let cpu_ns: u64 = run.cpu_ns.values().sum();
     let quantiles = Quantiles::of(&latency);
-    output.raw_quantiles(of, "latency", &quantiles);
-    output.raw_quantiles(of, "from due", &Quantiles::of(&from_due));
-    output.raw_missing(of, run.missing(), &run.reasons());
+    output.raw_quantiles(key, "latency", &quantiles);
+    output.raw_quantiles(key, "from due", &Quantiles::of(&from_due));
+    output.raw_missing(key, run.missing(), &run.reasons());
     if run.kind != Kind::Direct {
-        output.raw(of, "cpu us/sample", cpu_ns as f64 / 1_000.0 / run.accepted.max(1) as f64);
+        output.raw(key, "cpu us/sample", cpu_ns as f64 / 1_000.0 / run.accepted.max(1) as f64);
     }
     if let Some(bridge) = &run.bridge {
-        output.raw_quantiles(of, "shared memory", &bridge.shm.quantiles());
-        output.raw_quantiles(of, "hand-over", &bridge.hand_over.quantiles());
+        output.raw_quantiles(key, "shared memory", &bridge.shm.quantiles());
+        output.raw_quantiles(key, "hand-over", &bridge.hand_over.quantiles());
         program.shm.merge(&bridge.shm);
         program.hand_over.merge(&bridge.hand_over);
         let copies = program.copies.get_or_insert_default();
@@ -188,6 +192,7 @@ fn add(program: &mut Program, run: &Run, of: Of, output: &mut Output) {
     program.accepted += run.accepted;
 }
 
+/// The row of one program and case in the summary. `direct` has the quantiles of direct in each repetition.
 fn row(case: &Case, scheduling: Scheduling, name: &str, program: &Program, direct: &[Quantiles]) -> Latency {
     let hop = |of: fn(&Quantiles) -> Option<f64>| {
         let pairs = program.each.iter().zip(direct);
@@ -216,13 +221,13 @@ fn row(case: &Case, scheduling: Scheduling, name: &str, program: &Program, direc
         cpu_us_per_sample: (program.cpu_ns > 0)
             .then(|| program.cpu_ns as f64 / 1_000.0 / program.accepted.max(1) as f64),
         stages,
-        // One into shared memory, unless the sample was put together there, and another where the lane did
-        // not hand it on by reference.
-        copies: program.copies.map(|(forwarded, spared)| 2.0 - spared as f64 / forwarded.max(1) as f64),
+        // A sample is copied into shared memory unless ingress assembled it there, and copied out of it
+        // unless the lane forwarded it by reference.
+        copies: program.copies.map(|(forwarded, avoided)| 2.0 - avoided as f64 / forwarded.max(1) as f64),
     }
 }
 
-/// What became of the samples of a run.
+/// The row of a run in the loss table: received, lost, disordered and damaged samples.
 pub fn loss(case: &Case, scheduling: Scheduling, run: &Run) -> Loss {
     let mut numbers: Vec<u64> = run.records.iter().map(|record| record.number).collect();
     let disordered = numbers.windows(2).filter(|pair| pair[1] <= pair[0]).count() as u64;

@@ -1,5 +1,5 @@
-//! The programs around and beside the bridge: publisher, subscriber, relay. Each is this binary, started with
-//! a hidden argument, takes its orders line by line on stdin and answers on stdout.
+//! The programs of the test beds: publisher, subscriber, relay, drain and spinner. Each runs this binary with
+//! a hidden argument, reads commands line by line from stdin and answers on stdout.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead, Write};
@@ -23,18 +23,19 @@ use bytes::{Bytes, BytesMut};
 
 use super::system::{self, Place, sleep_until};
 
-/// One topic, by the largest sample that it carries.
+/// One topic, with the size of its largest sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Route {
     pub index: usize,
     pub max_sample_bytes: usize,
 }
 
-/// The payloads of a laser scan; others are point clouds. The bridge never looks, only the names differ.
+/// The largest sample of routes of type LaserScan; routes with larger ones are of type PointCloud2. Only the
+/// type names differ, because the bridge does not interpret payloads.
 const SCAN_BYTES: usize = 4096;
 
 impl Route {
-    /// Those with these largest samples.
+    /// Routes with these largest samples.
     pub fn all(sizes: &[usize]) -> Vec<Self> {
         sizes.iter().enumerate().map(|(index, &max_sample_bytes)| Self { index, max_sample_bytes }).collect()
     }
@@ -59,53 +60,55 @@ impl Route {
         }
     }
 
-    /// Samples that may wait in a reader: as ingress has it, 32 MiB at most, 16 to 1,024 samples.
+    /// The history depth of readers, as of ingress: at most 32 MiB, but 16 to 1,024 samples.
     fn reader_depth(self) -> u32 {
         ((32 << 20) / self.max_sample_bytes).clamp(16, 1024) as u32
     }
 
-    /// As they cross the command line: their sizes.
+    /// The routes as a command-line argument: their sizes.
     pub fn to_argument(routes: &[Self]) -> String {
         routes.iter().map(|route| route.max_sample_bytes.to_string()).collect::<Vec<_>>().join(",")
     }
 
     fn parse(text: &str) -> Result<Vec<Self>, String> {
         let sizes: Result<Vec<usize>, _> = text.split(',').map(str::parse).collect();
-        Ok(Self::all(&sizes.map_err(|_| format!("{text} are no sizes"))?))
+        Ok(Self::all(&sizes.map_err(|_| format!("{text} is not a list of sizes"))?))
     }
 }
 
-/// The ROS 2 topics before and after relay or bridge.
+/// The prefix of the input topics.
 pub const INPUT: &str = "/bench/in/";
+/// The prefix of the output topics of relay and bridge.
 pub const OUTPUT: &str = "/bench/critical/";
 
-/// What may be unacknowledged, on every RELIABLE writer of the bench and in the bridge (its default).
+/// The highest number of unacknowledged samples of each RELIABLE writer of the bench, the default of the
+/// bridge.
 const WINDOW_SAMPLES: usize = 256;
 
-/// What a payload begins with: its number, when it was due, when it was written; its number is at the end
-/// too.
+/// The bytes of the stamps at the beginning of a payload: sample number, due time, write time. The number is
+/// also at the end.
 const STAMPS: usize = 24;
 
-/// What the subscriber records of one sample. Instants of CLOCK_MONOTONIC in nanoseconds; 0 is unknown.
+/// The record of one received sample. Times are of CLOCK_MONOTONIC in nanoseconds; 0 is unknown.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Record {
     pub number: u64,
     pub due_at: u64,
     pub written_at: u64,
     pub arrived_at: u64,
-    /// When ingress took it.
+    /// When ingress took it from DDS.
     pub taken_at: u64,
     /// When the lane began to hand it to its DDS writer.
     pub handed_at: u64,
 }
 
-/// From one instant to another in microseconds; `NaN` if one is not known.
+/// The time from one instant to another in microseconds; `NaN` if one is unknown.
 fn us(from: u64, to: u64) -> f64 {
     if from == 0 || to == 0 { f64::NAN } else { (to as f64 - from as f64) / 1_000.0 }
 }
 
 impl Record {
-    /// How much later than it was due it was written.
+    /// The delay of the write after the due time.
     pub fn late_us(&self) -> f64 {
         us(self.due_at, self.written_at)
     }
@@ -134,8 +137,8 @@ pub fn run(role: &str, arguments: &[String]) -> ExitCode {
         "__subscriber" => subscriber(arguments),
         "__relay" => relay(arguments),
         "__drain" => drain(arguments),
-        "__spinner" => system::slice_of_a_noncritical_lane().and_then(|()| spin()),
-        other => Err(format!("no such role: {other}")),
+        "__spinner" => system::set_noncritical_time_slice().and_then(|()| spin()),
+        other => Err(format!("unknown role: {other}")),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -154,7 +157,7 @@ fn join(arguments: &[String], name: &str) -> Result<Participant, String> {
     let place = Place::parse(argument(arguments, 1)?)?;
     place.apply();
     place.lock_memory();
-    let domain_id = argument(arguments, 0)?.parse().map_err(|_| "the first argument is the domain")?;
+    let domain_id = argument(arguments, 0)?.parse().map_err(|_| "the first argument must be the domain")?;
     Participant::open(&ParticipantOptions {
         network: &DdsNetwork { domain_id, interfaces: Vec::new() },
         namespace: "/bench".to_owned(),
@@ -188,7 +191,7 @@ fn reader(
         .map_err(|error| error.to_string())
 }
 
-/// Waits for each writer to have a reader.
+/// Waits until each writer has matched a reader.
 fn wait_matched(writers: &[&RawWriter]) -> Result<(), String> {
     let give_up_at = clock::monotonic().plus_ms(20_000);
     for writer in writers {
@@ -199,21 +202,22 @@ fn wait_matched(writers: &[&RawWriter]) -> Result<(), String> {
                 None => std::thread::sleep(Duration::from_millis(5)),
             }
             if clock::monotonic() > give_up_at {
-                return Err("no reader within 20 s".to_owned());
+                return Err("a writer has matched no reader within 20 s".to_owned());
             }
         }
     }
     Ok(())
 }
 
-fn say(line: &str) {
+/// Writes an answer to stdout.
+fn answer(line: &str) {
     let mut out = io::stdout().lock();
     let _ = writeln!(out, "{line}");
     let _ = out.flush();
 }
 
-/// Sends when told: `send FIRST_ROUTE ROUTES RATE_HZ SAMPLES BYTES FIRST_NUMBER`, one route after the other,
-/// answered by `sent ACCEPTED REFUSED`.
+/// The publisher. The command `send FIRST_ROUTE ROUTES RATE_HZ SAMPLES BYTES FIRST_NUMBER` sends samples on
+/// the routes in turn; the answer is `sent ACCEPTED REFUSED`.
 fn publisher(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "publisher")?;
     let mut writers = Vec::new();
@@ -221,17 +225,18 @@ fn publisher(arguments: &[String]) -> Result<(), String> {
         writers.push((writer(&mut participant, INPUT, route)?, Arena::new(route)));
     }
     wait_matched(&writers.iter().map(|(writer, _)| writer).collect::<Vec<_>>())?;
-    say("ready");
+    answer("ready");
     for line in io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
         let words: Option<Vec<u64>> = line
             .strip_prefix("send ")
             .and_then(|numbers| numbers.split(' ').map(|word| word.parse().ok()).collect());
         let Some([first_route, routes, rate_hz, samples, bytes, first]) = words.as_deref() else {
-            return Err(format!("not an order: {line}"));
+            return Err(format!("unknown command: {line}"));
         };
         let (first_route, routes, bytes) = (*first_route as usize, *routes as usize, *bytes as usize);
-        let chosen = writers.get_mut(first_route..first_route + routes).ok_or("no such route")?;
+        let chosen =
+            writers.get_mut(first_route..first_route + routes).ok_or("the command names an unknown route")?;
         let (mut accepted, mut refused) = (0u64, 0u64);
         let start = clock::monotonic().0 + 20_000_000;
         for sample in 0..*samples {
@@ -249,61 +254,61 @@ fn publisher(arguments: &[String]) -> Result<(), String> {
                 Err(_) => refused += 1,
             }
         }
-        say(&format!("sent {accepted} {refused}"));
+        answer(&format!("sent {accepted} {refused}"));
     }
     Ok(())
 }
 
-/// Rung by the DDS library when a sample arrives, as in the bridge's ingress.
-struct Bell {
-    rung: AtomicBool,
+/// The waker of a reader: the DDS library wakes it when a sample arrives.
+struct WakeFlag {
+    is_set: AtomicBool,
     thread: Thread,
 }
 
-impl Bell {
+impl WakeFlag {
     fn new() -> Arc<Self> {
-        Arc::new(Self { rung: AtomicBool::new(true), thread: std::thread::current() })
+        Arc::new(Self { is_set: AtomicBool::new(true), thread: std::thread::current() })
     }
 }
 
-impl Wake for Bell {
+impl Wake for WakeFlag {
     fn wake(self: Arc<Self>) {
         self.wake_by_ref();
     }
 
     fn wake_by_ref(self: &Arc<Self>) {
-        self.rung.store(true, Ordering::Release);
+        self.is_set.store(true, Ordering::Release);
         self.thread.unpark();
     }
 }
 
-/// A reader with its bell.
-struct Inlet {
+/// A reader that wakes the calling thread when a sample arrives.
+struct WakingReader {
     reader: RawReader,
-    bell: Arc<Bell>,
+    wake_flag: Arc<WakeFlag>,
     waker: Waker,
 }
 
-impl Inlet {
+impl WakingReader {
     fn new(reader: RawReader) -> Self {
-        let bell = Bell::new();
-        Self { reader, waker: Waker::from(Arc::clone(&bell)), bell }
+        let wake_flag = WakeFlag::new();
+        Self { reader, waker: Waker::from(Arc::clone(&wake_flag)), wake_flag }
     }
 
-    /// Takes one sample, if one is there; `None` when none is, and then the bell is armed.
+    /// Takes one sample; without one, arms the waker and returns `None`.
     fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Option<SourceTimestamp> {
-        if !self.bell.rung.load(Ordering::Acquire) {
+        if !self.wake_flag.is_set.load(Ordering::Acquire) {
             return None;
         }
         let mut take = self.reader.take(lend);
         if take == Take::Empty {
-            self.bell.rung.store(false, Ordering::Release);
+            self.wake_flag.is_set.store(false, Ordering::Release);
             self.reader.arm(&self.waker);
             take = self.reader.take(lend);
         }
         match take {
             Take::Sample(origin) => {
-                self.bell.rung.store(true, Ordering::Release);
+                self.wake_flag.is_set.store(true, Ordering::Release);
                 Some(origin.source_timestamp)
             }
             Take::Malformed | Take::Empty => None,
@@ -311,8 +316,9 @@ impl Inlet {
     }
 }
 
-/// Records when told: `begin`, then `end SAMPLES PATIENCE_MS`, which waits for so many, or until none has
-/// come for so long, and is answered by `samples N DAMAGED` and a line for each.
+/// The subscriber. The command `begin` starts a recording; `end SAMPLES TIMEOUT_MS` ends it when that many
+/// samples have arrived or none has arrived for the timeout. The answer is `samples N DAMAGED` and a line for
+/// each sample.
 fn subscriber(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "subscriber")?;
     let (boards, _node) = match arguments.get(4) {
@@ -321,75 +327,76 @@ fn subscriber(arguments: &[String]) -> Result<(), String> {
     }
     .unzip();
     let prefix = argument(arguments, 3)?.to_owned();
-    let mut inlets = Vec::new();
+    let mut readers = Vec::new();
     for route in Route::parse(argument(arguments, 2)?)? {
         let reader = reader(&mut participant, &prefix, route, Reliability::Reliable)?;
-        inlets.push((route.index, Inlet::new(reader)));
+        readers.push((route.index, WakingReader::new(reader)));
     }
-    let orders = orders();
+    let commands = commands();
     let mut records: Vec<Record> = Vec::with_capacity(200_000);
     let mut damaged = 0u64;
     let mut ending: Option<(usize, u64)> = None;
     let mut last_at = clock::monotonic();
-    say("ready");
+    answer("ready");
     loop {
-        for (route, inlet) in &inlets {
+        for (route, reader) in &readers {
             loop {
                 let mut record = Record::default();
-                let mut whole = false;
-                let taken = inlet.take(&mut |payload, _| {
+                let mut undamaged = false;
+                let taken = reader.take(&mut |payload, _| {
                     record.arrived_at = clock::monotonic().0;
-                    whole = read_stamps(payload, &mut record);
+                    undamaged = read_stamps(payload, &mut record);
                 });
                 if taken.is_none() {
                     break;
                 }
                 last_at = clock::monotonic();
                 if let Some(boards) = &boards {
-                    look_at_boards(boards, *route, &mut record);
+                    read_board_times(boards, *route, &mut record);
                 }
-                damaged += u64::from(!whole);
+                damaged += u64::from(!undamaged);
                 records.push(record);
             }
         }
-        match orders.try_recv() {
-            Ok(order) => {
-                let words: Vec<&str> = order.split(' ').collect();
+        match commands.try_recv() {
+            Ok(command) => {
+                let words: Vec<&str> = command.split(' ').collect();
                 match words[..] {
                     ["begin"] => {
                         records.clear();
                         damaged = 0;
                     }
-                    ["end", samples, patience_ms] => {
-                        let number = |text: &str| text.parse::<u64>().map_err(|_| format!("in: {order}"));
+                    ["end", samples, timeout_ms] => {
+                        let number =
+                            |text: &str| text.parse::<u64>().map_err(|_| format!("{text} in: {command}"));
                         last_at = clock::monotonic();
-                        ending = Some((number(samples)? as usize, number(patience_ms)?));
+                        ending = Some((number(samples)? as usize, number(timeout_ms)?));
                     }
-                    _ => return Err(format!("not an order: {order}")),
+                    _ => return Err(format!("unknown command: {command}")),
                 }
             }
             Err(TryRecvError::Empty) => {}
             Err(TryRecvError::Disconnected) => return Ok(()),
         }
-        if let Some((samples, patience_ms)) = ending {
+        if let Some((samples, timeout_ms)) = ending {
             let waited_ms = clock::monotonic().since(last_at) / 1_000_000;
-            if records.len() >= samples || waited_ms > patience_ms {
+            if records.len() >= samples || waited_ms > timeout_ms {
                 ending = None;
-                let mut answer = format!("samples {} {damaged}\n", records.len());
+                let mut text = format!("samples {} {damaged}\n", records.len());
                 for r in &records {
-                    answer.push_str(&format!(
+                    text.push_str(&format!(
                         "{} {} {} {} {} {}\n",
                         r.number, r.due_at, r.written_at, r.arrived_at, r.taken_at, r.handed_at
                     ));
                 }
-                say(answer.trim_end());
+                answer(text.trim_end());
             }
         }
         std::thread::park_timeout(Duration::from_millis(100));
     }
 }
 
-/// Fills in what the payload says; whether it is whole.
+/// Copies the stamps of a payload to its record; returns whether the payload is undamaged.
 fn read_stamps(payload: &[u8], record: &mut Record) -> bool {
     let word = |at: usize| payload.get(at..at + 8)?.try_into().ok().map(u64::from_ne_bytes);
     let (Some(number), Some(due_at), Some(written_at)) = (word(0), word(8), word(16)) else {
@@ -399,26 +406,27 @@ fn read_stamps(payload: &[u8], record: &mut Record) -> bool {
     payload.len() >= STAMPS + 8 && word(payload.len() - 8) == Some(number)
 }
 
-/// The stages of the sample that just came, if the boards still speak of it: after its arrival was stamped,
-/// so this costs nothing that is measured.
-fn look_at_boards(boards: &Boards, route: usize, record: &mut Record) {
+/// Adds the times at ingress and the lane to the record of a sample, if the boards still have those of this
+/// sample. It is called after the arrival is stamped, so it adds nothing to the measured latency.
+fn read_board_times(boards: &Boards, route: usize, record: &mut Record) {
     let between = |at: u64| if at > record.written_at && at < record.arrived_at { at } else { 0 };
     record.taken_at = boards.ingress(route).map_or(0, |ingress| between(ingress.last_received_at.0));
     record.handed_at = boards.lane(0, route).map_or(0, |lane| between(lane.last_forwarded_at.0));
 }
 
-/// The boards of the bridge with that configuration, and the membership in it: whoever leaves last removes
-/// the bridge's files, so it is to last as long as the boards are read.
+/// Opens the boards of the bridge with a configuration file. The node must live as long as the boards are
+/// read: when the last node closes, it removes the bridge's files.
 pub fn boards(config: &Path) -> Result<(Boards, ShmNode), String> {
     let settings = config::load(Some(config), &|_| None).map_err(|error| error.to_string())?;
-    let root = settings.shared_memory.root_path.clone().ok_or("the configuration names no root")?;
+    let root =
+        settings.shared_memory.root_path.clone().ok_or("the configuration has no shared_memory.root_path")?;
     let node = ShmNode::open(&root, &settings.instance, "bench").map_err(|error| error.to_string())?;
     let boards = node.boards(&BridgeShape::of(&settings)).map_err(|error| error.to_string())?;
     Ok((boards, node))
 }
 
-/// Lines of stdin, each announced to the calling thread.
-fn orders() -> Receiver<String> {
+/// Reads commands from stdin on another thread, which unparks the calling thread for each.
+fn commands() -> Receiver<String> {
     let (sender, receiver) = channel();
     let thread = std::thread::current();
     std::thread::spawn(move || {
@@ -434,42 +442,43 @@ fn orders() -> Receiver<String> {
     receiver
 }
 
-/// Reads and writes with the DDS library in one process, without shared memory: what the bridge's hop is
-/// measured against. An ordinary program against the library's ordinary interface: woken by the library
-/// when a sample arrives, it drains its readers on a thread of its own. (Ingress takes samples on the
-/// library's receiving thread, and lends the library memory for large ones: extensions of ours.) It is not
-/// made slow for it: the same library with the same changes, a copy into an arena (the library lends what
-/// it received and keeps what it sends, so one copy there must be), no allocation for each sample.
+/// The relay, the reference for the bridge's hop: reads and writes with the DDS library in one process,
+/// without shared memory. It uses only the library's ordinary interface: the library wakes its thread when a
+/// sample arrives, and the thread takes all samples of its readers. (Ingress uses two extensions of the
+/// patched library: it takes samples on the library's receive thread, and lends it memory for large ones.)
+/// Otherwise it is as fast as possible: it uses the same patched library, allocates nothing per sample, and
+/// copies each sample once into an arena, which cannot be avoided because the library only lends received
+/// samples and keeps sent ones.
 fn relay(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "relay")?;
-    let mut lines = Vec::new();
+    let mut routes = Vec::new();
     for route in Route::parse(argument(arguments, 2)?)? {
-        let outlet = writer(&mut participant, OUTPUT, route)?;
-        let inlet = Inlet::new(reader(&mut participant, INPUT, route, Reliability::Reliable)?);
-        lines.push((inlet, outlet, Arena::new(route)));
+        let writer = writer(&mut participant, OUTPUT, route)?;
+        let reader = WakingReader::new(reader(&mut participant, INPUT, route, Reliability::Reliable)?);
+        routes.push((reader, writer, Arena::new(route)));
     }
-    let orders = orders();
-    say("ready");
+    let commands = commands();
+    answer("ready");
     let mut refused = 0u64;
     loop {
-        for (inlet, outlet, arena) in &mut lines {
+        for (reader, writer, arena) in &mut routes {
             loop {
                 let mut copy = None;
-                let taken = inlet.take(&mut |payload, encapsulation| {
+                let taken = reader.take(&mut |payload, encapsulation| {
                     copy = Some((arena.copy(payload), encapsulation));
                 });
                 let (Some(timestamp), Some((payload, encapsulation))) = (taken, copy) else { break };
-                if outlet.write(payload, encapsulation, timestamp).is_err() {
+                if writer.write(payload, encapsulation, timestamp).is_err() {
                     refused += 1;
                 }
             }
         }
-        match orders.try_recv() {
-            Ok(order) if order == "refused" => {
-                say(&format!("refused {refused}"));
+        match commands.try_recv() {
+            Ok(command) if command == "refused" => {
+                answer(&format!("refused {refused}"));
                 refused = 0;
             }
-            Ok(order) => return Err(format!("not an order: {order}")),
+            Ok(command) => return Err(format!("unknown command: {command}")),
             Err(TryRecvError::Empty) => {}
             Err(TryRecvError::Disconnected) => return Ok(()),
         }
@@ -477,29 +486,35 @@ fn relay(arguments: &[String]) -> Result<(), String> {
     }
 }
 
-/// Subscribes to what noncritical lanes send, on topics that begin with one of the prefixes, and forgets it.
+/// The drain: subscribes to the topics of noncritical lanes, which begin with one of the prefixes, and
+/// discards the samples.
 fn drain(arguments: &[String]) -> Result<(), String> {
     let mut participant = join(arguments, "drain")?;
-    let mut inlets = Vec::new();
+    let mut readers = Vec::new();
     for prefix in argument(arguments, 3)?.split(',') {
         for route in Route::parse(argument(arguments, 2)?)? {
-            inlets.push(Inlet::new(reader(&mut participant, prefix, route, Reliability::BestEffort)?));
+            readers.push(WakingReader::new(reader(
+                &mut participant,
+                prefix,
+                route,
+                Reliability::BestEffort,
+            )?));
         }
     }
-    let orders = orders();
-    say("ready");
+    let commands = commands();
+    answer("ready");
     loop {
-        for inlet in &inlets {
-            while inlet.take(&mut |_, _| {}).is_some() {}
+        for reader in &readers {
+            while reader.take(&mut |_, _| {}).is_some() {}
         }
-        if orders.try_recv() == Err(TryRecvError::Disconnected) {
+        if commands.try_recv() == Err(TryRecvError::Disconnected) {
             return Ok(());
         }
         std::thread::park_timeout(Duration::from_millis(100));
     }
 }
 
-/// Burns every CPU until standard input ends: as many threads as there are, in a loop that does nothing.
+/// The spinner: uses every CPU fully until stdin ends, with a busy loop in one thread per CPU.
 fn spin() -> Result<(), String> {
     for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
         std::thread::spawn(|| {
@@ -508,12 +523,12 @@ fn spin() -> Result<(), String> {
             }
         });
     }
-    say("ready");
+    answer("ready");
     for _ in io::stdin().lock().lines() {}
     Ok(())
 }
 
-/// Buffers that are used again when the DDS library has let go of what was in them.
+/// Buffers for payloads, which are reused after the DDS library has released them.
 struct Arena {
     chunk_bytes: usize,
     current: BytesMut,
@@ -526,6 +541,7 @@ impl Arena {
         Self { chunk_bytes, current: BytesMut::with_capacity(chunk_bytes), filled: VecDeque::new() }
     }
 
+    /// Makes `current` a chunk with space for a payload.
     fn reserve(&mut self, bytes: usize) {
         if self.current.capacity() - self.current.len() >= bytes {
             return;
@@ -544,7 +560,7 @@ impl Arena {
         self.current.split().freeze()
     }
 
-    /// A buffer of that length, to be filled.
+    /// A buffer of the given length for the caller to fill.
     fn buffer(&mut self, bytes: usize) -> BytesMut {
         self.reserve(bytes);
         self.current.resize(bytes, 0x5a);

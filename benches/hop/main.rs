@@ -1,20 +1,19 @@
-//! What the bridge costs, beside what it is measured against, all in one run.
+//! Measures the latency and the CPU time that the bridge adds, beside three references in the same run.
 //!
-//! - **wake-up**: an eventfd between two threads on the two CPUs, the least that a hand-over between
-//!   processes costs on this machine at this rate;
-//! - **direct**: a publisher process to a subscriber process, with the bridge's own DDS library;
+//! - **wake-up**: an eventfd between two threads on two CPUs, the lowest cost of a hand-over between
+//!   processes on this machine at this rate;
+//! - **direct**: a publisher process and a subscriber process, with the bridge's own DDS library;
 //! - **relay**: one process between them that reads and writes with that library, without shared memory;
 //! - **bridge**: the shipped binary.
 //!
-//! The programs of a section stay up all the time that it takes; only the publisher of one of them sends at a
-//! time, again and again one after the other. Sending is open loop: sample k is due at `start + k / rate`
-//! whatever became of the one before it, and both the latency from the moment of the write and the one from
-//! the moment it was due are recorded.
+//! The programs of a section run during the whole section and take turns: only one publisher sends at a time.
+//! Publishers are open loop: sample k is due at `start + k / rate`, no matter how the sample before it went.
+//! The bench records the latency both from the write and from the due time.
 //!
-//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. Other arguments: [`Options`].
+//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. [`Options`] lists the other arguments.
 
 mod beds;
-mod held;
+mod cpu_delay;
 mod histogram;
 mod isolation;
 mod latency;
@@ -58,18 +57,18 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Result<(), String> {
-    let _alone = system::alone()?;
-    let _awake = if options.awake { Some(system::awake()?) } else { None };
+    let _lock = system::lock_bench()?;
+    let _awake = if options.awake { Some(system::keep_cpus_awake()?) } else { None };
     let began = CpuTime::now();
     let mut options = options.clone();
     let mut summary = Summary {
         date: out::date(std::time::SystemTime::now()),
         machine: system::machine(),
         parameters: vec![format!(
-            "placement {}, {} repetitions, {} of hops and CPU that are judged, durations times {}{}{}",
+            "placement {}, {} repetitions, {} where a target applies to hop or CPU, durations times {}{}{}",
             options.placement.label(),
             options.repetitions,
-            options.judged_repetitions(),
+            options.target_repetitions(),
             options.longer,
             if options.quick { ", quick" } else { "" },
             if options.awake { ", CPUs kept awake" } else { "" }
@@ -78,9 +77,9 @@ fn measure(options: &Options) -> Result<(), String> {
     };
     if options.schedulings().contains(&Scheduling::Fifo) && !system::has_fifo() {
         if options.scheduling.is_some() {
-            return Err("no right to SCHED_FIFO: root, or CAP_SYS_NICE".to_owned());
+            return Err("--scheduling fifo needs root or CAP_SYS_NICE".to_owned());
         }
-        summary.skipped.push("scheduling fifo: no right to it".to_owned());
+        summary.skipped.push("scheduling fifo: needs root or CAP_SYS_NICE".to_owned());
         options.scheduling = Some(Scheduling::Other);
     }
     let first = options.first_scheduling().label();
@@ -89,7 +88,7 @@ fn measure(options: &Options) -> Result<(), String> {
     if let Some(duration) = options.soak {
         soak::measure(duration, &options, &mut output)?;
     } else {
-        output.summary.skipped.extend(options.left_out());
+        output.summary.skipped.extend(options.skipped());
         latency::measure(&options, &mut output)?;
         resources::measure(&options, &mut output)?;
         scale::measure(&options, &mut output)?;
@@ -97,7 +96,7 @@ fn measure(options: &Options) -> Result<(), String> {
     }
     let stolen_percent = CpuTime::now().stolen_percent_since(began);
     let line =
-        format!("the hypervisor kept {stolen_percent:.0} % of the CPUs' time for others meanwhile (steal)");
+        format!("steal: the hypervisor gave {stolen_percent:.0} % of the CPUs' time to other machines");
     output.summary.parameters.push(line);
     let folder = output.finish(&options)?;
     println!("raw data: {}", folder.display());
@@ -105,29 +104,30 @@ fn measure(options: &Options) -> Result<(), String> {
     if failures.is_empty() { Ok(()) } else { Err(failures.join("; ")) }
 }
 
-/// Fills the figures of docs/performance.md from runs that are kept.
+/// Fills docs/performance.md with the figures of saved runs.
 fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
     let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/performance.md");
-    let say = |path: &Path| {
+    let with_path = |path: &Path| {
         let path = path.display().to_string();
         move |error: &dyn std::fmt::Display| format!("{path}: {error}")
     };
-    let text = fs::read_to_string(&page).map_err(|error| say(&page)(&error))?;
-    let kept = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/runs");
+    let text = fs::read_to_string(&page).map_err(|error| with_path(&page)(&error))?;
+    let saved = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/runs");
     let mut runs = runs.to_vec();
     if runs.is_empty() {
-        runs.extend(report::runs_named(&text).iter().map(|name| kept.join(name)));
+        runs.extend(report::runs_named(&text).iter().map(|name| saved.join(name)));
     }
     let mut summaries = Vec::new();
     for run in &runs {
-        let name = run.file_name().ok_or("a run is a folder")?.to_string_lossy().into_owned();
+        let no_name = || format!("--page {}: name the folder of a run", run.display());
+        let name = run.file_name().ok_or_else(no_name)?.to_string_lossy().into_owned();
         let path = run.join("summary.json");
-        let text = fs::read_to_string(&path).map_err(|error| say(&path)(&error))?;
-        let summary: Summary = serde_json::from_str(&text).map_err(|error| say(&path)(&error))?;
+        let text = fs::read_to_string(&path).map_err(|error| with_path(&path)(&error))?;
+        let summary: Summary = serde_json::from_str(&text).map_err(|error| with_path(&path)(&error))?;
         summaries.push((name, summary));
     }
     let filled = report::fill(&text, &summaries)?;
-    fs::write(&page, filled).map_err(|error| say(&page)(&error))?;
-    println!("{} is filled from {} runs", page.display(), summaries.len());
+    fs::write(&page, filled).map_err(|error| with_path(&page)(&error))?;
+    println!("filled {} with the figures of {} runs", page.display(), summaries.len());
     Ok(())
 }

@@ -1,4 +1,5 @@
-//! Where the results go: the summary, the raw data beside it, the folder of the run.
+//! The output of a run: its summary, raw data, plots and other files, and the folder that they are written
+//! to.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -11,19 +12,19 @@ use super::link::Record;
 use super::options::Options;
 use super::report::{Quantiles, Summary, figures, readme};
 
-/// What a run has given so far.
+/// The results of a run so far.
 pub struct Output {
     pub summary: Summary,
     raw: String,
-    /// Every sample: too much to keep with the project, so it stays beside what was built.
+    /// A line for each sample. Too large for the repository, so it is written only to the target directory.
     samples: String,
-    /// Files that other tools wrote, such as strace.
+    /// Names and contents of files that other tools wrote, such as strace.
     files: Vec<(String, String)>,
 }
 
-/// What a figure of the raw data is of.
+/// The key columns of a row of raw data.
 #[derive(Clone, Copy)]
-pub struct Of<'a> {
+pub struct RowKey<'a> {
     pub section: &'a str,
     pub scheduling: &'a str,
     pub case: &'a str,
@@ -43,9 +44,9 @@ impl Output {
         }
     }
 
-    /// One figure of one repetition.
-    pub fn raw(&mut self, of: Of, figure: &str, value: f64) {
-        let Of { section, scheduling, case, program, repetition } = of;
+    /// Adds one figure of one repetition to the raw data.
+    pub fn raw(&mut self, key: RowKey, figure: &str, value: f64) {
+        let RowKey { section, scheduling, case, program, repetition } = key;
         let case = case.replace(',', "");
         let _ = writeln!(
             self.raw,
@@ -54,8 +55,8 @@ impl Output {
         );
     }
 
-    /// A distribution of one repetition.
-    pub fn raw_quantiles(&mut self, of: Of, name: &str, quantiles: &Quantiles) {
+    /// Adds the quantiles of one repetition to the raw data.
+    pub fn raw_quantiles(&mut self, key: RowKey, name: &str, quantiles: &Quantiles) {
         for (quantile, value) in [
             ("p50", quantiles.p50_us),
             ("p99", quantiles.p99_us),
@@ -63,25 +64,25 @@ impl Output {
             ("max", quantiles.max_us),
         ] {
             if let Some(value) = value {
-                self.raw(of, &format!("{name} {quantile} us"), value);
+                self.raw(key, &format!("{name} {quantile} us"), value);
             }
         }
     }
 
-    /// How many samples did not arrive, and what became of them.
-    pub fn raw_missing(&mut self, of: Of, missing: u64, reasons: &BTreeMap<String, u64>) {
-        self.raw(of, "missing", missing as f64);
+    /// Adds the number of missing samples, in total and by known reason, to the raw data.
+    pub fn raw_missing(&mut self, key: RowKey, missing: u64, reasons: &BTreeMap<String, u64>) {
+        self.raw(key, "missing", missing as f64);
         for (reason, count) in reasons {
-            self.raw(of, &format!("missing: {reason}"), *count as f64);
+            self.raw(key, &format!("missing: {reason}"), *count as f64);
         }
     }
 
-    /// One sample. When it was written is by CLOCK_MONOTONIC, as a trace of the kernel has it with the clock
-    /// `mono`.
-    pub fn sample(&mut self, of: Of, record: &Record) {
+    /// Adds a line for one sample to samples.csv. Its write time is of CLOCK_MONOTONIC, which is the clock
+    /// `mono` of a kernel trace.
+    pub fn sample(&mut self, key: RowKey, record: &Record) {
         let [late, latency, dds_in, dds_out] =
             [record.late_us(), record.latency_us(), record.dds_in_us(), record.dds_out_us()].map(short);
-        let Of { section, scheduling, case, program, repetition } = of;
+        let RowKey { section, scheduling, case, program, repetition } = key;
         let (case, written_at) = (case.replace(',', ""), record.written_at);
         let _ = writeln!(
             self.samples,
@@ -89,11 +90,12 @@ impl Output {
         );
     }
 
+    /// Adds a file that another tool wrote.
     pub fn file(&mut self, name: &str, text: String) {
         self.files.push((name.to_owned(), text));
     }
 
-    /// Prints the tables, writes the run, and yields its folder.
+    /// Prints the tables, writes the files of the run and returns its folder.
     pub fn finish(&self, options: &Options) -> Result<PathBuf, String> {
         println!("{}", readme(&self.summary));
         let manifest = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -103,9 +105,9 @@ impl Output {
         self.write_to(&folder)?;
         write(&folder.join("samples.csv"), &self.samples)?;
         if options.save {
-            let kept = manifest.join("benches").join("runs").join(&self.summary.date);
-            self.write_to(&kept)?;
-            println!("kept in {}", kept.display());
+            let saved = manifest.join("benches").join("runs").join(&self.summary.date);
+            self.write_to(&saved)?;
+            println!("saved in {}", saved.display());
         }
         Ok(folder)
     }
@@ -123,7 +125,7 @@ impl Output {
     }
 }
 
-/// A hundredth is less than any of the clocks can tell.
+/// A value with two decimals; a hundredth of a µs is below the resolution of the clocks.
 fn short(value: f64) -> String {
     if value.is_finite() { format!("{value:.2}") } else { String::new() }
 }
@@ -132,7 +134,7 @@ fn write(path: &Path, text: &str) -> Result<(), String> {
     fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))
 }
 
-/// `2025-11-20T14-05-00Z`, by the system's `date`, so that no calendar has to be written here.
+/// An instant such as `2025-11-20T14-05-00Z`, formatted by the `date` command.
 pub fn date(instant: SystemTime) -> String {
     let seconds = instant.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     Command::new("date")

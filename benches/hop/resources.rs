@@ -1,4 +1,4 @@
-//! What each process takes: CPU, sleeps, memory, system calls; idle and under load.
+//! Section `resources`: CPU time, wake-ups, memory and system calls of each process, idle and under load.
 
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -8,14 +8,15 @@ use nix::unistd::Pid;
 
 use super::beds::{Bed, Beds, Kind, Plan};
 use super::options::{Case, Options, SCAN};
-use super::out::{Of, Output};
-use super::report::{Call, JUDGED_HZ, Resource};
-use super::system::Taken;
+use super::out::{Output, RowKey};
+use super::report::{Call, Resource, TARGET_HZ};
+use super::system::Usage;
 
-const LOADS_HZ: [u64; 2] = [100, JUDGED_HZ];
+/// The rates of the loads.
+const LOADS_HZ: [u64; 2] = [100, TARGET_HZ];
 
-/// strace makes every call several times as long: only at this rate does what it counts stay what it is
-/// without.
+/// The rate of the load under strace. strace makes each system call several times as slow; at higher rates
+/// that would change the number of calls.
 const TRACED_HZ: u64 = 100;
 
 pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
@@ -32,9 +33,9 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
     eprintln!("resources: idle");
     idle(&beds, options.seconds(10.0), output);
     for rate_hz in LOADS_HZ {
-        // As with the hops, many short repetitions of what is judged.
-        let (repetitions, seconds) = if rate_hz == JUDGED_HZ {
-            (options.judged_repetitions(), 2.0)
+        // As for hops, many short repetitions where a target applies.
+        let (repetitions, seconds) = if rate_hz == TARGET_HZ {
+            (options.target_repetitions(), 2.0)
         } else {
             (options.repetitions, 5.0)
         };
@@ -60,40 +61,42 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
     Ok(())
 }
 
+/// Measures all processes of all beds at the same time, without load.
 fn idle(beds: &Beds, seconds: f64, output: &mut Output) {
-    let all: Vec<(&'static str, String, u32, Taken)> = beds
+    let all: Vec<(&'static str, String, u32, Usage)> = beds
         .0
         .iter()
         .flat_map(|bed| {
-            bed.processes().into_iter().map(|(name, pid)| (bed.name(), name, pid, Taken::by(pid)))
+            bed.processes().into_iter().map(|(name, pid)| (bed.name(), name, pid, Usage::of(pid)))
         })
         .collect();
     let began = Instant::now();
     std::thread::sleep(Duration::from_secs_f64(seconds));
     let seconds = began.elapsed().as_secs_f64();
     for (program, process, pid, before) in all {
-        let row = row((program, &process), 0, seconds, 0, before, Taken::by(pid));
+        let row = row((program, &process), 0, seconds, 0, before, Usage::of(pid));
         output.summary.resources.push(row);
     }
 }
 
+/// Measures the processes of one bed under load.
 fn load(bed: &mut Bed, case: &Case, repetition: usize, output: &mut Output) -> Result<(), String> {
-    let before: Vec<(String, u32, Taken)> =
-        bed.processes().into_iter().map(|(name, pid)| (name, pid, Taken::by(pid))).collect();
+    let before: Vec<(String, u32, Usage)> =
+        bed.processes().into_iter().map(|(name, pid)| (name, pid, Usage::of(pid))).collect();
     let began = Instant::now();
     let run = bed.measure(case)?;
     let seconds = began.elapsed().as_secs_f64();
     let name = case.name();
     for (process, pid, before) in before {
-        let row = row((bed.name(), &process), case.rate_hz, seconds, run.accepted, before, Taken::by(pid));
+        let row = row((bed.name(), &process), case.rate_hz, seconds, run.accepted, before, Usage::of(pid));
         let program = format!("{} {process}", bed.name());
-        let of = Of { section: "resources", scheduling: "", case: &name, program: &program, repetition };
-        output.raw(of, "cpu ms", row.cpu_ms);
-        output.raw(of, "sleeps", row.sleeps as f64);
-        output.raw(of, "preemptions", row.preemptions as f64);
-        output.raw(of, "rss KiB", row.rss_kib as f64);
-        output.raw(of, "samples", row.samples as f64);
-        output.raw(of, "seconds", row.seconds);
+        let key = RowKey { section: "resources", scheduling: "", case: &name, program: &program, repetition };
+        output.raw(key, "cpu ms", row.cpu_ms);
+        output.raw(key, "sleeps", row.sleeps as f64);
+        output.raw(key, "preemptions", row.preemptions as f64);
+        output.raw(key, "rss KiB", row.rss_kib as f64);
+        output.raw(key, "samples", row.samples as f64);
+        output.raw(key, "seconds", row.seconds);
         output.summary.resources.push(row);
     }
     Ok(())
@@ -104,8 +107,8 @@ fn row(
     rate_hz: u64,
     seconds: f64,
     samples: u64,
-    before: Taken,
-    after: Taken,
+    before: Usage,
+    after: Usage,
 ) -> Resource {
     let cpu_ms = after.cpu_ns.saturating_sub(before.cpu_ns) as f64 / 1e6;
     Resource {
@@ -126,7 +129,7 @@ fn row(
     }
 }
 
-/// Adds the repetitions of a process at a rate up; its memory is that of the last one.
+/// Merges the repetitions of each process and rate: sums their counts, and keeps the memory of the last one.
 fn merge(rows: &mut Vec<Resource>) {
     let mut merged: Vec<Resource> = Vec::new();
     for row in rows.drain(..) {
@@ -153,15 +156,15 @@ fn merge(rows: &mut Vec<Resource>) {
     *rows = merged;
 }
 
-/// A tool that looks at a process of the bed until it is told to stop.
-struct Watcher {
+/// A tool, perf or strace, that observes a process of the bed until it is stopped.
+struct Tracer {
     child: Child,
     process: String,
     file: tempfile::NamedTempFile,
 }
 
-impl Watcher {
-    /// `-o FILE` and `-p PID` are added.
+impl Tracer {
+    /// Starts the tool; `-o FILE` and `-p PID` are added to its arguments.
     fn start(tool: &str, arguments: &[&str], process: &str, pid: u32) -> Result<Self, String> {
         let file = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
         let mut command = Command::new(tool);
@@ -171,7 +174,7 @@ impl Watcher {
         Ok(Self { child, process: process.to_owned(), file })
     }
 
-    /// What it wrote.
+    /// Stops the tool; returns the name of the observed process and the text that the tool wrote.
     fn stop(mut self) -> (String, String) {
         let _ = kill(Pid::from_raw(self.child.id().cast_signed()), Signal::SIGINT);
         let _ = self.child.wait();
@@ -180,33 +183,33 @@ impl Watcher {
     }
 }
 
-/// Runs a load while a tool watches each process between publisher and subscriber; what it wrote of each, and
-/// the samples. An error says that the tool is not there.
-fn watched(
+/// Runs a load while a tool observes each process between publisher and subscriber. Returns the text of the
+/// tool for each process and the number of samples; fails when the tool cannot be started.
+fn traced(
     bed: &mut Bed,
     case: &Case,
     tool: &str,
     arguments: &[&str],
 ) -> Result<(Vec<(String, String)>, u64), String> {
-    let mut watchers = Vec::new();
-    for (process, pid) in bed.between() {
-        watchers.push(Watcher::start(tool, arguments, &process, pid)?);
+    let mut tracers = Vec::new();
+    for (process, pid) in bed.middle_processes() {
+        tracers.push(Tracer::start(tool, arguments, &process, pid)?);
     }
-    // It takes the tool a moment to attach to all threads.
+    // Time for the tool to attach to all threads.
     std::thread::sleep(Duration::from_millis(500));
     let run = bed.measure(case);
-    let texts = watchers.into_iter().map(Watcher::stop).collect();
+    let texts = tracers.into_iter().map(Tracer::stop).collect();
     Ok((texts, run?.accepted))
 }
 
-/// Counts system calls with perf, which costs a process next to nothing.
+/// Counts system calls with perf, which hardly slows a process down.
 fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> {
     if bed.kind() == Kind::Direct {
         return Ok(());
     }
     let arguments = ["stat", "-x", ",", "-e", "raw_syscalls:sys_enter"];
-    let (texts, samples) = match watched(bed, case, "perf", &arguments) {
-        Ok(watched) => watched,
+    let (texts, samples) = match traced(bed, case, "perf", &arguments) {
+        Ok(traced) => traced,
         Err(error) => {
             skip(output, format!("system calls by perf: {error}"));
             return Ok(());
@@ -225,7 +228,7 @@ fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), St
         let rows = output.summary.resources.iter_mut();
         let rows = rows
             .filter(|row| row.program == bed.name() && row.process == process && row.rate_hz == case.rate_hz);
-        // One of the repetitions' rows bears it until they are added up; `merge` keeps the last.
+        // Stored in the row of the last repetition, whose value `merge` keeps.
         if let Some(row) = rows.last() {
             row.system_calls_per_sample = Some(count / samples.max(1) as f64);
         }
@@ -233,13 +236,13 @@ fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), St
     Ok(())
 }
 
-/// Counts system calls by name with strace; what it wrote is kept.
+/// Counts system calls by name with strace, and keeps its output as a file of the run.
 fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> {
     if bed.kind() == Kind::Direct {
         return Ok(());
     }
-    let (texts, samples) = match watched(bed, case, "strace", &["-c", "-f", "-q"]) {
-        Ok(watched) => watched,
+    let (texts, samples) = match traced(bed, case, "strace", &["-c", "-f", "-q"]) {
+        Ok(traced) => traced,
         Err(error) => {
             skip(output, format!("system calls by strace: {error}"));
             return Ok(());
@@ -249,7 +252,7 @@ fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> 
         if !text.contains("syscall") {
             skip(output, format!("system calls of {process}: strace counted nothing"));
         }
-        for (call, count) in counted(&text) {
+        for (call, count) in parse_strace(&text) {
             output.summary.calls.push(Call {
                 program: bed.name().to_owned(),
                 process: process.clone(),
@@ -264,6 +267,7 @@ fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> 
     Ok(())
 }
 
+/// Records that something was not measured, and why.
 fn skip(output: &mut Output, line: String) {
     eprintln!("bench: {line}");
     if !output.summary.skipped.contains(&line) {
@@ -271,8 +275,8 @@ fn skip(output: &mut Output, line: String) {
     }
 }
 
-/// Lines of `strace -c`: `% time, seconds, usecs/call, calls, [errors,] syscall`.
-fn counted(text: &str) -> Vec<(String, u64)> {
+/// The calls and counts in the table of `strace -c`: `% time, seconds, usecs/call, calls, [errors,] syscall`.
+fn parse_strace(text: &str) -> Vec<(String, u64)> {
     let line = |line: &str| {
         let words: Vec<&str> = line.split_whitespace().collect();
         let call = *words.last()?;

@@ -1,20 +1,20 @@
-//! The same samples over more routes, and beside more noncritical lanes.
+//! Section `scale`: the same load over more routes, and with more noncritical lanes.
 
 use std::collections::BTreeMap;
 
 use super::beds::{Beds, Kind, Plan, Run, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
-use super::out::{Of, Output};
+use super::out::{Output, RowKey};
 use super::report::{Quantiles, Scale};
-use super::system::Taken;
+use super::system::Usage;
 
 const ROUTES: [usize; 4] = [1, 4, 16, 64];
 
-/// Of all routes together, so that the number of routes is all that differs.
+/// The total rate of all routes, so that only the number of routes differs.
 const RATE_HZ: u64 = 640;
 
-/// The critical lane and 0, 1, 3 and 7 others.
+/// Numbers of lanes: the critical lane and 0, 1, 3 or 7 noncritical ones.
 const LANES: [usize; 4] = [1, 2, 4, 8];
 
 pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
@@ -47,7 +47,8 @@ pub fn measure(options: &Options, output: &mut Output) -> Result<(), String> {
     take_turns(("lanes", &counts), &case, &mut beds, options, output)
 }
 
-/// Each bed with its count, one after the other, again and again.
+/// Measures the beds in turn, repetition by repetition. `counts` has the number of routes or lanes of each
+/// bed.
 fn take_turns(
     (of, counts): (&str, &[usize]),
     case: &Case,
@@ -62,11 +63,12 @@ fn take_turns(
             eprintln!("scale: {count} {of}, {}, {name}", bed.name());
             let run = bed.measure(case)?;
             let case = format!("{count} {of}");
-            let of = Of { section: "scale", scheduling: "", case: &case, program: bed.name(), repetition };
-            output.raw_quantiles(of, "latency", &Quantiles::of(&latencies_us(&run)));
+            let key =
+                RowKey { section: "scale", scheduling: "", case: &case, program: bed.name(), repetition };
+            output.raw_quantiles(key, "latency", &Quantiles::of(&latencies_us(&run)));
             for (process, ns) in &run.cpu_ns {
                 let us = *ns as f64 / 1_000.0 / run.accepted.max(1) as f64;
-                output.raw(of, &format!("{process} cpu us/sample"), us);
+                output.raw(key, &format!("{process} cpu us/sample"), us);
             }
             runs.push(run);
         }
@@ -95,13 +97,17 @@ fn take_turns(
                 .filter_map(|run| Quantiles::of(&latencies_us(run)).p50_us)
                 .collect(),
             cpu_us_per_sample,
-            rss_kib: bed.between().into_iter().map(|(name, pid)| (name, Taken::by(pid).rss_kib)).collect(),
+            rss_kib: bed
+                .middle_processes()
+                .into_iter()
+                .map(|(name, pid)| (name, Usage::of(pid).rss_kib))
+                .collect(),
         });
     }
     Ok(())
 }
 
-/// From the write to the subscriber's decoder.
+/// The latencies of a run, from the write to the subscriber's decoder.
 pub fn latencies_us(run: &Run) -> Vec<f64> {
     run.records.iter().map(Record::latency_us).collect()
 }

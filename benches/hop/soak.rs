@@ -1,22 +1,23 @@
-//! Memory over time: a whole bridge under load, and what each of its processes holds.
+//! The soak: the memory of each process of a whole bridge under load, over time.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::time::{Duration, Instant};
 
 use super::beds::{Beds, Plan, add_up};
-use super::held::HeldUp;
+use super::cpu_delay::CpuDelayMonitor;
 use super::options::{Case, Options, SCAN};
-use super::out::{Of, Output};
+use super::out::{Output, RowKey};
 use super::report::{Lossy, Soak, SoakSeries};
-use super::system::{Taken, descriptors};
+use super::system::{Usage, descriptors};
 
-/// Of each turn: most of the time scans, then some point clouds, which go by reference.
+/// The part of each turn in which scans are sent.
 const SCANS_S: f64 = 4.0;
+/// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
 const CLOUDS_S: f64 = 1.0;
 
-/// More points of a series than this show nothing more.
-const MOST_POINTS: usize = 400;
+/// The highest number of points of a series in the summary.
+const MAX_POINTS: usize = 400;
 
 pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Result<(), String> {
     let scheduling = options.first_scheduling();
@@ -27,18 +28,18 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
         load: format!("{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn", scans.name(), clouds.name()),
         ..Soak::default()
     };
-    let held_up = HeldUp::watch();
+    let cpu_delays = CpuDelayMonitor::start();
     let (began, mut turn) = (Instant::now(), 0);
     while began.elapsed() < duration {
-        let of = Of { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };
+        let key = RowKey { section: "soak", scheduling: "", case: "", program: "bridge", repetition: turn };
         for case in [&scans, &clouds] {
-            held_up.take_ms();
+            cpu_delays.take_max_ms();
             let run = bed.measure(case)?;
-            let (held_up_ms, missing) = (held_up.take_ms(), run.missing());
+            let (held_up_ms, missing) = (cpu_delays.take_max_ms(), run.missing());
             soak.accepted += run.accepted;
             soak.missing += missing;
             add_up(&mut soak.reasons, run.reasons());
-            output.raw(of, &format!("{} Hz: held up ms", case.rate_hz), held_up_ms);
+            output.raw(key, &format!("{} Hz: held up ms", case.rate_hz), held_up_ms);
             if missing > 0 {
                 soak.lossy.push(Lossy { at_s: began.elapsed().as_secs_f64(), missing, held_up_ms });
             } else {
@@ -46,10 +47,10 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
             }
         }
         let at_s = began.elapsed().as_secs_f64();
-        output.raw(of, "at s", at_s);
-        output.raw(of, "missing so far", soak.missing as f64);
-        let mut see = |name: String, unit: &str, value: f64| {
-            output.raw(of, &format!("{name} {unit}"), value);
+        output.raw(key, "at s", at_s);
+        output.raw(key, "missing so far", soak.missing as f64);
+        let mut add_point = |name: String, unit: &str, value: f64| {
+            output.raw(key, &format!("{name} {unit}"), value);
             match soak.series.iter_mut().find(|series| series.name == name && series.unit == unit) {
                 Some(series) => series.points.push((at_s, value)),
                 None => {
@@ -57,27 +58,27 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
                 }
             }
         };
-        for (process, pid) in bed.between() {
-            // Without the pool's slots, which count for a process once it has touched them: they have a
-            // series of their own.
-            let taken = Taken::by(pid);
-            see(process.clone(), "KiB", taken.rss_kib.saturating_sub(taken.shared_kib) as f64);
-            see(process, "descriptors", descriptors(pid) as f64);
+        for (process, pid) in bed.middle_processes() {
+            // Without shared memory, which has a series of its own: a slot of the pool adds to the resident
+            // memory of a process from its first access on.
+            let usage = Usage::of(pid);
+            add_point(process.clone(), "KiB", usage.rss_kib.saturating_sub(usage.shared_kib) as f64);
+            add_point(process, "descriptors", descriptors(pid) as f64);
         }
-        see("shared memory".to_owned(), "KiB", shared_kib(&bed.between()));
+        add_point("shared memory".to_owned(), "KiB", shared_kib(&bed.middle_processes()));
         eprintln!("soak: {:.0} of {} s, {} missing", at_s, duration.as_secs(), soak.missing);
         turn += 1;
     }
     soak.seconds = began.elapsed().as_secs_f64();
     for series in &mut soak.series {
-        let step = series.points.len().div_ceil(MOST_POINTS).max(1);
+        let step = series.points.len().div_ceil(MAX_POINTS).max(1);
         series.points = series.points.iter().copied().step_by(step).collect();
     }
     output.summary.soak = Some(soak);
     Ok(())
 }
 
-/// What the files in /dev/shm that these processes have mapped take there: pools, queues and boards.
+/// The allocated size of the files in /dev/shm that the processes have mapped: pools, queues and boards.
 fn shared_kib(processes: &[(String, u32)]) -> f64 {
     let mut files: Vec<String> = processes
         .iter()

@@ -1,4 +1,4 @@
-//! Where and how the programs run, and what machine it is.
+//! CPU affinity, scheduling and resource usage of the programs, and the description of the machine.
 
 use std::fs;
 use std::io::{ErrorKind, Write as _};
@@ -16,15 +16,15 @@ use nix::unistd::Pid;
 use super::options::Options;
 use super::report::Machine;
 
-/// Which CPU each stage of a sample's way has.
+/// The placement of the programs on CPUs. Stages are the processes that a sample passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Placement {
-    /// Each stage on the other CPU than the one before, so that every hand-over crosses CPUs, as the
-    /// eventfd's does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
+    /// Each stage on a different CPU than the one before, so that every hand-over crosses CPUs, as that of
+    /// the eventfd does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
     Alternating,
-    /// Publisher and subscriber on CPU 0, relay or bridge on CPU 1: what the bridge does is all on one CPU.
+    /// Publisher and subscriber on CPU 0, relay or all of the bridge on CPU 1.
     Split,
-    /// Wherever the kernel puts them.
+    /// No affinity.
     Free,
 }
 
@@ -34,7 +34,7 @@ impl Placement {
             "alternating" => Ok(Self::Alternating),
             "split" => Ok(Self::Split),
             "free" => Ok(Self::Free),
-            other => Err(format!("{other} is no placement: alternating, split or free")),
+            other => Err(format!("{other} is not a placement; allowed: alternating, split, free")),
         }
     }
 
@@ -56,11 +56,11 @@ impl Placement {
     }
 }
 
-/// How the programs are scheduled; the same for all.
+/// The scheduling policy of all programs on the path of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scheduling {
     Other,
-    /// SCHED_FIFO with priority 50: what other programs do on the machine no longer shows.
+    /// SCHED_FIFO with priority 50, so that other programs on the machine do not affect the result.
     Fifo,
 }
 
@@ -69,7 +69,7 @@ impl Scheduling {
         match text {
             "other" => Ok(Self::Other),
             "fifo" => Ok(Self::Fifo),
-            other => Err(format!("{other} is no scheduling: other or fifo")),
+            other => Err(format!("{other} is not a scheduling; allowed: other, fifo")),
         }
     }
 
@@ -83,7 +83,7 @@ impl Scheduling {
 
 pub const FIFO_PRIORITY: i32 = 50;
 
-/// A CPU and a scheduling policy for one program, as it crosses the command line.
+/// The CPU and the scheduling policy of one program, which are passed to it as an argument.
 #[derive(Clone, Copy, Debug)]
 pub struct Place {
     pub cpu: Option<usize>,
@@ -91,7 +91,7 @@ pub struct Place {
 }
 
 impl Place {
-    /// For one end of the eventfd: always the two CPUs, unless nothing is pinned.
+    /// The place of one end (0 or 1) of the eventfd: the CPU with that number, unless the placement is free.
     pub fn of(options: &Options, scheduling: Scheduling, end: usize) -> Self {
         let cpu = (options.placement != Placement::Free).then_some(end);
         Self { cpu, scheduling }
@@ -103,12 +103,12 @@ impl Place {
     }
 
     pub fn parse(text: &str) -> Result<Self, String> {
-        let (cpu, scheduling) = text.split_once(':').ok_or("a place is CPU:SCHEDULING")?;
+        let (cpu, scheduling) = text.split_once(':').ok_or("a place must be CPU:SCHEDULING")?;
         Ok(Self { cpu: cpu.parse().ok(), scheduling: Scheduling::parse(scheduling)? })
     }
 
-    /// Applies to this thread and those that it starts. What is refused is said: the figures would mean
-    /// something else.
+    /// Applies CPU and scheduling to this thread and those that it starts. Prints what the kernel refuses,
+    /// because it changes the meaning of the figures.
     pub fn apply(self) {
         if let Some(cpu) = self.cpu {
             let mut set = CpuSet::new();
@@ -135,20 +135,20 @@ impl Place {
     }
 }
 
-/// Held while a bench runs. The name is one of this network namespace, as the DDS domains are, and of no file
-/// that another user's bench could not open.
+/// Takes the lock that a running bench holds: an abstract socket name. It is unique in the network namespace,
+/// as the DDS domains are, and unlike a file it has no permissions that keep out other users.
 ///
 /// # Errors
-/// Another one runs. Both would use the same DDS domains, and receive each other's samples.
-pub fn alone() -> Result<UnixListener, String> {
+/// Another bench runs. Both would use the same DDS domains and receive each other's samples.
+pub fn lock_bench() -> Result<UnixListener, String> {
     let name = SocketAddr::from_abstract_name("adaptive-bridge-bench");
     name.and_then(|name| UnixListener::bind_addr(&name)).map_err(|error| match error.kind() {
-        ErrorKind::AddrInUse => "another bench runs: wait until it has ended".to_owned(),
-        _ => format!("cannot see whether another bench runs: {error}"),
+        ErrorKind::AddrInUse => "another bench runs; wait until it has ended".to_owned(),
+        _ => format!("cannot check whether another bench runs: {error}"),
     })
 }
 
-/// Whether this process may have SCHED_FIFO; tried on a thread that ends at once.
+/// Whether this process may use SCHED_FIFO, tried on a thread that ends at once.
 pub fn has_fifo() -> bool {
     let tried = std::thread::spawn(|| {
         // SAFETY: as above; it is a thread that does nothing else.
@@ -162,13 +162,13 @@ pub fn has_fifo() -> bool {
     tried.join().unwrap_or(false)
 }
 
-/// What a process has taken so far, all its threads together, and its memory at present.
+/// The resource usage of a process: counters of all its threads so far, and its present memory.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Taken {
+pub struct Usage {
     pub cpu_ns: u64,
-    /// Times that a thread went to sleep (`voluntary_ctxt_switches`).
+    /// How often a thread went to sleep (`voluntary_ctxt_switches`).
     pub sleeps: u64,
-    /// Times that a thread was taken off its CPU (`nonvoluntary_ctxt_switches`).
+    /// How often a thread was preempted (`nonvoluntary_ctxt_switches`).
     pub preemptions: u64,
     pub rss_kib: u64,
     pub anonymous_kib: u64,
@@ -176,11 +176,11 @@ pub struct Taken {
     pub file_kib: u64,
 }
 
-impl Taken {
-    pub fn by(pid: u32) -> Self {
+impl Usage {
+    pub fn of(pid: u32) -> Self {
         let read = |path: String| fs::read_to_string(path).unwrap_or_default();
         let memory = read(format!("/proc/{pid}/status"));
-        let mut taken = Self {
+        let mut usage = Self {
             cpu_ns: cpu_ns(pid),
             rss_kib: field(&memory, "VmRSS:"),
             anonymous_kib: field(&memory, "RssAnon:"),
@@ -190,26 +190,26 @@ impl Taken {
         };
         for task in fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {
             let status = fs::read_to_string(task.path().join("status")).unwrap_or_default();
-            taken.sleeps += field(&status, "voluntary_ctxt_switches:");
-            taken.preemptions += field(&status, "nonvoluntary_ctxt_switches:");
+            usage.sleeps += field(&status, "voluntary_ctxt_switches:");
+            usage.preemptions += field(&status, "nonvoluntary_ctxt_switches:");
         }
-        taken
+        usage
     }
 }
 
-/// The number behind a name in a file of /proc.
+/// The number that follows a name in a file of /proc; 0 without one.
 fn field(text: &str, name: &str) -> u64 {
     let value =
         text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next()?.parse().ok());
     value.unwrap_or(0)
 }
 
-/// Open files of a process.
+/// The number of open files of a process.
 pub fn descriptors(pid: u32) -> usize {
     fs::read_dir(format!("/proc/{pid}/fd")).map_or(0, Iterator::count)
 }
 
-/// What the threads of a process had of the CPUs, in nanoseconds (the first number of their schedstat).
+/// The CPU time of all threads of a process in nanoseconds (the first number of their schedstat).
 pub fn cpu_ns(pid: u32) -> u64 {
     let Ok(tasks) = fs::read_dir(format!("/proc/{pid}/task")) else { return 0 };
     tasks
@@ -219,8 +219,8 @@ pub fn cpu_ns(pid: u32) -> u64 {
         .sum()
 }
 
-/// Idle CPUs do not sleep until the file is dropped (the kernel's CPU latency QoS).
-pub fn awake() -> Result<fs::File, String> {
+/// Keeps idle CPUs from sleeping until the returned file is dropped (the kernel's CPU latency QoS).
+pub fn keep_cpus_awake() -> Result<fs::File, String> {
     const FILE: &str = "/dev/cpu_dma_latency";
     const LATENCY_US: i32 = 0;
     let asked = fs::File::options().write(true).open(FILE).and_then(|mut file| {
@@ -228,16 +228,16 @@ pub fn awake() -> Result<fs::File, String> {
         Ok(file)
     });
     asked.map_err(|error| {
-        format!("--awake: {FILE}: {error}; run as root, outside of a container, or without --awake")
+        format!("--awake: {FILE}: {error}; run as root and outside of a container, or without --awake")
     })
 }
 
-/// Pins this thread to a CPU and puts it before every other.
-pub fn most_urgent_on(cpu: usize) {
+/// Pins this thread to a CPU and gives it the highest real-time priority.
+pub fn run_with_highest_priority_on(cpu: usize) {
     Place { cpu: Some(cpu), scheduling: Scheduling::Other }.apply();
     if let Err(error) = set_policy(libc::SCHED_FIFO, 99) {
         eprintln!(
-            "bench: no SCHED_FIFO: {error}; how long CPU {cpu} was held up includes what others ran on it"
+            "bench: no SCHED_FIFO: {error}; the delays of CPU {cpu} include those by other threads on it"
         );
     }
 }
@@ -252,9 +252,9 @@ fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
     Errno::result(outcome).map(drop)
 }
 
-/// Asks for the time slice that `config/default.yaml` gives a noncritical lane, 10 ms, for this thread and
-/// those that it starts.
-pub fn slice_of_a_noncritical_lane() -> Result<(), String> {
+/// Sets the time slice that `config/default.yaml` gives a noncritical lane, 10 ms, for this thread and those
+/// that it starts.
+pub fn set_noncritical_time_slice() -> Result<(), String> {
     // SAFETY: `sched_attr` is plain data for which all zeroes are valid. The first call writes no more than
     // the length that it is given, the second only reads.
     let outcome = unsafe {
@@ -266,10 +266,10 @@ pub fn slice_of_a_noncritical_lane() -> Result<(), String> {
             Errno::result(libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0))
         })
     };
-    outcome.map(drop).map_err(|error| format!("no time slice: {error}"))
+    outcome.map(drop).map_err(|error| format!("cannot set the time slice: {error}"))
 }
 
-/// Sleeps until that instant of CLOCK_MONOTONIC.
+/// Sleeps until an instant of CLOCK_MONOTONIC.
 pub fn sleep_until(instant_ns: u64) {
     let until = libc::timespec {
         tv_sec: (instant_ns / 1_000_000_000) as i64,
@@ -280,7 +280,7 @@ pub fn sleep_until(instant_ns: u64) {
     {}
 }
 
-/// What the figures depend on.
+/// Describes the machine, commit and command of this run.
 pub fn machine() -> Machine {
     let read = |path: &str| fs::read_to_string(path).map(|text| text.trim().to_owned()).unwrap_or_default();
     let cpu = read("/proc/cpuinfo")

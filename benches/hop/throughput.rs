@@ -1,30 +1,33 @@
-//! The highest rate without loss: doubled until something is lost, then halved in between. A rate counts when
-//! nothing is refused, lost or damaged and the publisher keeps its schedule, twice in a row.
+//! Section `throughput`: searches for the highest rate without loss, by doubling until a run fails and then
+//! by bisection. A run passes when no sample is refused, lost or damaged and the publisher keeps its
+//! schedule. The resulting rate must pass twice.
 
 use super::beds::{Bed, Beds, Run};
 use super::latency::loss;
 use super::options::{Case, Options, PAYLOADS};
-use super::out::{Of, Output};
+use super::out::{Output, RowKey};
 use super::report::{Attempt, Throughput, payload};
 use super::system::Scheduling;
 
-/// Doubling begins here; any machine can do it.
+/// The data rate of the first run, which any machine sustains.
 const FIRST_MB_PER_S: f64 = 5.0;
-const MOST_FIRST_HZ: f64 = 1_000.0;
+/// The highest rate of the first run.
+const MAX_FIRST_HZ: f64 = 1_000.0;
 
-/// Halvings between a rate that is lossless and twice of it: the result is within 6 % of the limit.
-const HALVINGS: usize = 4;
+/// Bisections between the last rate that passed and twice that rate: the result is within 6 % of the limit.
+const BISECTIONS: usize = 4;
 
-/// No rate beyond this is tried: the publisher's own loop takes 5 µs.
-const MOST_HZ: f64 = 200_000.0;
+/// The highest rate that is tried, because the publisher's own loop takes 5 µs.
+const MAX_HZ: f64 = 200_000.0;
 
-/// The payloads that are wanted.
+/// The payloads that the options select.
 pub fn payloads(options: &Options) -> Vec<usize> {
     let quick = |bytes: &usize| !options.quick || *bytes == 2_948;
     let wanted = |bytes: &usize| options.wants("throughput", &payload(*bytes));
     PAYLOADS.into_iter().filter(quick).filter(wanted).collect()
 }
 
+/// Searches for the highest rate of a payload in each bed.
 pub fn search(
     bytes: usize,
     scheduling: Scheduling,
@@ -37,7 +40,7 @@ pub fn search(
         let found = search_in(bytes, scheduling, seconds, bed)?;
         let case = payload(bytes);
         for (index, attempt) in found.attempts.iter().enumerate() {
-            let of = Of {
+            let key = RowKey {
                 section: "throughput",
                 scheduling: scheduling.label(),
                 case: &case,
@@ -45,7 +48,7 @@ pub fn search(
                 repetition: index,
             };
             let outcome = if attempt.failure.is_some() { "failed at Hz" } else { "passed at Hz" };
-            output.raw(of, outcome, attempt.rate_hz);
+            output.raw(key, outcome, attempt.rate_hz);
         }
         output.summary.throughput.push(found);
     }
@@ -62,7 +65,7 @@ fn search_in(
     let mut attempts: Vec<Attempt> = Vec::new();
     let mut passes = |rate_hz: f64| -> Result<bool, String> {
         let case = Case::lasting(rate_hz.round() as u64, bytes, seconds, route);
-        let run = bed.measure_with_patience(&case, 1_500)?;
+        let run = bed.measure_with_timeout(&case, 1_500)?;
         let failure = failure(&case, scheduling, &run);
         eprintln!(
             "throughput: {}, {}: {}",
@@ -75,9 +78,9 @@ fn search_in(
         Ok(passed)
     };
     let mut passed: Option<f64> = None;
-    let mut rate_hz = (FIRST_MB_PER_S * 1e6 / bytes as f64).min(MOST_FIRST_HZ).round();
+    let mut rate_hz = (FIRST_MB_PER_S * 1e6 / bytes as f64).min(MAX_FIRST_HZ).round();
     let mut failed = None;
-    while failed.is_none() && rate_hz <= MOST_HZ {
+    while failed.is_none() && rate_hz <= MAX_HZ {
         if passes(rate_hz)? {
             passed = Some(rate_hz);
             rate_hz *= 2.0;
@@ -87,7 +90,7 @@ fn search_in(
     }
     if let Some(mut above) = failed {
         let mut below = passed.unwrap_or(0.0);
-        for _ in 0..HALVINGS {
+        for _ in 0..BISECTIONS {
             let middle = f64::midpoint(below, above).round();
             if passes(middle)? {
                 below = middle;
@@ -97,7 +100,7 @@ fn search_in(
         }
         passed = (below > 0.0).then_some(below);
     }
-    // Once may be luck.
+    // The rate must pass once more; if it does not, lower rates are tried.
     while let Some(found) = passed.filter(|found| *found >= 1.0) {
         if passes(found)? {
             break;
@@ -109,7 +112,7 @@ fn search_in(
         .filter(|attempt| passed.is_none_or(|passed| attempt.rate_hz >= passed))
         .filter_map(|attempt| Some((attempt.rate_hz, attempt.failure.as_ref()?)))
         .min_by(|one, other| one.0.total_cmp(&other.0));
-    let limit = next.map_or("not reached".to_owned(), |(rate, why)| format!("{rate:.0} Hz: {why}"));
+    let limit = next.map_or("not reached".to_owned(), |(rate, failure)| format!("{rate:.0} Hz: {failure}"));
     Ok(Throughput {
         scheduling: scheduling.label().to_owned(),
         bytes,
@@ -121,7 +124,7 @@ fn search_in(
     })
 }
 
-/// Why a run does not count; none where it does.
+/// The reason why a run failed; `None` when it passed.
 fn failure(case: &Case, scheduling: Scheduling, run: &Run) -> Option<String> {
     let account = loss(case, scheduling, run);
     let last = run.records.iter().max_by_key(|record| record.number);
@@ -136,7 +139,7 @@ fn failure(case: &Case, scheduling: Scheduling, run: &Run) -> Option<String> {
     } else if account.damaged > 0 {
         Some(format!("{} damaged", account.damaged))
     } else if behind_ns > run_ns / 50 {
-        // 2 % of the run.
+        // More than 2 % of the duration of the run.
         Some(format!("the publisher is {} ms behind at the end", behind_ns / 1_000_000))
     } else {
         None

@@ -1,4 +1,4 @@
-//! The machine's floor: what it takes to wake a thread on the other CPU through an eventfd.
+//! The wake-up reference: the time to wake a thread on the other CPU through an eventfd.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,13 +9,13 @@ use super::options::{Case, Options};
 use super::system::{self, Place, Scheduling};
 use adaptive_bridge::clock;
 
-/// Latencies in nanoseconds of as many wake-ups as the case has samples, at its rate: from before the write
-/// to after the read.
+/// Measures as many wake-ups as the case has samples, at its rate. Returns their latencies in nanoseconds,
+/// from before the write to after the read.
 pub fn eventfd(case: &Case, options: &Options, scheduling: Scheduling) -> Result<Vec<u64>, String> {
-    let say = |error: nix::errno::Errno| format!("eventfd: {error}");
-    let event = Arc::new(EventFd::from_flags(EfdFlags::EFD_SEMAPHORE).map_err(say)?);
+    let event = EventFd::from_flags(EfdFlags::EFD_SEMAPHORE).map_err(|error| format!("eventfd: {error}"))?;
+    let event = Arc::new(event);
     let (samples, rate_hz) = (case.samples, case.rate_hz);
-    // One for each wake-up: a late sleeper finds several.
+    // The write time of each wake-up: a late sleeper finds several pending.
     let written_at: Arc<[AtomicU64]> = (0..samples).map(|_| AtomicU64::new(0)).collect();
     let sleeper = {
         let (event, written_at) = (Arc::clone(&event), Arc::clone(&written_at));
@@ -45,6 +45,6 @@ pub fn eventfd(case: &Case, options: &Options, scheduling: Scheduling) -> Result
             }
         }
     });
-    waker.join().map_err(|_| "the waking thread died".to_owned())?;
-    sleeper.join().map_err(|_| "the sleeping thread died".to_owned())
+    waker.join().map_err(|_| "the waking thread panicked".to_owned())?;
+    sleeper.join().map_err(|_| "the sleeping thread panicked".to_owned())
 }

@@ -1,4 +1,4 @@
-//! The plots of a run: file name and content.
+//! The plots of a run.
 
 use super::format::number;
 use super::plot::{Bars, Line, Panel, Series, lines};
@@ -7,7 +7,7 @@ use super::tables::{PROGRAMS, payload, payloads};
 
 const CLASSES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
 
-/// Those for which the run has data.
+/// The file name and content of each plot for which the run has data.
 pub fn figures(summary: &Summary) -> Vec<(String, String)> {
     let mut files = Vec::new();
     for scheduling in ["other", "fifo"] {
@@ -29,7 +29,7 @@ fn latency(summary: &Summary, scheduling: &str) -> Option<String> {
         let mut shown = Vec::new();
         for (program, class) in PROGRAMS.iter().zip(["f", "c", "b", "a"]) {
             let of = |quantile: fn(&super::summary::Quantiles) -> Option<f64>| {
-                // The wake-up carries nothing, so it stands beside every payload.
+                // The wake-up has no payload, so it is shown with every payload.
                 let fits = |row: &&&super::summary::Latency| {
                     row.program == *program && (row.bytes == bytes || row.program == "wake-up")
                 };
@@ -160,7 +160,7 @@ fn isolation(summary: &Summary, scheduling: &str) -> Option<String> {
         values: rows.iter().map(|row| of(row)).collect(),
     };
     let bars = Bars {
-        label: "Critical latency by what the noncritical lane does",
+        label: "Critical latency by condition of the noncritical lane",
         title: "latency of the critical lane, µs",
         groups: rows.iter().map(|row| row.condition.clone()).collect(),
         series: vec![

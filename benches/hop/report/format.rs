@@ -1,11 +1,11 @@
-//! How values are written.
+//! Formatting of values in tables and plots.
 
-/// For attributes and text of SVG.
+/// Escapes text for attributes and text of SVG.
 pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// With three digits that say something, and a comma between thousands; a dash for what is not known.
+/// A value with about three significant digits and a comma between thousands; a dash without a value.
 pub fn number(value: Option<f64>) -> String {
     let Some(value) = value.filter(|value| value.is_finite()) else { return "–".to_owned() };
     let magnitude = value.abs();
@@ -23,7 +23,7 @@ pub fn number(value: Option<f64>) -> String {
     if rest.is_empty() { format!("{sign}{grouped}") } else { format!("{sign}{grouped}.{rest}") }
 }
 
-/// From the least to the most.
+/// The range from the lowest to the highest value.
 pub fn range(values: &[f64]) -> String {
     let of = |better: fn(f64, f64) -> f64| values.iter().copied().reduce(better);
     match (of(f64::min), of(f64::max)) {
@@ -32,7 +32,7 @@ pub fn range(values: &[f64]) -> String {
     }
 }
 
-/// A count.
+/// A count with a comma between thousands.
 pub fn count(value: u64) -> String {
     number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()
 }

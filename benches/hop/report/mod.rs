@@ -1,5 +1,5 @@
-//! What a run of the bench gave, and what is made of it: tables, plots, targets, the page
-//! docs/performance.md. Pure: numbers in, text out, so that a test can hand in made-up runs.
+//! The summary of a bench run and the reports made from it: tables, plots, targets, and the page
+//! docs/performance.md. Pure, so that tests can pass invented runs.
 
 mod figures;
 mod format;
@@ -18,4 +18,4 @@ pub use summary::{
     Summary, Throughput,
 };
 pub use tables::{payload, soak_failures};
-pub use targets::JUDGED_HZ;
+pub use targets::TARGET_HZ;

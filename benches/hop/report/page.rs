@@ -1,5 +1,5 @@
-//! docs/performance.md, whose tables come from runs, and the README of a run. The page's words are written by
-//! hand; between `<!-- figures:SECTION -->` and `<!-- end -->` stands what the runs say, and nothing else.
+//! Fills the tables of docs/performance.md, and makes the README of a run. The text of the page is written by
+//! hand; everything between `<!-- figures:SECTION -->` and `<!-- end -->` is generated from runs.
 
 use std::fmt::Write as _;
 
@@ -10,12 +10,12 @@ use super::{tables, targets};
 const BEGIN: &str = "<!-- figures:";
 const END: &str = "<!-- end -->";
 
-/// Where the page finds the runs.
+/// The path of the runs, relative to the page.
 const RUNS: &str = "../benches/runs/";
 
 /// All sections, with their titles in the README of a run.
 const SECTIONS: [(&str, &str); 11] = [
-    ("targets", "What to reach"),
+    ("targets", "Targets"),
     ("latency-other", "Latency, scheduling other"),
     ("latency-fifo", "Latency, scheduling fifo, memory locked"),
     ("loss", "Loss"),
@@ -28,17 +28,17 @@ const SECTIONS: [(&str, &str); 11] = [
     ("soak", "Memory over time"),
 ];
 
-/// The page with its figures replaced by those of the runs, each a folder's name and content: of each section
-/// by the first run that has it. Without runs the page says so.
+/// Replaces the figures of the page by those of the runs, which are pairs of folder name and summary. Each
+/// section shows the first run that has it, or `Not measured yet.`
 ///
 /// # Errors
-/// The page has a section that is not known, or one without an end.
+/// The page has an unknown section, or one without an end.
 pub fn fill(page: &str, runs: &[(String, Summary)]) -> Result<String, String> {
     let mut filled = String::new();
     let mut rest = page;
     while let Some(at) = rest.find(BEGIN) {
         let (before, from) = rest.split_at(at);
-        let (head, _) = from.split_once('\n').ok_or("a section without an end")?;
+        let (head, _) = from.split_once('\n').ok_or("the last section has no end")?;
         let name = head.trim_start_matches(BEGIN).trim_end().trim_end_matches("-->").trim();
         let end = from.find(END).ok_or_else(|| format!("section {name} has no end"))?;
         if from[head.len()..end].contains(BEGIN) {
@@ -57,10 +57,10 @@ fn list(runs: &[(String, Summary)]) -> String {
     for (name, summary) in runs {
         let _ = writeln!(text, "[{name}]({RUNS}{name}/README.md):\n\n{}", tables::run(summary));
     }
-    if text.is_empty() { "No run is shown yet.\n".to_owned() } else { text }
+    if text.is_empty() { "No runs yet.\n".to_owned() } else { text }
 }
 
-/// The runs that the page names.
+/// The names of the runs that the page links to.
 pub fn runs_named(page: &str) -> Vec<String> {
     let before = format!("]({RUNS}");
     let links = page.split(before.as_str()).skip(1);
@@ -70,10 +70,10 @@ pub fn runs_named(page: &str) -> Vec<String> {
 
 fn of_runs(name: &str, runs: &[(String, Summary)]) -> Result<Option<String>, String> {
     if !SECTIONS.iter().any(|(known, _)| *known == name) {
-        return Err(format!("{name} is no section of a run"));
+        return Err(format!("{name} is not a section of a run"));
     }
     if name == "targets" {
-        // All runs together say what is reached.
+        // The targets need the figures of all runs together.
         let mut all = Summary::default();
         for (_, summary) in runs.iter().rev() {
             all.take(summary);
@@ -84,7 +84,7 @@ fn of_runs(name: &str, runs: &[(String, Summary)]) -> Result<Option<String>, Str
 }
 
 impl Summary {
-    /// Takes over what the other run has.
+    /// Replaces the sections that the other run has.
     fn take(&mut self, other: &Self) {
         let other = other.clone();
         if !other.latency.is_empty() {
@@ -105,7 +105,7 @@ impl Summary {
     }
 }
 
-/// The tables and plots of a section; `plots` is where those are.
+/// The tables and plots of a section; `plots` is the path of the plots.
 fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
     let files = figures(summary);
     let plot = |file: &str, alt: &str| {
@@ -121,7 +121,7 @@ fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
             let all = tables::latencies(summary, scheduling).unwrap_or_default();
             plot(&format!("{name}.svg"), "Latency over rate, by payload")
                 + &format!("{hops}\nStages of the bridge:\n\n{stages}\n")
-                + &format!("<details><summary>All of each program</summary>\n\n{all}\n</details>\n")
+                + &format!("<details><summary>All figures of each program</summary>\n\n{all}\n</details>\n")
         }
         "loss" => tables::loss(summary)?,
         "throughput" => {
@@ -140,7 +140,7 @@ fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
             plot(&format!("{name}.svg"), &alt) + &tables::scale(summary, name)?
         }
         "isolation" => {
-            let alt = "Critical latency by what the noncritical lane does";
+            let alt = "Critical latency by condition of the noncritical lane";
             plot("isolation-other.svg", alt) + &plot("isolation-fifo.svg", alt) + &tables::isolation(summary)?
         }
         "soak" => plot("soak.svg", "Memory of each process over time") + &tables::soak(summary)?,
@@ -149,7 +149,7 @@ fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
     Some(text)
 }
 
-/// The README of a run: all that it measured.
+/// The README of a run, with all its sections.
 pub fn readme(summary: &Summary) -> String {
     let mut text = format!("# Bench run of {}\n\n{}", summary.date, tables::run(summary));
     for (name, title) in SECTIONS {

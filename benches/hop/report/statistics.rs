@@ -1,17 +1,17 @@
-//! Quantiles, medians, and whether something grows.
+//! Quantiles, medians with their confidence interval, and growth.
 
-/// The quantile of unsorted values, by nearest rank; `NaN` of none.
+/// The quantile of unsorted values by nearest rank; `NaN` without values.
 pub fn quantile(values: &[f64], quantile: f64) -> f64 {
     let sorted = sorted(values);
     if sorted.is_empty() {
         return f64::NAN;
     }
-    // A share such as 0.999 of 1,000 is 999, not the 999.0000000000001 that it is in binary.
+    // The small subtraction corrects products such as 0.999 * 1,000, which is 999.0000000000001 in binary.
     let rank = (quantile * sorted.len() as f64 - 1e-9).ceil().max(1.0) as usize;
     sorted[rank.min(sorted.len()) - 1]
 }
 
-/// The middle value, or the mean of the two middle ones.
+/// The median: the middle value, or the mean of the two middle ones; `NaN` without values.
 pub fn median(values: &[f64]) -> f64 {
     let sorted = sorted(values);
     if sorted.is_empty() {
@@ -21,12 +21,12 @@ pub fn median(values: &[f64]) -> f64 {
     if sorted.len() % 2 == 1 { sorted[middle] } else { f64::midpoint(sorted[middle - 1], sorted[middle]) }
 }
 
-/// Where the median lies of what the values are drawn from, with a certainty of 95 %: between two of the
-/// values. The binomial distribution tells which ones, whatever theirs is. `None` of fewer than six, which
-/// can't tell.
+/// The 95 % confidence interval of the median of the distribution that the values are drawn from. Its bounds
+/// are two of the values, chosen by the binomial distribution (as in the sign test), so it holds for any
+/// distribution. `None` with fewer than six values, which are not enough.
 pub fn median_interval(values: &[f64]) -> Option<(f64, f64)> {
     let sorted = sorted(values);
-    // How likely it is that no more than `below` of the values are less than the median.
+    // `total` is the probability that at most `below` of the values are less than the median.
     let (mut below, mut chance) = (0, 0.5_f64.powi(i32::try_from(sorted.len()).ok()?));
     let mut total = chance;
     while 2.0 * total <= 0.05 {
@@ -44,12 +44,12 @@ fn sorted(values: &[f64]) -> Vec<f64> {
     sorted
 }
 
-/// How much a value grows for each unit of time: the median of the slopes between all pairs of points (Theil
-/// and Sen), which a few outliers do not move. At most 500 points are looked at, evenly chosen. `None` of
-/// fewer than three points.
+/// The growth of a value per unit of time: the median of the slopes between all pairs of points (Theil and
+/// Sen), which is robust against outliers. Uses at most 500 points, evenly chosen. `None` with fewer than
+/// three points.
 pub fn growth(points: &[(f64, f64)]) -> Option<f64> {
-    const MOST: usize = 500;
-    let step = points.len().div_ceil(MOST).max(1);
+    const MAX_POINTS: usize = 500;
+    let step = points.len().div_ceil(MAX_POINTS).max(1);
     let points: Vec<(f64, f64)> = points.iter().copied().step_by(step).collect();
     if points.len() < 3 {
         return None;

@@ -1,5 +1,5 @@
-//! What a run gave, as `summary.json` holds it. A section that was not measured is empty. Figures are in the
-//! unit that their name ends with; `null` is not known.
+//! The results of a run, as stored in `summary.json`. Sections that were not measured are empty. Names of
+//! figures end with their unit; unknown figures are `null`.
 
 use std::collections::BTreeMap;
 
@@ -7,15 +7,15 @@ use serde::{Deserialize, Serialize};
 
 use super::statistics::quantile;
 
-/// All of a run.
+/// All results of a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Summary {
     pub date: String,
     pub machine: Machine,
-    /// Placement, durations and the like, a sentence each.
+    /// Placement, durations and other parameters, one per line of text.
     pub parameters: Vec<String>,
-    /// What was not measured, and why.
+    /// Cases that were not measured, with the reason.
     pub skipped: Vec<String>,
     pub latency: Vec<Latency>,
     pub loss: Vec<Loss>,
@@ -27,7 +27,7 @@ pub struct Summary {
     pub soak: Option<Soak>,
 }
 
-/// What the figures depend on.
+/// The machine, commit and command of a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Machine {
@@ -40,14 +40,14 @@ pub struct Machine {
     pub rmem_max: String,
 }
 
-/// A distribution, in µs.
+/// The quantiles of a distribution, in µs.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quantiles {
     pub samples: u64,
     pub p50_us: Option<f64>,
-    /// Of 100 samples or more.
+    /// Only with 100 samples or more.
     pub p99_us: Option<f64>,
-    /// Of 1,000 samples or more: of fewer it would be the maximum by another name.
+    /// Only with 1,000 samples or more: with fewer it would be the maximum.
     pub p999_us: Option<f64>,
     pub max_us: Option<f64>,
 }
@@ -66,7 +66,7 @@ impl Quantiles {
     }
 }
 
-/// Latency of one program at one rate and payload. All repetitions together, but for hops.
+/// The latency of one program at one rate and payload. Figures are of all repetitions together, except hops.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Latency {
@@ -75,28 +75,30 @@ pub struct Latency {
     pub bytes: usize,
     /// `wake-up`, `direct`, `relay`, `bridge`.
     pub program: String,
-    /// Sent and not received.
+    /// Samples that were sent and not received.
     pub missing: u64,
-    /// What became of those, as far as anybody said so: refused, or dropped by name.
+    /// The known reasons of missing samples: refused by a writer, or dropped, by drop reason.
     pub reasons: BTreeMap<String, u64>,
     /// From the write to the subscriber's decoder.
     pub latency: Quantiles,
-    /// The same, from when the sample was due.
+    /// From the due time of the sample to the subscriber's decoder.
     pub from_due: Quantiles,
     /// The median of each repetition.
     pub repetitions_p50_us: Vec<f64>,
-    /// The median, over the repetitions, of what is beyond direct in the same repetition.
+    /// The median, over the repetitions, of the difference of this p50 and the p50 of direct in the same
+    /// repetition.
     pub hop_p50_us: Option<f64>,
+    /// The same for the p99.
     pub hop_p99_us: Option<f64>,
-    /// What all threads of relay or bridge had of the CPUs.
+    /// The CPU time of all threads of relay or bridge.
     pub cpu_us_per_sample: Option<f64>,
-    /// Of the bridge: `DDS in`, `shared memory`, `hand-over`, `DDS out`.
+    /// The stages of the bridge: `DDS in`, `shared memory`, `hand-over`, `DDS out`.
     pub stages: BTreeMap<String, Quantiles>,
-    /// Copies of a payload in user space from the receive buffer to the DDS writer.
+    /// The number of copies of a payload in user space from the receive buffer to the DDS writer.
     pub copies: Option<f64>,
 }
 
-/// A long run at a rate that must lose nothing.
+/// A long run at a rate at which no sample may be lost.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Loss {
@@ -105,27 +107,27 @@ pub struct Loss {
     pub bytes: usize,
     pub program: String,
     pub accepted: u64,
-    /// Refused by the publisher's own writer.
+    /// Samples that the publisher's own writer refused.
     pub refused: u64,
     pub received: u64,
     pub lost: u64,
     pub disordered: u64,
     pub damaged: u64,
     pub drops: BTreeMap<String, u64>,
-    /// Of the bridge: received = forwarded + every named drop.
+    /// Whether the bridge accounts for every sample: received = forwarded + every named drop.
     pub whole: Option<bool>,
 }
 
-/// The highest rate without loss.
+/// The highest rate without loss of one program and payload.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Throughput {
     pub scheduling: String,
     pub bytes: usize,
     pub program: String,
-    /// Nothing was lost here, twice in a row.
+    /// The highest rate that passed twice.
     pub rate_hz: Option<f64>,
-    /// What ended the search at the next higher rate that was tried.
+    /// The failure at the next higher rate that was tried.
     pub limit: String,
     pub run_s: f64,
     pub attempts: Vec<Attempt>,
@@ -135,31 +137,31 @@ pub struct Throughput {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Attempt {
     pub rate_hz: f64,
-    /// Why the rate does not count; none where it does.
+    /// The reason why the run failed; `None` when it passed.
     pub failure: Option<String>,
 }
 
-/// What one process takes under one load.
+/// The resource usage of one process under one load.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Resource {
     /// `direct`, `relay`, `bridge`.
     pub program: String,
     pub process: String,
-    /// 0: idle.
+    /// The rate of the load; 0 when idle.
     pub rate_hz: u64,
     pub seconds: f64,
     pub samples: u64,
     pub cpu_ms: f64,
-    /// For each sample, of each repetition.
+    /// The CPU time per sample in each repetition.
     pub repetitions_cpu_us: Vec<f64>,
-    /// Times that a thread went to sleep, and so was woken.
+    /// How often a thread went to sleep, and so was woken.
     pub sleeps: u64,
-    /// Times that a thread was taken off its CPU.
+    /// How often a thread was preempted.
     pub preemptions: u64,
-    /// By perf, where it can; in a run of its own.
+    /// Counted by perf in a run of its own; `None` without perf.
     pub system_calls_per_sample: Option<f64>,
-    /// Resident, at the end of the load.
+    /// Resident memory at the end of the load.
     pub rss_kib: u64,
     pub anonymous_kib: u64,
     pub shared_kib: u64,
@@ -167,12 +169,13 @@ pub struct Resource {
 }
 
 impl Resource {
+    /// A value divided by the number of samples; `None` when idle.
     pub fn per_sample(&self, value: f64) -> Option<f64> {
         (self.samples > 0).then(|| value / self.samples as f64)
     }
 }
 
-/// One system call of one process, as strace counted it.
+/// The count of one system call of one process, by strace.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Call {
     pub program: String,
@@ -183,7 +186,7 @@ pub struct Call {
     pub samples: u64,
 }
 
-/// One program with so many routes or lanes.
+/// The figures of one program with a number of routes or lanes.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Scale {
@@ -197,12 +200,12 @@ pub struct Scale {
     pub reasons: BTreeMap<String, u64>,
     pub latency: Quantiles,
     pub repetitions_p50_us: Vec<f64>,
-    /// Of each process.
+    /// The CPU time of each process.
     pub cpu_us_per_sample: BTreeMap<String, f64>,
     pub rss_kib: BTreeMap<String, u64>,
 }
 
-/// The critical lane while something is wrong with the noncritical one.
+/// The latency of the critical lane in one condition of the noncritical one.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Isolation {
@@ -214,14 +217,14 @@ pub struct Isolation {
     pub missing: u64,
     pub reasons: BTreeMap<String, u64>,
     pub latency: Quantiles,
-    /// Of each round.
+    /// The p99.9 of each round.
     pub rounds_p999_us: Vec<f64>,
-    /// What the noncritical egress forwarded meanwhile.
+    /// Samples that the noncritical egress forwarded.
     pub noncritical_forwarded: u64,
     pub kills: u64,
 }
 
-/// Memory over time.
+/// The memory of a bridge under load over time.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Soak {
@@ -230,31 +233,31 @@ pub struct Soak {
     pub accepted: u64,
     pub missing: u64,
     pub reasons: BTreeMap<String, u64>,
-    /// Where samples are missing.
+    /// The periods of load in which samples are missing.
     pub lossy: Vec<Lossy>,
-    /// The most that a CPU was held up for within 100 ms, where none are missing; `None` in older runs.
+    /// The longest delay of a CPU within 100 ms in all other periods; `None` in older runs.
     pub held_up_ms: Option<f64>,
     pub series: Vec<SoakSeries>,
 }
 
-/// Some seconds of load of which samples are missing.
+/// A period of load, some seconds long, in which samples are missing.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Lossy {
-    /// When they ended, in seconds since the first began.
+    /// The end of the period, in seconds since the soak began.
     pub at_s: f64,
     pub missing: u64,
-    /// The most that a CPU was held up for within 100 ms.
+    /// The longest delay of a CPU within 100 ms.
     pub held_up_ms: f64,
 }
 
-/// One process, or the shared memory of all.
+/// The values of one quantity over time, of one process or of the shared memory of all.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct SoakSeries {
     pub name: String,
     /// `KiB`, `samples`, `descriptors`.
     pub unit: String,
-    /// Seconds since the load began, and value.
+    /// Pairs of the time in seconds since the soak began and the value.
     pub points: Vec<(f64, f64)>,
 }

@@ -1,11 +1,11 @@
-//! Tables in Markdown whose columns also line up as text.
+//! Markdown tables whose columns are also aligned as plain text.
 
 use std::fmt::Write as _;
 
-/// A column with a longer cell than this is one of words.
-const MOST_FIGURE_CHARS: usize = 24;
+/// The longest cell of a column of figures; columns with a longer cell hold text.
+const MAX_FIGURE_CHARS: usize = 24;
 
-/// A table that grows by rows. The first column and those of words are flush left, the others flush right.
+/// A table. The first column and columns of text are flush left, columns of figures flush right.
 pub struct Table {
     rows: Vec<Vec<String>>,
 }
@@ -15,7 +15,7 @@ impl Table {
         Self { rows: vec![heads.iter().map(|head| (*head).to_owned()).collect()] }
     }
 
-    /// A row; what is missing of it stays empty.
+    /// Adds a row; missing cells stay empty.
     pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
         let columns = self.rows[0].len();
         let mut cells: Vec<String> = cells.into_iter().map(|cell| cell.replace('|', "/")).collect();
@@ -35,7 +35,7 @@ impl Table {
         let left: Vec<bool> = widths
             .iter()
             .enumerate()
-            .map(|(column, width)| column == 0 || *width > MOST_FIGURE_CHARS)
+            .map(|(column, width)| column == 0 || *width > MAX_FIGURE_CHARS)
             .collect();
         let mut text = String::new();
         for (index, row) in self.rows.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! The tables of each section, in Markdown; `None` where the run did not measure it.
+//! The Markdown tables of each section; `None` where the run did not measure it.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -11,7 +11,7 @@ use super::targets;
 
 pub const PROGRAMS: [&str; 4] = ["wake-up", "direct", "relay", "bridge"];
 
-/// `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.
+/// The size of a payload with a unit: `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.
 pub fn payload(bytes: usize) -> String {
     match bytes {
         bytes if bytes >= 1 << 20 && bytes.is_multiple_of(1 << 20) => format!("{} MiB", bytes >> 20),
@@ -21,19 +21,19 @@ pub fn payload(bytes: usize) -> String {
     }
 }
 
-/// `critical queue_overflow 7, relay window_full 2`.
+/// Counts by name, such as `critical queue_overflow 7, relay window_full 2`.
 fn by_name(counts: &BTreeMap<String, u64>) -> String {
     let counts: Vec<String> =
         counts.iter().map(|(name, value)| format!("{name} {}", count(*value))).collect();
     counts.join(", ")
 }
 
-/// How many samples did not arrive, and what became of them: `7 (critical queue_overflow 7)`.
+/// The number of missing samples and the known reasons, such as `7 (critical queue_overflow 7)`.
 fn missing(samples: u64, reasons: &BTreeMap<String, u64>) -> String {
     if reasons.is_empty() { count(samples) } else { format!("{} ({})", count(samples), by_name(reasons)) }
 }
 
-/// The payloads of these rows, smallest first, without the wake-up's, which is none.
+/// The payloads of the rows, smallest first, except those of the wake-up, which has no payload.
 pub fn payloads<'a>(rows: impl Iterator<Item = &'a Latency>) -> Vec<usize> {
     let mut sizes: Vec<usize> = rows.filter(|row| row.program != "wake-up").map(|row| row.bytes).collect();
     sizes.sort_unstable();
@@ -41,7 +41,7 @@ pub fn payloads<'a>(rows: impl Iterator<Item = &'a Latency>) -> Vec<usize> {
     sizes
 }
 
-/// Machine, commit, command, parameters.
+/// The machine, commit, command, parameters and skipped cases of a run.
 pub fn run(summary: &Summary) -> String {
     let machine = &summary.machine;
     let mut text = format!(
@@ -63,7 +63,7 @@ pub fn run(summary: &Summary) -> String {
     text
 }
 
-/// One line for each rate and payload: hops, their ratio, tails.
+/// The hops, their ratio and the tails, a row for each rate and payload.
 pub fn hops(summary: &Summary, scheduling: &str) -> Option<String> {
     let mut table = Table::new(&[
         "µs",
@@ -100,7 +100,7 @@ pub fn hops(summary: &Summary, scheduling: &str) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// Everything that is known of each program.
+/// All latency figures, a row for each rate, payload and program.
 pub fn latencies(summary: &Summary, scheduling: &str) -> Option<String> {
     let mut table = Table::new(&[
         "µs",
@@ -138,7 +138,7 @@ pub fn latencies(summary: &Summary, scheduling: &str) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// The bridge's stages.
+/// The latencies of the bridge's stages, a row for each rate and payload.
 pub fn stages(summary: &Summary, scheduling: &str) -> Option<String> {
     const STAGES: [&str; 4] = ["DDS in", "shared memory", "hand-over", "DDS out"];
     let mut table = Table::new(&[
@@ -166,6 +166,7 @@ pub fn stages(summary: &Summary, scheduling: &str) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
+/// The payloads and rates of the latency section.
 fn cases(summary: &Summary, scheduling: &str) -> Vec<(usize, u64)> {
     let rows = summary.latency.iter().filter(|row| row.scheduling == scheduling && row.program != "wake-up");
     let mut cases: Vec<(usize, u64)> = rows.map(|row| (row.bytes, row.rate_hz)).collect();
@@ -174,6 +175,7 @@ fn cases(summary: &Summary, scheduling: &str) -> Vec<(usize, u64)> {
     cases
 }
 
+/// The latency of one program in one case.
 fn latency<'a>(
     summary: &'a Summary,
     scheduling: &str,
@@ -189,7 +191,7 @@ fn latency<'a>(
     })
 }
 
-/// Runs that must lose nothing.
+/// The runs in which no sample may be lost.
 pub fn loss(summary: &Summary) -> Option<String> {
     let mut table = Table::new(&[
         "",
@@ -221,7 +223,7 @@ pub fn loss(summary: &Summary) -> Option<String> {
 
 /// The highest rates without loss.
 pub fn throughput(summary: &Summary) -> Option<String> {
-    let mut table = Table::new(&["", "rate, Hz", "MB/s", "of direct", "what ended it at the next rate"]);
+    let mut table = Table::new(&["", "rate, Hz", "MB/s", "vs direct", "failure at the next higher rate"]);
     for row in &summary.throughput {
         let direct = summary
             .throughput
@@ -239,7 +241,7 @@ pub fn throughput(summary: &Summary) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// What relay and bridge take in all.
+/// The total resource usage of relay and bridge.
 pub fn totals(summary: &Summary) -> Option<String> {
     const PARTS: [(&str, &str, &[&str]); 3] = [
         ("relay", "relay", &["relay"]),
@@ -250,17 +252,17 @@ pub fn totals(summary: &Summary) -> Option<String> {
         "",
         "CPU, % of one",
         "CPU per 1,000 samples, ms",
-        "of the relay",
+        "vs relay",
         "wake-ups/sample",
         "system calls/sample",
         "RSS, MiB",
-        "of it anonymous",
+        "anonymous, MiB",
     ]);
     let mut rates: Vec<u64> = summary.resources.iter().map(|row| row.rate_hz).collect();
     rates.sort_unstable();
     rates.dedup();
     for rate_hz in rates {
-        let mut of_relay = None;
+        let mut relay_share = None;
         for (program, name, processes) in PARTS {
             let is_part = |row: &&Resource| {
                 row.rate_hz == rate_hz && row.program == program && processes.contains(&row.process.as_str())
@@ -270,7 +272,7 @@ pub fn totals(summary: &Summary) -> Option<String> {
             let sum = |of: &dyn Fn(&Resource) -> f64| rows.iter().map(|row| of(row)).sum::<f64>();
             let cpu_ms = sum(&|row| row.cpu_ms);
             let share = cpu_ms / first.seconds.max(1e-9) / 10.0;
-            let relay = *of_relay.get_or_insert(share);
+            let relay = *relay_share.get_or_insert(share);
             let calls: Option<f64> = rows.iter().map(|row| row.system_calls_per_sample).sum();
             table.row([
                 format!("{}, {name}", load(rate_hz)),
@@ -291,7 +293,7 @@ fn load(rate_hz: u64) -> String {
     if rate_hz == 0 { "idle".to_owned() } else { format!("{} Hz", count(rate_hz)) }
 }
 
-/// CPU, sleeps and memory of each process. What a process does when idle is part of its figures under load.
+/// The CPU time, wake-ups and memory of each process. Figures under load include the idle turns.
 pub fn resources(summary: &Summary) -> Option<String> {
     let mut table = Table::new(&[
         "",
@@ -302,9 +304,9 @@ pub fn resources(summary: &Summary) -> Option<String> {
         "preempted/s",
         "system calls/sample",
         "RSS, MiB",
-        "anonymous",
-        "shared",
-        "file",
+        "anonymous, MiB",
+        "shared, MiB",
+        "file, MiB",
     ]);
     let mebibytes = |kib: u64| number(Some(kib as f64 / 1_024.0));
     let mut rows: Vec<&Resource> = summary.resources.iter().collect();
@@ -314,7 +316,7 @@ pub fn resources(summary: &Summary) -> Option<String> {
         table.row([
             format!("{}, {}: {}", load(row.rate_hz), row.program, row.process),
             per_s(row.cpu_ms / 10.0),
-            // ms for 1,000 samples is µs for one.
+            // ms per 1,000 samples are µs per sample.
             number(row.per_sample(row.cpu_ms * 1_000.0)),
             per_s(row.sleeps as f64),
             number(row.per_sample(row.sleeps as f64)),
@@ -329,9 +331,9 @@ pub fn resources(summary: &Summary) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// System calls per sample, those that make at least a hundredth of a call.
+/// System calls per sample, by name where there is at least one in a hundred samples.
 pub fn calls(summary: &Summary) -> Option<String> {
-    let mut table = Table::new(&["", "samples", "calls/sample", "of them"]);
+    let mut table = Table::new(&["", "samples", "calls/sample", "by name"]);
     let mut processes: Vec<(&str, &str, u64)> = Vec::new();
     for call in &summary.calls {
         let process = (call.program.as_str(), call.process.as_str(), call.rate_hz);
@@ -362,7 +364,7 @@ pub fn calls(summary: &Summary) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// Latency, CPU and memory over the number of routes or lanes.
+/// Latency, CPU time and memory over the number of routes or lanes.
 pub fn scale(summary: &Summary, of: &str) -> Option<String> {
     let mut table = Table::new(&[
         "",
@@ -371,7 +373,7 @@ pub fn scale(summary: &Summary, of: &str) -> Option<String> {
         "p99.9, µs",
         "p50 of repetitions",
         "CPU/sample, µs",
-        "of it",
+        "by process",
         "RSS, MiB",
         "missing",
     ]);
@@ -413,8 +415,8 @@ pub fn scale(summary: &Summary, of: &str) -> Option<String> {
     Some(text)
 }
 
-/// What one more route or lane costs each program: p50 and CPU of ingress and the critical lane (or of the
-/// relay) for each sample, in µs.
+/// The cost of each further route or lane for each program: p50, and CPU time per sample of ingress and the
+/// critical lane (or of the relay), in µs.
 fn slopes(summary: &Summary, of: &str) -> Vec<(&'static str, (f64, f64))> {
     let of_program = |program: &'static str| {
         let rows = || summary.scale.iter().filter(|row| row.of == of && row.program == program);
@@ -429,7 +431,7 @@ fn slopes(summary: &Summary, of: &str) -> Vec<(&'static str, (f64, f64))> {
     ["relay", "bridge"].into_iter().filter_map(of_program).collect()
 }
 
-/// The slope of the line through the points.
+/// The slope of the least-squares line through the points.
 fn least_squares(points: &[(f64, f64)]) -> Option<f64> {
     let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / points.len() as f64;
     let (x, y) = (mean(|point| point.0), mean(|point| point.1));
@@ -437,7 +439,7 @@ fn least_squares(points: &[(f64, f64)]) -> Option<f64> {
     (squares > 0.0).then(|| points.iter().map(|point| (point.0 - x) * (point.1 - y)).sum::<f64>() / squares)
 }
 
-/// The critical lane by what the noncritical one does.
+/// The latency of the critical lane, a row for each condition of the noncritical one.
 pub fn isolation(summary: &Summary) -> Option<String> {
     let mut table = Table::new(&[
         "noncritical lane",
@@ -447,13 +449,14 @@ pub fn isolation(summary: &Summary) -> Option<String> {
         "p99.9, µs",
         "max, µs",
         "p99.9 of rounds",
-        "their median",
-        "of a round / undisturbed (95 %)",
+        "median of rounds",
+        "round / undisturbed (95 %)",
         "missing",
         "noncritical forwarded",
     ]);
     for row in &summary.isolation {
-        let ratio = if row.condition == row.against { None } else { targets::against(summary, row) };
+        let ratio =
+            if row.condition == row.against { None } else { targets::ratio_to_baseline(summary, row) };
         table.row([
             format!("{}, {} Hz, {}", row.condition, count(row.rate_hz), row.scheduling),
             count(row.latency.samples),
@@ -471,14 +474,14 @@ pub fn isolation(summary: &Summary) -> Option<String> {
     (!table.is_empty()).then(|| table.text())
 }
 
-/// Memory over time.
+/// The load, the missing samples and the memory over time of a soak.
 pub fn soak(summary: &Summary) -> Option<String> {
     let soak = summary.soak.as_ref()?;
     let mut table = Table::new(&["", "first", "last", "most", "unit", "per hour", ""]);
     for series in &soak.series {
         let values = || series.points.iter().map(|point| point.1);
         let (trend, per_hour) = targets::trend(series);
-        let judged = series.unit == "KiB";
+        let is_memory = series.unit == "KiB";
         table.row([
             series.name.clone(),
             number(values().next()),
@@ -487,7 +490,7 @@ pub fn soak(summary: &Summary) -> Option<String> {
             series.unit.clone(),
             number(per_hour),
             match trend {
-                _ if !judged => String::new(),
+                _ if !is_memory => String::new(),
                 targets::Trend::Flat => "flat".to_owned(),
                 targets::Trend::Grows => "**grows**".to_owned(),
                 targets::Trend::TooShort => "too short to tell".to_owned(),
@@ -500,28 +503,28 @@ pub fn soak(summary: &Summary) -> Option<String> {
         soak.load,
         count(soak.accepted),
         missing(soak.missing, &soak.reasons),
-        held_up(soak),
+        cpu_delays(soak),
         table.text()
     ))
 }
 
-/// Whether the CPUs were held up when samples went missing, and when none did.
-fn held_up(soak: &Soak) -> String {
+/// The longest CPU delays in the periods with missing samples, and in all others.
+fn cpu_delays(soak: &Soak) -> String {
     let Some(otherwise_ms) = soak.held_up_ms else { return String::new() };
-    let mut text = "\n\nHeld up within 100 ms, the CPU that was most:".to_owned();
+    let mut text = "\n\nLongest delay of a CPU within 100 ms:".to_owned();
     for lossy in &soak.lossy {
         text.push_str(&format!(
-            " {} ms by {} s, when {} went missing;",
+            " {} ms in the period until {} s, in which {} samples are missing;",
             number(Some(lossy.held_up_ms)),
             count(lossy.at_s as u64),
             count(lossy.missing),
         ));
     }
-    text.push_str(&format!(" up to {} ms when none did.", number(Some(otherwise_ms))));
+    text.push_str(&format!(" up to {} ms in periods without missing samples.", number(Some(otherwise_ms))));
     text
 }
 
-/// Whether a soak found growth or loss.
+/// The growth and loss for which a soak fails; empty when it passes.
 pub fn soak_failures(summary: &Summary) -> Vec<String> {
     let Some(soak) = &summary.soak else { return Vec::new() };
     let grows = soak.series.iter().filter(|series| series.unit == "KiB");

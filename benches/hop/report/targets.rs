@@ -1,4 +1,4 @@
-//! What the overhead should be, and whether it is.
+//! The targets for the bridge's overhead, and whether a run meets them.
 
 use super::format::number;
 use super::statistics::{growth, median, median_interval};
@@ -6,38 +6,39 @@ use super::summary::{Isolation, Latency, SoakSeries, Summary};
 use super::table::Table;
 use super::tables::payload;
 
-/// The hop of the bridge is judged by that of the relay, at this rate with this payload.
+/// A target for the bridge's hop at one rate and payload.
 pub struct Hop {
     pub rate_hz: u64,
     pub bytes: usize,
-    /// The most that it may be of the relay's.
-    most: f64,
-    /// The most that it may be by itself: what a C++ router of one process adds on such a machine.
-    most_us: Option<f64>,
+    /// The highest ratio to the relay's hop.
+    max_ratio: f64,
+    /// The highest hop: what a C++ router of one process adds on such a machine.
+    max_us: Option<f64>,
 }
 
-/// The CPU of the bridge is judged by that of the relay at this rate.
-pub const JUDGED_HZ: u64 = 1_000;
+/// The rate of the target for the bridge's CPU time, as a ratio to the relay's.
+pub const TARGET_HZ: u64 = 1_000;
 
+/// The targets for hops.
 pub const HOPS: [Hop; 5] = [
-    Hop { rate_hz: 1_000, bytes: 2_948, most: 1.0, most_us: Some(75.0) },
-    Hop { rate_hz: 100, bytes: 2_948, most: 1.25, most_us: Some(145.0) },
-    Hop { rate_hz: 10, bytes: 1 << 20, most: 1.0, most_us: None },
-    Hop { rate_hz: 30, bytes: 1 << 20, most: 1.0, most_us: None },
-    Hop { rate_hz: 100, bytes: 1 << 20, most: 1.0, most_us: None },
+    Hop { rate_hz: 1_000, bytes: 2_948, max_ratio: 1.0, max_us: Some(75.0) },
+    Hop { rate_hz: 100, bytes: 2_948, max_ratio: 1.25, max_us: Some(145.0) },
+    Hop { rate_hz: 10, bytes: 1 << 20, max_ratio: 1.0, max_us: None },
+    Hop { rate_hz: 30, bytes: 1 << 20, max_ratio: 1.0, max_us: None },
+    Hop { rate_hz: 100, bytes: 1 << 20, max_ratio: 1.0, max_us: None },
 ];
 
-/// One thing to reach.
+/// A row of the table of targets.
 struct Target {
     what: String,
     limit: String,
     value: String,
-    /// Not known where the run does not say.
+    /// Whether the target is met; `None` when the run does not tell.
     met: Option<bool>,
 }
 
 impl Target {
-    /// Met when the value is at most the limit.
+    /// A target that is met when the value is at most the limit.
     fn at_most(what: String, limit: f64, unit: &str, value: Option<f64>) -> Self {
         let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
         Self {
@@ -48,8 +49,8 @@ impl Target {
         }
     }
 
-    /// Met when the median is certain to be at most the limit, if there is enough to be certain of it; of few
-    /// values when it is.
+    /// A target for a median. With six or more values it is met when the whole confidence interval is at most
+    /// the limit; with fewer, when the median is.
     fn median_at_most(what: String, limit: f64, unit: &str, values: Vec<f64>) -> Self {
         let Some(estimate) = Estimate::of(&values) else { return Self::at_most(what, limit, unit, None) };
         let met = match estimate.interval {
@@ -61,7 +62,7 @@ impl Target {
     }
 }
 
-/// The table of all that the run can say something about; `None` where that is nothing.
+/// The table of all targets for which the run has figures; `None` when there are none.
 pub fn table(summary: &Summary) -> Option<String> {
     let mut targets = Vec::new();
     for scheduling in ["other", "fifo"] {
@@ -84,12 +85,12 @@ pub fn table(summary: &Summary) -> Option<String> {
         let of = |program: &str, process: Option<&str>| {
             let rows = summary.resources.iter().filter(|row| {
                 row.program == program
-                    && row.rate_hz == JUDGED_HZ
+                    && row.rate_hz == TARGET_HZ
                     && process.map_or(!["publisher", "subscriber"].contains(&row.process.as_str()), |only| {
                         row.process == only
                     })
             });
-            // Of each repetition; of runs that did not keep them, of all.
+            // A value for each repetition; older runs only have one for all.
             rows.map(|row| match &row.repetitions_cpu_us[..] {
                 [] => row.per_sample(row.cpu_ms).into_iter().collect(),
                 each => each.to_vec(),
@@ -107,20 +108,25 @@ pub fn table(summary: &Summary) -> Option<String> {
             "critical p99.9, noncritical lane {} / {}, {}",
             row.condition, row.against, row.scheduling
         );
-        // The same twice is no target; it says what can be told at all.
+        // `repeat` has no target: it shows the noise of the comparison.
         if row.condition != "repeat" {
-            let (value, met) = match against(summary, row) {
-                Some(ratio) => (ratio.text(), ratio.is_at_most(MOST_OF_UNDISTURBED)),
+            let (value, met) = match ratio_to_baseline(summary, row) {
+                Some(ratio) => (ratio.text(), ratio.is_at_most(MAX_RATIO_TO_UNDISTURBED)),
                 None => (number(None), None),
             };
-            targets.push(Target { what, limit: format!("at most {MOST_OF_UNDISTURBED:.2}"), value, met });
+            targets.push(Target {
+                what,
+                limit: format!("at most {MAX_RATIO_TO_UNDISTURBED:.2}"),
+                value,
+                met,
+            });
         }
     }
     for series in summary.soak.iter().flat_map(|soak| &soak.series).filter(|series| series.unit == "KiB") {
         let (trend, kib_per_hour) = trend(series);
         targets.push(Target {
             what: format!("growth of the memory of {}", series.name),
-            limit: format!("at most {} KiB/h", number(Some(MOST_KIB_PER_HOUR))),
+            limit: format!("at most {} KiB/h", number(Some(MAX_KIB_PER_HOUR))),
             value: match trend {
                 Trend::TooShort => "too short to tell".to_owned(),
                 _ => number(kib_per_hour) + " KiB/h",
@@ -132,7 +138,7 @@ pub fn table(summary: &Summary) -> Option<String> {
             },
         });
     }
-    let mut table = Table::new(&["", "to reach", "measured", ""]);
+    let mut table = Table::new(&["", "target", "measured", ""]);
     for target in targets {
         let met = match target.met {
             Some(true) => "met",
@@ -153,7 +159,7 @@ fn latency(summary: &Summary, scheduling: &str, targets: &mut Vec<Target>) {
                 && (row.bytes == bytes || program == "wake-up")
         })
     };
-    // Of each repetition.
+    // The hop of each repetition.
     let hops = |hop: &Hop, program| -> Option<Vec<f64>> {
         let with = row(hop.rate_hz, hop.bytes, program)?.repetitions_p50_us.iter();
         let without = &row(hop.rate_hz, hop.bytes, "direct")?.repetitions_p50_us;
@@ -167,15 +173,15 @@ fn latency(summary: &Summary, scheduling: &str, targets: &mut Vec<Target>) {
             hop.rate_hz,
             payload(hop.bytes)
         );
-        // One of the relay that is lost in the noise counts as if it were nothing.
+        // If the relay's hop is lost in the noise, it counts as 0.
         let ratio = |(bridge, relay)| hop_ratio(bridge, relay).unwrap_or(f64::INFINITY);
         let ratios = bridge.iter().copied().zip(relay).map(ratio).collect();
-        targets.push(Target::median_at_most(what, hop.most, "", ratios));
+        targets.push(Target::median_at_most(what, hop.max_ratio, "", ratios));
     }
     for hop in &HOPS {
-        let (Some(most_us), Some(bridge)) = (hop.most_us, hops(hop, "bridge")) else { continue };
+        let (Some(max_us), Some(bridge)) = (hop.max_us, hops(hop, "bridge")) else { continue };
         let what = format!("hop of the bridge, {} Hz of {}, {scheduling}", hop.rate_hz, payload(hop.bytes));
-        targets.push(Target::median_at_most(what, most_us, "µs", bridge));
+        targets.push(Target::median_at_most(what, max_us, "µs", bridge));
     }
     for rate_hz in [1_000, 100] {
         let Some(bridge) = row(rate_hz, 2_948, "bridge") else { continue };
@@ -187,29 +193,29 @@ fn latency(summary: &Summary, scheduling: &str, targets: &mut Vec<Target>) {
     }
 }
 
-/// The hop of the bridge over that of the relay; none where the relay's is lost in the noise.
+/// The ratio of the bridge's hop to the relay's; `None` when the relay's hop is lost in the noise.
 pub fn hop_ratio(bridge_us: f64, relay_us: f64) -> Option<f64> {
     (relay_us > 0.0).then(|| bridge_us / relay_us)
 }
 
-/// The critical p99.9 over that of nothing wrong.
-const MOST_OF_UNDISTURBED: f64 = 1.1;
+/// The highest ratio of the critical p99.9 in a condition to that in its undisturbed baseline.
+const MAX_RATIO_TO_UNDISTURBED: f64 = 1.1;
 
-/// What is known of a median.
+/// An estimated median.
 pub struct Estimate {
     /// The median of the values.
     pub median: f64,
-    /// Where the median of what they are drawn from lies with a certainty of 95 %; none of few values.
+    /// The 95 % confidence interval of the median; `None` with too few values.
     pub interval: Option<(f64, f64)>,
 }
 
 impl Estimate {
-    /// None of no values.
+    /// `None` without values.
     fn of(values: &[f64]) -> Option<Self> {
         (!values.is_empty()).then(|| Self { median: median(values), interval: median_interval(values) })
     }
 
-    /// `1.02 (0.97 to 1.08)`.
+    /// Median and interval, such as `1.02 (0.97 to 1.08)`.
     pub fn text(&self) -> String {
         let interval = self.interval.map_or(String::new(), |(low, high)| {
             format!(" ({} to {})", number(Some(low)), number(Some(high)))
@@ -217,7 +223,8 @@ impl Estimate {
         number(Some(self.median)) + &interval
     }
 
-    /// Not known where the interval has the limit within it.
+    /// Whether the median is at most the limit; `None` when the limit is within the interval or there is
+    /// none.
     fn is_at_most(&self, limit: f64) -> Option<bool> {
         let (low, high) = self.interval?;
         if high <= limit {
@@ -230,11 +237,12 @@ impl Estimate {
     }
 }
 
-/// How the p99.9 of a condition is to that of what it is compared with.
+/// The ratio of the p99.9 of a condition to that of its baseline.
 ///
-/// Round by round, for both of a round had the same neighbours on the machine, and one round in which the
-/// hypervisor held the CPUs does not decide, as it does over the p99.9 of all rounds' samples.
-pub fn against(summary: &Summary, row: &Isolation) -> Option<Estimate> {
+/// It is the median of the ratios of the rounds: conditions of the same round ran under the same load of the
+/// machine, and one round in which the hypervisor took the CPUs does not decide, as it would for the p99.9
+/// over the samples of all rounds.
+pub fn ratio_to_baseline(summary: &Summary, row: &Isolation) -> Option<Estimate> {
     let other = summary
         .isolation
         .iter()
@@ -244,34 +252,35 @@ pub fn against(summary: &Summary, row: &Isolation) -> Option<Estimate> {
     Estimate::of(&ratios)
 }
 
-/// More than this is growth: 24 MiB a day.
-pub const MOST_KIB_PER_HOUR: f64 = 1_024.0;
+/// The highest slope of memory that is not growth: 24 MiB a day.
+pub const MAX_KIB_PER_HOUR: f64 = 1_024.0;
 
-/// Growth below this in all the time looked at is not told from the steps in which an allocator takes memory.
-const STEPS_KIB: f64 = 256.0;
+/// The total growth that cannot be distinguished from the steps in which an allocator takes memory.
+const ALLOCATION_STEP_KIB: f64 = 256.0;
 
-/// This share of the time, at the beginning, is not looked at: caches and pools fill.
+/// The share of the time at the beginning that is ignored, because caches and pools still fill.
 const WARM_UP: f64 = 0.2;
 
+/// Whether memory grows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trend {
     Flat,
     Grows,
-    /// Flat as far as can be seen, and a growth that counts could not be seen.
+    /// No growth was found, but the run was too short to find one.
     TooShort,
 }
 
-/// Whether the memory grows, and the slope in KiB per hour.
+/// The trend of the memory, and its slope in KiB per hour.
 pub fn trend(series: &SoakSeries) -> (Trend, Option<f64>) {
     let end = series.points.last().map_or(0.0, |point| point.0);
-    let looked_at: Vec<(f64, f64)> =
+    let points: Vec<(f64, f64)> =
         series.points.iter().copied().filter(|point| point.0 >= end * WARM_UP).collect();
-    let Some(kib_per_second) = growth(&looked_at) else { return (Trend::TooShort, None) };
-    let seconds = end - looked_at.first().map_or(0.0, |point| point.0);
+    let Some(kib_per_second) = growth(&points) else { return (Trend::TooShort, None) };
+    let seconds = end - points.first().map_or(0.0, |point| point.0);
     let kib_per_hour = kib_per_second * 3_600.0;
-    let trend = if kib_per_second * seconds > STEPS_KIB {
-        if kib_per_hour > MOST_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
-    } else if STEPS_KIB / seconds * 3_600.0 > MOST_KIB_PER_HOUR {
+    let trend = if kib_per_second * seconds > ALLOCATION_STEP_KIB {
+        if kib_per_hour > MAX_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
+    } else if ALLOCATION_STEP_KIB / seconds * 3_600.0 > MAX_KIB_PER_HOUR {
         Trend::TooShort
     } else {
         Trend::Flat

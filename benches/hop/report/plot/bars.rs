@@ -1,4 +1,4 @@
-//! Bars in groups.
+//! Bar charts with groups of bars.
 
 use super::axis::Axis;
 use super::file;
@@ -7,24 +7,24 @@ use super::svg::{Anchor, Svg, TEXT};
 
 const HEIGHT: f64 = 190.0;
 
-/// Bars of a kind: one for each group, `None` where nothing was measured.
+/// The bars of one kind: a value for each group, `None` where nothing was measured.
 pub struct Series<'a> {
     pub name: &'a str,
-    /// `a` to `f`.
+    /// The CSS class of the colour, `a` to `f`.
     pub class: &'a str,
     pub values: Vec<Option<f64>>,
 }
 
-/// What is drawn.
+/// A bar chart.
 pub struct Bars<'a> {
-    /// For those who can't see it.
+    /// The text alternative for screen readers.
     pub label: &'a str,
-    /// What the values are.
+    /// The quantity and unit of the values.
     pub title: &'a str,
     pub groups: Vec<String>,
     pub series: Vec<Series<'a>>,
     pub logarithmic: bool,
-    /// How values are written above the bars.
+    /// Formats a value for the text above its bar.
     pub shown: fn(Option<f64>) -> String,
 }
 
@@ -55,7 +55,7 @@ impl Bars<'_> {
                 svg.rect(&format!("fill {}", series.class), corner, size, Some(&tip));
                 svg.text("t", (x + bar_width / 2.0, y - 4.0), Anchor::Middle, &shown);
             }
-            // Long names of neighbours would run into each other on one line.
+            // Every other name is one line lower, so that long names do not overlap.
             let lower = if self.groups.len() > 4 && group % 2 == 1 { TEXT + 2.0 } else { 0.0 };
             let at = (left + group_width * 0.43, bottom + TEXT + 4.0 + lower);
             svg.text("t", at, Anchor::Middle, name);
@@ -69,7 +69,7 @@ impl Bars<'_> {
         let high = values.iter().copied().fold(0.0, f64::max);
         if self.logarithmic {
             let low = values.iter().copied().filter(|value| *value > 0.0).fold(f64::INFINITY, f64::min);
-            // Half the lowest, so that the lowest bar can be seen.
+            // The axis begins at half the lowest value, so that the lowest bar is visible.
             Axis::decades((if low.is_finite() { low / 2.0 } else { 1.0 }, high), extent)
         } else {
             Axis::linear((0.0, high * 1.05), extent)

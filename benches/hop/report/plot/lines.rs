@@ -1,4 +1,4 @@
-//! Lines over a number, in panels above each other.
+//! Line charts: panels above each other with a common x axis.
 
 use super::axis::Axis;
 use super::file;
@@ -10,18 +10,19 @@ const PANEL: f64 = 130.0;
 /// A line of a panel.
 pub struct Line<'a> {
     pub name: &'a str,
-    /// `a` to `f`; with ` tail` behind it, thin, dashed, and not in the legend.
+    /// The CSS class of the colour, `a` to `f`. With ` tail` appended, the line is thin and dashed and not in
+    /// the legend.
     pub class: String,
     pub points: Vec<(f64, f64)>,
 }
 
-/// Lines with axes in common.
+/// Lines with common axes.
 pub struct Panel<'a> {
     pub title: String,
     pub lines: Vec<Line<'a>>,
 }
 
-/// Panels with one x axis. `logarithmic` is for both axes; a linear y axis begins at 0.
+/// Draws panels with a common x axis. `logarithmic` applies to both axes; a linear y axis begins at 0.
 pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) -> String {
     let mut svg = Svg::default();
     let finite = |panels: &[Panel], of: fn(&(f64, f64)) -> f64| {

@@ -1,5 +1,5 @@
-//! Plots as SVG files: the drawing is that of the evaluation's report, so that there is one of it; the
-//! charts are the bench's own.
+//! Plots as SVG files. Axes, frames and SVG elements are shared with the report of the evaluation; the charts
+//! are the bench's own.
 
 #[allow(
     dead_code,
@@ -20,10 +20,11 @@ mod svg;
 pub use bars::{Bars, Series};
 pub use lines::{Line, Panel, lines};
 
-/// A page shows the file as an image, which has no style sheet but its own.
+/// The style sheet of each file. Pages include the files as images, to which a page's style sheet does not
+/// apply.
 const STYLE: &str = include_str!("style.css");
 
-/// A drawing as a file of its own.
+/// The content of an SVG file with a drawing, the style sheet and a background.
 fn file(drawing: &str) -> String {
     let end = drawing.find('>').map_or(0, |at| at + 1);
     let (head, body) = drawing.split_at(end);
