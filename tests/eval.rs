@@ -240,7 +240,7 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     // What is there is left as it is, and what was made otherwise is not mixed with it.
     let before = fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap();
     let said = run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
-    assert!(said.contains("0 made, 1 were there, 0 failed"), "{said}");
+    assert!(said.contains("0 finished, 1 already in the results, 0 failed"), "{said}");
     assert_eq!(fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap(), before);
     for (arguments, differs) in [("--quick --seed 4", "--seed"), ("--seed 3", "--quick")] {
         let output = run(out, &format!("run bridge_strong --switch plain {arguments}"));
@@ -305,7 +305,7 @@ fn a_run_over_a_trace_keeps_it_and_says_what_each_of_its_rows_lost() {
     fs::write(&trace, of_file.replace("0.5778", "57.78")).unwrap();
     let output = run(out.path(), &arguments);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    let mistake = "drive_away_and_back.csv:65: loss is '57.78', and may be 0 to 1 (a share, not percent)";
+    let mistake = "drive_away_and_back.csv:65: loss is '57.78', but must be 0 to 1 (a share, not percent)";
     assert!(!output.status.success() && said.contains(mistake), "{said}");
 }
 
@@ -379,7 +379,7 @@ fn what_a_harness_that_is_killed_leaves_is_removed_by_the_next() {
     harness.kill9();
     assert!(!traces(pid).is_empty(), "a killed harness can't clean up");
     let said = run_well(out.path(), "run baseline_clean --quick");
-    assert!(said.contains("removed what a harness that died has left"), "{said}");
+    assert!(said.contains("removed the leftovers of a harness that no longer runs"), "{said}");
     assert_eq!(traces(pid), Vec::<String>::new());
     Run::read(out.path(), "baseline_clean.fast.none.netns.plain.r1").assert_consistent();
     assert!(!out.path().join(".partial").exists());
@@ -400,10 +400,10 @@ fn a_run_that_fails_is_kept_with_its_reason_and_the_next_is_made() {
     let output = run(out.path(), &arguments);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("1 made, 0 were there, 1 failed"), "{said}");
+    assert!(said.contains("1 finished, 0 already in the results, 1 failed"), "{said}");
     let failed = out.path().join("failed/baseline_clean.fast.none.netns.plain.r1");
     let reason = fs::read_to_string(failed.join("reason.txt")).unwrap();
-    assert!(reason.contains("ended before its time"), "{reason}");
+    assert!(reason.contains("ended during the run"), "{reason}");
     assert!(failed.join("scenario.yaml").exists());
     Run::read(out.path(), "baseline_clean.cyclone.none.netns.plain.r1").assert_consistent();
 }

@@ -509,7 +509,7 @@ fn what_can_not_be_is_said() {
     };
     for (arguments, code, said) in [
         ("impair --source 10.0.0.1 --backend nfqueue --queue 4", 1, "another program listens on NFQUEUE 4"),
-        ("impair --source 10.0.0.1 --gilbert-elliott 2 0 0 0", 2, "p is 2, and may be 0 to 1"),
+        ("impair --source 10.0.0.1 --gilbert-elliott 2 0 0 0", 2, "p is 2, but must be 0 to 1"),
         ("impair --source 10.0.0.1 --delay-ms -1", 2, "unexpected argument"),
         ("impair --source 10.0.0.1 --jitter-ms 1e9", 2, "0 to 60000 ms"),
         ("impair --source 10.0.0.1 --level mild", 2, "--reading"),
@@ -517,7 +517,7 @@ fn what_can_not_be_is_said() {
         (
             &format!("impair --source 10.0.0.1 --trace {bad}"),
             2,
-            "trace.csv:2: loss is '3', and may be 0 to 1",
+            "trace.csv:2: loss is '3', but must be 0 to 1",
         ),
         ("impair --source 10.0.0.1 --trace a.csv --level mild", 2, "cannot be used with"),
         ("impair --source 10.0.0.1 --trace a.csv --delay-ms 3", 2, "cannot be used with"),

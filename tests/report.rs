@@ -262,7 +262,7 @@ fn a_run_that_cannot_be_read_is_told_and_the_others_are_shown() {
     let (_out, page) = report_of(results.path());
     parse(&page);
     assert!(page.contains("publisher.csv:1: there is no column time_ns"));
-    assert!(page.contains("format 2, and this program knows 1"));
+    assert!(page.contains("format 2, but this program reads format 1"));
     assert!(page.contains("failed: no &lt;luck&gt;"));
     assert!(page.contains("3 runs failed or could not be read"));
 }
@@ -290,7 +290,7 @@ fn a_folder_without_runs_is_an_error() {
     assert_eq!(output.status.code(), Some(1));
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(
-        said.contains("has no finished run; `adaptive-bridge-eval run` or `matrix` makes some"),
+        said.contains("has no finished run; first record some with `adaptive-bridge-eval run` or `matrix`"),
         "{said}"
     );
     assert_eq!(fs::read_dir(empty.path()).unwrap().count(), 0);

@@ -1,4 +1,4 @@
-//! Why an evaluation did not go on.
+//! The error type of the evaluation harness.
 
 use std::fmt;
 use std::io;
@@ -6,22 +6,22 @@ use std::path::Path;
 
 use super::impairment::ImpairmentError;
 
-/// Why something of an evaluation could not be done.
+/// Why a command of the evaluation harness failed.
 #[derive(Debug)]
 pub enum EvalError {
-    /// What failed, for who has to mend it.
+    /// A failure, with a message for the user.
     Failed(String),
-    /// A signal asked to end.
+    /// SIGINT or SIGTERM arrived.
     Interrupted,
 }
 
 impl EvalError {
-    /// A failure in a sentence.
-    pub fn new(what: impl Into<String>) -> Self {
-        Self::Failed(what.into())
+    /// Creates a failure with this message.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self::Failed(message.into())
     }
 
-    /// A file or folder could not be used.
+    /// Creates a failure of an operation on a file or folder.
     pub fn file(path: &Path, error: &io::Error) -> Self {
         Self::Failed(format!("{}: {error}", path.display()))
     }
@@ -30,7 +30,7 @@ impl EvalError {
 impl fmt::Display for EvalError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Failed(what) => f.write_str(what),
+            Self::Failed(message) => f.write_str(message),
             Self::Interrupted => f.write_str("interrupted"),
         }
     }

@@ -1,11 +1,11 @@
-//! The evaluation harness, `adaptive-bridge-eval`. It drives the bridge as its users do, by its program.
+//! The evaluation harness, `adaptive-bridge-eval`. It starts the bridge as users do, by its program.
 //!
 //! - [`impairment`]: links that lose and delay packets.
-//! - [`scenario`]: what is run.
-//! - [`bed`]: the hosts on which it is run.
-//! - [`harness`]: makes the runs and records them.
-//! - [`statistics`]: what is computed from the records. Pure.
-//! - [`report`]: what the records show: tables, figures and verdicts.
+//! - [`scenario`]: the experiments, read from YAML files.
+//! - [`bed`]: test beds, the hosts that experiments run on.
+//! - [`harness`]: executes runs and records them.
+//! - [`statistics`]: pure functions that compute figures from the records.
+//! - [`report`]: tables, figures and verdicts from the records.
 
 pub mod bed;
 mod cli;

@@ -1,6 +1,6 @@
-//! Hosts as containers on a bridge network, as in the paper. The containers have this machine's own programs
-//! and libraries (`/usr` and `/etc`, read only), so nothing has to be pulled or built; network, shared memory
-//! and files are their own. They share the machine's process ids, so that signals and counters work as in
+//! Hosts as containers on a bridge network, as in the paper. The containers mount this machine's programs and
+//! libraries (`/usr` and `/etc`, read only), so no image has to be pulled or built; each has its own network,
+//! shared memory and files. They share the machine's process ids, so that signals and counters work as in
 //! network namespaces.
 
 use std::fs;
@@ -16,38 +16,38 @@ use crate::eval::error::EvalError;
 use crate::eval::impairment::system;
 use crate::eval::scenario::Switch;
 
-/// An image of folders to mount into, and of the links between them.
+/// The image of all hosts: empty folders to mount into, and symbolic links into `/usr`.
 const IMAGE: &str = "adaptive-bridge-eval:host";
 const FOLDERS: [&str; 8] = ["usr", "etc", "proc", "sys", "dev", "tmp", "run", "var"];
 const LINKS: [&str; 4] = ["bin", "sbin", "lib", "lib64"];
-/// What a network is called. Hosts have no dash in their names.
+/// Name of the docker network. Names of hosts have no dash.
 const NETWORK: &str = "bridge-network";
-/// Docker gives 64 MiB, too little for the shared memory of ten routes.
+/// Size of a container's /dev/shm: docker's default of 64 MiB is too small for ten routes.
 const SHM_SIZE: &str = "1g";
 
-/// Why this machine can't; `None` when it can.
-pub(super) fn missing(asked: Switch) -> Option<String> {
+/// Why this machine cannot create such a bed; `None` when it can.
+pub(super) fn missing(wanted: Switch) -> Option<String> {
     if !nix::unistd::geteuid().is_root() {
-        return Some("programs on containers are started as root".to_owned());
+        return Some("it needs root to run programs in containers".to_owned());
     }
     if let Err(error) = docker("version") {
         return Some(error.to_string());
     }
-    let link = |name: &&str| fs::symlink_metadata(format!("/{name}")).is_ok_and(|it| it.is_dir());
-    if let Some(name) = LINKS.iter().find(|name| link(name)) {
-        return Some(format!("/{name} is not a link into /usr on this machine"));
+    let is_folder = |name: &&str| fs::symlink_metadata(format!("/{name}")).is_ok_and(|it| it.is_dir());
+    if let Some(name) = LINKS.iter().find(|name| is_folder(name)) {
+        return Some(format!("/{name} is not a symbolic link into /usr on this machine"));
     }
-    let own = switch();
-    (asked != own).then(|| format!("docker's bridge is a {} one here", own.name()))
+    let present = switch();
+    (wanted != present).then(|| format!("docker's bridge on this machine is a {} switch", present.name()))
 }
 
-/// What docker's bridge is on this machine. Docker itself turns connection tracking on.
+/// The kind of switch that docker's bridge is on this machine. Docker itself enables connection tracking.
 pub fn switch() -> Switch {
     let setting = fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables").unwrap_or_default();
     if setting.trim() == "1" { Switch::Reassembling } else { Switch::Plain }
 }
 
-/// Removes what this process has made, whole or not.
+/// Removes containers and network of this process when it is dropped, even if the bed is incomplete.
 struct Remover;
 
 impl Drop for Remover {
@@ -57,7 +57,7 @@ impl Drop for Remover {
     }
 }
 
-/// Makes the containers.
+/// Creates the network and a container for each host.
 pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError> {
     make_image()?;
     let remover = Remover;
@@ -82,39 +82,40 @@ pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError>
     Ok(Bed { hosts, switch, _remover: Box::new(remover) })
 }
 
-/// Makes the image anew: that takes no time, and an older one may be of another shape.
+/// Creates the image, also if it exists: that is fast, and the existing one may be of another version.
 fn make_image() -> Result<(), EvalError> {
     let folder = stale::scratch("image");
     let root = folder.join("root");
-    let made = FOLDERS.iter().try_for_each(|name| fs::create_dir_all(root.join(name)));
-    let linked = made.and_then(|()| {
+    let created = FOLDERS.iter().try_for_each(|name| fs::create_dir_all(root.join(name)));
+    let linked = created.and_then(|()| {
         LINKS.iter().try_for_each(|name| std::os::unix::fs::symlink(format!("usr/{name}"), root.join(name)))
     });
     linked.map_err(|error| EvalError::file(&root, &error))?;
     let archive = folder.join("image.tar");
     let (archive, root) = (archive.display(), root.display());
-    let made = system::run(&system::words(&format!("tar --create --file {archive} --directory {root} .")))
-        .map_err(EvalError::from)
-        .and_then(|_| docker(&format!("import {archive} {IMAGE}")));
+    let imported =
+        system::run(&system::words(&format!("tar --create --file {archive} --directory {root} .")))
+            .map_err(EvalError::from)
+            .and_then(|_| docker(&format!("import {archive} {IMAGE}")));
     let _ = fs::remove_dir_all(&folder);
-    made.map(|_| ())
+    imported.map(|_| ())
 }
 
 fn host(name: &str, container: &str) -> Result<Host, EvalError> {
-    let strange = |what: &str| EvalError::new(format!("container {container}: no {what}"));
-    let shown: Value = serde_json::from_str(&docker(&format!("inspect {container}"))?).unwrap_or_default();
-    let pid = shown[0]["State"]["Pid"].as_u64().filter(|pid| *pid > 0).ok_or_else(|| strange("process"))?;
-    let networks = shown[0]["NetworkSettings"]["Networks"].as_object();
+    let lacks = |what: &str| EvalError::new(format!("container {container} has no {what}"));
+    let found: Value = serde_json::from_str(&docker(&format!("inspect {container}"))?).unwrap_or_default();
+    let pid = found[0]["State"]["Pid"].as_u64().filter(|pid| *pid > 0).ok_or_else(|| lacks("process"))?;
+    let networks = found[0]["NetworkSettings"]["Networks"].as_object();
     let address = networks.and_then(|networks| networks.values().next()?["IPAddress"].as_str());
-    let address: Ipv4Addr = address.and_then(|text| text.parse().ok()).ok_or_else(|| strange("address"))?;
+    let address: Ipv4Addr = address.and_then(|text| text.parse().ok()).ok_or_else(|| lacks("address"))?;
     let network = Network::new(format!("/proc/{pid}/ns/net"));
-    let port = port(&network)?.ok_or_else(|| strange("port on the bridge"))?;
+    let port = port(&network)?.ok_or_else(|| lacks("port on the bridge"))?;
     let namespaces = ["--mount", "--net", "--ipc", "--uts"].map(str::to_owned);
     let entry = ["nsenter".to_owned(), format!("--target={pid}")].into_iter().chain(namespaces).collect();
     Ok(Host { name: name.to_owned(), address, network, entry, port, uplink: None })
 }
 
-/// The interface of this machine at the other end of the container's.
+/// Finds the machine's end of the veth pair whose other end is the container's interface.
 fn port(network: &Network) -> Result<Option<String>, EvalError> {
     let inside: Value = serde_json::from_str(&network.run("ip -j link show dev eth0")?).unwrap_or_default();
     let index = &inside[0]["link_index"];
@@ -125,7 +126,7 @@ fn port(network: &Network) -> Result<Option<String>, EvalError> {
     Ok(found.and_then(|link| link["ifname"].as_str()).map(str::to_owned))
 }
 
-/// Containers and networks of harnesses, of this one too; none where there is no docker.
+/// Lists containers and networks of all harness processes, including this one; empty without docker.
 pub(super) fn leftovers() -> Vec<String> {
     let containers = docker("ps --all --filter name=^abe- --format {{.Names}}").unwrap_or_default();
     let networks = docker("network ls --filter name=^abe- --format {{.Name}}").unwrap_or_default();
@@ -133,7 +134,7 @@ pub(super) fn leftovers() -> Vec<String> {
     containers.lines().chain(networks.lines()).map(str::to_owned).collect()
 }
 
-/// Removes a container or a network of that name.
+/// Removes the container or network of that name.
 pub(super) fn remove(name: &str) {
     let what = if name.ends_with(NETWORK) { "network rm" } else { "rm --force" };
     let _ = docker(&format!("{what} {name}"));

@@ -1,4 +1,4 @@
-//! Test beds: hosts on one switch, made for a run and removed after it.
+//! Test beds: hosts connected to one switch, created for a run and removed after it.
 
 mod docker;
 mod netns;
@@ -18,7 +18,7 @@ use super::scenario::Switch;
 pub use docker::switch as docker_switch;
 pub use network::Network;
 
-/// What the hosts are made of.
+/// The kind of a test bed's hosts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum BedKind {
@@ -29,7 +29,7 @@ pub enum BedKind {
 }
 
 impl BedKind {
-    /// As the command line has it.
+    /// The name used on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Netns => "netns",
@@ -37,7 +37,7 @@ impl BedKind {
         }
     }
 
-    /// Why this machine can't make such a bed with that switch; `None` when it can.
+    /// Why this machine cannot create such a bed with that switch; `None` when it can.
     pub fn missing(self, switch: Switch) -> Option<String> {
         match self {
             Self::Netns => netns::missing(switch),
@@ -45,11 +45,11 @@ impl BedKind {
         }
     }
 
-    /// Makes a bed with these hosts. What `sender` sends is impaired before a switch that puts fragments
-    /// together. `shared` are the folders that the hosts' programs read and write.
+    /// Creates a bed with these hosts. If the switch reassembles fragments, the packets of `sender` can be
+    /// impaired before it. `shared` are the folders that the hosts' programs read and write.
     ///
     /// # Errors
-    /// The machine refused something.
+    /// A command failed.
     pub fn make(
         self,
         hosts: &[String],
@@ -64,55 +64,56 @@ impl BedKind {
     }
 }
 
-/// Hosts and their switch. Dropping it kills what runs on them and removes them.
+/// Hosts and their switch. Dropping a bed kills the processes on its hosts and removes the hosts.
 pub struct Bed {
     hosts: Vec<Host>,
     switch: Network,
-    /// Dropped with it.
+    /// Removes the hosts when it is dropped.
     _remover: Box<dyn Any>,
 }
 
-/// One host.
+/// A host of a test bed.
 #[derive(Clone, Debug)]
 pub struct Host {
-    /// Its name in the scenario.
+    /// The host's name in the scenario.
     pub name: String,
     /// Its address on the switch's network.
     pub address: Ipv4Addr,
-    /// Its interfaces, ports and tables.
+    /// Its network namespace.
     pub network: Network,
-    /// The program, with arguments, that runs another one there.
+    /// The command prefix that runs a program on the host.
     entry: Vec<String>,
-    /// The interface of the switch that leads to it.
+    /// The interface of the switch that leads to the host.
     pub port: String,
-    /// What its cable to the switch leads through, where packets can be lost before the switch sees them.
+    /// The network namespace between the host and the switch, in which packets can be lost before the switch
+    /// sees them.
     pub uplink: Option<Network>,
 }
 
 impl Bed {
-    /// The host of that name.
+    /// Returns the host with that name.
     ///
     /// # Errors
-    /// There is none.
+    /// The bed has no such host.
     pub fn host(&self, name: &str) -> Result<&Host, EvalError> {
         let host = self.hosts.iter().find(|host| host.name == name);
         host.ok_or_else(|| EvalError::new(format!("the bed has no host '{name}'")))
     }
 
-    /// All hosts.
+    /// All hosts of the bed.
     pub fn hosts(&self) -> &[Host] {
         &self.hosts
     }
 
-    /// Where the ports are.
+    /// The switch's network namespace, which has the ports of all hosts.
     pub fn switch(&self) -> &Network {
         &self.switch
     }
 }
 
 impl Host {
-    /// A command that will run on this host, under the pid of the child itself. It is killed when the thread
-    /// that starts it ends, so that nothing outlives a harness that is killed.
+    /// Builds a command that runs a program on this host, with the child's own pid. The program is killed
+    /// when the thread that started it ends, so that it does not outlive a killed harness.
     pub fn command(&self, program: &Path) -> Command {
         let mut words = self.entry.iter();
         let mut command = Command::new(words.next().map_or("nsenter", String::as_str));

@@ -1,5 +1,5 @@
-//! Hosts as network namespaces: each with its own addresses, ports and multicast, on veth pairs to a bridge
-//! in a namespace of its own. They share all else with the machine.
+//! Hosts as network namespaces, each connected by a veth pair to a bridge in a separate namespace. Addresses,
+//! ports and multicast are per host; the hosts share everything else with the machine.
 
 use std::fs;
 use std::net::Ipv4Addr;
@@ -12,29 +12,30 @@ use crate::eval::error::EvalError;
 use crate::eval::impairment::system;
 use crate::eval::scenario::Switch;
 
-/// Whether what passes a bridge of the present network namespace goes through netfilter.
+/// Setting of the current network namespace: whether packets through its bridges pass netfilter.
 const BRIDGE_NETFILTER: &str = "/proc/sys/net/bridge/bridge-nf-call-iptables";
 
-/// How a user without rights gets a namespace of its own in which it is root, and where `ip` may keep others.
+/// Command with which a user without privileges becomes root in a user namespace in which `ip` can create
+/// network namespaces.
 const AS_USER: &str = "unshare --user --map-root-user --net --mount sh -c \
                        'mount -t tmpfs none /run && adaptive-bridge-eval ...'";
 
-/// Why this machine can't; `None` when it can.
+/// Why this machine cannot create such a bed; `None` when it can.
 pub(super) fn missing(switch: Switch) -> Option<String> {
     if !nix::unistd::geteuid().is_root() {
-        return Some(format!("network namespaces need root, if only that of a user namespace: {AS_USER}"));
+        return Some(format!("network namespaces need root; root of a user namespace is enough: {AS_USER}"));
     }
     let probe = stale::name("probe");
-    let made = ip(&format!("netns add {probe}"));
+    let created = ip(&format!("netns add {probe}"));
     stale::remove_namespace(&probe);
-    if let Err(error) = made {
-        return Some(format!("network namespaces can't be made: {error}"));
+    if let Err(error) = created {
+        return Some(format!("network namespaces cannot be created: {error}"));
     }
     let lacks = switch == Switch::Reassembling && !Path::new(BRIDGE_NETFILTER).exists();
     lacks.then(|| "the kernel has no bridge netfilter: modprobe br_netfilter".to_owned())
 }
 
-/// Removes what this process has made, whole or not.
+/// Removes the namespaces of this process when it is dropped, even if the bed is incomplete.
 struct Remover;
 
 impl Drop for Remover {
@@ -43,8 +44,8 @@ impl Drop for Remover {
     }
 }
 
-/// Makes the hosts, all connected at once. Where the switch puts fragments together, the cable of the sender
-/// leads through a second, plain one: what is lost there leaves incomplete datagrams to the switch.
+/// Creates the hosts and connects them to the switch. If the switch reassembles fragments, the sender is
+/// connected through a second, plain switch: packets lost there leave incomplete datagrams at the first one.
 pub(super) fn make(names: &[String], sender: &str, switch: Switch) -> Result<Bed, EvalError> {
     let remover = Remover;
     let between = stale::name("switch");
@@ -52,7 +53,7 @@ pub(super) fn make(names: &[String], sender: &str, switch: Switch) -> Result<Bed
     let network = network(&between);
     set_bridge_netfilter(&network, switch == Switch::Reassembling)?;
     if switch == Switch::Reassembling {
-        // A rule that asks for a connection begins connection tracking in this namespace.
+        // A rule that matches connections enables connection tracking in this namespace.
         network.run("iptables -w 5 -A FORWARD -m conntrack --ctstate ESTABLISHED -j ACCEPT")?;
     }
     let mut hosts = Vec::with_capacity(names.len());
@@ -91,7 +92,8 @@ fn make_switch(namespace: &str) -> Result<(), EvalError> {
     ip(&format!("-n {namespace} link set br0 up"))
 }
 
-/// A switch whose packets go through netfilter, without connection tracking: each fragment still is a packet.
+/// Creates a switch whose packets pass netfilter without connection tracking, so that each fragment stays a
+/// separate packet.
 fn make_uplink(namespace: &str) -> Result<(), EvalError> {
     make_switch(namespace)?;
     set_bridge_netfilter(&network(namespace), true)
@@ -99,7 +101,7 @@ fn make_uplink(namespace: &str) -> Result<(), EvalError> {
 
 fn set_bridge_netfilter(network: &Network, on: bool) -> Result<(), EvalError> {
     network.within(|| {
-        // Where there is none, there is nothing to be switched off.
+        // Without the kernel module, bridge netfilter is off.
         if !on && !Path::new(BRIDGE_NETFILTER).exists() {
             return Ok(());
         }

@@ -1,4 +1,4 @@
-//! A network namespace, by the file that stands for it.
+//! A network namespace and the commands that run in it.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -10,22 +10,22 @@ use nix::sched::{CloneFlags, setns};
 use crate::eval::error::EvalError;
 use crate::eval::impairment::system;
 
-/// Interfaces, ports and tables of a host or of the switch.
+/// The network namespace of a host or of the switch, identified by its file.
 #[derive(Clone, Debug)]
 pub struct Network(PathBuf);
 
 impl Network {
-    /// That of a file such as `/run/netns/NAME` or `/proc/PID/ns/net`.
+    /// Refers to the namespace of a file such as `/run/netns/NAME` or `/proc/PID/ns/net`.
     pub fn new(file: impl Into<PathBuf>) -> Self {
         Self(file.into())
     }
 
-    /// The words that run a program in it.
+    /// The command prefix that runs a program in the namespace.
     pub fn entry(&self) -> Vec<String> {
         vec!["nsenter".to_owned(), format!("--net={}", self.0.display())]
     }
 
-    /// A command that will run in it, and in all else where the harness is.
+    /// Builds a command that runs a program in this network namespace, and in the harness's other namespaces.
     pub fn command(&self, program: &Path) -> Command {
         let mut command = Command::new("nsenter");
         command.arg(format!("--net={}", self.0.display()));
@@ -33,19 +33,20 @@ impl Network {
         command
     }
 
-    /// Runs a command line without quotes to its end; yields what it wrote to stdout.
+    /// Runs a command line without quotes in the namespace and waits for its end; returns its stdout.
     ///
     /// # Errors
-    /// It is not there, or failed.
+    /// The program is not installed, or failed.
     pub fn run(&self, line: &str) -> Result<String, EvalError> {
         let words: Vec<String> = self.entry().into_iter().chain(system::words(line)).collect();
         Ok(system::run(&words)?)
     }
 
-    /// Calls a function in it. Files of `/proc/thread-self/net` and sockets that it opens stay there.
+    /// Calls a function in the namespace, on a separate thread. Files of `/proc/thread-self/net` and sockets
+    /// that it opens stay in the namespace.
     ///
     /// # Errors
-    /// The namespace can't be entered, or the function failed.
+    /// The namespace cannot be entered, or the function failed.
     pub fn within<T: Send>(
         &self,
         call: impl FnOnce() -> Result<T, EvalError> + Send,

@@ -1,5 +1,5 @@
-//! What a harness makes on the machine, by whose it is: names carry the process id, so that what one that was
-//! killed has left is known and removed by the next.
+//! Names and removal of what a harness creates on the machine. The names contain the harness's process id, so
+//! that the next harness finds and removes the leftovers of a killed one.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,37 +10,37 @@ use nix::unistd::Pid;
 
 use crate::eval::impairment::system;
 
-/// Where `ip` keeps network namespaces.
+/// The folder of network namespaces created by `ip`.
 pub(super) const NAMESPACES: &str = "/run/netns";
 
-/// Namespaces, containers and folders are called `abe-PID-NAME`.
+/// Prefix of the names of namespaces, containers and folders: `abe-PID-NAME`.
 const PREFIX: &str = "abe-";
-/// The bridge's shared memory begins with `ab1_` and its instance.
+/// The folder of shared-memory segments. The bridge's segments are named `ab1_INSTANCE_…`.
 const SEGMENTS: &str = "/dev/shm";
 const SEGMENT_PREFIX: &str = "ab1_abe_";
 
-/// The name of something of this process.
+/// Builds the name of a namespace, container or folder of this process.
 pub fn name(what: &str) -> String {
     format!("{PREFIX}{}-{what}", process::id())
 }
 
-/// The instance of a bridge of this process.
+/// The instance name of the bridge that this process starts.
 pub fn instance() -> String {
     format!("abe_{}", process::id())
 }
 
-/// A folder of this process for short-lived files, which is not made yet. Its path is short, as names in it
-/// may be long.
+/// The folder for the bridge's temporary files, which is not created yet. Its path is short, as the names in
+/// it may be long.
 pub fn folder() -> PathBuf {
     scratch("bridge")
 }
 
-/// A folder of this process for short-lived files of another kind.
+/// Another folder of this process for temporary files.
 pub(super) fn scratch(what: &str) -> PathBuf {
     std::env::temp_dir().join(name(what))
 }
 
-/// Removes what harnesses that are gone have left, and says what it was.
+/// Removes the leftovers of harness processes that no longer run; returns a description of each.
 pub fn remove_all() -> Vec<String> {
     let mut removed = Vec::new();
     for name in names(NAMESPACES).into_iter().filter(|name| is_stale(name, PREFIX)) {
@@ -64,7 +64,8 @@ pub fn remove_all() -> Vec<String> {
     removed
 }
 
-/// Removes the bridge's shared memory and folder of this process, whatever state it was killed in.
+/// Removes shared memory and folder of the bridge that this process started, also after the bridge was
+/// killed.
 pub fn remove_own_bridge() {
     let prefix = format!("ab1_{}_", instance());
     for name in names(SEGMENTS).into_iter().filter(|name| name.starts_with(&prefix)) {
@@ -73,13 +74,13 @@ pub fn remove_own_bridge() {
     let _ = fs::remove_dir_all(folder());
 }
 
-/// Removes the namespaces of a process.
+/// Removes the network namespaces of a harness process.
 pub(super) fn remove_namespaces(pid: u32) {
     let prefix = format!("{PREFIX}{pid}-");
     names(NAMESPACES).iter().filter(|name| name.starts_with(&prefix)).for_each(|name| remove_namespace(name));
 }
 
-/// Kills what runs in a namespace and removes it. What has gone meanwhile is as good as removed.
+/// Kills the processes in a namespace and removes it; ignores errors, as it may have been removed already.
 pub(super) fn remove_namespace(name: &str) {
     let line = |arguments: &str| system::words(&format!("ip netns {arguments} {name}"));
     let pids = system::run(&line("pids")).unwrap_or_default();
@@ -89,7 +90,7 @@ pub(super) fn remove_namespace(name: &str) {
     let _ = system::run(&line("del"));
 }
 
-/// Whether a name with that prefix carries the id of a process that is gone.
+/// Whether a name with that prefix contains the id of a process that no longer runs.
 fn is_stale(name: &str, prefix: &str) -> bool {
     let rest = name.strip_prefix(prefix);
     let pid = rest.and_then(|rest| rest.split(['-', '_']).next()?.parse::<u32>().ok());
@@ -106,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_carries_the_id_of_a_process_that_is_gone_is_stale() {
+    fn only_names_with_the_id_of_a_process_that_no_longer_runs_are_stale() {
         let own = process::id();
         // Linux has no process ids beyond 2^22.
         assert!(is_stale("abe-9999999-slow", PREFIX));

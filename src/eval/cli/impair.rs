@@ -1,4 +1,4 @@
-//! `impair`: an impaired link in the present network namespace, switched by words on stdin.
+//! `impair`: an impaired link in the current network namespace, controlled by commands on stdin.
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -15,7 +15,7 @@ use nix::sys::time::{TimeSpec, TimeValLike};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use super::failed;
-use super::impair_report::{Event, Loss, Played, Report};
+use super::impair_report::{Event, Loss, Report, TraceReport};
 use crate::clock;
 use crate::eval::impairment::{
     self, Backend, BackendChoice, GilbertElliott, Impairment, ImpairmentError, Level, LinkState, NormalDelay,
@@ -23,30 +23,30 @@ use crate::eval::impairment::{
 };
 use crate::model::MonotonicNs;
 
-/// The longest line that is read from stdin.
+/// The longest command that is read from stdin; the rest of a longer line is discarded.
 const LINE_MAX_BYTES: usize = 256;
 
-/// What `impair` is asked.
+/// Command-line arguments of `impair`.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "On stdin: `on`, `off` and `down` (every packet is lost) switch the link, `counters` \
-                        shows what it has done."
+    after_help = "Commands on stdin: `on`, `off` (every packet passes) and `down` (every packet is lost) \
+                        switch the link; `counters` prints its counters."
 )]
 pub(super) struct Arguments {
-    /// The IPv4 address of the host whose packets are lost and delayed
+    /// The IPv4 address of the host whose packets are dropped and delayed
     #[arg(long, value_name = "ADDRESS")]
     source: Ipv4Addr,
-    /// On a host that passes packets on: only those for this address (NFQUEUE only)
+    /// On a host that forwards packets: impair only those for this address (NFQUEUE only)
     #[arg(long, value_name = "ADDRESS")]
     destination: Option<Ipv4Addr>,
-    /// Loss by a row of the paper's Table I
+    /// Loss of a row of the paper's Table I
     #[arg(long, value_enum, default_value = "clean")]
     level: Level,
-    /// Which reading of Table I: its last columns, or what the paper's harness made of them
+    /// Reading of Table I's loss columns: as printed, or swapped, as the paper's harness ran them
     #[arg(long, value_enum, required_if_eq_any = [("level", "mild"), ("level", "moderate"), ("level", "strong")])]
     reading: Option<Reading>,
-    /// Loss by the four probabilities of a Gilbert-Elliott chain: good to bad, bad to good, lost in good,
-    /// lost in bad; 0 to 1 each
+    /// Loss of a Gilbert-Elliott chain with these four probabilities, 0 to 1 each: from good to bad, from
+    /// bad to good, loss in the good state, loss in the bad state
     #[arg(long, num_args = 4, value_names = ["P", "R", "GOOD", "BAD"], conflicts_with_all = ["level", "reading"])]
     gilbert_elliott: Option<Vec<f64>>,
     /// Mean delay
@@ -55,30 +55,30 @@ pub(super) struct Arguments {
     /// Standard deviation of the delay
     #[arg(long, value_name = "MS", default_value_t = 0.0)]
     jitter_ms: f64,
-    /// Loss and delay from time to time by a trace of a link, a CSV file: time_s,loss,delay_ms and, if need
-    /// be, jitter_ms (config/scenarios/README.md). It begins when the link is first on
+    /// Loss and delay that change over time by a trace of a link, a CSV file with the columns time_s, loss,
+    /// delay_ms and, optionally, jitter_ms (config/scenarios/README.md). It starts when the link is first on
     #[arg(
         long,
         value_name = "FILE",
         conflicts_with_all = ["level", "reading", "gilbert_elliott", "delay_ms", "jitter_ms"]
     )]
     trace: Option<PathBuf>,
-    /// Begin the trace anew at its end, rather than stay in its last row
+    /// Restart the trace at its end instead of staying in its last row
     #[arg(long, requires = "trace")]
     trace_repeat: bool,
-    /// Play the trace so many times faster than it says, 0.001 to 100000
+    /// Replay the trace this many times faster than its times, 0.001 to 100000
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed, requires = "trace")]
     trace_speed: f64,
-    /// The same losses and delays for the same seed (NFQUEUE only)
+    /// Seed of losses and delays: the same seed gives the same ones (NFQUEUE only)
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// State of the link to begin with
+    /// State of the link at the start
     #[arg(long, value_name = "on|off|down", default_value_t = LinkState::On)]
     state: LinkState,
-    /// What does it
+    /// Back end that impairs the link
     #[arg(long, value_enum, default_value = "auto")]
     backend: BackendChoice,
-    /// A number of an NFQUEUE (or of an ifb) that no other program in this network namespace uses
+    /// Number of the NFQUEUE (or of the ifb); no other program in this network namespace may use it
     #[arg(long, value_name = "N", default_value_t = 0)]
     queue: u16,
     /// Print JSON (docs/eval-json.md), one object on each line
@@ -86,7 +86,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// What a trace may be slowed down and sped up by.
+/// Parses the factor by which a trace is sped up or slowed down.
 fn speed(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(speed) if (0.001..=100_000.0).contains(&speed) => Ok(speed),
@@ -104,7 +104,7 @@ impl Arguments {
     fn impairment(&self) -> Result<Impairment, ImpairmentError> {
         let loss = match self.gilbert_elliott.as_deref() {
             Some(&[p, r, good, bad]) => GilbertElliott::new(p, r, good, bad)?,
-            // A reading is there for every level that has two.
+            // clap requires --reading for every level for which the readings differ.
             _ => self.level.model(self.reading.unwrap_or(Reading::AsPrinted)),
         };
         Ok(Impairment { loss, delay: NormalDelay::new(self.delay_ms, self.jitter_ms)?, seed: self.seed })
@@ -130,30 +130,31 @@ fn impair(
     model: Impairment,
     mut replay: Option<Replay>,
 ) -> Result<(), ImpairmentError> {
-    // Before anything is set up, so that a signal always finds who removes it.
+    // Before the link is set up, so that a signal never ends this process without removing the link.
     let signals = signals().map_err(|error| ImpairmentError::system("signal handlers", error))?;
     let Opened { backend, reason } = {
         let Arguments { backend, source, destination, queue, .. } = arguments;
-        // A trace holds its first row until it begins.
-        let begin = replay.as_ref().map(|replay| *replay.now());
-        let begin = begin.map_or(model, |TraceRow { loss, delay, .. }| Impairment { loss, delay, ..model });
-        impairment::open(*backend, *source, *destination, *queue, &begin)?
+        // A trace stays in its first row until it starts.
+        let first_row = replay.as_ref().map(|replay| *replay.current_row());
+        let initial =
+            first_row.map_or(model, |TraceRow { loss, delay, .. }| Impairment { loss, delay, ..model });
+        impairment::open(*backend, *source, *destination, *queue, &initial)?
     };
     if let Some(replay) = replay.as_mut().filter(|_| arguments.state == LinkState::On) {
-        replay.begin(clock::monotonic());
+        replay.start(clock::monotonic());
     }
-    let mut link = Running { arguments, model, replay, backend, reason };
+    let mut link = RunningLink { arguments, model, replay, backend, reason };
     if arguments.state != LinkState::On {
         link.backend.switch(arguments.state)?;
     }
-    if link.show(Event::Ready)? {
+    if link.print(Event::Ready)? {
         link.serve(&signals)?;
-        link.show(Event::Ended)?;
+        link.print(Event::Ended)?;
     }
     Ok(())
 }
 
-/// A stream that becomes readable with SIGINT and SIGTERM.
+/// Returns a stream that becomes readable when SIGINT or SIGTERM arrives.
 fn signals() -> io::Result<UnixStream> {
     let (reader, writer) = UnixStream::pair()?;
     for signal in [SIGINT, SIGTERM] {
@@ -162,19 +163,19 @@ fn signals() -> io::Result<UnixStream> {
     Ok(reader)
 }
 
-struct Running<'a> {
+struct RunningLink<'a> {
     arguments: &'a Arguments,
-    /// What it does without a trace.
+    /// The impairment when there is no trace.
     model: Impairment,
     replay: Option<Replay>,
     backend: Box<dyn Backend>,
     reason: String,
 }
 
-impl Running<'_> {
-    /// Works until a signal comes, or who reads stdout has gone.
+impl RunningLink<'_> {
+    /// Runs the link until a signal arrives or the reader of stdout has closed it.
     fn serve(&mut self, signals: &UnixStream) -> Result<(), ImpairmentError> {
-        // Without a buffer, in which a line could wait while poll sees nothing.
+        // Unbuffered: a line in a buffer would not wake poll.
         let stdin = io::stdin().as_fd().try_clone_to_owned();
         let mut stdin = File::from(stdin.map_err(|error| ImpairmentError::system("stdin", error))?);
         let mut commands = Some(Commands::default());
@@ -184,18 +185,18 @@ impl Running<'_> {
                 if commands.is_some() {
                     fds.push(PollFd::new(stdin.as_fd(), PollFlags::POLLIN));
                 }
-                let own = fds.len();
+                let before_backend = fds.len();
                 fds.extend(self.backend.fd().map(|fd| PollFd::new(fd, PollFlags::POLLIN)));
                 match ppoll(&mut fds, self.timeout(), None) {
                     Ok(_) | Err(Errno::EINTR) => {}
                     Err(error) => return Err(ImpairmentError::system("poll", error)),
                 }
-                // An end of file and an error are found by reading.
+                // Reading finds out whether it is data, the end of the file or an error.
                 let ready = |fd: Option<&PollFd>| fd.and_then(PollFd::any).unwrap_or(false);
-                (ready(fds.first()), ready(fds[..own].get(1)))
+                (ready(fds.first()), ready(fds[..before_backend].get(1)))
             };
             let now = clock::monotonic();
-            self.play(now)?;
+            self.advance_trace(now)?;
             self.backend.work()?;
             if signal {
                 return Ok(());
@@ -203,11 +204,11 @@ impl Running<'_> {
             if let Some(reader) = commands.as_mut().filter(|_| input) {
                 let lines = reader.read(&mut stdin);
                 if lines.is_none() {
-                    // Whoever gave the commands has gone or gives none: the link stays as it is.
+                    // stdin has ended: the link keeps its state.
                     commands = None;
                 }
                 for line in lines.unwrap_or_default() {
-                    if !self.obey(line.trim())? {
+                    if !self.execute(line.trim())? {
                         return Ok(());
                     }
                 }
@@ -215,8 +216,8 @@ impl Running<'_> {
         }
     }
 
-    /// Goes on to the row of the trace that is on at `now`.
-    fn play(&mut self, now: MonotonicNs) -> Result<(), ImpairmentError> {
+    /// Applies the row of the trace that is in force at `now`.
+    fn advance_trace(&mut self, now: MonotonicNs) -> Result<(), ImpairmentError> {
         let Some(replay) = &mut self.replay else { return Ok(()) };
         if replay.next_change().is_some_and(|change| change <= now) {
             replay.count(&self.backend.counters()?);
@@ -233,33 +234,35 @@ impl Running<'_> {
         Some(TimeSpec::nanoseconds(i64::try_from(wait_ns).unwrap_or(i64::MAX)))
     }
 
-    /// Obeys a line of stdin; `false` when nobody reads the answer.
-    fn obey(&mut self, line: &str) -> Result<bool, ImpairmentError> {
+    /// Executes a command from stdin; returns `false` when the reader of stdout has closed it.
+    fn execute(&mut self, line: &str) -> Result<bool, ImpairmentError> {
         match (line, line.parse()) {
             ("", _) => Ok(true),
-            ("counters", _) => self.show(Event::Counters),
+            ("counters", _) => self.print(Event::Counters),
             (_, Ok(state)) => {
                 self.backend.switch(state)?;
                 if let Some(replay) = self.replay.as_mut().filter(|_| state == LinkState::On) {
-                    replay.begin(clock::monotonic());
+                    replay.start(clock::monotonic());
                 }
-                self.show(Event::Changed)
+                self.print(Event::Changed)
             }
             (_, Err(_)) => {
-                eprintln!("adaptive-bridge-eval: '{line}' is not one of on, off, down, counters");
+                eprintln!(
+                    "adaptive-bridge-eval: unknown command '{line}'; must be on, off, down or counters"
+                );
                 Ok(true)
             }
         }
     }
 
-    /// Prints what the link does; `false` when nobody reads it.
-    fn show(&mut self, event: Event) -> Result<bool, ImpairmentError> {
+    /// Prints the link's state and counters; returns `false` when the reader of stdout has closed it.
+    fn print(&mut self, event: Event) -> Result<bool, ImpairmentError> {
         let counters = self.backend.counters()?;
         if let Some(replay) = &mut self.replay {
             replay.count(&counters);
         }
         let (loss, delay) = match &self.replay {
-            Some(replay) => (replay.now().loss, replay.now().delay),
+            Some(replay) => (replay.current_row().loss, replay.current_row().delay),
             None => (self.model.loss, self.model.delay),
         };
         let file = self.arguments.trace.as_deref().and_then(Path::file_name).unwrap_or_default();
@@ -279,7 +282,7 @@ impl Running<'_> {
             loss_bad: loss.loss_bad(),
             delay_ms: delay.mean_ms(),
             jitter_ms: delay.sigma_ms(),
-            trace: self.replay.as_ref().map(|replay| Played::of(replay, &file, speed, event)),
+            trace: self.replay.as_ref().map(|replay| TraceReport::of(replay, &file, speed, event)),
             counters,
             kernel_dropped: self.backend.kernel_dropped()?,
             loss: match &self.replay {
@@ -302,14 +305,14 @@ impl Running<'_> {
     }
 }
 
-/// Lines from stdin, of which only whole ones count.
+/// Assembles whole lines from the pieces that stdin delivers.
 #[derive(Default)]
 struct Commands {
-    begun: Vec<u8>,
+    partial_line: Vec<u8>,
 }
 
 impl Commands {
-    /// Reads what there is; `None` at its end.
+    /// Reads the available bytes; returns the lines that they complete, `None` at the end of the input.
     fn read(&mut self, input: &mut impl Read) -> Option<Vec<String>> {
         let mut bytes = [0; LINE_MAX_BYTES];
         let count = match input.read(&mut bytes) {
@@ -321,10 +324,10 @@ impl Commands {
         let mut lines = Vec::new();
         for byte in &bytes[..count] {
             if *byte == b'\n' {
-                lines.push(String::from_utf8_lossy(&self.begun).into_owned());
-                self.begun.clear();
-            } else if self.begun.len() < LINE_MAX_BYTES {
-                self.begun.push(*byte);
+                lines.push(String::from_utf8_lossy(&self.partial_line).into_owned());
+                self.partial_line.clear();
+            } else if self.partial_line.len() < LINE_MAX_BYTES {
+                self.partial_line.push(*byte);
             }
         }
         Some(lines)
@@ -336,7 +339,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn commands_come_in_pieces_and_several_at_once() {
+    fn a_read_may_return_part_of_a_command_or_several() {
         let mut commands = Commands::default();
         assert_eq!(commands.read(&mut &b"of"[..]), Some(vec![]));
         assert_eq!(commands.read(&mut &b"f\non\ndo"[..]), Some(vec!["off".to_owned(), "on".to_owned()]));
@@ -345,6 +348,6 @@ mod tests {
         for _ in 0..100 {
             assert_eq!(commands.read(&mut &[b'x'; LINE_MAX_BYTES][..]), Some(vec![]));
         }
-        assert_eq!(commands.begun.len(), LINE_MAX_BYTES);
+        assert_eq!(commands.partial_line.len(), LINE_MAX_BYTES);
     }
 }

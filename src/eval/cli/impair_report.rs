@@ -1,4 +1,4 @@
-//! What `impair` prints: a line for people, or JSON.
+//! The output of `impair`: lines of text or of JSON.
 
 use std::fmt;
 use std::net::Ipv4Addr;
@@ -7,15 +7,15 @@ use serde::Serialize;
 
 use crate::eval::impairment::{Counters, GilbertElliott, LinkState, Replay, RowCounts};
 
-/// Why something is shown.
+/// The event that a line of output reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Event {
     /// The link is in place.
     Ready,
-    /// It was switched.
+    /// The link was switched.
     Changed,
-    /// It was asked for.
+    /// The user requested the counters.
     Counters,
     /// The link is about to be removed.
     Ended,
@@ -37,7 +37,7 @@ pub(super) struct Report<'a> {
     pub loss_bad: f64,
     pub delay_ms: f64,
     pub jitter_ms: f64,
-    pub trace: Option<Played<'a>>,
+    pub trace: Option<TraceReport<'a>>,
     #[serde(flatten)]
     pub counters: Counters,
     pub kernel_dropped: u64,
@@ -47,21 +47,21 @@ pub(super) struct Report<'a> {
 
 /// The trace that the link follows.
 #[derive(Debug, Serialize)]
-pub(super) struct Played<'a> {
+pub(super) struct TraceReport<'a> {
     file: &'a str,
     repeat: bool,
     speed: f64,
     length_s: f64,
     row: Option<usize>,
     round: u64,
-    /// Only at the end: there may be thousands.
+    /// Only in the last line: a trace may have thousands of rows.
     #[serde(skip_serializing_if = "Option::is_none")]
-    rows: Option<Vec<PlayedRow>>,
+    rows: Option<Vec<RowReport>>,
 }
 
-/// What a row of the trace was to do, and what happened while it was on.
+/// The model of a row of the trace, and the packets counted while the row was in force.
 #[derive(Debug, Serialize)]
-struct PlayedRow {
+struct RowReport {
     time_s: f64,
     loss: f64,
     delay_ms: f64,
@@ -70,12 +70,12 @@ struct PlayedRow {
     counts: RowCounts,
 }
 
-impl<'a> Played<'a> {
+impl<'a> TraceReport<'a> {
     pub fn of(replay: &Replay, file: &'a str, speed: f64, event: Event) -> Self {
         let seconds = |ns: u64| ns as f64 / 1e9;
         let rows = || {
             let rows = replay.trace().rows().iter().zip(replay.counts());
-            let row = rows.map(|(row, counts)| PlayedRow {
+            let row = rows.map(|(row, counts)| RowReport {
                 time_s: seconds(row.at_ns),
                 loss: row.loss.stationary_loss(),
                 delay_ms: row.delay.mean_ms(),
@@ -86,17 +86,17 @@ impl<'a> Played<'a> {
         };
         Self {
             file,
-            repeat: replay.repeats(),
+            repeat: replay.is_repeated(),
             speed,
             length_s: seconds(replay.trace().length_ns()),
-            row: replay.has_begun().then_some(replay.row()),
+            row: replay.has_started().then_some(replay.row()),
             round: replay.round(),
             rows: (event == Event::Ended).then(rows),
         }
     }
 }
 
-/// The loss that was applied while the link was on, and that of the model.
+/// The measured loss while the link was on, and the loss that the model expects.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Loss {
     loss: Option<f64>,
@@ -106,7 +106,7 @@ pub(super) struct Loss {
 }
 
 impl Loss {
-    /// By the correlated chain.
+    /// The loss of a link that follows one correlated chain.
     pub fn of_chain(model: &GilbertElliott, counters: &Counters) -> Self {
         let any = counters.judged > 0;
         let loss_expected = model.stationary_loss();
@@ -118,7 +118,8 @@ impl Loss {
         }
     }
 
-    /// By a trace: each packet is expected to be lost as the row says in which it came.
+    /// The loss of a link that follows a trace: a packet's expected loss is that of the row in force at its
+    /// arrival.
     pub fn of_trace(replay: &Replay, counters: &Counters) -> Self {
         let (lost_expected, error) = replay.lost_expected();
         if counters.judged == 0 {
@@ -156,8 +157,8 @@ impl fmt::Display for Report<'_> {
         }
         for (count, what) in [
             (counters.cut, "lost while down"),
-            (counters.overflowed, "dropped as too many were on their way"),
-            (counters.held, "on their way"),
+            (counters.overflowed, "dropped because too many were in transit"),
+            (counters.held, "in transit"),
             (self.kernel_dropped, "dropped by the kernel before the link"),
         ] {
             if count > 0 {

@@ -1,7 +1,6 @@
 //! The command line of `adaptive-bridge-eval`: one file for each subcommand.
 //!
-//! Exit codes: 0 done, 1 failed while running, 2 wrong command line. Logs go to stderr; what a program may
-//! want to read goes to stdout, and nothing else does.
+//! Exit codes: 0 success, 1 failed while running, 2 wrong command line. Logs go to stderr, results to stdout.
 
 mod impair;
 mod impair_report;
@@ -14,7 +13,7 @@ use clap::{Parser, Subcommand};
 
 use crate::telemetry;
 
-/// The evaluation of Adaptive Bridge: the paper's experiments and more, on hosts and links of its own.
+/// Evaluate Adaptive Bridge: the paper's experiments and others, on simulated hosts and links
 #[derive(Debug, Parser)]
 #[command(name = "adaptive-bridge-eval", version, max_term_width = 100)]
 struct Cli {
@@ -24,15 +23,15 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Show the scenarios
+    /// List the scenarios
     List(runs::Folder),
     /// Run scenarios
     Run(runs::RunArguments),
     /// Run every scenario
     Matrix(runs::MatrixArguments),
-    /// Make the report of a folder of results: HTML, Markdown and CSV
+    /// Write the report of a folder of results: HTML, Markdown and CSV
     Report(report::Arguments),
-    /// Lose and delay what this network namespace receives from one host, until SIGINT or SIGTERM
+    /// Drop and delay packets that this network namespace receives from one host, until SIGINT or SIGTERM
     Impair(impair::Arguments),
 }
 
@@ -50,7 +49,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Prints why a command failed, and gives its exit code.
+/// Prints why a command failed; returns its exit code.
 fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     eprintln!("adaptive-bridge-eval: {error}");
     ExitCode::FAILURE

@@ -1,4 +1,4 @@
-//! `report`: what a folder of results shows, as a page, as Markdown and as CSV.
+//! `report`: writes the report of a folder of results as HTML, Markdown and CSV.
 
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -9,13 +9,13 @@ use clap::Args;
 use super::failed;
 use crate::eval::report;
 
-/// What `report` is asked.
+/// Command-line arguments of `report`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The folder that `run` or `matrix` wrote to
     #[arg(value_name = "DIR")]
     results: PathBuf,
-    /// Where the report is written [default: DIR]
+    /// The folder that the report is written to [default: DIR]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 }
@@ -31,7 +31,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     }
     let files = written.files.iter().map(|file| file.display().to_string());
     let lines: Vec<String> = written.verdicts.iter().cloned().chain(files).collect();
-    // Who reads may have gone: the report is written all the same.
+    // A closed stdout is no failure: the report's files are written.
     match writeln!(io::stdout(), "{}", lines.join("\n")) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => failed(&error),
         _ => ExitCode::SUCCESS,

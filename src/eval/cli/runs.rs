@@ -1,4 +1,4 @@
-//! `list`, `run` and `matrix`: the scenarios, and runs of them.
+//! `list`, `run` and `matrix`: list scenarios and run them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,40 +14,41 @@ use crate::eval::harness::{self, Dimensions, Library, Plan, Settings};
 use crate::eval::impairment::{BackendChoice, Reading};
 use crate::eval::scenario::{Scenario, Switch};
 
-/// Seconds that a run takes beside its window: hosts, matching, settling, acknowledgements.
-const AROUND_S: f64 = 20.0;
+/// Seconds that a run takes in addition to its measured window: to create hosts, to match, to settle and to
+/// wait for acknowledgements.
+const OVERHEAD_S: f64 = 20.0;
 
-/// Where the scenarios are.
+/// The folder of the scenarios.
 #[derive(Args, Debug)]
 pub(super) struct Folder {
-    /// The folder of the scenarios
+    /// The folder that scenarios are read from
     #[arg(long, value_name = "DIR", default_value = "config/scenarios")]
     scenarios: PathBuf,
 }
 
-/// What `run` is asked.
+/// Command-line arguments of `run`.
 #[derive(Args, Debug)]
 pub(super) struct RunArguments {
-    /// Names of scenarios, as `list` shows them, or files
+    /// Names of scenarios, as `list` prints them, or their files
     #[arg(required = true)]
     scenario: Vec<String>,
-    /// Whose DDS publisher and subscribers run on; several with commas
+    /// DDS library of the publisher and the subscribers; separate several by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "fast")]
     library: Vec<Library>,
-    /// Which reading of Table I; several with commas
+    /// Reading of the paper's Table I; separate several by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "as-printed")]
     reading: Vec<Reading>,
     #[command(flatten)]
     common: Common,
 }
 
-/// What `matrix` is asked.
+/// Command-line arguments of `matrix`.
 #[derive(Args, Debug)]
 pub(super) struct MatrixArguments {
-    /// Whose DDS publisher and subscribers run on; several with commas
+    /// DDS library of the publisher and the subscribers; separate several by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "fast,cyclone")]
     library: Vec<Library>,
-    /// Which reading of Table I; several with commas
+    /// Reading of the paper's Table I; separate several by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "as-printed,as-run")]
     reading: Vec<Reading>,
     #[command(flatten)]
@@ -56,34 +57,34 @@ pub(super) struct MatrixArguments {
 
 #[derive(Args, Debug)]
 struct Common {
-    /// What the hosts are made of; several with commas
+    /// Kind of the test bed's hosts; separate several by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "netns")]
     bed: Vec<BedKind>,
-    /// The host between; several with commas [default: as the scenario says]
+    /// Switch between the hosts; separate several by commas [default: those of the scenario]
     #[arg(long, value_enum, value_delimiter = ',')]
     switch: Vec<Switch>,
-    /// A few seconds in place of minutes: shows that it works, and measures nothing
+    /// Smoke runs of a few seconds: they show that everything works; their figures mean nothing
     #[arg(long)]
     quick: bool,
-    /// How often each
+    /// Repetitions of each run
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
-    /// The links lose the same packets for the same seed (where they are of NFQUEUE)
+    /// Seed of the links: with the same seed they drop the same packets (NFQUEUE only)
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// The folder of the results; runs that are there are not made again
+    /// The folder of the results; runs that it already contains are skipped
     #[arg(long, value_name = "DIR", default_value = "eval-results")]
     out: PathBuf,
-    /// What impairs the links
+    /// Back end that impairs the links
     #[arg(long, value_enum, default_value = "auto")]
     backend: BackendChoice,
-    /// The CPUs for a host's programs, such as `critical=1` or `bridge=0-1`; repeatable
+    /// The CPUs that run a host's programs, such as `critical=1` or `bridge=0-1`; repeatable
     #[arg(long, value_name = "HOST=CPUS", value_parser = pin)]
     pin: Vec<(String, String)>,
-    /// The program `adaptive-bridge` [default: the one beside this program]
+    /// The program `adaptive-bridge` [default: the one in this program's folder]
     #[arg(long, value_name = "FILE")]
     bridge: Option<PathBuf>,
-    /// The folder of the peers' programs
+    /// The folder of the peer programs (the DDS publishers and subscribers)
     #[arg(long, value_name = "DIR", default_value = "tests/peers/build")]
     peers: PathBuf,
     #[command(flatten)]
@@ -114,12 +115,12 @@ pub(super) fn list(folder: &Folder) -> ExitCode {
 pub(super) fn run(arguments: &RunArguments) -> ExitCode {
     let folder = &arguments.common.folder.scenarios;
     let scenarios = arguments.scenario.iter().map(|name| find(folder, name)).collect();
-    make(scenarios, &arguments.library, &arguments.reading, &arguments.common)
+    run_all(scenarios, &arguments.library, &arguments.reading, &arguments.common)
 }
 
 pub(super) fn matrix(arguments: &MatrixArguments) -> ExitCode {
     let scenarios = Scenario::load_all(&arguments.common.folder.scenarios);
-    make(scenarios, &arguments.library, &arguments.reading, &arguments.common)
+    run_all(scenarios, &arguments.library, &arguments.reading, &arguments.common)
 }
 
 fn find(folder: &Path, name: &str) -> Result<Scenario, EvalError> {
@@ -130,16 +131,19 @@ fn find(folder: &Path, name: &str) -> Result<Scenario, EvalError> {
     if path.exists() {
         return Scenario::load(&path);
     }
-    Err(EvalError::new(format!("no scenario '{name}' in {}: `list` shows what there is", folder.display())))
+    let folder = folder.display();
+    Err(EvalError::new(format!(
+        "no scenario '{name}' in {folder}: `adaptive-bridge-eval list` lists them all"
+    )))
 }
 
-fn make(
+fn run_all(
     scenarios: Result<Vec<Scenario>, EvalError>,
     libraries: &[Library],
     readings: &[Reading],
     common: &Common,
 ) -> ExitCode {
-    let made = scenarios.and_then(|scenarios| {
+    let outcome = scenarios.and_then(|scenarios| {
         let scenarios: Vec<Rc<Scenario>> = scenarios.into_iter().map(Rc::new).collect();
         let dimensions = Dimensions {
             libraries: libraries.to_vec(),
@@ -151,21 +155,21 @@ fn make(
         let plans = dimensions.plans(&scenarios, bed::docker_switch());
         let settings = common.settings()?;
         check_possible(&plans, &settings)?;
-        let seconds: f64 = plans.iter().map(|plan| plan.duration_s(settings.quick) + AROUND_S).sum();
+        let seconds: f64 = plans.iter().map(|plan| plan.duration_s(settings.quick) + OVERHEAD_S).sum();
         eprintln!("{} runs, about {:.0} min, into {}", plans.len(), seconds / 60.0, settings.out.display());
-        harness::make_all(&plans, &settings)
+        harness::run_all(&plans, &settings)
     });
-    match made {
+    match outcome {
         Ok(outcome) => {
-            let harness::Outcome { made, skipped, failed } = outcome;
-            eprintln!("{made} made, {skipped} were there, {failed} failed");
+            let harness::Outcome { finished, skipped, failed } = outcome;
+            eprintln!("{finished} finished, {skipped} already in the results, {failed} failed");
             if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
         }
         Err(error) => failed(&error),
     }
 }
 
-/// Whatever would fail in the middle of a matrix is said before it.
+/// Checks that peers, test beds and the bridge exist, so that no run of a matrix fails for want of them.
 fn check_possible(plans: &[Plan], settings: &Settings) -> Result<(), EvalError> {
     let mut beds: Vec<(BedKind, Switch)> = Vec::new();
     for plan in plans {
@@ -177,11 +181,14 @@ fn check_possible(plans: &[Plan], settings: &Settings) -> Result<(), EvalError> 
     for (bed, switch) in beds {
         if let Some(reason) = bed.missing(switch) {
             let (bed, switch) = (bed.name(), switch.name());
-            return Err(EvalError::new(format!("no {bed} bed with a {switch} switch here: {reason}")));
+            return Err(EvalError::new(format!(
+                "this machine cannot make a {bed} bed with a {switch} switch: {reason}"
+            )));
         }
     }
     if !settings.bridge.exists() {
-        return Err(EvalError::new(format!("{} is not there: cargo build", settings.bridge.display())));
+        let bridge = settings.bridge.display();
+        return Err(EvalError::new(format!("{bridge} does not exist; run `cargo build` or give --bridge")));
     }
     Ok(())
 }
@@ -189,7 +196,7 @@ fn check_possible(plans: &[Plan], settings: &Settings) -> Result<(), EvalError> 
 impl Common {
     fn settings(&self) -> Result<Settings, EvalError> {
         let harness = std::env::current_exe()
-            .map_err(|error| EvalError::new(format!("where this program is: {error}")))?;
+            .map_err(|error| EvalError::new(format!("the path of this program: {error}")))?;
         let beside = harness.with_file_name("adaptive-bridge");
         let absolute = |path: &Path| std::path::absolute(path).map_err(|error| EvalError::file(path, &error));
         Ok(Settings {

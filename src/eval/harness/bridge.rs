@@ -1,4 +1,4 @@
-//! The bridge of a run: its programs, as a user starts them, and what it says of itself.
+//! The bridge of a run: starts its programs as a user does, and records its status.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -17,14 +17,15 @@ use crate::eval::bed::{Bed, Host, stale};
 use crate::eval::error::EvalError;
 use crate::eval::scenario::Scenario;
 
-/// The least that a route takes in, in bytes; a message may be that much longer than its payload, too.
+/// The configured maximum size of a sample is its payload plus this: the minimum that a route may have, and
+/// enough for the message around the payload.
 const SAMPLE_ROOM_BYTES: u64 = 65_536;
 
 /// A bridge and the responders of its remote subscribers.
 pub(super) struct Bridge {
     up: Program,
     responders: Vec<Program>,
-    /// `status --watch`, once the bridge is up.
+    /// The running `status --watch`, once the bridge is up.
     watch: Option<Program>,
     program: PathBuf,
     config: PathBuf,
@@ -33,7 +34,7 @@ pub(super) struct Bridge {
 }
 
 impl Bridge {
-    /// Starts it.
+    /// Starts the bridge and the responders.
     pub fn start(plan: &Plan, settings: &Settings, bed: &Bed, folder: &Path) -> Result<Self, EvalError> {
         let config = folder.join("bridge.yaml");
         fs::write(&config, configuration(&plan.scenario))
@@ -60,7 +61,7 @@ impl Bridge {
         command
     }
 
-    /// Whether every process runs. From then on it is watched.
+    /// Whether every process runs; once that is so, starts to watch the status.
     pub fn is_up(&mut self, host: &Host, folder: &Path) -> Result<bool, EvalError> {
         if self.watch.is_some() {
             return Ok(true);
@@ -78,18 +79,18 @@ impl Bridge {
         Ok(true)
     }
 
-    /// Records what `status` has said since.
+    /// Records the status lines since the last call.
     pub fn sample(&mut self) -> Result<(), EvalError> {
-        for (time, status) in self.watch.as_mut().map(Program::listen).unwrap_or_default() {
+        for (time, status) in self.watch.as_mut().map(Program::read_lines).unwrap_or_default() {
             self.record.line(&json!({ "time_ns": time.0, "status": status }).to_string())?;
             self.latest = status;
         }
         Ok(())
     }
 
-    /// Whether so many readers are matched on each lane of each route, and every responder has been heard.
+    /// Whether all readers of each lane of each route are matched, and every responder has answered a probe.
     pub fn is_matched(&self, scenario: &Scenario) -> bool {
-        let wanted = |lane: &Value| match lane.as_str() {
+        let expected = |lane: &Value| match lane.as_str() {
             Some("critical") => 1,
             name => scenario.remotes.iter().filter(|remote| Some(remote.lane.as_str()) == name).count(),
         };
@@ -97,13 +98,13 @@ impl Bridge {
         let lanes = routes.iter().flat_map(|route| route["lanes"].as_array().into_iter().flatten());
         let mut lanes = lanes.peekable();
         let matched = lanes.peek().is_some()
-            && lanes.all(|lane| lane["readers"].as_u64() >= Some(wanted(&lane["lane"]) as u64));
+            && lanes.all(|lane| lane["readers"].as_u64() >= Some(expected(&lane["lane"]) as u64));
         let subscribers = self.latest["subscribers"].as_array().map(Vec::as_slice).unwrap_or_default();
-        let heard = subscribers.iter().filter(|subscriber| subscriber["last_response_age_ms"].is_number());
-        matched && heard.count() >= scenario.remotes.len()
+        let answered = subscribers.iter().filter(|subscriber| subscriber["last_response_age_ms"].is_number());
+        matched && answered.count() >= scenario.remotes.len()
     }
 
-    /// Its processes as `status` knows them, and the responders.
+    /// The bridge's processes listed in its status, its supervisor and the responders.
     pub fn processes(&self) -> Vec<(String, i32)> {
         let listed = self.latest["processes"].as_array().map(Vec::as_slice).unwrap_or_default();
         let roles = listed.iter().filter_map(|process| {
@@ -114,12 +115,12 @@ impl Bridge {
         own.map(|program| (program.name.clone(), program.pid().as_raw())).chain(roles).collect()
     }
 
-    /// The programs that are to run all the time.
+    /// The programs that must not end during the run.
     pub fn programs(&mut self) -> impl Iterator<Item = &mut Program> {
         std::iter::once(&mut self.up).chain(&mut self.responders).chain(self.watch.as_mut())
     }
 
-    /// Ends it; what was not as it should be.
+    /// Stops all programs; returns the problems.
     pub fn end(mut self) -> Result<Vec<String>, EvalError> {
         self.sample()?;
         self.record.flush()?;
@@ -127,14 +128,14 @@ impl Bridge {
         let watch = self.watch.as_mut();
         for program in watch.into_iter().chain(&mut self.responders).chain(std::iter::once(&mut self.up)) {
             if !program.end(Duration::from_secs(10)) {
-                problems.push(format!("{} did not end as asked; see its log", program.name));
+                problems.push(format!("{} did not end cleanly on SIGTERM; see its log", program.name));
             }
         }
         Ok(problems)
     }
 }
 
-/// Shared memory is removed after the processes that use it.
+/// Stops the processes, then removes the shared memory that they use.
 impl Drop for Bridge {
     fn drop(&mut self) {
         for program in std::iter::once(&mut self.up).chain(&mut self.responders) {
@@ -144,7 +145,7 @@ impl Drop for Bridge {
     }
 }
 
-/// The defaults, for the routes and remote subscribers of a scenario.
+/// The bridge's configuration for the routes and remote subscribers of a scenario, with default settings.
 fn configuration(scenario: &Scenario) -> String {
     let workload = &scenario.workload;
     let mut yaml = format!("instance: {}\nros: {{domain_id: 0}}\ntopics:\n", stale::instance());

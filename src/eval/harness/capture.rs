@@ -1,5 +1,6 @@
-//! What passes the interface of a remote subscriber's host, counted by packets, IP fragments and RTPS
-//! submessages: whether a lane sends fragments, how often a writer asks for acknowledgements and repairs.
+//! Captures packets at the interface of a remote subscriber's host and counts packets, IP fragments and RTPS
+//! submessages. The counts show whether a lane sends fragments, how often writers send heartbeats, and how
+//! often readers request repairs.
 
 use std::os::fd::{AsRawFd, OwnedFd};
 
@@ -11,16 +12,17 @@ use nix::sys::socket::{
 use crate::eval::bed::Network;
 use crate::eval::error::EvalError;
 
-/// Linux' names of what a captured packet is (linux/if_packet.h, linux/if_arp.h).
+/// Linux's types of captured packets and of interfaces (linux/if_packet.h, linux/if_arp.h).
 const PACKET_OUTGOING: u8 = 4;
 const ARPHRD_LOOPBACK: u16 = 772;
 
-/// Packets wait here for the next turn of the harness.
+/// The socket's receive buffer, for the packets between two turns of the harness.
 const RECEIVE_BUFFER_BYTES: usize = 32 << 20;
-/// Longer packets are cut off; headers of what one Ethernet frame holds are whole.
+/// The length at which packets are truncated; longer than an Ethernet frame, so that all headers are
+/// complete.
 const PACKET_BYTES: usize = 2_048;
 
-/// What was seen in one direction, since the start.
+/// Counts of captured packets and submessages in one direction, since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Tally {
     packets: u64,
@@ -52,8 +54,8 @@ impl Tally {
         )
     }
 
-    /// Counts an IP packet of which `packet` is the beginning and `length` the whole; one that is not UDP in
-    /// IPv4 does not count.
+    /// Counts an IP packet of `length` bytes that starts with `packet`; ignores packets other than UDP over
+    /// IPv4.
     fn add(&mut self, packet: &[u8], length: usize) {
         let Some(ip) = packet.get(..20) else { return };
         let header = usize::from(ip[0] & 0x0f) * 4;
@@ -80,7 +82,8 @@ impl Tally {
                 0 => u16::from_be_bytes([low, high]),
                 _ => u16::from_le_bytes([low, high]),
             };
-            // Where the kind of the writer stands: after two entity ids, in DATA after flags besides.
+            // The position of the writer's entity kind: at the end of the second entity id, which in DATA
+            // follows 4 bytes of flags.
             let (counter, user, kind_at) = match id {
                 0x06 => (&mut self.acknack, Some(&mut self.user_acknack), 7),
                 0x07 => (&mut self.heartbeat, Some(&mut self.user_heartbeat), 7),
@@ -92,11 +95,11 @@ impl Tally {
                 _ => (&mut 0, None, 0),
             };
             *counter += 1;
-            // The two upper bits of the kind are 11 for built-in entities, and 00 for a user's.
+            // The two upper bits of the entity kind are 11 for built-in entities, and 00 for user entities.
             if let (Some(user), Some(0)) = (user, body.get(kind_at).map(|kind| kind >> 6)) {
                 *user += 1;
             }
-            // The last one of a message may go on to its end without a length.
+            // A length of 0 means that the submessage extends to the end of the message.
             rest = match usize::from(length) {
                 0 if id != 0x01 && id != 0x09 => &[],
                 length => body.get(length..).unwrap_or_default(),
@@ -105,7 +108,7 @@ impl Tally {
     }
 }
 
-/// Captures at one host.
+/// The packet capture at one host.
 pub(super) struct Capture {
     pub port: String,
     socket: OwnedFd,
@@ -114,16 +117,16 @@ pub(super) struct Capture {
 }
 
 impl Capture {
-    /// Begins to capture at a host.
+    /// Starts to capture at a host.
     pub fn open(port: &str, network: &Network) -> Result<Self, EvalError> {
         let refused = |error: Errno| EvalError::new(format!("a packet socket at {port}: {error}"));
         let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
-        // Datagram: without the header of the link.
+        // Datagram: packets without the link-layer header.
         let open = || {
             socket(AddressFamily::Packet, SockType::Datagram, flags, SockProtocol::EthAll).map_err(refused)
         };
         let socket = network.within(open)?;
-        // Beyond the system's limit where that is allowed, otherwise up to it.
+        // Above the system's limit where the process may, otherwise up to it.
         if setsockopt(&socket, sockopt::RcvBufForce, &RECEIVE_BUFFER_BYTES).is_err() {
             setsockopt(&socket, sockopt::RcvBuf, &RECEIVE_BUFFER_BYTES).map_err(refused)?;
         }
@@ -131,23 +134,24 @@ impl Capture {
         Ok(Self { port: port.to_owned(), socket, to_host, from_host })
     }
 
-    /// Counts what has passed since.
-    pub fn work(&mut self) {
+    /// Counts the packets captured since the last call.
+    pub fn count_packets(&mut self) {
         let mut packet = [0; PACKET_BYTES];
         while let Ok((length, Some(link))) = recvfrom::<LinkAddr>(self.socket.as_raw_fd(), &mut packet) {
             if link.hatype() == ARPHRD_LOOPBACK {
                 continue;
             }
-            let seen = &packet[..length.min(PACKET_BYTES)];
-            // The packet's own word: what was received is cut off.
-            let whole = seen.get(2..4).map_or(length, |it| usize::from(u16::from_be_bytes([it[0], it[1]])));
+            let captured = &packet[..length.min(PACKET_BYTES)];
+            // The length in the IP header, as the captured packet may be truncated.
+            let whole =
+                captured.get(2..4).map_or(length, |it| usize::from(u16::from_be_bytes([it[0], it[1]])));
             let tally =
                 if link.pkttype() == PACKET_OUTGOING { &mut self.from_host } else { &mut self.to_host };
-            tally.add(seen, whole);
+            tally.add(captured, whole);
         }
     }
 
-    /// What was seen, by direction.
+    /// The counts of each direction.
     pub fn tallies(&self) -> [(&'static str, &Tally); 2] {
         [("to_host", &self.to_host), ("from_host", &self.from_host)]
     }
@@ -181,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn submessages_of_users_and_of_discovery_are_told_apart() {
+    fn submessages_of_user_and_built_in_entities_are_counted_separately() {
         let message = rtps(&[
             &submessage(0x0e, 0, 0),
             &submessage(0x15, 11, 0x03),
@@ -224,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_submessage_may_have_no_length_and_anything_may_be_cut_off() {
+    fn the_last_submessage_may_have_length_0_and_packets_may_be_truncated() {
         let mut data = submessage(0x15, 11, 0x03);
         data[2] = 0;
         let message = rtps(&[&submessage(0x0e, 0, 0), &data]);

@@ -1,4 +1,4 @@
-//! What the kernel counts of interfaces, of fragments and of processes, in the shape of its files.
+//! Parses the kernel's counters of interfaces, fragments and processes from files of `/proc`.
 
 use std::fs::File;
 use std::io::{Read, Seek};
@@ -6,7 +6,7 @@ use std::io::{Read, Seek};
 use crate::eval::bed::Network;
 use crate::eval::error::EvalError;
 
-/// A file of `/proc` that is read again and again. Opened in a network namespace, it stays there.
+/// An open file of `/proc` that is read repeatedly. It stays in the network namespace it was opened in.
 pub(super) struct ProcFile {
     file: File,
     text: String,
@@ -20,7 +20,7 @@ impl ProcFile {
         Ok(Self { file: network.within(open)?, text: String::new() })
     }
 
-    /// What it says now; nothing if it can't be read.
+    /// Reads the current text; empty if that fails.
     pub fn read(&mut self) -> &str {
         self.text.clear();
         if self.file.rewind().and_then(|()| self.file.read_to_string(&mut self.text)).is_err() {
@@ -30,7 +30,7 @@ impl ProcFile {
     }
 }
 
-/// Counters of an interface, by its own view.
+/// Counters of an interface; sent and received are from the interface's point of view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Interface {
     pub received_bytes: u64,
@@ -41,7 +41,7 @@ pub(super) struct Interface {
 }
 
 impl Interface {
-    /// From `net/dev`.
+    /// Parses the counters of an interface from `net/dev`.
     pub fn find(text: &str, name: &str) -> Option<Self> {
         let mut lines = text.lines().filter_map(|line| line.split_once(':'));
         let (_, values) = lines.find(|(interface, _)| interface.trim() == name)?;
@@ -56,7 +56,7 @@ impl Interface {
     }
 }
 
-/// A value of `net/snmp`, where a line of names goes before each line of values.
+/// Parses a value from `net/snmp`, in which a line of names precedes each line of values.
 pub(super) fn snmp(text: &str, protocol: &str, name: &str) -> Option<u64> {
     let mut lines = text.lines().filter_map(|line| line.split_once(": "));
     let (_, names) = lines.find(|(found, _)| *found == protocol)?;
@@ -65,7 +65,7 @@ pub(super) fn snmp(text: &str, protocol: &str, name: &str) -> Option<u64> {
     values.split_whitespace().nth(at)?.parse().ok()
 }
 
-/// Incomplete datagrams and the memory they hold, from `net/sockstat`.
+/// Parses the number of incomplete datagrams and their memory from `net/sockstat`.
 pub(super) fn fragments(text: &str) -> Option<(u64, u64)> {
     let line = text.lines().find_map(|line| line.strip_prefix("FRAG: "))?;
     let mut words = line.split_whitespace();
@@ -73,16 +73,16 @@ pub(super) fn fragments(text: &str) -> Option<(u64, u64)> {
     Some((queues, words.nth(1)?.parse().ok()?))
 }
 
-/// CPU time in clock ticks, from `/proc/PID/stat`.
+/// Parses the CPU time in clock ticks from `/proc/PID/stat`.
 pub(super) fn cpu_ticks(stat: &str) -> Option<u64> {
-    // The second field is the name, in parentheses, with anything in it.
+    // The second field is the name in parentheses; it may contain any character.
     let (_, rest) = stat.rsplit_once(')')?;
     let mut fields = rest.split_whitespace().skip(11);
     let user: u64 = fields.next()?.parse().ok()?;
     Some(user + fields.next()?.parse::<u64>().ok()?)
 }
 
-/// Resident memory in bytes, from `/proc/PID/status`.
+/// Parses the resident memory in bytes from `/proc/PID/status`.
 pub(super) fn rss_bytes(status: &str) -> Option<u64> {
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
     Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1_024)
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn processes_are_read_whatever_their_name() {
+    fn processes_are_read_with_any_name() {
         assert_eq!(cpu_ticks("12 (a) b) S 1 2 3 4 5 6 7 8 9 10 100 20 0 0"), Some(120));
         assert_eq!(cpu_ticks("12"), None);
         assert_eq!(rss_bytes("Name: a\nVmRSS:\t  10 kB\n"), Some(10_240));

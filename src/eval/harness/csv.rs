@@ -1,4 +1,4 @@
-//! A CSV file that is written row by row.
+//! Writes a CSV file row by row.
 
 use std::fmt::Display;
 use std::fs::File;
@@ -7,28 +7,28 @@ use std::path::{Path, PathBuf};
 
 use crate::eval::error::EvalError;
 
-/// A file with a header. Values are numbers and names without commas.
+/// A CSV file that is being written. Values are numbers and names without commas.
 pub(super) struct Csv {
     path: PathBuf,
     file: BufWriter<File>,
 }
 
 impl Csv {
-    /// Begins a file of that name in a folder.
+    /// Creates a file in a folder and writes its header.
     pub fn create(folder: &Path, name: &str, header: &str) -> Result<Self, EvalError> {
         let mut csv = Self::create_without_header(folder, name)?;
         csv.line(header)?;
         Ok(csv)
     }
 
-    /// Begins a file of other lines than values.
+    /// Creates a file without a header, for lines that are not CSV.
     pub fn create_without_header(folder: &Path, name: &str) -> Result<Self, EvalError> {
         let path = folder.join(name);
         let file = File::create(&path).map_err(|error| EvalError::file(&path, &error))?;
         Ok(Self { path, file: BufWriter::new(file) })
     }
 
-    /// A row.
+    /// Writes a row.
     pub fn row(&mut self, values: &[&dyn Display]) -> Result<(), EvalError> {
         let mut line = String::with_capacity(128);
         for (at, value) in values.iter().enumerate() {
@@ -40,12 +40,12 @@ impl Csv {
         self.line(&line)
     }
 
-    /// A row as it stands.
+    /// Writes a line unchanged.
     pub fn line(&mut self, line: &str) -> Result<(), EvalError> {
         writeln!(self.file, "{line}").map_err(|error| EvalError::file(&self.path, &error))
     }
 
-    /// Writes out what waits.
+    /// Flushes buffered lines.
     pub fn flush(&mut self) -> Result<(), EvalError> {
         self.file.flush().map_err(|error| EvalError::file(&self.path, &error))
     }

@@ -1,4 +1,5 @@
-//! The impaired links of a run: a program at each receiver, and caps on the ports of the switch.
+//! The impaired links of a run: an `impair` process for each direction, and bandwidth caps on the ports of
+//! the switch.
 
 use std::path::Path;
 use std::time::Duration;
@@ -15,19 +16,20 @@ use crate::eval::error::EvalError;
 use crate::eval::impairment::Level;
 use crate::eval::scenario::{Action, FORWARD, RETURN, Remote, Scenario};
 
-/// How long packets may wait for the token bucket of a cap, and how much passes at once. A router of a slow
-/// radio link has some such queue; a longer one delays more and drops less.
+/// Burst size and queue length of a cap's token bucket, similar to a router of a slow radio link. A longer
+/// queue delays more packets and drops fewer.
 const CAP_QUEUE: &str = "burst 16kb latency 200ms";
 
-/// A link is no program of a host, and must not wait for the CPU behind ten publishers: beside ten senders it
-/// lost 85 % of 1.9 million packets before it saw them, and none so (docs/decisions/0005-impaired-link.md).
-/// Where it may not be, `nice` says so and goes on.
+/// Niceness of link processes, so that they do not wait for the CPU behind the publishers: beside ten senders
+/// at normal priority, 85 % of 1.9 million packets were dropped before the link saw them, and none at this
+/// one (docs/decisions/0005-impaired-link.md). Without the right to it, `nice` warns and runs the program
+/// anyway.
 const NICENESS: &str = "-20";
 
 const COLUMNS: &str = "time_ns,link,state,seen,fragments,judged,lost,cut,held,passed,kernel_dropped,overflowed,\
                        lost_expected,trace_row";
 
-/// A program that impairs what a host receives from another.
+/// A process that impairs the packets that a host receives from another.
 struct Link {
     remote: String,
     entry: LinkEntry,
@@ -42,15 +44,15 @@ struct Cap {
     on: bool,
 }
 
-/// All links of a run. They are clean until they are switched.
+/// All links of a run. They start clean (`off`).
 pub(super) struct Links {
     links: Vec<Link>,
     caps: Vec<Cap>,
     csv: Csv,
 }
 
-/// One direction of a link.
-struct Way<'a> {
+/// The impairment of one direction of a link.
+struct Direction<'a> {
     direction: &'static str,
     host: &'a str,
     source: &'a str,
@@ -60,15 +62,15 @@ struct Way<'a> {
 }
 
 impl Links {
-    /// Starts the programs.
+    /// Starts the processes of all links.
     pub fn open(plan: &Plan, settings: &Settings, bed: &Bed, folder: &Path) -> Result<Self, EvalError> {
         let scenario = &plan.scenario;
         let mut links = Vec::new();
         let mut caps = Vec::new();
         for remote in &scenario.remotes {
-            for way in ways(scenario, remote) {
+            for direction in directions(scenario, remote) {
                 let number = u16::try_from(links.len()).unwrap_or(u16::MAX);
-                links.push(open(plan, settings, bed, folder, remote, &way, number)?);
+                links.push(open(plan, settings, bed, folder, remote, &direction, number)?);
             }
             if let Some(kbit_per_s) = remote.cap_kbit_per_s {
                 let port = bed.host(&remote.name)?.port.clone();
@@ -78,20 +80,20 @@ impl Links {
         Ok(Self { links, caps, csv: Csv::create(folder, "links.csv", COLUMNS)? })
     }
 
-    /// Whether all of them are there.
+    /// Whether all links are in place.
     pub fn are_ready(&mut self) -> bool {
-        self.links.iter_mut().all(|link| link.program.said("ready").is_some())
+        self.links.iter_mut().all(|link| link.program.latest("ready").is_some())
     }
 
-    /// Does to a remote subscriber's link what an event says.
+    /// Applies an event's action to a remote subscriber's link.
     pub fn switch(&mut self, bed: &Bed, remote: &str, action: Action) -> Result<(), EvalError> {
-        let word = match action {
+        let command = match action {
             Action::LinkOn => "on",
             Action::LinkDown => "down",
             _ => "off",
         };
         for link in self.links.iter_mut().filter(|link| link.remote == remote) {
-            link.program.tell(word);
+            link.program.send_line(command);
         }
         for cap in self.caps.iter_mut().filter(|cap| cap.remote == remote) {
             let on = action != Action::LinkOff;
@@ -106,17 +108,17 @@ impl Links {
         Ok(())
     }
 
-    /// Ports with a cap.
+    /// Ports with an active cap.
     pub fn capped_ports(&self) -> impl Iterator<Item = &str> {
         self.caps.iter().filter(|cap| cap.on).map(|cap| cap.port.as_str())
     }
 
-    /// Records what the links have counted since they were asked last, and asks again.
+    /// Records the counters that the links have returned to the last request, and requests them again.
     pub fn sample(&mut self) -> Result<(), EvalError> {
         for link in &mut self.links {
-            if let Some((time, said)) = link.program.take("counters") {
-                let number = |key: &str| said[key].as_u64().unwrap_or(0);
-                let state = said["state"].as_str().unwrap_or("");
+            if let Some((time, counters)) = link.program.take_latest("counters") {
+                let number = |key: &str| counters[key].as_u64().unwrap_or(0);
+                let state = counters["state"].as_str().unwrap_or("");
                 let counts = [
                     "seen",
                     "fragments",
@@ -129,31 +131,32 @@ impl Links {
                     "overflowed",
                 ];
                 let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
-                let expected = said["lost_expected"].as_f64().unwrap_or(0.0);
-                let trace_row = said["trace"]["row"].as_u64().map_or(String::new(), |row| row.to_string());
+                let expected = counters["lost_expected"].as_f64().unwrap_or(0.0);
+                let trace_row =
+                    counters["trace"]["row"].as_u64().map_or(String::new(), |row| row.to_string());
                 let counts = counts.join(",");
                 self.csv.row(&[&time.0, &link.entry.name, &state, &counts, &expected, &trace_row])?;
             }
-            link.program.tell("counters");
+            link.program.send_line("counters");
         }
         Ok(())
     }
 
-    /// The programs, to be watched.
+    /// The processes of all links.
     pub fn programs(&mut self) -> impl Iterator<Item = &mut Program> {
         self.links.iter_mut().map(|link| &mut link.program)
     }
 
-    /// Removes all links; yields what they were and what they did, and what makes that doubtful.
+    /// Removes all links; returns their manifest entries with the final counters, and the problems.
     pub fn end(mut self) -> Result<(Vec<LinkEntry>, Vec<String>), EvalError> {
         let mut entries = Vec::new();
         let mut problems = Vec::new();
         for link in &mut self.links {
             let name = link.entry.name.clone();
             if !link.program.end(Duration::from_secs(10)) {
-                problems.push(format!("the link {name} did not end as asked"));
+                problems.push(format!("the link {name} did not end cleanly on SIGTERM"));
             }
-            let last = link.program.last_words("ended");
+            let last = link.program.wait_for_last("ended");
             problems.extend(last.as_ref().and_then(|last| lost_beside_the_model(&name, last)));
             entries.push(LinkEntry { impairment: last, ..link.entry.clone() });
         }
@@ -176,7 +179,8 @@ impl Links {
     }
 }
 
-/// What a link lost that its model did not, of what it said at its end.
+/// The problem of packets that a link lost although its model did not, by the link's last output; `None` if
+/// there are none.
 fn lost_beside_the_model(name: &str, last: &Value) -> Option<String> {
     let [seen, unseen, no_room] =
         ["seen", "kernel_dropped", "overflowed"].map(|key| last[key].as_u64().unwrap_or(0));
@@ -184,43 +188,44 @@ fn lost_beside_the_model(name: &str, last: &Value) -> Option<String> {
     let percent = 100.0 * lost as f64 / (seen + unseen).max(1) as f64;
     (lost > 0).then(|| {
         format!(
-            "the link {name} lost {lost} packets ({percent:.2} %) that its model did not lose: {unseen} before \
-             it saw them, as its program did not keep up, and {no_room} for want of room"
+            "the link {name} lost {lost} packets ({percent:.2} %) that its model did not lose: {unseen} in \
+             the kernel, because its process did not keep up, and {no_room} because too many were in transit"
         )
     })
 }
 
-/// What is impaired of a remote subscriber's link. One that is never switched and loses nothing needs no
-/// program.
-fn ways<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Way<'a>> {
+/// The directions of a remote subscriber's link that need a process: those that are impaired or cut.
+fn directions<'a>(scenario: &Scenario, remote: &'a Remote) -> Vec<Direction<'a>> {
     let sender = scenario.variant.sender();
     let is_cut =
         scenario.events.iter().any(|event| event.action == Action::LinkDown && event.to == remote.name);
-    let mut ways = Vec::new();
+    let mut directions = Vec::new();
     if remote.is_impaired() || is_cut {
         let (delay_ms, jitter_ms) = (remote.delay_ms, remote.jitter_ms);
         let (host, source) = (remote.name.as_str(), sender);
-        ways.push(Way { direction: FORWARD, host, source, level: remote.level, delay_ms, jitter_ms });
+        let level = remote.level;
+        directions.push(Direction { direction: FORWARD, host, source, level, delay_ms, jitter_ms });
     }
     if remote.is_impaired_back() || is_cut {
         let (delay_ms, jitter_ms) = (remote.return_delay_ms, remote.return_jitter_ms);
         let (host, source) = (sender, remote.name.as_str());
-        ways.push(Way { direction: RETURN, host, source, level: Level::Clean, delay_ms, jitter_ms });
+        let level = Level::Clean;
+        directions.push(Direction { direction: RETURN, host, source, level, delay_ms, jitter_ms });
     }
-    ways
+    directions
 }
 
-/// Starts the program of one direction; `number` tells it from the others.
+/// Starts the process of one direction; `number` is different for each link of a run.
 fn open(
     plan: &Plan,
     settings: &Settings,
     bed: &Bed,
     folder: &Path,
     remote: &Remote,
-    way: &Way,
+    to: &Direction,
     number: u16,
 ) -> Result<Link, EvalError> {
-    let (host, source) = (bed.host(way.host)?, bed.host(way.source)?);
+    let (host, source) = (bed.host(to.host)?, bed.host(to.source)?);
     let uplink = source.uplink.as_ref();
     let mut command = uplink.unwrap_or(&host.network).command(Path::new("nice"));
     command.args(["-n", NICENESS]).arg(&settings.harness);
@@ -230,28 +235,27 @@ fn open(
     }
     command.args(["--backend", settings.backend_name(), "--queue", &number.to_string()]);
     command.args(["--source", &source.address.to_string()]);
-    if let Some(trace) = remote.trace_of(way.direction) {
-        command.arg("--trace").arg(folder.join(remote.trace_name(way.direction)));
+    if let Some(trace) = remote.trace_of(to.direction) {
+        command.arg("--trace").arg(folder.join(remote.trace_name(to.direction)));
         command.args(["--trace-speed", &plan.speed(settings.quick).to_string()]);
         if trace.repeat {
             command.arg("--trace-repeat");
         }
     } else {
-        command.args(["--level", way.level.name()]);
+        command.args(["--level", to.level.name()]);
         if let Some(reading) = plan.reading {
             command.args(["--reading", reading.name()]);
         }
-        command.args(["--delay-ms", &way.delay_ms.to_string(), "--jitter-ms", &way.jitter_ms.to_string()]);
+        command.args(["--delay-ms", &to.delay_ms.to_string(), "--jitter-ms", &to.jitter_ms.to_string()]);
     }
     command.args(["--seed", &settings.link_seed(plan.repetition, number).to_string()]);
-    let name = format!("{}<-{}", way.host, way.source);
-    let program =
-        Program::start(&format!("link-{}-{}", way.host, way.source), command, &folder.join("logs"))?;
+    let name = format!("{}<-{}", to.host, to.source);
+    let program = Program::start(&format!("link-{}-{}", to.host, to.source), command, &folder.join("logs"))?;
     let entry = LinkEntry {
         name,
-        direction: way.direction,
-        host: way.host.to_owned(),
-        source: way.source.to_owned(),
+        direction: to.direction,
+        host: to.host.to_owned(),
+        source: to.source.to_owned(),
         before_switch: uplink.is_some(),
         cap_kbit_per_s: None,
         impairment: None,
@@ -266,17 +270,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_model_did_not_lose_is_told_as_that() {
-        let said = |unseen: u64, no_room: u64| {
+    fn packets_lost_in_addition_to_the_model_are_a_problem() {
+        let problem = |unseen: u64, no_room: u64| {
             let last = json!({"seen": 300, "lost": 50, "kernel_dropped": unseen, "overflowed": no_room});
             lost_beside_the_model("slow<-publisher", &last)
         };
-        assert_eq!(said(0, 0), None);
+        assert_eq!(problem(0, 0), None);
         assert_eq!(
-            said(100, 20).as_deref(),
+            problem(100, 20).as_deref(),
             Some(
-                "the link slow<-publisher lost 120 packets (30.00 %) that its model did not lose: 100 before it saw \
-                 them, as its program did not keep up, and 20 for want of room"
+                "the link slow<-publisher lost 120 packets (30.00 %) that its model did not lose: 100 in the \
+                 kernel, because its process did not keep up, and 20 because too many were in transit"
             )
         );
     }

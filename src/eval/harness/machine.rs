@@ -1,4 +1,4 @@
-//! The machine and the software that a run was made with.
+//! The machine and the software of a run.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::telemetry::CpuTime;
 
-/// The machine.
+/// Properties and load of the machine.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Machine {
     pub kernel: String,
@@ -23,7 +23,7 @@ pub(super) struct Machine {
 }
 
 impl Machine {
-    /// As it is now.
+    /// Reads the properties of this machine and its current load.
     pub fn read() -> Self {
         let text = |path: &str| fs::read_to_string(path).unwrap_or_default();
         let load = text("/proc/loadavg");
@@ -41,19 +41,19 @@ impl Machine {
         }
     }
 
-    /// With what the hypervisor took since then.
+    /// Adds the CPU time that the hypervisor took since the first reading.
     pub fn read_again(self) -> Self {
         Self { stolen_percent: CpuTime::now().stolen_percent_since(self.read_at), ..self }
     }
 }
 
-/// What a file of `name`, a separator and a value on each line says of a name; empty if it says nothing.
+/// Finds the value of a name in a text with a name, a separator and a value on each line; empty if not found.
 fn field(text: &str, name: &str, separator: char) -> String {
     let mut pairs = text.lines().filter_map(|line| line.split_once(separator));
     pairs.find(|(key, _)| key.trim() == name).map(|(_, value)| value.trim().to_owned()).unwrap_or_default()
 }
 
-/// The programs.
+/// Versions of the programs of a run.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Software {
     pub version: &'static str,
@@ -64,22 +64,22 @@ pub(super) struct Software {
 }
 
 impl Software {
-    /// The harness, the checkout in which it runs, and the bridge.
+    /// Reads the versions of the harness, of the checkout in which it runs, and of the bridge.
     pub fn read(bridge: Option<&Path>) -> Self {
-        let commit = said(Command::new("git").args(["rev-parse", "HEAD"]));
-        let changes = said(Command::new("git").args(["status", "--porcelain", "--untracked-files=no"]));
+        let commit = stdout_of(Command::new("git").args(["rev-parse", "HEAD"]));
+        let changes = stdout_of(Command::new("git").args(["status", "--porcelain", "--untracked-files=no"]));
         Self {
             version: env!("CARGO_PKG_VERSION"),
             modified: changes.is_some_and(|changes| !changes.is_empty()),
             commit,
-            bridge: bridge.and_then(|bridge| said(Command::new(bridge).arg("--version"))),
+            bridge: bridge.and_then(|bridge| stdout_of(Command::new(bridge).arg("--version"))),
             peer: None,
         }
     }
 }
 
-/// What a program says, if it ends well.
-fn said(command: &mut Command) -> Option<String> {
+/// Runs a program; returns its stdout if it succeeds.
+fn stdout_of(command: &mut Command) -> Option<String> {
     let output = command.stdin(Stdio::null()).stderr(Stdio::null()).output().ok()?;
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }

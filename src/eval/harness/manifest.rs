@@ -1,4 +1,4 @@
-//! `manifest.json`: what a run was. docs/eval-results.md describes every key.
+//! `manifest.json`, the description of a run. docs/eval-results.md describes every key.
 
 use std::collections::BTreeMap;
 
@@ -10,10 +10,10 @@ use crate::eval::bed::BedKind;
 use crate::eval::impairment::{Level, Reading};
 use crate::eval::scenario::{Switch, Variant};
 
-/// The version of the format. It grows when a key is renamed or given another meaning.
+/// The version of the format. It increases when a key is renamed or its meaning changes.
 pub(super) const FORMAT: u32 = 1;
 
-/// A run.
+/// The manifest of a run.
 #[derive(Debug, Serialize)]
 pub(super) struct Manifest<'a> {
     pub format: u32,
@@ -45,7 +45,7 @@ pub(super) struct Manifest<'a> {
     pub problems: Vec<String>,
 }
 
-/// A publisher or subscriber.
+/// The entry of a publisher or subscriber.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct EndpointEntry {
     pub name: String,
@@ -64,7 +64,7 @@ pub(super) struct EndpointEntry {
     pub summary: Option<Value>,
 }
 
-/// An impaired link.
+/// The entry of an impaired link.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct LinkEntry {
     pub name: String,
@@ -76,7 +76,7 @@ pub(super) struct LinkEntry {
     pub impairment: Option<Value>,
 }
 
-/// A port of the switch.
+/// The entry of a port of the switch.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct PortEntry {
     pub host: String,

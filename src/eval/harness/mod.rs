@@ -1,5 +1,5 @@
-//! Makes the runs of a matrix, one after the other: each in a folder of its own that is there when it is
-//! whole. docs/eval-results.md describes the folders.
+//! Executes the runs of a matrix one after the other. A finished run's folder is moved into the results in
+//! one step, so that it is complete. docs/eval-results.md describes the folders.
 
 mod bridge;
 mod capture;
@@ -33,7 +33,7 @@ pub use settings::{Library, Settings};
 use super::bed::{Host, stale};
 use super::error::EvalError;
 
-/// Variables that would change what the programs of a run do.
+/// Environment variables that are removed, as they would change the behaviour of a run's programs.
 const FOREIGN_VARIABLES: [&str; 9] = [
     "ADAPTIVE_BRIDGE_CONFIG",
     "CYCLONEDDS_URI",
@@ -46,7 +46,7 @@ const FOREIGN_VARIABLES: [&str; 9] = [
     "RUNTIME_DIRECTORY",
 ];
 
-/// A command that will run a program on a host, on the CPUs that are meant for it.
+/// Builds a command that runs a program on a host, on the CPUs chosen by `--pin`.
 fn pinned(settings: &Settings, host: &Host, program: &Path) -> Command {
     let mut command = match settings.pins.get(&host.name) {
         Some(cpus) => {
@@ -63,23 +63,24 @@ fn pinned(settings: &Settings, host: &Host, program: &Path) -> Command {
     command
 }
 
-/// How the runs of a matrix went.
+/// The numbers of finished, skipped and failed runs of a matrix.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Outcome {
-    /// Made now.
-    pub made: usize,
-    /// Made before.
+    /// Runs that finished.
+    pub finished: usize,
+    /// Runs that the results already contained.
     pub skipped: usize,
-    /// Failed; the folder `failed` has what there is of them.
+    /// Runs that failed; the folder `failed` has their incomplete results.
     pub failed: usize,
 }
 
-/// Makes every run that is not there yet.
+/// Executes every run that the results do not contain yet. A run that fails is counted, and the next one
+/// starts.
 ///
 /// # Errors
-/// A signal asked to end, another harness writes into the same folder, the folder has runs of other settings,
-/// or a file can't be written. A run that fails is counted, and the next one is made.
-pub fn make_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalError> {
+/// A signal arrived, another harness writes into the same folder, the folder has runs of other settings, or a
+/// file cannot be written.
+pub fn run_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalError> {
     let folder = |name: &str| settings.out.join(name);
     fs::create_dir_all(folder("runs")).map_err(|error| EvalError::file(&settings.out, &error))?;
     let _lock = lock(&settings.out)?;
@@ -89,7 +90,7 @@ pub fn make_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalErro
             .map_err(|error| EvalError::new(format!("signal handlers: {error}")))?;
     }
     for removed in stale::remove_all() {
-        eprintln!("removed what a harness that died has left: {removed}");
+        eprintln!("removed the leftovers of a harness that no longer runs: {removed}");
     }
     for plan in plans {
         check_same(plan, settings, &folder("runs").join(plan.name()))?;
@@ -110,7 +111,7 @@ pub fn make_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalErro
                 rename(&partial, &done)?;
                 let _ = fs::remove_dir_all(folder("failed").join(&name));
                 progress.end("done");
-                outcome.made += 1;
+                outcome.finished += 1;
             }
             Err(EvalError::Interrupted) => {
                 let _ = fs::remove_dir_all(&partial);
@@ -127,7 +128,7 @@ pub fn make_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalErro
     Ok(outcome)
 }
 
-/// Held while a harness writes into a folder.
+/// Locks the results while this harness writes into them.
 fn lock(out: &Path) -> Result<Flock<File>, EvalError> {
     let path = out.join(".lock");
     let file = File::create(&path).map_err(|error| EvalError::file(&path, &error))?;
@@ -135,7 +136,7 @@ fn lock(out: &Path) -> Result<Flock<File>, EvalError> {
         .map_err(|_| EvalError::new(format!("another harness writes into {}", out.display())))
 }
 
-/// An error where the folder of a run has one of other settings, which a report would mix with these.
+/// Fails if the folder of a run has one with other settings, which a report would mix with this one.
 fn check_same(plan: &Plan, settings: &Settings, done: &Path) -> Result<(), EvalError> {
     if !done.exists() {
         return Ok(());
@@ -154,12 +155,12 @@ fn check_same(plan: &Plan, settings: &Settings, done: &Path) -> Result<(), EvalE
         return Ok(());
     };
     Err(EvalError::new(format!(
-        "{} was made with other settings ({differs}); choose another --out, or remove it",
+        "{} was recorded with other settings ({differs}); choose another --out, or remove it",
         done.display()
     )))
 }
 
-/// A folder with nothing in it.
+/// Creates an empty folder, after removing an existing one.
 fn empty(folder: &Path) -> Result<(), EvalError> {
     if folder.exists() {
         fs::remove_dir_all(folder).map_err(|error| EvalError::file(folder, &error))?;

@@ -12,35 +12,34 @@ use crate::eval::bed::Bed;
 use crate::eval::error::EvalError;
 use crate::eval::scenario::{ReaderHistory, Scenario, Variant};
 
-/// The paper's bound of the writer's history in Fast DDS; RustDDS gets the same.
+/// The paper's limit of the writer's history in Fast DDS; also used for RustDDS.
 const WRITER_MAX_SAMPLES: &str = "200";
-/// How long write may wait for room. Fast DDS has 100 ms by default; on Cyclone DDS ROS 2 asks for no limit,
-/// and so does the paper (section V-C). The longest that the peer takes is 1,000 s.
+/// How long a write may block. The default of Fast DDS is 100 ms; with Cyclone DDS, ROS 2 sets no limit, and
+/// the paper neither (section V-C). The peer accepts at most 1,000 s.
 const CYCLONE_MAX_BLOCKING_MS: &str = "1000000";
 
-/// The paper's settings of Cyclone DDS: data by unicast, and a writer's history cache of 600 KiB that does
-/// not adapt itself downwards.
+/// The paper's settings of Cyclone DDS: data by unicast, and a fixed writer history cache of 600 KiB.
 const CYCLONE_URI: &str = "<General><AllowMulticast>spdp</AllowMulticast></General><Internal><Watermarks>\
      <WhcHigh>600 KiB</WhcHigh><WhcHighInit>600 KiB</WhcHighInit><WhcAdaptive>false</WhcAdaptive>\
      </Watermarks></Internal>";
 
-/// How long a publisher goes on behind the end of the window, in seconds.
+/// How long a publisher continues after the end of the window, in seconds.
 const AFTER_END_S: f64 = 0.2;
 
-/// A publisher or subscriber that runs.
+/// A running publisher or subscriber.
 pub(super) struct Endpoint {
     pub entry: EndpointEntry,
     pub program: Program,
 }
 
-/// What an endpoint is for.
+/// The role of an endpoint in a run.
 enum Role<'a> {
     Publisher,
     Critical,
     Slow { lane: &'a str },
 }
 
-/// Starts the subscribers of all routes, and publishers that wait to be told to begin.
+/// Starts the subscribers of all routes, and publishers that wait for SIGUSR1 to start publishing.
 pub(super) fn start(
     plan: &Plan,
     settings: &Settings,
@@ -51,10 +50,10 @@ pub(super) fn start(
     let scenario = &plan.scenario;
     let mut endpoints = Vec::new();
     for route in 0..scenario.workload.routes {
-        let mut start = |who: &str, role: &Role| -> Result<(), EvalError> {
-            let name = scenario.endpoint_name(who, route);
-            let (entry, program) = endpoint(plan, settings, name, who, route, role, (folder, duration_s))?;
-            let mut command = pinned(settings, bed.host(who)?, &program);
+        let mut start = |host: &str, role: &Role| -> Result<(), EvalError> {
+            let name = scenario.endpoint_name(host, route);
+            let (entry, program) = endpoint(plan, settings, name, host, route, role, (folder, duration_s))?;
+            let mut command = pinned(settings, bed.host(host)?, &program);
             command.args(&entry.command_line[1..]).envs(&entry.environment);
             let program = Program::start(&entry.name, command, &folder.join("logs"))?;
             endpoints.push(Endpoint { entry, program });
@@ -69,7 +68,7 @@ pub(super) fn start(
     Ok(endpoints)
 }
 
-/// What an endpoint is, and its program.
+/// Returns the manifest entry of an endpoint, with its command line, and the path of its program.
 fn endpoint(
     plan: &Plan,
     settings: &Settings,
@@ -145,7 +144,7 @@ fn endpoint(
     Ok((entry, program))
 }
 
-/// The DDS topic of a route on a lane, or of its publisher.
+/// The DDS topic of a route's output on a lane, or of its input.
 fn dds_topic(scenario: &Scenario, route: usize, lane: Option<&str>) -> String {
     let name = scenario.route_name(route);
     match lane {

@@ -1,4 +1,4 @@
-//! Which runs there are to make.
+//! The plan of a matrix: which runs to execute.
 
 use std::rc::Rc;
 
@@ -7,41 +7,41 @@ use crate::eval::bed::BedKind;
 use crate::eval::impairment::Reading;
 use crate::eval::scenario::{Scenario, Switch};
 
-/// One run.
+/// A run: a scenario in one setting.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// What is run.
+    /// The scenario.
     pub scenario: Rc<Scenario>,
-    /// On whose DDS.
+    /// The DDS library of the publishers and subscribers.
     pub library: Library,
-    /// Of Table I; `None` where nothing is lost by it.
+    /// The reading of Table I; `None` if no link loses packets by it.
     pub reading: Option<Reading>,
-    /// On what hosts.
+    /// The kind of test bed.
     pub bed: BedKind,
-    /// With what between them.
+    /// The switch between the hosts.
     pub switch: Switch,
-    /// Which of several.
+    /// The number of the repetition, from 1.
     pub repetition: u32,
 }
 
-/// All that a scenario is to be combined with.
+/// The settings that each scenario is combined with.
 #[derive(Clone, Debug)]
 pub struct Dimensions {
-    /// Libraries.
+    /// DDS libraries.
     pub libraries: Vec<Library>,
-    /// Readings of Table I, for scenarios that have them.
+    /// Readings of Table I, for scenarios to which they make a difference.
     pub readings: Vec<Reading>,
-    /// Beds.
+    /// Kinds of test beds.
     pub beds: Vec<BedKind>,
-    /// Hosts between; none: those of the scenario.
+    /// Switches between the hosts; empty for those of the scenario.
     pub switches: Vec<Switch>,
-    /// How often.
+    /// The number of repetitions of each run.
     pub repetitions: u32,
 }
 
 impl Dimensions {
-    /// Every combination, the repetitions outermost, so that an interrupted matrix has the first of each. A
-    /// docker bed is run with the one switch that it has.
+    /// Returns every combination. Repetitions are the outermost loop, so that an interrupted matrix has the
+    /// first repetition of each. A docker bed has only the switch that docker provides.
     pub fn plans(&self, scenarios: &[Rc<Scenario>], docker_switch: Switch) -> Vec<Plan> {
         let mut plans = Vec::new();
         for repetition in 1..=self.repetitions {
@@ -69,13 +69,13 @@ impl Dimensions {
         match (bed, self.switches.as_slice()) {
             (BedKind::Docker, []) => vec![docker_switch],
             (BedKind::Netns, []) => scenario.switches.clone(),
-            (_, asked) => asked.to_vec(),
+            (_, chosen) => chosen.to_vec(),
         }
     }
 }
 
 impl Plan {
-    /// The name of its folder.
+    /// The name of the run and of its folder.
     pub fn name(&self) -> String {
         format!(
             "{}.{}.{}.{}.{}.r{}",
@@ -88,17 +88,17 @@ impl Plan {
         )
     }
 
-    /// The measured window, in seconds.
+    /// The length of the measured window, in seconds.
     pub fn duration_s(&self, quick: bool) -> f64 {
         if quick { self.scenario.quick_s } else { self.scenario.duration_s }
     }
 
-    /// How much faster than in the scenario everything happens.
+    /// The factor by which a smoke run is faster than the scenario.
     pub fn speed(&self, quick: bool) -> f64 {
         self.scenario.duration_s / self.duration_s(quick)
     }
 
-    /// When an event is due, in seconds from the beginning of the window.
+    /// Scales an event's time, in seconds from the beginning of the window, to this run.
     pub fn at_s(&self, at_s: f64, quick: bool) -> f64 {
         at_s * self.duration_s(quick) / self.scenario.duration_s
     }
@@ -127,10 +127,10 @@ mod tests {
     }
 
     #[test]
-    fn every_combination_is_there_once_and_the_first_repetition_comes_first() {
+    fn every_combination_is_planned_once_and_the_first_repetition_first() {
         let scenarios = [scenario("clean", "clean"), scenario("mild", "mild")];
         let plans = dimensions().plans(&scenarios, Switch::Reassembling);
-        // Two libraries, two switches, two repetitions; what loses nothing has no readings.
+        // Two libraries, two switches, two repetitions; the scenario without loss has no readings.
         assert_eq!(plans.len(), 2 * 2 * 2 * (1 + 2));
         let mut names: Vec<String> = plans.iter().map(Plan::name).collect();
         assert_eq!(names[0], "clean.fast.none.netns.plain.r1");
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn switches_are_as_asked_else_of_the_scenario_and_docker_has_one() {
+    fn switches_are_those_given_or_the_scenarios_and_docker_has_one() {
         let scenarios = [scenario("mild", "mild")];
         let count = |dimensions: &Dimensions| dimensions.plans(&scenarios, Switch::Reassembling).len();
         let one = Dimensions { switches: vec![Switch::Plain], ..dimensions() };
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn events_move_with_the_window() {
+    fn times_of_events_scale_with_the_window() {
         let scenarios = [scenario("mild", "mild")];
         let plan = &dimensions().plans(&scenarios, Switch::Plain)[0];
         assert_eq!((plan.duration_s(false), plan.at_s(60.0, false)), (180.0, 60.0));

@@ -1,4 +1,4 @@
-//! A child process that speaks JSON, one object on each line of its stdout, and logs to a file.
+//! A child process that writes JSON to stdout, one object per line, and its log to a file.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,28 +18,29 @@ use crate::clock;
 use crate::eval::error::EvalError;
 use crate::model::MonotonicNs;
 
-/// How often it is looked for the last line of a program, 10 ms apart.
-const LAST_WORDS_TRIES: u32 = 100;
+/// How often [`Program::wait_for_last`] reads the output, every 10 ms.
+const LAST_LINE_TRIES: u32 = 100;
 
-/// A line of output and when it came.
-pub(super) type Said = (MonotonicNs, Value);
+/// A line of output and its time of arrival.
+pub(super) type TimedLine = (MonotonicNs, Value);
 
 /// A running child, the leader of a process group. Dropping it kills the group.
 pub(super) struct Program {
     pub name: String,
     child: Child,
     stdin: Option<ChildStdin>,
-    lines: Receiver<Said>,
-    /// The latest line of each event; a line without one is of event "".
-    latest: BTreeMap<String, Said>,
+    lines: Receiver<TimedLine>,
+    /// The latest line of each event.
+    latest: BTreeMap<String, TimedLine>,
     ended: Option<ExitStatus>,
 }
 
 impl Program {
-    /// Starts it. Call it on a thread that lives as long as the run: its end kills the child.
+    /// Starts the program. Must be called on a thread that lives as long as the run, as the thread's end
+    /// kills the child.
     pub fn start(name: &str, mut command: Command, logs: &Path) -> Result<Self, EvalError> {
         let log = logs.join(format!("{name}.log"));
-        // It may be a second start of the same program.
+        // Append: the same program may have been started before.
         let log = File::options().append(true).create(true).open(&log);
         let log = log.map_err(|error| EvalError::file(logs, &error))?;
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).process_group(0);
@@ -53,13 +54,14 @@ impl Program {
         Ok(Self { name: name.to_owned(), child, stdin, lines, latest: BTreeMap::new(), ended: None })
     }
 
-    /// Its process id.
+    /// The process id of the child.
     pub fn pid(&self) -> Pid {
         Pid::from_raw(i32::try_from(self.child.id()).unwrap_or(0))
     }
 
-    /// Takes in what it has said; yields the lines without an event.
-    pub fn listen(&mut self) -> Vec<Said> {
+    /// Reads the lines since the last call: keeps the latest line of each event, and returns lines without an
+    /// event.
+    pub fn read_lines(&mut self) -> Vec<TimedLine> {
         let mut plain = Vec::new();
         for (time, value) in self.lines.try_iter() {
             match value["event"].as_str().map(str::to_owned) {
@@ -73,43 +75,44 @@ impl Program {
     }
 
     /// The latest line of an event so far.
-    pub fn said(&mut self, event: &str) -> Option<&Value> {
-        self.listen();
+    pub fn latest(&mut self, event: &str) -> Option<&Value> {
+        self.read_lines();
         self.latest.get(event).map(|(_, value)| value)
     }
 
-    /// Takes the latest line of an event and when it came, so that the next one is another.
-    pub fn take(&mut self, event: &str) -> Option<Said> {
-        self.listen();
+    /// Removes and returns the latest line of an event, so that the next call does not return the same one.
+    pub fn take_latest(&mut self, event: &str) -> Option<TimedLine> {
+        self.read_lines();
         self.latest.remove(event)
     }
 
-    /// The last line of an event of one that has ended; some of what it said may still be on its way.
-    pub fn last_words(&mut self, event: &str) -> Option<Value> {
-        for _ in 0..LAST_WORDS_TRIES {
-            if let Some(said) = self.said(event) {
-                return Some(said.clone());
+    /// The last line of an event after the program has ended. Waits up to 1 s, as the thread that reads the
+    /// output may be late.
+    pub fn wait_for_last(&mut self, event: &str) -> Option<Value> {
+        for _ in 0..LAST_LINE_TRIES {
+            if let Some(line) = self.latest(event) {
+                return Some(line.clone());
             }
             thread::sleep(Duration::from_millis(10));
         }
         None
     }
 
-    /// Writes a line to its stdin. One that has gone does not hear it, which is found elsewhere.
-    pub fn tell(&mut self, line: &str) {
+    /// Writes a line to the program's stdin. Ignores errors: [`Self::ended`] finds a program that has ended.
+    pub fn send_line(&mut self, line: &str) {
         if let Some(stdin) = &mut self.stdin {
             let _ = writeln!(stdin, "{line}");
         }
     }
 
-    /// Sends it a signal.
+    /// Sends a signal to the program, unless it has ended.
     pub fn signal(&self, signal: Signal) {
         if self.ended.is_none() {
             let _ = kill(self.pid(), signal);
         }
     }
 
-    /// How it ended, once it has.
+    /// The exit status of the program, once it has ended.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         if self.ended.is_none() {
             self.ended = self.child.try_wait().unwrap_or(None);
@@ -117,11 +120,11 @@ impl Program {
         self.ended
     }
 
-    /// Asks it to end (SIGTERM), and kills it after a patience; whether it ended as asked.
-    pub fn end(&mut self, patience: Duration) -> bool {
+    /// Ends the program with SIGTERM, and kills it after a timeout; returns whether it ended with success.
+    pub fn end(&mut self, timeout: Duration) -> bool {
         self.signal(Signal::SIGCONT);
         self.signal(Signal::SIGTERM);
-        let deadline = clock::monotonic().plus_ns(u64::try_from(patience.as_nanos()).unwrap_or(u64::MAX));
+        let deadline = clock::monotonic().plus_ns(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
         while self.ended().is_none() {
             if clock::monotonic() >= deadline {
                 self.kill();
@@ -134,7 +137,7 @@ impl Program {
 
     fn kill(&mut self) {
         let _ = killpg(self.pid(), Signal::SIGKILL);
-        // SIGKILL can't be refused, so this wait is short.
+        // A process cannot ignore SIGKILL, so this wait is short.
         self.ended = self.child.wait().ok();
     }
 }
@@ -147,8 +150,8 @@ impl Drop for Program {
     }
 }
 
-/// Passes on each line that is JSON. Programs say nothing else there.
-fn read(stdout: ChildStdout, sender: &Sender<Said>) {
+/// Sends each line of JSON to the receiver; ignores other lines.
+fn read(stdout: ChildStdout, sender: &Sender<TimedLine>) {
     for line in BufReader::new(stdout).lines().map_while(Result::ok) {
         if let Ok(value) = serde_json::from_str(&line)
             && sender.send((clock::monotonic(), value)).is_err()

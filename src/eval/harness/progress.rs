@@ -1,10 +1,10 @@
-//! What the terminal shows while runs are made: a line for each, in place where it is a terminal.
+//! The progress on stderr: a line for each run, updated in place on a terminal.
 
 use std::io::{IsTerminal, Write, stderr};
 
 use crate::model::MonotonicNs;
 
-/// The line of the present run.
+/// The progress line of the current run.
 pub(super) struct Progress {
     head: String,
     in_place: bool,
@@ -12,7 +12,7 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// Begins the line of run `number` of `all`.
+    /// Starts the line of run `number` of `all`.
     pub fn begin(number: usize, all: usize, run: &str) -> Self {
         let progress = Self {
             head: format!("[{number}/{all}] {run}"),
@@ -25,18 +25,18 @@ impl Progress {
         progress
     }
 
-    /// Shows what is being done.
+    /// Shows the phase of the run.
     pub fn phase(&mut self, what: &str) {
         self.show(what);
     }
 
-    /// Shows how far the measured window is.
+    /// Shows the time in the measured window.
     pub fn time(&mut self, begin: MonotonicNs, now: MonotonicNs, duration_s: f64) {
         let seconds = now.since(begin) / 1_000_000_000;
         self.show(&format!("{seconds} of {duration_s:.0} s"));
     }
 
-    /// Ends the line.
+    /// Ends the line with the outcome of the run.
     pub fn end(&mut self, outcome: &str) {
         if self.in_place {
             eprintln!("\r\x1b[K{}: {outcome}", self.head);

@@ -1,4 +1,4 @@
-//! One run, from its hosts to its folder of results.
+//! Executes one run, from creating its hosts to writing its results.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -25,17 +25,17 @@ use crate::eval::error::EvalError;
 use crate::eval::scenario::{Action, Event, Scenario, Variant};
 use crate::model::MonotonicNs;
 
-/// How long matching and all else that has to happen before a run may take.
-const SET_UP_PATIENCE_S: f64 = 60.0;
-/// How long a publisher may take behind the end of the window: 10 s of waiting for acknowledgements, and a
-/// call of write that is held up.
-const PUBLISHER_PATIENCE_S: f64 = 30.0;
-/// How long a program may take to end when it is asked to.
-const END_PATIENCE: Duration = Duration::from_secs(5);
+/// Timeout of each step before the window, such as matching.
+const SET_UP_TIMEOUT_S: f64 = 60.0;
+/// Timeout of publishers after the end of the window: 10 s for acknowledgements, and time for a blocked
+/// write.
+const PUBLISHER_TIMEOUT_S: f64 = 30.0;
+/// Timeout of a program after SIGTERM.
+const END_TIMEOUT: Duration = Duration::from_secs(5);
 const TICK: Duration = Duration::from_millis(20);
 const SAMPLE_MS: u64 = 1_000;
 
-/// Makes one run. The results are in `folder` when it returns without an error.
+/// Executes one run. When it returns without an error, the results are in `folder`.
 pub(super) fn run(
     plan: &Plan,
     settings: &Settings,
@@ -53,10 +53,10 @@ pub(super) fn run(
         fs::write(&path, &trace.text).map_err(|error| EvalError::file(&path, &error))?;
     }
     let machine = Machine::read();
-    progress.phase("making the hosts");
+    progress.phase("creating the hosts");
     let shared = shared_folders(settings, folder);
     let shared: Vec<&Path> = shared.iter().map(PathBuf::as_path).collect();
-    // Declared first, so that it is dropped last: its programs end before their hosts.
+    // Declared before the run, so that it is dropped last: programs end before their hosts are removed.
     let sender = plan.scenario.variant.sender();
     let bed = plan.bed.make(&host_names(&plan.scenario), sender, plan.switch, &shared)?;
     let mut run = Run::start(plan, settings, folder, &bed, interrupted)?;
@@ -74,15 +74,15 @@ fn host_names(scenario: &Scenario) -> Vec<String> {
     fixed.map(str::to_owned).chain(scenario.remotes.iter().map(|remote| remote.name.clone())).collect()
 }
 
-/// What programs on hosts with files of their own have to see.
+/// The folders that programs need on hosts with a separate file system.
 fn shared_folders(settings: &Settings, folder: &Path) -> Vec<PathBuf> {
     let programs = [&settings.bridge, &settings.harness].into_iter();
     let programs = programs.filter_map(|program| program.parent().map(Path::to_owned));
     programs.chain([settings.peers.clone(), folder.to_owned()]).collect()
 }
 
-/// A run that is on. Fields are dropped in this order: the endpoints before the links, and these before the
-/// bridge, so that nothing is recorded that was not meant.
+/// A run in progress. Fields are dropped in this order: the endpoints first, then the links, then the bridge,
+/// so that endpoints do not record effects of the end.
 struct Run<'a> {
     plan: &'a Plan,
     settings: &'a Settings,
@@ -130,7 +130,7 @@ impl<'a> Run<'a> {
         })
     }
 
-    /// Starts the endpoints and waits until everybody knows everybody.
+    /// Waits for links and bridge, starts the endpoints and waits until all of them are matched.
     fn match_all(&mut self, progress: &mut Progress) -> Result<(), EvalError> {
         progress.phase("starting the links");
         self.wait("the links", |run| Ok(run.links.are_ready()))?;
@@ -148,9 +148,9 @@ impl<'a> Run<'a> {
         };
         self.wait("publishers and subscribers to match", |run| {
             let matched = run.endpoints.iter_mut().all(|endpoint| {
-                let wanted = if endpoint.entry.role == "publisher" { readers } else { 1 };
-                let matched = endpoint.program.said("matched").and_then(|said| said["current"].as_u64());
-                matched >= Some(wanted as u64)
+                let expected = if endpoint.entry.role == "publisher" { readers } else { 1 };
+                let matched = endpoint.program.latest("matched").and_then(|line| line["current"].as_u64());
+                matched >= Some(expected as u64)
             });
             Ok(matched && run.bridge.as_ref().is_none_or(|it| it.is_matched(&run.plan.scenario)))
         })
@@ -163,11 +163,11 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Lets the publishers begin, and does what the scenario says; yields the measured window.
+    /// Starts the publishers and applies the scenario's events; returns the measured window.
     fn measure(&mut self, progress: &mut Progress) -> Result<(MonotonicNs, MonotonicNs), EvalError> {
         self.publishers().for_each(|publisher| publisher.program.signal(Signal::SIGUSR1));
         self.wait("the first samples", |run| {
-            Ok(run.publishers().all(|publisher| publisher.program.said("progress").is_some()))
+            Ok(run.publishers().all(|publisher| publisher.program.latest("progress").is_some()))
         })?;
         let quick = self.settings.quick;
         let duration_s = self.plan.duration_s(quick);
@@ -175,31 +175,31 @@ impl<'a> Run<'a> {
         let begin = after(clock::monotonic(), self.settings.settle_s());
         self.wait_until(begin, |_| {})?;
 
-        self.note(begin, "begin", "")?;
+        self.record_event(begin, "begin", "")?;
         for remote in &self.plan.scenario.remotes {
-            // Where nothing is impaired and no event changes that, there is nothing to tell.
-            let mentioned =
+            // A link that is never impaired and has no event needs no record.
+            let has_event =
                 self.plan.scenario.events.iter().any(|it| it.action.is_of_link() && it.to == remote.name);
             let impaired =
                 remote.is_impaired() || remote.is_impaired_back() || remote.cap_kbit_per_s.is_some();
-            if remote.impaired_at_begin && (impaired || mentioned) {
-                self.act(&Event { at_s: 0.0, action: Action::LinkOn, to: remote.name.clone() })?;
+            if remote.impaired_at_begin && (impaired || has_event) {
+                self.apply(&Event { at_s: 0.0, action: Action::LinkOn, to: remote.name.clone() })?;
             }
         }
         let plan = self.plan;
         for event in &plan.scenario.events {
             let due = after(begin, plan.at_s(event.at_s, quick));
             self.wait_until(due, |now| progress.time(begin, now, duration_s))?;
-            self.act(event)?;
+            self.apply(event)?;
         }
         let end = after(begin, duration_s);
         self.wait_until(end, |now| progress.time(begin, now, duration_s))?;
-        self.note(end, "end", "")?;
+        self.record_event(end, "end", "")?;
         Ok((begin, end))
     }
 
-    /// Does what an event says.
-    fn act(&mut self, event: &Event) -> Result<(), EvalError> {
+    /// Applies and records an event.
+    fn apply(&mut self, event: &Event) -> Result<(), EvalError> {
         match event.action {
             action if action.is_of_link() => self.links.switch(self.bed, &event.to, action)?,
             action => {
@@ -216,45 +216,45 @@ impl<'a> Run<'a> {
                     .map_err(|error| EvalError::new(format!("{signal} to {name} ({pid}): {error}")))?;
             }
         }
-        self.note(clock::monotonic(), event.action.name(), &event.to)
+        self.record_event(clock::monotonic(), event.action.name(), &event.to)
     }
 
-    fn note(&mut self, time: MonotonicNs, event: &str, subject: &str) -> Result<(), EvalError> {
+    fn record_event(&mut self, time: MonotonicNs, event: &str, subject: &str) -> Result<(), EvalError> {
         self.events.row(&[&time.0, &event, &subject])
     }
 
-    /// Waits until each publisher has its acknowledgements, or has given up on them.
+    /// Waits until each publisher has received its acknowledgements, or its wait for them has timed out.
     fn await_publishers(&mut self) -> Result<(), EvalError> {
-        let deadline = after(clock::monotonic(), PUBLISHER_PATIENCE_S);
+        let deadline = after(clock::monotonic(), PUBLISHER_TIMEOUT_S);
         while clock::monotonic() < deadline
-            && !self.publishers().all(|publisher| publisher.program.said("summary").is_some())
+            && !self.publishers().all(|publisher| publisher.program.latest("summary").is_some())
         {
             self.turn()?;
         }
         Ok(())
     }
 
-    /// Ends everything in order, and writes down what it was.
+    /// Stops all programs in order, and writes the manifest.
     fn finish(self, machine: &Machine, begin: MonotonicNs, end: MonotonicNs) -> Result<(), EvalError> {
         let Self { plan, settings, folder, bed, mut endpoints, links, bridge, sampler, mut events, .. } =
             self;
         let mut problems = Vec::new();
         let mut software = Software::read(bridge.is_some().then_some(settings.bridge.as_path()));
-        // First publishers, so that no subscriber goes while it is written to.
+        // Publishers first, so that no subscriber ends while a publisher still writes.
         endpoints.sort_by_key(|endpoint| endpoint.entry.role != "publisher");
         let mut entries = Vec::with_capacity(endpoints.len());
         for Endpoint { mut entry, mut program } in endpoints {
-            program.end(END_PATIENCE);
-            entry.summary = program.last_words("summary");
+            program.end(END_TIMEOUT);
+            entry.summary = program.wait_for_last("summary");
             if entry.summary.is_none() {
-                problems.push(format!("{} was held up and had to be killed", entry.name));
+                problems.push(format!("{} did not end on SIGTERM and was killed", entry.name));
             }
-            let library = program.said("ready").and_then(|ready| ready["library"].as_str());
+            let library = program.latest("ready").and_then(|ready| ready["library"].as_str());
             software.peer = software.peer.or(library.map(str::to_owned));
             entries.push(entry);
         }
-        let (links, of_links) = links.end()?;
-        problems.extend(of_links);
+        let (links, link_problems) = links.end()?;
+        problems.extend(link_problems);
         if let Some(bridge) = bridge {
             problems.extend(bridge.end()?);
         }
@@ -301,23 +301,25 @@ impl<'a> Run<'a> {
         self.endpoints.iter_mut().filter(|endpoint| endpoint.entry.role == "publisher")
     }
 
-    /// All processes whose use is recorded, by name.
+    /// All processes whose CPU time and memory are recorded, by name.
     fn processes(&self) -> Vec<(String, i32)> {
         let endpoints = self.endpoints.iter();
         let endpoints = endpoints.map(|it| (it.entry.name.clone(), it.program.pid().as_raw()));
         endpoints.chain(self.bridge.iter().flat_map(Bridge::processes)).collect()
     }
 
-    /// Waits for a condition of the set-up.
+    /// Waits for a condition before the window.
     fn wait(
         &mut self,
         what: &str,
         mut fulfilled: impl FnMut(&mut Self) -> Result<bool, EvalError>,
     ) -> Result<(), EvalError> {
-        let deadline = after(clock::monotonic(), SET_UP_PATIENCE_S);
+        let deadline = after(clock::monotonic(), SET_UP_TIMEOUT_S);
         while !fulfilled(self)? {
             if clock::monotonic() >= deadline {
-                return Err(EvalError::new(format!("waited {SET_UP_PATIENCE_S} s in vain for {what}")));
+                return Err(EvalError::new(format!(
+                    "timed out after {SET_UP_TIMEOUT_S} s waiting for {what}"
+                )));
             }
             self.turn()?;
         }
@@ -335,18 +337,18 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Samples if it is time to, looks after the programs, and sleeps for a moment.
+    /// Makes one turn: counts packets, samples once a second, checks the programs, and sleeps for a tick.
     fn turn(&mut self) -> Result<(), EvalError> {
         if self.interrupted.load(Ordering::Relaxed) {
             return Err(EvalError::Interrupted);
         }
-        self.sampler.work();
+        self.sampler.count_packets();
         let now = clock::monotonic();
         if now >= self.next_sample {
             self.next_sample = now.plus_ms(SAMPLE_MS);
             self.sample(now)?;
         }
-        self.look_after_programs()?;
+        self.check_programs()?;
         std::thread::sleep(TICK);
         Ok(())
     }
@@ -364,19 +366,18 @@ impl<'a> Run<'a> {
         self.links.sample()
     }
 
-    /// Nobody ends by itself but a publisher that has sent all.
-    fn look_after_programs(&mut self) -> Result<(), EvalError> {
+    /// Fails if a program has ended, other than a publisher that has finished.
+    fn check_programs(&mut self) -> Result<(), EvalError> {
         let endpoints = self.endpoints.iter_mut().map(|endpoint| &mut endpoint.program);
         let bridge = self.bridge.iter_mut().flat_map(Bridge::programs);
         for program in endpoints.chain(self.links.programs()).chain(bridge) {
             if let Some(status) = program.ended()
-                && !(status.success() && program.said("summary").is_some())
+                && !(status.success() && program.latest("summary").is_some())
             {
-                let what = program.said("error").map(|said| said["message"].to_string()).unwrap_or_default();
-                return Err(EvalError::new(format!(
-                    "{} ended before its time ({status}) {what}; see logs/{}.log",
-                    program.name, program.name
-                )));
+                let error = program.latest("error").map(|line| format!(" {}", line["message"]));
+                let (name, error) = (&program.name, error.unwrap_or_default());
+                let text = format!("{name} ended during the run ({status}){error}; see logs/{name}.log");
+                return Err(EvalError::new(text));
             }
         }
         Ok(())
@@ -384,16 +385,16 @@ impl<'a> Run<'a> {
 }
 
 fn ports(bed: &Bed) -> Vec<PortEntry> {
-    let shown: BTreeMap<String, u64> = bed.hosts().iter().filter_map(mtu).collect();
+    let mtus: BTreeMap<String, u64> = bed.hosts().iter().filter_map(mtu).collect();
     bed.hosts()
         .iter()
-        .map(|host| PortEntry { host: host.name.clone(), mtu: shown.get(&host.name).copied() })
+        .map(|host| PortEntry { host: host.name.clone(), mtu: mtus.get(&host.name).copied() })
         .collect()
 }
 
 fn mtu(host: &Host) -> Option<(String, u64)> {
-    let shown = host.network.run("ip -j link show dev eth0").ok()?;
-    let links: serde_json::Value = serde_json::from_str(&shown).ok()?;
+    let output = host.network.run("ip -j link show dev eth0").ok()?;
+    let links: serde_json::Value = serde_json::from_str(&output).ok()?;
     Some((host.name.clone(), links[0]["mtu"].as_u64()?))
 }
 

@@ -1,5 +1,5 @@
-//! What is read once a second while a run is on: the switch's ports, the hosts' fragments and sockets, the
-//! processes' CPU time and memory.
+//! Samples kernel counters once a second during a run: ports of the switch, fragments and sockets of hosts,
+//! CPU time and memory of processes.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::eval::bed::{Bed, Network};
 use crate::eval::error::EvalError;
 use crate::model::MonotonicNs;
 
-/// The files of a host that are read.
+/// The open `/proc` files of a host.
 struct HostFiles {
     name: String,
     snmp: ProcFile,
@@ -28,7 +28,7 @@ impl HostFiles {
     }
 }
 
-/// Reads and records.
+/// Reads counters and writes them to the CSV files of a run.
 pub(super) struct Sampler {
     ports: Vec<(String, String)>,
     interfaces: ProcFile,
@@ -42,7 +42,7 @@ pub(super) struct Sampler {
 }
 
 impl Sampler {
-    /// Of all hosts of a bed; packets are captured at the remote ones.
+    /// Opens the files of all hosts of a bed, and packet captures at the remote ones.
     pub fn open(bed: &Bed, remotes: &[&str], folder: &Path) -> Result<Self, EvalError> {
         let mut hosts = vec![HostFiles::open("switch", bed.switch())?];
         for host in bed.hosts() {
@@ -74,12 +74,13 @@ impl Sampler {
         })
     }
 
-    /// To be called often: takes in what was captured.
-    pub fn work(&mut self) {
-        self.captures.iter_mut().for_each(Capture::work);
+    /// Counts the packets captured since the last call. Must be called often, as the kernel's buffer is
+    /// limited.
+    pub fn count_packets(&mut self) {
+        self.captures.iter_mut().for_each(Capture::count_packets);
     }
 
-    /// Reads all once. `queue_drops` are what the caps on ports have dropped, by port.
+    /// Reads and records all counters once. `queue_drops` are the packets that caps have dropped, by port.
     pub fn sample(
         &mut self,
         now: MonotonicNs,
@@ -117,7 +118,7 @@ impl Sampler {
         }
         for (name, pid) in processes {
             let read = |file: &str| fs::read_to_string(format!("/proc/{pid}/{file}")).unwrap_or_default();
-            // One that has just died is left out.
+            // A process that has just ended is left out.
             if let (Some(ticks), Some(rss)) = (cpu_ticks(&read("stat")), rss_bytes(&read("status"))) {
                 self.processes.row(&[&now.0, name, pid, &(ticks * self.tick_ms), &rss])?;
             }
@@ -125,7 +126,7 @@ impl Sampler {
         Ok(())
     }
 
-    /// Writes out what waits.
+    /// Flushes the files.
     pub fn end(mut self) -> Result<(), EvalError> {
         self.wire.flush()?;
         self.kernel.flush()?;
@@ -134,7 +135,7 @@ impl Sampler {
     }
 }
 
-/// What a cap has dropped, from `tc -s -j qdisc show dev PORT`.
+/// Parses the packets that a cap has dropped from the output of `tc -s -j qdisc show dev PORT`.
 pub(super) fn queue_drops(json: &str) -> u64 {
     let queues: serde_json::Value = serde_json::from_str(json).unwrap_or_default();
     let list = queues.as_array().map(Vec::as_slice).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! What holds for all runs of a harness.
+//! The settings that all runs of a harness share.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -9,7 +9,7 @@ use serde::Serialize;
 use crate::eval::error::EvalError;
 use crate::eval::impairment::BackendChoice;
 
-/// Whose DDS the publishers and subscribers run on.
+/// The DDS library of the publishers and subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Library {
@@ -22,7 +22,7 @@ pub enum Library {
 }
 
 impl Library {
-    /// As the command line has it.
+    /// The name used on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Fast => "fast",
@@ -32,40 +32,40 @@ impl Library {
     }
 }
 
-/// How far the seeds of a repetition are from those of the next: more than a run has links.
+/// Distance between the seeds of two repetitions: more than a run has links.
 const SEEDS_OF_A_REPETITION: u64 = 1_000;
 
-/// What holds for all runs.
+/// Settings of the harness that apply to all runs.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// The folder of the results.
     pub out: PathBuf,
-    /// This program.
+    /// Path of this program.
     pub harness: PathBuf,
-    /// The program `adaptive-bridge`.
+    /// Path of the program `adaptive-bridge`.
     pub bridge: PathBuf,
-    /// The folder of the peers.
+    /// The folder of the peer programs.
     pub peers: PathBuf,
-    /// A smoke run.
+    /// Whether runs are smoke runs.
     pub quick: bool,
-    /// Of the links.
+    /// Seed of the links.
     pub seed: u64,
-    /// What impairs the links.
+    /// Back end of the links.
     pub backend: BackendChoice,
-    /// The CPUs, as `taskset` takes them, on which the programs of a host run.
+    /// The CPUs that run the programs of a host, in the format of `taskset`, by host.
     pub pins: BTreeMap<String, String>,
-    /// The command line, for the record.
+    /// The harness's command line, for the manifest.
     pub command_line: Vec<String>,
 }
 
 impl Settings {
-    /// How long a publisher publishes before the measured window begins, in seconds: matching is over by
-    /// then, and the classifier has its first window of probes.
+    /// How long publishers publish before the measured window begins, in seconds: enough for matching and for
+    /// the classifier's first window of probes.
     pub const fn settle_s(&self) -> f64 {
         if self.quick { 1.0 } else { 10.0 }
     }
 
-    /// The back end as the command line has it.
+    /// The back end's name on the command line.
     pub const fn backend_name(&self) -> &'static str {
         match self.backend {
             BackendChoice::Auto => "auto",
@@ -74,27 +74,27 @@ impl Settings {
         }
     }
 
-    /// The seed of a link of a run, the links being numbered from 0. A repetition meets other losses than the
-    /// one before it, or it would say nothing of the spread; scenarios of the same repetition meet the same.
+    /// The seed of a run's link, by its number from 0. Repetitions have different losses, so that their
+    /// spread is meaningful; scenarios of the same repetition have the same losses.
     pub fn link_seed(&self, repetition: u32, link: u16) -> u64 {
         let of_repetition = SEEDS_OF_A_REPETITION * u64::from(repetition.saturating_sub(1));
         self.seed.wrapping_add(of_repetition).wrapping_add(u64::from(link))
     }
 
-    /// The program of a library's publishers and subscribers.
+    /// Finds the peer program of a library.
     ///
     /// # Errors
-    /// It is not built.
+    /// The program has not been built.
     pub fn peer(&self, library: Library) -> Result<PathBuf, EvalError> {
         let name = format!("{}_peer", library.name());
-        // The one on RustDDS is built by cargo, beside this program.
+        // Cargo builds the RustDDS peer into the folder `examples` beside this program.
         let beside = self.harness.parent().map(|folder| folder.join("examples"));
         let folders = std::iter::once(self.peers.clone()).chain(beside);
         let found = folders.map(|folder| folder.join(&name)).find(|path| path.exists());
         found.ok_or_else(|| {
             let how = match library {
-                Library::Rust => "make peers, or cargo build --example rust_peer",
-                _ => "make peers, and see what it says",
+                Library::Rust => "run `make peers` or `cargo build --example rust_peer`",
+                _ => "run `make peers` and read its output",
             };
             EvalError::new(format!("{name} is not in {}: {how}", self.peers.display()))
         })

@@ -1,4 +1,4 @@
-//! What puts a link in the way of real packets, and which of the two ways is taken.
+//! The interface of the two back ends that impair real packets, and the choice between them.
 
 use std::net::Ipv4Addr;
 use std::os::fd::BorrowedFd;
@@ -13,33 +13,33 @@ use super::netem::Netem;
 use super::nfqueue::Nfqueue;
 use crate::model::MonotonicNs;
 
-/// An impairment of what this network namespace receives from one source. Dropping it ends it.
+/// Impairs the packets that this network namespace receives from one source, until it is dropped.
 pub trait Backend {
-    /// `nfqueue` or `netem`.
+    /// The back end's name, `nfqueue` or `netem`.
     fn name(&self) -> &'static str;
 
-    /// Whether a seed decides what happens to which packet.
+    /// Whether losses and delays are reproducible from a seed.
     fn is_seeded(&self) -> bool;
 
-    /// What is readable when there is work; `None` when the kernel does it all.
+    /// The descriptor that is readable when packets wait; `None` when the kernel handles all packets.
     fn fd(&self) -> Option<BorrowedFd<'_>>;
 
-    /// When there is work although nothing is readable.
+    /// When the next delayed packet must be released; `None` when none is delayed here.
     fn next_release(&self) -> Option<MonotonicNs>;
 
-    /// Does what there is to do, and does not wait.
+    /// Handles waiting packets and releases delayed ones that are due; does not block.
     ///
     /// # Errors
-    /// The operating system refused something; the impairment is over.
+    /// The operating system refused an operation; the impairment has ended.
     fn work(&mut self) -> Result<(), ImpairmentError>;
 
     /// Switches the link.
     ///
     /// # Errors
-    /// The operating system refused it; the state is the one before.
+    /// The operating system refused it; the state is unchanged.
     fn switch(&mut self, state: LinkState) -> Result<(), ImpairmentError>;
 
-    /// Changes what the link does while it is on, for packets that come from now on.
+    /// Changes loss and delay while the link is on, for packets that arrive from now on.
     ///
     /// # Errors
     /// The operating system refused it.
@@ -48,45 +48,45 @@ pub trait Backend {
     /// The state of the link.
     fn state(&self) -> LinkState;
 
-    /// What it has done so far.
+    /// The packets counted so far.
     ///
     /// # Errors
-    /// The operating system does not say.
+    /// The operating system's counters cannot be read.
     fn counters(&mut self) -> Result<Counters, ImpairmentError>;
 
-    /// Packets that the kernel dropped before the link saw them, as the back end did not keep up. Anything
-    /// but 0 spoils a measurement.
+    /// Packets that the kernel dropped before the link saw them, because the back end did not keep up. Any
+    /// value but 0 invalidates a measurement.
     ///
     /// # Errors
-    /// The operating system does not say.
+    /// The operating system's counters cannot be read.
     fn kernel_dropped(&self) -> Result<u64, ImpairmentError>;
 }
 
-/// Which back end is wanted.
+/// The back end that the user requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum BackendChoice {
     /// netem where the kernel has it, otherwise NFQUEUE
     Auto,
-    /// The model in user space: seeded, needs iptables
+    /// The model in user space over NFQUEUE: seeded, needs iptables
     Nfqueue,
     /// tc netem: not seeded, needs the kernel's netem and ifb
     Netem,
 }
 
-/// A back end, and why it is this one.
+/// The result of [`open`].
 pub struct Opened {
-    /// It, with the link on.
+    /// The back end, with the link on.
     pub backend: Box<dyn Backend>,
-    /// Why it was chosen.
+    /// Why this back end was chosen.
     pub reason: String,
 }
 
-/// Begins to impair what the present network namespace receives from `source`, or of that only what is for
-/// `destination`, where it passes packets on. `queue` is a number that no other program in the namespace
-/// uses.
+/// Starts to impair the packets that the current network namespace receives from `source`; with a
+/// `destination`, only the packets that the namespace forwards to it. No other program in the namespace may
+/// use the number `queue`.
 ///
 /// # Errors
-/// The machine can't, or what the link needs is in use.
+/// The machine lacks what the back end needs, or the queue is in use.
 pub fn open(
     choice: BackendChoice,
     source: Ipv4Addr,
@@ -96,12 +96,12 @@ pub fn open(
 ) -> Result<Opened, ImpairmentError> {
     let lacks_netem = match choice {
         BackendChoice::Nfqueue => None,
-        _ if destination.is_some() => Some("here it impairs only what a host itself receives".to_owned()),
+        _ if destination.is_some() => Some("it does not support --destination".to_owned()),
         BackendChoice::Netem | BackendChoice::Auto => super::netem::missing(queue),
     };
     let (netem, reason) = match (choice, lacks_netem) {
-        (BackendChoice::Nfqueue, _) => (false, "asked for".to_owned()),
-        (BackendChoice::Netem, None) => (true, "asked for".to_owned()),
+        (BackendChoice::Nfqueue, _) => (false, "chosen by --backend".to_owned()),
+        (BackendChoice::Netem, None) => (true, "chosen by --backend".to_owned()),
         (BackendChoice::Netem, Some(reason)) => {
             return Err(ImpairmentError::NoBackend { backend: "netem", reason });
         }

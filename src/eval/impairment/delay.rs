@@ -1,4 +1,4 @@
-//! Delay: how long each packet takes, and the packets that are on their way.
+//! The delay of packets: its distribution, and the packets in transit.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -10,13 +10,13 @@ use super::error::ImpairmentError;
 use super::random;
 use crate::model::MonotonicNs;
 
-/// The longest mean and deviation that are accepted: a minute.
+/// The largest allowed mean and standard deviation: a minute.
 const DELAY_MAX_MS: f64 = 60_000.0;
-/// How far netem's table of the normal distribution reaches, in standard deviations.
+/// The range of netem's table of the normal distribution, in standard deviations.
 const TABLE_END: f64 = 4.0;
 
-/// Delays of a normal distribution, truncated as netem truncates it: what would be less than nothing is
-/// nothing, and what is more than four standard deviations off is four.
+/// Normally distributed delays, truncated as netem truncates them: at 0, and at four standard deviations from
+/// the mean.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NormalDelay {
     mean_ms: f64,
@@ -27,7 +27,7 @@ impl NormalDelay {
     /// No delay.
     pub const NONE: Self = Self { mean_ms: 0.0, sigma_ms: 0.0 };
 
-    /// Mean and standard deviation before the distribution is truncated, in milliseconds, 0 to 60,000 each.
+    /// Creates delays with this mean and standard deviation before truncation, in ms, 0 to 60,000 each.
     ///
     /// # Errors
     /// One of them is out of its range.
@@ -54,12 +54,12 @@ impl NormalDelay {
         self.sigma_ms
     }
 
-    /// Whether every packet passes at once.
+    /// Whether every packet passes without delay.
     pub fn is_none(&self) -> bool {
         *self == Self::NONE
     }
 
-    /// The delay of a packet, in nanoseconds.
+    /// Draws the delay of a packet, in nanoseconds.
     fn draw_ns(&self, random: &mut Pcg64) -> u64 {
         let normal: f64 = StandardNormal.sample(random);
         let ms = self.mean_ms + self.sigma_ms * normal.clamp(-TABLE_END, TABLE_END);
@@ -68,37 +68,37 @@ impl NormalDelay {
     }
 }
 
-/// The packets that are on their way, each to be released at an instant of its own. A packet may overtake
-/// another, as under netem; those of the same instant keep their order.
+/// The packets in transit, each with its release time. A packet may overtake another, as with netem; packets
+/// with the same release time keep their order.
 #[derive(Clone, Debug)]
 pub struct DelayLine {
     delay: NormalDelay,
     random: Pcg64,
-    /// By release, then by arrival; and the packet.
+    /// Release time, arrival number, packet.
     held: BinaryHeap<Reverse<(MonotonicNs, u64, u32)>>,
-    taken: u64,
+    arrived: u64,
 }
 
 impl DelayLine {
-    /// A line whose delays are always the same for a seed.
+    /// Creates an empty delay line; the same seed always gives the same delays.
     pub fn new(delay: NormalDelay, seed: u64) -> Self {
-        Self { delay, random: random::of_delay(seed), held: BinaryHeap::new(), taken: 0 }
+        Self { delay, random: random::of_delay(seed), held: BinaryHeap::new(), arrived: 0 }
     }
 
-    /// Packets that come from now on have other delays; those on their way keep theirs.
+    /// Changes the delays of packets that arrive from now on; packets in transit keep theirs.
     pub fn set(&mut self, delay: NormalDelay) {
         self.delay = delay;
     }
 
-    /// Takes a packet in at `now`, and says when it will be released.
+    /// Adds a packet that arrives at `now`; returns its release time.
     pub fn push(&mut self, packet: u32, now: MonotonicNs) -> MonotonicNs {
         let release = now.plus_ns(self.delay.draw_ns(&mut self.random));
-        self.held.push(Reverse((release, self.taken, packet)));
-        self.taken += 1;
+        self.held.push(Reverse((release, self.arrived, packet)));
+        self.arrived += 1;
         release
     }
 
-    /// The next packet whose time has come at `now`.
+    /// Removes and returns the next packet that is due at `now`.
     pub fn pop_due(&mut self, now: MonotonicNs) -> Option<u32> {
         if self.next_release()? > now {
             return None;
@@ -106,17 +106,17 @@ impl DelayLine {
         self.held.pop().map(|Reverse((_, _, packet))| packet)
     }
 
-    /// When the next packet is to be released; `None` when none is on its way.
+    /// The next release time; `None` when no packet is in transit.
     pub fn next_release(&self) -> Option<MonotonicNs> {
         self.held.peek().map(|Reverse((release, _, _))| *release)
     }
 
-    /// Packets that are on their way.
+    /// The number of packets in transit.
     pub fn len(&self) -> usize {
         self.held.len()
     }
 
-    /// Whether no packet is on its way.
+    /// Whether no packet is in transit.
     pub fn is_empty(&self) -> bool {
         self.held.is_empty()
     }
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn no_delay_is_negative_or_further_off_than_four_deviations() {
+    fn delays_are_truncated_at_zero_and_at_four_deviations() {
         let delays = delays_ms(10.0, 10.0, 200_000, 5);
         assert!(delays.iter().all(|delay| (0.0..=50.0).contains(delay)));
         // Φ(−1) is 15.9 %.
@@ -174,7 +174,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn packets_leave_once_each_when_their_time_has_come_and_in_its_order(
+        fn each_packet_leaves_once_at_its_release_time(
             gaps_us in proptest::collection::vec(0..5_000_u64, 1..200),
             sigma_ms in 0.0..20.0,
             seed: u64,
@@ -192,7 +192,7 @@ mod tests {
                 releases.push(line.push(packet as u32, now));
                 prop_assert_eq!(line.len(), releases.len() - left.len());
             }
-            // From then on at each release, and not one nanosecond earlier.
+            // Each remaining packet leaves at its release time, and not one nanosecond earlier.
             while let Some(release) = line.next_release() {
                 if release.0 > now.0 {
                     prop_assert_eq!(line.pop_due(MonotonicNs(release.0 - 1)), None);

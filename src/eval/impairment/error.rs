@@ -1,4 +1,4 @@
-//! What can go wrong with an impairment, in the words of someone who has to mend it.
+//! The error type of impairments.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -10,47 +10,47 @@ use super::trace::TraceProblem;
 pub enum ImpairmentError {
     /// A parameter is out of its range.
     BadParameter {
-        /// Which one.
+        /// The parameter's name.
         name: &'static str,
-        /// What it was.
+        /// Its value.
         value: String,
-        /// What it may be.
+        /// The allowed range.
         allowed: &'static str,
     },
-    /// A file is no trace of a link.
+    /// A file is no valid trace of a link.
     BadTrace {
-        /// Which one.
+        /// The file.
         path: PathBuf,
-        /// What is wrong with it, line by line; at least one.
+        /// The mistakes in it, at least one.
         problems: Vec<TraceProblem>,
     },
-    /// A program that sets up the network said no, or is not there.
+    /// A program that sets up the network failed, or is not installed.
     Command {
         /// Its command line.
         command: String,
-        /// What it said.
-        said: String,
+        /// Its error message.
+        message: String,
     },
     /// Another program listens on the queue.
     QueueTaken {
         /// The number of the queue.
         queue: u16,
     },
-    /// The operating system refused something.
+    /// An operation of the operating system failed.
     System {
-        /// What was to be done.
+        /// The operation, or the file.
         what: String,
-        /// What it said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// An answer of the kernel or of a program made no sense.
+    /// The kernel or a program returned something that cannot be interpreted.
     Unexpected {
-        /// What it was about, and what came.
+        /// What was returned, and by what.
         what: String,
     },
-    /// The kernel lacks what the back end needs.
+    /// The machine lacks what the back end needs.
     NoBackend {
-        /// Its name.
+        /// The back end's name.
         backend: &'static str,
         /// What is missing.
         reason: String,
@@ -67,7 +67,7 @@ impl fmt::Display for ImpairmentError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::BadParameter { name, value, allowed } => {
-                write!(f, "{name} is {value}, and may be {allowed}")
+                write!(f, "{name} is {value}, but must be {allowed}")
             }
             Self::BadTrace { path, problems } => {
                 for (at, TraceProblem { line, what }) in problems.iter().enumerate() {
@@ -76,7 +76,7 @@ impl fmt::Display for ImpairmentError {
                 }
                 Ok(())
             }
-            Self::Command { command, said } => write!(f, "`{command}` failed: {said}"),
+            Self::Command { command, message } => write!(f, "`{command}` failed: {message}"),
             Self::QueueTaken { queue } => {
                 write!(
                     f,
@@ -86,13 +86,13 @@ impl fmt::Display for ImpairmentError {
             Self::System { what, source } => {
                 write!(f, "{what}: {source}")?;
                 if source.kind() == std::io::ErrorKind::PermissionDenied {
-                    write!(f, " (it needs root, or CAP_NET_ADMIN)")?;
+                    write!(f, " (this needs root or CAP_NET_ADMIN)")?;
                 }
                 Ok(())
             }
             Self::Unexpected { what } => write!(f, "unexpected: {what}"),
             Self::NoBackend { backend, reason } => {
-                write!(f, "this machine can't impair a link by {backend}: {reason}")
+                write!(f, "this machine cannot impair a link with {backend}: {reason}")
             }
         }
     }

@@ -1,5 +1,5 @@
-//! The Gilbert-Elliott model of bursty loss: a Markov chain of a good and a bad state, each of which loses
-//! packets with a probability of its own. It moves once for each packet, whatever the time between them.
+//! The Gilbert-Elliott model of bursty loss: a Markov chain with a good and a bad state, each with its own
+//! loss probability. The chain makes one step per packet, whatever the time between packets.
 
 use rand_pcg::Pcg64;
 
@@ -16,14 +16,15 @@ pub struct GilbertElliott {
 }
 
 impl GilbertElliott {
-    /// Loses nothing.
+    /// A model without loss.
     pub const CLEAN: Self = Self { p: 0.0, r: 1.0, loss_good: 0.0, loss_bad: 0.0 };
 
-    /// From good to bad with `p` and back with `r` at each packet; `loss_good` and `loss_bad` are the losses
-    /// in the two states (`1-k` and `1-h` in the words of tc-netem(8)).
+    /// Creates a model that, at each packet, changes from good to bad with probability `p` and back with `r`;
+    /// `loss_good` and `loss_bad` are the loss probabilities in the two states (`1-k` and `1-h` in
+    /// tc-netem(8)).
     ///
     /// # Errors
-    /// One of them is no probability.
+    /// A parameter is not from 0 to 1.
     pub fn new(p: f64, r: f64, loss_good: f64, loss_bad: f64) -> Result<Self, ImpairmentError> {
         for (name, value) in [("p", p), ("r", r), ("loss in good", loss_good), ("loss in bad", loss_bad)] {
             if !(0.0..=1.0).contains(&value) {
@@ -37,15 +38,15 @@ impl GilbertElliott {
         Ok(Self { p, r, loss_good, loss_bad })
     }
 
-    /// Each packet is lost with the same probability, whatever became of others.
+    /// Creates a model that loses each packet with the same probability, independently of others.
     ///
     /// # Errors
-    /// It is no probability.
+    /// `loss` is not from 0 to 1.
     pub fn independent(loss: f64) -> Result<Self, ImpairmentError> {
         Self::new(0.0, 1.0, loss, loss)
     }
 
-    /// Constants of the paper.
+    /// Creates a model from constants of the paper, unchecked.
     pub(super) const fn of_table(p: f64, r: f64, loss_good: f64, loss_bad: f64) -> Self {
         Self { p, r, loss_good, loss_bad }
     }
@@ -70,8 +71,8 @@ impl GilbertElliott {
         self.loss_bad
     }
 
-    /// The share of packets that find the chain in its bad state, in the long run. A chain that never moves
-    /// stays good, which it begins as.
+    /// The share of packets that find the chain in the bad state, in the long run. A chain that never moves
+    /// stays in the good state, where it starts.
     pub fn bad_share(&self) -> f64 {
         if self.p == 0.0 { 0.0 } else { self.p / (self.p + self.r) }
     }
@@ -82,12 +83,12 @@ impl GilbertElliott {
         (1.0 - bad) * self.loss_good + bad * self.loss_bad
     }
 
-    /// The variance of the share lost among `packets` packets in a row of the stationary chain; infinite for
-    /// none.
+    /// The variance of the lost share of `packets` consecutive packets of the stationary chain; infinite for
+    /// 0 packets.
     ///
-    /// Losses come in bursts, so that it is larger than `loss × (1 − loss) / packets` of independent ones.
-    /// The covariance of two packets that are k apart is the variance of the two states' losses times
-    /// `(1 − p − r)^k`; this is the sum over all pairs.
+    /// Losses come in bursts, so the variance is larger than `loss × (1 − loss) / packets`, that of
+    /// independent losses. The covariance of two packets k apart is the variance of the two states' losses
+    /// times `(1 − p − r)^k`; this is the sum over all pairs.
     pub fn loss_variance(&self, packets: u64) -> f64 {
         if packets == 0 {
             return f64::INFINITY;
@@ -106,21 +107,21 @@ impl GilbertElliott {
         (n * loss * (1.0 - loss) + 2.0 * between_states * pairs) / (n * n)
     }
 
-    /// The standard error of the loss measured over so many packets: the root of
-    /// [`loss_variance`](Self::loss_variance). An interval of 1.96 of it to both sides has 95 % of the
+    /// The standard error of the loss measured over `packets` packets: the root of
+    /// [`loss_variance`](Self::loss_variance). An interval of ±1.96 standard errors contains 95 % of the
     /// measurements.
     pub fn loss_standard_error(&self, packets: u64) -> f64 {
         self.loss_variance(packets).sqrt()
     }
 }
 
-/// Neither `powf`, which takes no negative base with such exponents, nor `powi`, which ends at 2³¹.
+/// Returns `base` to the power of `exponent`: `powi` ends at 2³¹, and `powf` alone loses the sign.
 fn power(base: f64, exponent: u64) -> f64 {
     let magnitude = base.abs().powf(exponent as f64);
     if base < 0.0 && exponent % 2 == 1 { -magnitude } else { magnitude }
 }
 
-/// A running chain. It begins in the good state, as netem's does.
+/// The running chain of a [`GilbertElliott`] model. It starts in the good state, as netem's does.
 #[derive(Clone, Debug)]
 pub struct Chain {
     model: GilbertElliott,
@@ -129,17 +130,17 @@ pub struct Chain {
 }
 
 impl Chain {
-    /// A chain whose losses are always the same for a seed.
+    /// Creates a chain; the same seed always gives the same losses.
     pub fn new(model: GilbertElliott, seed: u64) -> Self {
         Self { model, bad: false, random: random::of_loss(seed) }
     }
 
-    /// Goes on in the present state by another model. The numbers drawn are the same as without this.
+    /// Changes the model; the chain keeps its state and its sequence of random numbers.
     pub fn set(&mut self, model: GilbertElliott) {
         self.model = model;
     }
 
-    /// Whether the next packet is lost: the state that it finds decides, and then the chain moves.
+    /// Decides whether the next packet is lost, by the chain's current state; then makes a step.
     pub fn next_is_lost(&mut self) -> bool {
         let (loss, moves) =
             if self.bad { (self.model.loss_bad, self.model.r) } else { (self.model.loss_good, self.model.p) };
@@ -161,8 +162,8 @@ mod tests {
             .prop_map(|(p, r, good, bad)| GilbertElliott::new(p, r, good, bad).expect("probabilities"))
     }
 
-    /// The variance by its definition: over all sequences of states, weighed by their probabilities, of a
-    /// chain that begins stationary.
+    /// The variance by its definition: over all sequences of states, weighted by their probabilities, of a
+    /// chain that starts stationary.
     fn variance_by_enumeration(model: &GilbertElliott, packets: u32) -> f64 {
         let bad_share = model.bad_share();
         let loss = [model.loss_good, model.loss_bad];
@@ -187,22 +188,22 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_variance_is_that_of_the_definition(model in model(), packets in 1..9_u32) {
-            // A chain that never moves has no stationary distribution of its own; it stays good.
+        fn the_formula_of_the_variance_fits_its_definition(model in model(), packets in 1..9_u32) {
+            // A chain that never moves has no unique stationary distribution; it stays in the good state.
             let (formula, definition) =
                 (model.loss_variance(u64::from(packets)), variance_by_enumeration(&model, packets));
             prop_assert!((formula - definition).abs() < 1e-9, "{formula} {definition}");
         }
 
         #[test]
-        fn a_run_loses_what_the_stationary_chain_loses(model in model(), seed: u64) {
+        fn the_loss_of_a_run_is_near_that_of_the_stationary_chain(model in model(), seed: u64) {
             const PACKETS: u64 = 20_000;
             let mut chain = Chain::new(model, seed);
             let lost = (0..PACKETS).filter(|_| chain.next_is_lost()).count() as f64 / PACKETS as f64;
-            // It begins good, and forgets that by (1 − p − r) at each packet.
+            // The influence of the initial good state decays by (1 − p − r) at each packet.
             let memory = (1.0 - model.p - model.r).abs();
             let start = 2.0 / (PACKETS as f64 * (1.0 - memory)).max(1.0);
-            // Where hardly a state change is to be expected the estimate is not normal: only bounds hold.
+            // With few expected state changes the estimate is not normally distributed.
             prop_assume!(model.p == 0.0 || (model.p.min(model.r) > 0.01 && memory < 0.99));
             let tolerance = 6.0 * model.loss_standard_error(PACKETS) + start + 1e-3;
             prop_assert!((lost - model.stationary_loss()).abs() <= tolerance, "{lost} {tolerance}");
@@ -227,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn two_hundred_runs_spread_as_the_variance_says() {
+    fn two_hundred_runs_spread_by_the_computed_variance() {
         let model = GilbertElliott::new(0.02, 0.10, 0.01, 0.50).expect("probabilities");
         const PACKETS: u64 = 5_000;
         let errors = (0..200).map(|seed| {
@@ -245,14 +246,14 @@ mod tests {
     }
 
     #[test]
-    fn another_seed_gives_other_losses_and_these_are_those_of_seed_7() {
+    fn seeds_give_different_losses_and_seed_7_gives_the_recorded_ones() {
         let model = GilbertElliott::new(0.02, 0.10, 0.01, 0.50).expect("probabilities");
         let lost = |seed| {
             let mut chain = Chain::new(model, seed);
             (0..300).filter(|_| chain.next_is_lost()).collect::<Vec<_>>()
         };
         assert_ne!(lost(7), lost(8));
-        // A seed that is written down beside results must mean the same in later versions, too.
+        // A seed that is recorded with results must give the same losses in later versions, too.
         assert_eq!(lost(7), LOST_OF_SEED_7);
     }
 
@@ -262,7 +263,7 @@ mod tests {
     ];
 
     #[test]
-    fn what_is_no_probability_is_refused() {
+    fn a_parameter_that_is_no_probability_is_refused() {
         for bad in [-0.1, 1.1, f64::NAN, f64::INFINITY] {
             let error = GilbertElliott::new(0.1, 0.1, 0.0, bad).expect_err("no probability");
             assert!(error.to_string().contains("loss in bad"), "{error}");

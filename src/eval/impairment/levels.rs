@@ -19,20 +19,20 @@ pub enum Level {
     Strong,
 }
 
-/// How the last two columns of Table I are read. netem takes the loss in the bad state first and that in the
-/// good one last (tc-netem(8)); the paper's harness passes them the other way round. So what was run is not
-/// what is printed, and a figure is of one of the two.
+/// How the last two columns of Table I are read. netem takes the loss in the bad state before that in the
+/// good state (tc-netem(8)); the paper's harness passes them in the opposite order. So the losses that were
+/// run differ from the printed ones, and each figure belongs to one of the two readings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Reading {
-    /// As the table says: 2.3, 7.1 and 9.2 % are lost in the long run.
+    /// As printed in the table: 2.3, 7.1 and 9.2 % are lost in the long run.
     AsPrinted,
-    /// As the harness ran it, the losses of the two states swapped: 28, 33 and 42 %.
+    /// As the paper's harness ran it, with the losses of the two states swapped: 28, 33 and 42 %.
     AsRun,
 }
 
 impl Reading {
-    /// As the command line has it.
+    /// The name used on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::AsPrinted => "as-printed",
@@ -45,7 +45,7 @@ impl Level {
     /// All rows.
     pub const ALL: [Self; 4] = [Self::Clean, Self::Mild, Self::Moderate, Self::Strong];
 
-    /// As the command line has it.
+    /// The name used on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Clean => "clean",
@@ -55,7 +55,7 @@ impl Level {
         }
     }
 
-    /// The model of this row.
+    /// The loss model of this row.
     pub const fn model(self, reading: Reading) -> GilbertElliott {
         let (p, r, loss_good, loss_bad) = match self {
             Self::Clean => return GilbertElliott::CLEAN,

@@ -1,4 +1,5 @@
-//! What an impaired link does to each packet. Pure: packets are numbers, time is an argument.
+//! The model of an impaired link: decides what happens to each packet. Pure: packets are numbers, time is an
+//! argument.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,28 +10,28 @@ use super::delay::{DelayLine, NormalDelay};
 use super::gilbert_elliott::{Chain, GilbertElliott};
 use crate::model::MonotonicNs;
 
-/// How many packets may be on their way at once; those beyond it are dropped, as by a full queue. It is 20 ms
-/// of a million packets a second.
+/// The largest number of packets in transit; further ones are dropped, as by a full queue. It is 20 ms of a
+/// million packets a second.
 pub const HELD_MAX: usize = 20_000;
 
-/// What a link does while it is on.
+/// Loss and delay of a link while it is on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Impairment {
-    /// Which packets are lost.
+    /// The model of loss.
     pub loss: GilbertElliott,
-    /// How long the others take.
+    /// The delay of packets that are not lost.
     pub delay: NormalDelay,
-    /// The same losses and delays, packet by packet, for the same seed.
+    /// Seed of the random numbers; the same seed gives the same losses and delays, packet by packet.
     pub seed: u64,
 }
 
-/// Whether a link is impaired.
+/// The state of a link: impaired, clean or cut.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LinkState {
     /// Packets are lost and delayed.
     On,
-    /// Packets pass at once.
+    /// Packets pass without loss or delay.
     Off,
     /// Every packet is lost.
     Down,
@@ -54,7 +55,7 @@ impl FromStr for LinkState {
             "on" => Ok(Self::On),
             "off" => Ok(Self::Off),
             "down" => Ok(Self::Down),
-            _ => Err(format!("'{text}' is not one of on, off, down")),
+            _ => Err("must be on, off or down".to_owned()),
         }
     }
 }
@@ -62,7 +63,7 @@ impl FromStr for LinkState {
 /// A packet that has arrived at the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
-    /// The number by which the kernel knows it.
+    /// The kernel's number of the packet.
     pub packet: u32,
     /// Its length, IP header included; 0 when unknown.
     pub bytes: u32,
@@ -70,40 +71,40 @@ pub struct Arrival {
     pub fragment: bool,
 }
 
-/// What becomes of a packet.
+/// The link's decision about a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fate {
-    /// It passes now.
+    /// The packet passes now.
     Pass,
-    /// It is lost.
+    /// The packet is lost.
     Drop,
-    /// It is on its way; [`Link::pop_due`] will yield it.
+    /// The packet is in transit; [`Link::pop_due`] returns it when its delay is over.
     Hold,
 }
 
-/// What a link has done so far, in packets. Each fragment of a datagram is one.
+/// Numbers of packets that a link has handled. Each fragment of a datagram is a packet.
 ///
 /// `seen = passed + lost + cut + overflowed + held` at every instant.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counters {
-    /// Arrived.
+    /// Packets that arrived.
     pub seen: u64,
-    /// Those of them that are fragments of a datagram. By NFQUEUE only.
+    /// Packets that arrived and are fragments of a datagram. NFQUEUE only.
     pub fragments: u64,
-    /// The longest that arrived, in bytes. More than the MTU says that something before the link puts
-    /// fragments together (connection tracking does), so that loss is not by packet. By NFQUEUE only.
+    /// Length of the longest packet that arrived, in bytes. If it is above the MTU, something before the link
+    /// (such as connection tracking) reassembles fragments, so loss is not by packet. NFQUEUE only.
     pub largest_bytes: u32,
-    /// Arrived while the link was on: so many steps the chain made.
+    /// Packets that arrived while the link was on, which is the number of steps of the chain.
     pub judged: u64,
-    /// Lost by the chain.
+    /// Packets lost by the chain.
     pub lost: u64,
-    /// Lost as the link was down.
+    /// Packets lost because the link was down.
     pub cut: u64,
-    /// Lost as too many were on their way.
+    /// Packets lost because too many were in transit.
     pub overflowed: u64,
-    /// On their way.
+    /// Packets in transit.
     pub held: u64,
-    /// Passed, at once or after their delay.
+    /// Packets that passed, without or after a delay.
     pub passed: u64,
 }
 
@@ -112,46 +113,47 @@ pub struct Counters {
 pub struct Link {
     chain: Chain,
     line: DelayLine,
-    delays: bool,
+    has_delay: bool,
     state: LinkState,
     counters: Counters,
 }
 
 impl Link {
-    /// A link that is on.
+    /// Creates a link that is on.
     pub fn new(impairment: &Impairment) -> Self {
         Self {
             chain: Chain::new(impairment.loss, impairment.seed),
             line: DelayLine::new(impairment.delay, impairment.seed),
-            delays: !impairment.delay.is_none(),
+            has_delay: !impairment.delay.is_none(),
             state: LinkState::On,
             counters: Counters::default(),
         }
     }
 
-    /// Switches it. What is on its way stays so, and the chain stands still until the link is on again.
+    /// Switches the link. Packets in transit stay there, and the chain makes no steps until the link is on
+    /// again.
     pub fn switch(&mut self, state: LinkState) {
         self.state = state;
     }
 
-    /// Changes what it does while it is on, for packets that come from now on.
+    /// Changes loss and delay while the link is on, for packets that arrive from now on.
     pub fn set(&mut self, loss: GilbertElliott, delay: NormalDelay) {
         self.chain.set(loss);
         self.line.set(delay);
-        self.delays = !delay.is_none();
+        self.has_delay = !delay.is_none();
     }
 
-    /// Its state.
+    /// The state of the link.
     pub fn state(&self) -> LinkState {
         self.state
     }
 
-    /// What it has done so far.
+    /// The packets counted so far.
     pub fn counters(&self) -> Counters {
         Counters { held: self.line.len() as u64, ..self.counters }
     }
 
-    /// Decides about a packet.
+    /// Decides what happens to a packet that arrives at `now`.
     pub fn arrive(&mut self, arrival: Arrival, now: MonotonicNs) -> Fate {
         self.counters.seen += 1;
         self.counters.fragments += u64::from(arrival.fragment);
@@ -170,7 +172,7 @@ impl Link {
         if self.chain.next_is_lost() {
             self.counters.lost += 1;
             Fate::Drop
-        } else if !self.delays {
+        } else if !self.has_delay {
             self.counters.passed += 1;
             Fate::Pass
         } else if self.line.len() >= HELD_MAX {
@@ -182,14 +184,14 @@ impl Link {
         }
     }
 
-    /// The next packet whose delay is over at `now`.
+    /// Removes and returns the next packet whose delay is over at `now`.
     pub fn pop_due(&mut self, now: MonotonicNs) -> Option<u32> {
         let packet = self.line.pop_due(now)?;
         self.counters.passed += 1;
         Some(packet)
     }
 
-    /// When the next delay is over; `None` when no packet is on its way.
+    /// When the next delay is over; `None` when no packet is in transit.
     pub fn next_release(&self) -> Option<MonotonicNs> {
         self.line.next_release()
     }
@@ -270,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_than_the_limit_is_held() {
+    fn packets_above_the_limit_in_transit_are_dropped() {
         let delay = NormalDelay::new(1_000.0, 0.0).expect("in range");
         let mut link = Link::new(&Impairment { loss: GilbertElliott::CLEAN, delay, seed: 1 });
         for packet in 0..HELD_MAX as u32 {
@@ -283,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_on_its_way_arrives_though_the_link_is_cut() {
+    fn packets_in_transit_arrive_although_the_link_is_cut() {
         let delay = NormalDelay::new(10.0, 0.0).expect("in range");
         let mut link = Link::new(&Impairment { loss: GilbertElliott::CLEAN, delay, seed: 1 });
         link.arrive(arrival(4), MonotonicNs(0));
@@ -293,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn states_are_written_as_they_are_read() {
+    fn states_parse_from_their_printed_form() {
         for state in [LinkState::On, LinkState::Off, LinkState::Down] {
             assert_eq!(state.to_string().parse(), Ok(state));
         }

@@ -1,10 +1,9 @@
-//! A link that loses and delays packets as a radio link does: bursts of loss by Gilbert and Elliott, delay by
-//! the normal distribution, both seeded, or both as a trace of a link has them from time to time; and the
-//! link switched off, on, or cut while traffic flows.
+//! A link that loses and delays packets as a radio link does. Losses come in bursts (Gilbert-Elliott) and
+//! delays are normally distributed, both seeded; or a trace of a link sets both over time. The link can be
+//! switched on, off or cut while traffic flows.
 //!
-//! What happens to a packet is decided by a [`Link`], which is pure. It is put in the way of real packets by
-//! one of two back ends: `tc netem` where the kernel has it, otherwise the same model in user space over
-//! NFQUEUE.
+//! [`Link`] is the model; it is pure. One of two back ends applies it to real packets: `tc netem` where the
+//! kernel has it, otherwise the same model in user space over NFQUEUE.
 
 mod backend;
 mod delay;

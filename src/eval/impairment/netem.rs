@@ -1,6 +1,6 @@
-//! The link by `tc netem`, which impairs what an interface sends. What is received is first sent through an
-//! intermediate device (ifb), so that the link is in the same place as that of NFQUEUE: in the receiver's
-//! network namespace, before fragments are put together, and for one source only.
+//! The back end that uses `tc netem`, which impairs packets that an interface sends. Received packets are
+//! first redirected through an intermediate device (ifb), so that the link is in the same place as that of
+//! NFQUEUE: in the receiver's network namespace, before fragments are reassembled, and for one source only.
 
 use std::net::Ipv4Addr;
 use std::os::fd::BorrowedFd;
@@ -15,15 +15,15 @@ use super::link::{Counters, HELD_MAX, Impairment, LinkState};
 use super::system::{run, words};
 use crate::model::MonotonicNs;
 
-/// Which of the devices are links of ours.
+/// Prefix of the names of the harness's ifb devices.
 const DEVICE: &str = "abimpair";
 
-/// Why this machine has no netem; `None` when it has. It is tried in the present network namespace, on a
-/// device of its own, with a delay too: its distribution is a file that comes with `tc`, or does not.
+/// Why netem does not work on this machine; `None` when it works. Tries it in the current network namespace
+/// on a separate device, with a delay too: not every package of `tc` includes the file of its distribution.
 pub(super) fn missing(queue: u16) -> Option<String> {
     let device = format!("abprobe{queue}");
     let _ = run(&words(&format!("ip link del {device}")));
-    let tried = [
+    let commands = [
         format!("ip link add {device} type ifb"),
         format!(
             "tc qdisc add dev {device} root netem limit 10 delay 1ms 1ms distribution normal \
@@ -35,7 +35,7 @@ pub(super) fn missing(queue: u16) -> Option<String> {
              action mirred egress redirect dev {device}"
         ),
     ];
-    let failed = tried.iter().find_map(|line| run(&words(line)).err());
+    let failed = commands.iter().find_map(|line| run(&words(line)).err());
     let _ = run(&words(&format!("ip link del {device}")));
     failed.map(|error| error.to_string())
 }
@@ -46,7 +46,7 @@ struct Commands {
     device: String,
     /// The interface through which packets of the source arrive.
     interface: String,
-    /// Of the filter; another for each link at the interface, and never 0, which means any.
+    /// Priority of the filter: different for each link at the interface, and never 0, which means any.
     priority: u32,
     source: Ipv4Addr,
     impairment: Impairment,
@@ -54,7 +54,7 @@ struct Commands {
 
 impl Commands {
     fn new(source: Ipv4Addr, interface: String, queue: u16, impairment: Impairment) -> Self {
-        // The largest would be 65,536, one too many.
+        // tc takes 16 bits.
         let priority = (u32::from(queue) + 1).min(u32::from(u16::MAX));
         Self { device: format!("{DEVICE}{queue}"), interface, priority, source, impairment }
     }
@@ -72,7 +72,8 @@ impl Commands {
         line
     }
 
-    /// Each with what undoes it, where that is not part of undoing another. The ingress discipline is there.
+    /// The commands that set up the link, each with the command that undoes it, unless undoing another one
+    /// includes it. The ingress discipline must exist.
     fn set_up(&self) -> [(String, Option<String>); 4] {
         let Self { device, interface, priority, source, .. } = self;
         let filter = format!("dev {interface} parent ffff: protocol ip prio {priority}");
@@ -89,7 +90,7 @@ impl Commands {
         ]
     }
 
-    /// All links at an interface share its ingress discipline, which may be there.
+    /// Adds the interface's ingress discipline, or shares the existing one of the interface's other links.
     fn add_ingress(&self) -> Result<(), ImpairmentError> {
         let interface = &self.interface;
         let Err(error) = run(&words(&format!("tc qdisc add dev {interface} ingress"))) else { return Ok(()) };
@@ -97,13 +98,15 @@ impl Commands {
         if can_share(&filters, self.source) {
             return Ok(());
         }
-        let show = format!("`tc filter show dev {interface} parent ffff:` shows it");
-        let what =
-            format!("a filter at {interface} that is no link's, or is for {} too; {show}", self.source);
+        let show = format!("`tc filter show dev {interface} parent ffff:` lists it");
+        let what = format!(
+            "a filter of another program at {interface}, or a link that also impairs {}; {show}",
+            self.source
+        );
         Err(ImpairmentError::Unexpected { what })
     }
 
-    /// Whoever finds no filter left is the last.
+    /// Removes the interface's ingress discipline if no link has a filter left in it.
     fn remove_ingress(&self) -> Result<(), ImpairmentError> {
         if self.filters()?.trim().is_empty() {
             run(&words(&format!("tc qdisc del dev {} ingress", self.interface)))?;
@@ -120,8 +123,8 @@ impl Commands {
     }
 }
 
-/// Whether all filters that `tc filter show` shows redirect to links of ours, and none what comes from this
-/// source: the first of two would take it from the other.
+/// Whether all filters in the output of `tc filter show` redirect to the harness's links, and none of them
+/// matches this source: of two filters that match it, only the first would get its packets.
 fn can_share(filters: &str, source: Ipv4Addr) -> bool {
     let to_link = format!("mirred (Egress Redirect to device {DEVICE}");
     let of_source = format!("match {:08x}/", u32::from(source));
@@ -132,7 +135,8 @@ fn can_share(filters: &str, source: Ipv4Addr) -> bool {
     })
 }
 
-/// netem takes the loss in the bad state before that in the good one: `p r 1-h 1-k` (tc-netem(8)).
+/// The loss arguments of netem, which takes the loss in the bad state before that in the good state:
+/// `p r 1-h 1-k` (tc-netem(8)).
 fn loss(model: &GilbertElliott) -> String {
     if *model == GilbertElliott::CLEAN {
         return String::new();
@@ -157,13 +161,13 @@ fn percent(share: f64) -> String {
     format!("{}%", decimal(share * 100.0))
 }
 
-/// Without an exponent, without zeros at the end.
+/// Formats a number without an exponent and without trailing zeros.
 fn decimal(value: f64) -> String {
     let text = format!("{value:.6}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
-/// What the queueing discipline has counted.
+/// The counters of the queueing discipline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Statistics {
     passed: u64,
@@ -173,8 +177,8 @@ struct Statistics {
 
 impl Statistics {
     fn parse(json: &str) -> Option<Self> {
-        let shown: Value = serde_json::from_str(json).ok()?;
-        let netem = shown.as_array()?.iter().find(|qdisc| qdisc["kind"] == "netem")?;
+        let qdiscs: Value = serde_json::from_str(json).ok()?;
+        let netem = qdiscs.as_array()?.iter().find(|qdisc| qdisc["kind"] == "netem")?;
         let number = |name: &str| netem[name].as_u64();
         Some(Self { passed: number("packets")?, dropped: number("drops")?, held: number("qlen")? })
     }
@@ -184,8 +188,8 @@ impl Statistics {
     }
 }
 
-/// An impairment by `tc netem`. Its random numbers are not seeded: that takes a newer kernel and a newer `tc`
-/// than are common.
+/// An impairment by `tc netem`. Its random numbers are not seeded: that needs a newer kernel and a newer `tc`
+/// than most machines have.
 pub struct Netem {
     commands: Commands,
     undo: Vec<String>,
@@ -195,11 +199,11 @@ pub struct Netem {
 }
 
 impl Netem {
-    /// Begins to impair what the present network namespace receives from `source`. What a former one with the
-    /// same number has left is removed.
+    /// Starts to impair the packets that the current network namespace receives from `source`. Removes the
+    /// leftovers of a killed process that used the same number.
     ///
     /// # Errors
-    /// The machine can't, or the interface has an ingress discipline with filters of another's.
+    /// A command failed, or the interface has an ingress discipline with filters of other programs.
     pub fn open(source: Ipv4Addr, queue: u16, impairment: &Impairment) -> Result<Self, ImpairmentError> {
         let route = run(&words(&format!("ip -j route get {source}")))?;
         let interface = interface_of(&route).ok_or_else(|| ImpairmentError::Unexpected {
@@ -227,11 +231,11 @@ impl Netem {
         Ok(netem)
     }
 
-    /// Adds what has happened since the last time, all of it in the present state.
+    /// Adds the packets since the last call to the counters of the link's current state.
     fn count(&mut self) -> Result<(), ImpairmentError> {
-        let shown = run(&words(&self.commands.statistics()))?;
-        let now = Statistics::parse(&shown)
-            .ok_or_else(|| ImpairmentError::Unexpected { what: format!("statistics of tc: {shown}") })?;
+        let output = run(&words(&self.commands.statistics()))?;
+        let now = Statistics::parse(&output)
+            .ok_or_else(|| ImpairmentError::Unexpected { what: format!("statistics of tc: {output}") })?;
         self.add(now);
         Ok(())
     }
@@ -308,16 +312,16 @@ impl Drop for Netem {
     fn drop(&mut self) {
         for line in self.undo.drain(..).rev() {
             if let Err(error) = run(&words(&line)) {
-                tracing::warn!(%error, "an impairment was not removed");
+                tracing::warn!(%error, "could not remove an impairment");
             }
         }
         if let Err(error) = self.commands.remove_ingress() {
-            tracing::warn!(%error, "an ingress discipline was not removed");
+            tracing::warn!(%error, "could not remove an ingress discipline");
         }
     }
 }
 
-/// The interface in an answer of `ip -j route get`.
+/// Parses the interface from the output of `ip -j route get`.
 fn interface_of(json: &str) -> Option<String> {
     let routes: Value = serde_json::from_str(json).ok()?;
     Some(routes.get(0)?.get("dev")?.as_str()?.to_owned())
@@ -350,13 +354,13 @@ mod tests {
     }
 
     #[test]
-    fn a_row_of_a_trace_is_a_loss_without_states() {
+    fn a_row_of_a_trace_uses_a_loss_without_states() {
         let mut commands = commands(Level::Clean, Reading::AsRun, 40.5, 2.25);
         let head =
             "tc qdisc change dev abimpair7 root netem limit 20000 delay 40.5ms 2.25ms distribution normal";
-        for (loss, said) in [(0.0, ""), (0.0123, " loss 1.23%"), (1.0, " loss 100%")] {
+        for (loss, arguments) in [(0.0, ""), (0.0123, " loss 1.23%"), (1.0, " loss 100%")] {
             commands.impairment.loss = GilbertElliott::independent(loss).expect("a probability");
-            assert_eq!(commands.netem("change", LinkState::On), format!("{head}{said}"));
+            assert_eq!(commands.netem("change", LinkState::On), format!("{head}{arguments}"));
         }
     }
 
@@ -395,7 +399,7 @@ mod tests {
 
     #[test]
     fn an_ingress_discipline_is_shared_with_links_of_other_sources_only() {
-        // As iproute2 6.1 shows a link.
+        // The output of iproute2 6.1 for a link.
         let filter = |number: u32, action: &str| {
             let priority = number + 1;
             format!(
@@ -423,7 +427,7 @@ mod tests {
 
     #[test]
     fn statistics_are_counted_by_the_state_of_the_link() {
-        // As iproute2 6.1 prints them, shortened.
+        // The output of iproute2 6.1, shortened.
         let json = |packets, drops, qlen| {
             format!(
                 "[{{\"kind\":\"netem\",\"handle\":\"8001:\",\"root\":true,\"refcnt\":2,\"options\":{{}},\

@@ -1,4 +1,4 @@
-//! A trace that is played: which of its rows is on, and what was really lost in each. Pure: time is an
+//! The replay of a trace: which of its rows is in force, and the packets that each row lost. Pure: time is an
 //! argument.
 
 use serde::Serialize;
@@ -8,64 +8,64 @@ use super::link::Counters;
 use super::trace::{Trace, TraceRow};
 use crate::model::MonotonicNs;
 
-/// What happened while a row was on, in all rounds together.
+/// Packets counted while a row was in force, over all rounds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct RowCounts {
     /// Packets that arrived while the link was on.
     pub judged: u64,
-    /// Lost of them by the model.
+    /// The packets of these that the model lost.
     pub lost: u64,
 }
 
-/// A trace that is played from the moment it is begun, once or again and again. The last row of one that is
-/// not repeated stays on.
+/// The replay of a trace, once or repeatedly. Without repetition the last row stays in force.
 #[derive(Clone, Debug)]
 pub struct Replay {
     trace: Trace,
     repeat: bool,
-    begun: Option<MonotonicNs>,
+    started_at: Option<MonotonicNs>,
     round: u64,
     row: usize,
+    /// The link's counters at the last call of [`Self::count`].
     counted: RowCounts,
     counts: Vec<RowCounts>,
 }
 
 impl Replay {
-    /// One that waits to be begun, with its first row on.
+    /// Creates a replay that has not started; its first row is in force.
     pub fn new(trace: Trace, repeat: bool) -> Self {
         let counts = vec![RowCounts::default(); trace.rows().len()];
-        // A single row has no end that it could be repeated after.
+        // The end of a single row is unknown, so there is nothing to repeat.
         let repeat = repeat && trace.length_ns() > 0;
-        Self { trace, repeat, begun: None, round: 0, row: 0, counted: RowCounts::default(), counts }
+        Self { trace, repeat, started_at: None, round: 0, row: 0, counted: RowCounts::default(), counts }
     }
 
-    /// Begins it, unless it has begun: a link that is switched off for a while misses that part.
-    pub fn begin(&mut self, now: MonotonicNs) {
-        self.begun.get_or_insert(now);
+    /// Starts the replay, unless it has started. It goes on while the link is switched off.
+    pub fn start(&mut self, now: MonotonicNs) {
+        self.started_at.get_or_insert(now);
     }
 
-    /// Whether it has begun.
-    pub fn has_begun(&self) -> bool {
-        self.begun.is_some()
+    /// Whether the replay has started.
+    pub fn has_started(&self) -> bool {
+        self.started_at.is_some()
     }
 
-    /// When another row is on; `None` before it is begun and when the last row stays on.
+    /// When the next row comes into force; `None` before the start and when the last row stays in force.
     pub fn next_change(&self) -> Option<MonotonicNs> {
-        let begun = self.begun?;
+        let started_at = self.started_at?;
         let before_ns = self.round.saturating_mul(self.trace.length_ns());
         let in_round_ns = match self.trace.rows().get(self.row + 1) {
             Some(next) => next.at_ns,
             None if self.repeat => self.trace.length_ns(),
             None => return None,
         };
-        Some(begun.plus_ns(before_ns.saturating_add(in_round_ns)))
+        Some(started_at.plus_ns(before_ns.saturating_add(in_round_ns)))
     }
 
-    /// Goes to the row that is on at `now`, of which there may have been others meanwhile. First
-    /// [`count`](Self::count) what happened in the one before.
+    /// Advances to the row in force at `now`, which may skip rows, and returns it. Call
+    /// [`count`](Self::count) before, for the packets of the previous row.
     pub fn advance(&mut self, now: MonotonicNs) -> &TraceRow {
-        if let Some(begun) = self.begun {
-            let mut since_ns = now.since(begun);
+        if let Some(started_at) = self.started_at {
+            let mut since_ns = now.since(started_at);
             if self.repeat {
                 self.round = since_ns / self.trace.length_ns();
                 since_ns %= self.trace.length_ns();
@@ -73,15 +73,15 @@ impl Replay {
             // The first row is at 0.
             self.row = self.trace.rows().partition_point(|row| row.at_ns <= since_ns).saturating_sub(1);
         }
-        self.now()
+        self.current_row()
     }
 
-    /// The row that is on.
-    pub fn now(&self) -> &TraceRow {
+    /// The row in force.
+    pub fn current_row(&self) -> &TraceRow {
         &self.trace.rows()[self.row]
     }
 
-    /// Gives to the row that is on what the link has counted since this was called last.
+    /// Adds the packets that the link has counted since the last call to the row in force.
     pub fn count(&mut self, counters: &Counters) {
         let counts = &mut self.counts[self.row];
         counts.judged += counters.judged.saturating_sub(self.counted.judged);
@@ -94,28 +94,28 @@ impl Replay {
         &self.trace
     }
 
-    /// Whether it begins anew at its end.
-    pub fn repeats(&self) -> bool {
+    /// Whether the replay restarts at the end of the trace.
+    pub fn is_repeated(&self) -> bool {
         self.repeat
     }
 
-    /// Which row is on, from 0.
+    /// The index of the row in force, from 0.
     pub fn row(&self) -> usize {
         self.row
     }
 
-    /// How often the trace has been played to its end.
+    /// The number of completed rounds of the trace.
     pub fn round(&self) -> u64 {
         self.round
     }
 
-    /// What was counted, row by row.
+    /// The packets counted in each row.
     pub fn counts(&self) -> &[RowCounts] {
         &self.counts
     }
 
-    /// How many packets the trace loses on average of those that came, and the standard error of that: each
-    /// by the row it came in, and independent of all others.
+    /// The expected number of lost packets, given the packets that arrived in each row, and its standard
+    /// error. Losses of packets are independent.
     pub fn lost_expected(&self) -> (f64, f64) {
         let sum = |of: fn(&GilbertElliott, f64) -> f64| {
             let rows = self.trace.rows().iter().zip(&self.counts);
@@ -145,17 +145,17 @@ mod tests {
         MonotonicNs(7_000_000_000).plus_ms(ms)
     }
 
-    /// Packets at the same distance through a link that follows a trace; yields which were lost, and when
-    /// each of the others was released.
+    /// Sends packets at equal intervals through a link that follows a trace; returns the lost packets, and
+    /// the release time of each.
     fn play(replay: &mut Replay, seed: u64, packets: u32, gap_us: u64) -> (Vec<u32>, Vec<MonotonicNs>) {
-        let TraceRow { loss, delay, .. } = *replay.now();
+        let TraceRow { loss, delay, .. } = *replay.current_row();
         let mut link = Link::new(&Impairment { loss, delay, seed });
         let mut lost = Vec::new();
-        // Without a delay a packet is released when it comes.
+        // Without a delay a packet is released at its arrival.
         let mut released: Vec<MonotonicNs> =
             (0..packets).map(|packet| at_ms(0).plus_ns(u64::from(packet) * gap_us * 1_000)).collect();
         let mut now = at_ms(0);
-        replay.begin(now);
+        replay.start(now);
         let mut release = |link: &mut Link, now: MonotonicNs| {
             while let Some(due) = link.next_release().filter(|due| *due <= now) {
                 let packet = link.pop_due(due).expect("it is due");
@@ -180,12 +180,12 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_on_from_their_time_to_the_next_and_the_last_stays() {
+    fn a_row_is_in_force_until_the_next_and_the_last_one_stays() {
         let mut once = replay(TEXT, false);
-        assert_eq!((once.next_change(), once.row(), once.has_begun()), (None, 0, false));
-        assert_eq!(once.advance(at_ms(9_000)).at_ns, 0, "it has not begun");
-        once.begin(at_ms(0));
-        once.begin(at_ms(500));
+        assert_eq!((once.next_change(), once.row(), once.has_started()), (None, 0, false));
+        assert_eq!(once.advance(at_ms(9_000)).at_ns, 0, "it has not started");
+        once.start(at_ms(0));
+        once.start(at_ms(500));
         let mut seen = Vec::new();
         while let Some(change) = once.next_change() {
             once.advance(MonotonicNs(change.0 - 1));
@@ -199,20 +199,20 @@ mod tests {
     }
 
     #[test]
-    fn a_repeated_trace_begins_anew_after_its_last_row() {
+    fn a_repeated_trace_restarts_after_its_last_row() {
         let mut repeated = replay(TEXT, true);
-        repeated.begin(at_ms(0));
+        repeated.start(at_ms(0));
         repeated.advance(at_ms(3_999));
         assert_eq!((repeated.row(), repeated.round(), repeated.next_change()), (3, 0, Some(at_ms(4_000))));
         repeated.advance(at_ms(4_000));
         assert_eq!((repeated.row(), repeated.round(), repeated.next_change()), (0, 1, Some(at_ms(5_000))));
-        // Who was asleep for rounds goes on where it would be.
+        // A process that slept for several rounds goes on in the row of the present time.
         repeated.advance(at_ms(41_500));
         assert_eq!((repeated.row(), repeated.round(), repeated.next_change()), (1, 10, Some(at_ms(42_000))));
         let mut one = replay("time_s,loss,delay_ms\n0,0.5,0\n", true);
-        one.begin(at_ms(0));
+        one.start(at_ms(0));
         one.advance(at_ms(99_999));
-        assert_eq!((one.next_change(), one.repeats(), one.round()), (None, false, 0));
+        assert_eq!((one.next_change(), one.is_repeated(), one.round()), (None, false, 0));
     }
 
     #[test]
@@ -249,7 +249,7 @@ mod tests {
         let lost = |seed| play(&mut replay(TEXT, false), seed, 4_000, 1_000);
         assert_eq!(lost(7), lost(7));
         assert_ne!(lost(7).0, lost(8).0);
-        // The same numbers are drawn whatever the rows say: a row of more loss loses the same and more.
+        // The random numbers do not depend on the rows: a row with more loss loses the same packets and more.
         let more = TEXT.replace("1,0.3,20,5", "1,0.6,0,0");
         let (less, more) = (lost(7).0, play(&mut replay(&more, false), 7, 4_000, 1_000).0);
         assert!(less.iter().all(|packet| more.contains(packet)) && less.len() < more.len());
@@ -257,12 +257,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_the_steps_the_row_is_that_of_the_time_and_every_packet_is_in_one(
+        fn the_row_depends_on_the_time_only_and_every_packet_is_counted_in_a_row(
             gaps_ms in proptest::collection::vec((0..3_000_u64, 0..50_u64), 1..60),
             repeat: bool,
         ) {
             let mut replay = replay(TEXT, repeat);
-            replay.begin(at_ms(0));
+            replay.start(at_ms(0));
             let (mut ms, mut judged) = (0, 0);
             for (gap_ms, packets) in gaps_ms {
                 ms += gap_ms;

@@ -1,16 +1,16 @@
-//! The programs that set up the network.
+//! Runs the programs that set up the network.
 
 use std::ffi::OsString;
 use std::process::{Command, Stdio};
 
 use super::error::ImpairmentError;
 
-/// Where Debian keeps them, which is not in every user's path.
+/// The folders of system programs on Debian, which are not in every user's PATH.
 const SYSTEM_FOLDERS: &str = "/usr/local/sbin:/usr/sbin:/sbin";
 
-/// Runs a program to its end; yields what it wrote to stdout.
+/// Runs a program and waits for its end; returns its stdout.
 pub(in crate::eval) fn run(words: &[String]) -> Result<String, ImpairmentError> {
-    let failed = |said: String| ImpairmentError::Command { command: words.join(" "), said };
+    let failed = |message: String| ImpairmentError::Command { command: words.join(" "), message };
     let Some((program, arguments)) = words.split_first() else {
         return Err(failed("no program".to_owned()));
     };
@@ -20,8 +20,8 @@ pub(in crate::eval) fn run(words: &[String]) -> Result<String, ImpairmentError> 
     if output.status.success() {
         return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
     }
-    let said = String::from_utf8_lossy(&output.stderr);
-    Err(failed(format!("{} ({})", said.trim().replace('\n', "; "), output.status)))
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    Err(failed(format!("{} ({})", stderr.trim().replace('\n', "; "), output.status)))
 }
 
 fn path() -> OsString {
@@ -33,7 +33,7 @@ fn path() -> OsString {
     path
 }
 
-/// A command line without quotes as words.
+/// Splits a command line without quotes into words.
 pub(in crate::eval) fn words(line: &str) -> Vec<String> {
     line.split_whitespace().map(str::to_owned).collect()
 }
@@ -43,7 +43,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_failure_names_the_command_and_what_it_said() {
+    fn a_failure_has_the_command_and_its_error_message() {
         let error = run(&words("ls /nowhere-at-all")).expect_err("no such folder").to_string();
         assert!(error.contains("`ls /nowhere-at-all`") && error.contains("No such file"), "{error}");
         let error = run(&words("no-such-program a")).expect_err("no such program").to_string();

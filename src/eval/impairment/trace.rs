@@ -1,4 +1,4 @@
-//! A trace of a link: what it lost and how long its packets took, from a CSV file, a row for each time.
+//! A trace of a link, read from a CSV file: its loss and delay over time.
 
 use std::fs::File;
 use std::io::Read;
@@ -8,14 +8,14 @@ use super::delay::NormalDelay;
 use super::error::ImpairmentError;
 use super::gilbert_elliott::GilbertElliott;
 
-/// The largest file, in bytes: a day of rows of a second is 2 MB.
+/// The largest file, in bytes: a day with a row for each second is 2 MB.
 const MAX_BYTES: u64 = 8 << 20;
-/// The latest time of a row, in seconds: a day, as the window of a run may have.
+/// The latest time of a row, in seconds: a day, the longest window of a run.
 const TIME_MAX_S: f64 = 86_400.0;
-/// More mistakes than these are told as a number.
+/// The largest number of mistakes that are listed; further ones are only counted.
 const PROBLEMS_SHOWN: usize = 10;
 
-/// The columns that there may be; the first three must be.
+/// The names of the columns; the first three are required.
 const COLUMNS: [&str; 4] = ["time_s", "loss", "delay_ms", "jitter_ms"];
 const REQUIRED: usize = 3;
 const TIME: usize = 0;
@@ -23,14 +23,14 @@ const LOSS: usize = 1;
 const DELAY: usize = 2;
 const JITTER: usize = 3;
 
-/// What a link does from a time on.
+/// Loss and delay of a link from a time on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TraceRow {
-    /// Since when, in nanoseconds from the beginning of the trace.
+    /// When the row comes into force, in nanoseconds from the start of the trace.
     pub at_ns: u64,
-    /// Each packet is lost with the same probability, whatever became of the one before it.
+    /// The loss; packets are lost independently of each other.
     pub loss: GilbertElliott,
-    /// How long the others take.
+    /// The delay of packets that are not lost.
     pub delay: NormalDelay,
 }
 
@@ -41,20 +41,20 @@ pub struct Trace {
     length_ns: u64,
 }
 
-/// What is wrong with a line of a file.
+/// A mistake in a line of a trace file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TraceProblem {
-    /// From 1.
+    /// The number of the line, from 1.
     pub line: usize,
-    /// A sentence.
+    /// The message for the user.
     pub what: String,
 }
 
 impl Trace {
-    /// Reads a file; yields its text, too.
+    /// Reads and parses a file; also returns its text.
     ///
     /// # Errors
-    /// It can't be read, or is no trace; what is wrong is told line by line.
+    /// The file cannot be read, or has mistakes; the error lists them by line.
     pub fn load(path: &Path) -> Result<(Self, String), ImpairmentError> {
         let refused = |error| ImpairmentError::system(path.display().to_string(), error);
         let file = File::open(path).map_err(refused)?;
@@ -68,19 +68,19 @@ impl Trace {
         let text = String::from_utf8(bytes).map_err(|error| {
             let good = &error.as_bytes()[..error.utf8_error().valid_up_to()];
             let line = 1 + good.iter().filter(|byte| **byte == b'\n').count();
-            bad(vec![TraceProblem { line, what: "no text (UTF-8)".to_owned() }])
+            bad(vec![TraceProblem { line, what: "must be text in UTF-8".to_owned() }])
         })?;
         let trace = Self::parse(&text).map_err(bad)?;
         Ok((trace, text))
     }
 
-    /// Reads the text of a file: a header, then a row for each time; commas, no quotes. Lines that begin with
-    /// `#` are for people.
+    /// Parses the text of a file: a header, then rows; commas, no quotes. Lines that start with `#` are
+    /// comments.
     ///
     /// # Errors
-    /// What is wrong, line by line.
+    /// The mistakes in the text, by line.
     pub fn parse(text: &str) -> Result<Self, Vec<TraceProblem>> {
-        // Spreadsheets put a byte order mark first.
+        // Spreadsheet programs write a byte order mark.
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let lines = text.lines().enumerate().map(|(index, line)| (index + 1, line.trim()));
         let mut lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
@@ -104,7 +104,7 @@ impl Trace {
                     rows.push(row);
                 }
                 Err((at_s, found)) => {
-                    // A time that reads well is what the next has to be behind.
+                    // The next row must be later than this one if its time is valid.
                     before_s = at_s.or(before_s);
                     for what in found {
                         if problems.len() < PROBLEMS_SHOWN {
@@ -117,10 +117,10 @@ impl Trace {
             }
         }
         if more > 0 {
-            problems.push(problem(last_line, format!("up to here {more} more")));
+            problems.push(problem(last_line, format!("{more} more mistakes up to this line")));
         }
         if problems.is_empty() && rows.is_empty() {
-            problems.push(problem(header_line, "there are no rows behind the header".to_owned()));
+            problems.push(problem(header_line, "there are no rows after the header".to_owned()));
         }
         let length_ns = match rows.as_slice() {
             [.., before, last] => last.at_ns + (last.at_ns - before.at_ns),
@@ -129,18 +129,18 @@ impl Trace {
         if problems.is_empty() { Ok(Self { rows, length_ns }) } else { Err(problems) }
     }
 
-    /// Its rows.
+    /// The rows, in the order of their times.
     pub fn rows(&self) -> &[TraceRow] {
         &self.rows
     }
 
-    /// Its length, in nanoseconds: the last row lasts as long as the one before it. 0 where there is but one,
-    /// which says nothing of its end.
+    /// The length of the trace, in nanoseconds: the last row lasts as long as the one before it. 0 for a
+    /// single row, whose end is unknown.
     pub const fn length_ns(&self) -> u64 {
         self.length_ns
     }
 
-    /// The same in another time: twice as fast with a `speed` of 2.
+    /// Returns the trace with its times divided by `speed`: twice as fast with a `speed` of 2.
     #[must_use]
     pub fn at_speed(&self, speed: f64) -> Self {
         // From float to integer `as` saturates.
@@ -149,7 +149,7 @@ impl Trace {
         Self { rows: rows.collect(), length_ns: scaled(self.length_ns) }
     }
 
-    /// The mean of its losses over its time: what a steady flow of packets loses.
+    /// The mean loss over the trace's time: the loss of a steady flow of packets.
     pub fn mean_loss(&self) -> f64 {
         if self.length_ns == 0 {
             return self.rows.last().map_or(0.0, |row| row.loss.stationary_loss());
@@ -164,10 +164,10 @@ impl Trace {
 }
 
 fn no_header() -> String {
-    format!("there is no header; it is {}", COLUMNS.join(","))
+    format!("there is no header; it must be {}", COLUMNS.join(","))
 }
 
-/// The place of each of [`COLUMNS`] in a header.
+/// Finds the place of each of [`COLUMNS`] in a header.
 fn columns(header: &str) -> Result<[Option<usize>; COLUMNS.len()], Vec<String>> {
     let names: Vec<&str> = header.split(',').map(str::trim).collect();
     if !names.iter().any(|name| COLUMNS.contains(name)) {
@@ -176,7 +176,7 @@ fn columns(header: &str) -> Result<[Option<usize>; COLUMNS.len()], Vec<String>> 
     let mut problems = Vec::new();
     for (at, name) in names.iter().enumerate() {
         if !COLUMNS.contains(name) {
-            problems.push(format!("there is a column '{name}', and may be {}", COLUMNS.join(", ")));
+            problems.push(format!("unknown column '{name}'; the columns are {}", COLUMNS.join(", ")));
         } else if names[..at].contains(name) {
             problems.push(format!("there are two columns {name}"));
         }
@@ -184,13 +184,13 @@ fn columns(header: &str) -> Result<[Option<usize>; COLUMNS.len()], Vec<String>> 
     let places = COLUMNS.map(|column| names.iter().position(|name| *name == column));
     for (column, place) in COLUMNS.iter().zip(&places).take(REQUIRED) {
         if place.is_none() {
-            problems.push(format!("there is no column {column}; the header is {}", COLUMNS.join(",")));
+            problems.push(format!("there is no column {column}; the header must be {}", COLUMNS.join(",")));
         }
     }
     if problems.is_empty() { Ok(places) } else { Err(problems) }
 }
 
-/// A row and its time in seconds, or what is wrong with it and its time where that reads well.
+/// Parses a row; returns its time in seconds and the row, or its time if that is valid and its mistakes.
 fn row(
     text: &str,
     places: &[Option<usize>; COLUMNS.len()],
@@ -199,21 +199,21 @@ fn row(
     let fields: Vec<&str> = text.split(',').map(str::trim).collect();
     let wanted = places.iter().flatten().count();
     if fields.len() != wanted {
-        return Err((None, vec![format!("{} fields, and the header has {wanted}", fields.len())]));
+        return Err((None, vec![format!("{} fields, but the header has {wanted}", fields.len())]));
     }
     let mut problems = Vec::new();
     let mut number = |column: usize, allowed: &str, is_allowed: &dyn Fn(f64) -> bool| {
         let text = places[column].map(|place| fields[place])?;
         let value = text.parse().ok().filter(|value: &f64| is_allowed(*value));
         if value.is_none() {
-            problems.push(format!("{} is '{text}', and may be {allowed}", COLUMNS[column]));
+            problems.push(format!("{} is '{text}', but must be {allowed}", COLUMNS[column]));
         }
         value
     };
     let time_s = match before_s {
         None => number(TIME, "0 in the first row", &|value| value == 0.0),
         Some(before_s) => {
-            let allowed = format!("more than {before_s}, the time of the row before it, to {TIME_MAX_S}");
+            let allowed = format!("above {before_s}, the time of the previous row, and at most {TIME_MAX_S}");
             number(TIME, &allowed, &|value| value > before_s && value <= TIME_MAX_S)
         }
     };
@@ -265,38 +265,38 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_line_column_value_and_what_is_allowed() {
+    fn a_mistake_has_line_column_value_and_allowed_range() {
         const HEADER: &str = "time_s,loss,delay_ms\n";
-        let share = "and may be 0 to 1 (a share, not percent)";
-        for (text, said) in [
-            ("", "1: there is no header; it is time_s,loss,delay_ms,jitter_ms"),
-            ("# nothing\n\n", "1: there is no header; it is time_s,loss,delay_ms,jitter_ms"),
-            ("0,0,5\n", "1: there is no header; it is time_s,loss,delay_ms,jitter_ms"),
+        let share = "but must be 0 to 1 (a share, not percent)";
+        for (text, message) in [
+            ("", "1: there is no header; it must be time_s,loss,delay_ms,jitter_ms"),
+            ("# nothing\n\n", "1: there is no header; it must be time_s,loss,delay_ms,jitter_ms"),
+            ("0,0,5\n", "1: there is no header; it must be time_s,loss,delay_ms,jitter_ms"),
             (
                 "#\ntime_s,loss\n0,0\n",
-                "2: there is no column delay_ms; the header is time_s,loss,delay_ms,jitter_ms",
+                "2: there is no column delay_ms; the header must be time_s,loss,delay_ms,jitter_ms",
             ),
             ("time_s,loss,delay_ms,loss\n", "1: there are two columns loss"),
             (
                 "time_s,loss,delay_ms,bandwidth_kbit\n",
-                "1: there is a column 'bandwidth_kbit', and may be time_s, loss, delay_ms, jitter_ms",
+                "1: unknown column 'bandwidth_kbit'; the columns are time_s, loss, delay_ms, jitter_ms",
             ),
-            (HEADER, "1: there are no rows behind the header"),
-            (&format!("{HEADER}0,0\n"), "2: 2 fields, and the header has 3"),
-            (&format!("{HEADER}0,0,5,\n"), "2: 4 fields, and the header has 3"),
-            (&format!("{HEADER}1,0,5\n"), "2: time_s is '1', and may be 0 in the first row"),
-            (&format!("{HEADER}-1,0,5\n"), "2: time_s is '-1', and may be 0 in the first row"),
+            (HEADER, "1: there are no rows after the header"),
+            (&format!("{HEADER}0,0\n"), "2: 2 fields, but the header has 3"),
+            (&format!("{HEADER}0,0,5,\n"), "2: 4 fields, but the header has 3"),
+            (&format!("{HEADER}1,0,5\n"), "2: time_s is '1', but must be 0 in the first row"),
+            (&format!("{HEADER}-1,0,5\n"), "2: time_s is '-1', but must be 0 in the first row"),
             (
                 &format!("{HEADER}0,0,5\n#\n2,0,5\n2,0,5\n"),
-                "5: time_s is '2', and may be more than 2, the time of the row before it, to 86400",
+                "5: time_s is '2', but must be above 2, the time of the previous row, and at most 86400",
             ),
             (
                 &format!("{HEADER}0,0,5\n86401,0,5\n"),
-                "3: time_s is '86401', and may be more than 0, the time of the row before it, to 86400",
+                "3: time_s is '86401', but must be above 0, the time of the previous row, and at most 86400",
             ),
             (
                 &format!("{HEADER}0,0,5\nnan,0,5\n"),
-                "3: time_s is 'nan', and may be more than 0, the time of the row before it, to 86400",
+                "3: time_s is 'nan', but must be above 0, the time of the previous row, and at most 86400",
             ),
             (&format!("{HEADER}0,5,5\n"), &format!("2: loss is '5', {share}")),
             (&format!("{HEADER}0,5%,5\n"), &format!("2: loss is '5%', {share}")),
@@ -304,44 +304,44 @@ mod tests {
             (&format!("{HEADER}0,NaN,5\n"), &format!("2: loss is 'NaN', {share}")),
             (&format!("{HEADER}0,,5\n"), &format!("2: loss is '', {share}")),
             (&format!("{HEADER}0,\"0\",5\n"), &format!("2: loss is '\"0\"', {share}")),
-            (&format!("{HEADER}0,0,-5\n"), "2: delay_ms is '-5', and may be 0 to 60000 ms"),
-            (&format!("{HEADER}0,0,inf\n"), "2: delay_ms is 'inf', and may be 0 to 60000 ms"),
-            ("time_s,loss,delay_ms,jitter_ms\n0,0,5,x\n", "2: jitter_ms is 'x', and may be 0 to 60000 ms"),
+            (&format!("{HEADER}0,0,-5\n"), "2: delay_ms is '-5', but must be 0 to 60000 ms"),
+            (&format!("{HEADER}0,0,inf\n"), "2: delay_ms is 'inf', but must be 0 to 60000 ms"),
+            ("time_s,loss,delay_ms,jitter_ms\n0,0,5,x\n", "2: jitter_ms is 'x', but must be 0 to 60000 ms"),
         ] {
-            assert_eq!(problems(text), [said], "{text}");
+            assert_eq!(problems(text), [message], "{text}");
         }
     }
 
     #[test]
-    fn all_mistakes_are_told_at_once_but_not_thousands() {
-        // A line without a time changes nothing about what the next has to be behind.
+    fn all_mistakes_are_listed_up_to_a_limit() {
+        // A line without a valid time does not change the lower limit of the next time.
         let found = problems("time_s,loss,delay_ms\n0,2,-1\n1\nx,0,0\n0,0,0\n1,0,0\n");
         let lines: Vec<&str> =
             found.iter().map(|problem| problem.split(" is ").next().unwrap_or("")).collect();
         assert_eq!(
             lines,
-            ["2: loss", "2: delay_ms", "3: 1 fields, and the header has 3", "4: time_s", "5: time_s"]
+            ["2: loss", "2: delay_ms", "3: 1 fields, but the header has 3", "4: time_s", "5: time_s"]
         );
         let many = format!("time_s,loss,delay_ms\n{}", "0,9,9\n".repeat(1_000));
         let found = problems(&many);
         assert_eq!(found.len(), PROBLEMS_SHOWN + 1);
-        assert_eq!(found[PROBLEMS_SHOWN], "1001: up to here 1989 more");
+        assert_eq!(found[PROBLEMS_SHOWN], "1001: 1989 more mistakes up to this line");
     }
 
     #[test]
-    fn a_file_that_is_none_is_named_with_the_line() {
+    fn errors_of_a_file_have_its_path_and_the_line() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.csv");
-        let said = |bytes: &[u8]| {
+        let message = |bytes: &[u8]| {
             std::fs::write(&path, bytes).expect("written");
             Trace::load(&path).expect_err("no trace").to_string()
         };
         let name = path.display();
-        assert_eq!(said(b"time_s,loss,delay_ms\n0,0,0\n\xff"), format!("{name}:3: no text (UTF-8)"));
-        let at_once = said(b"time_s,loss,delay_ms\n0,2,-1\n");
-        assert!(at_once.starts_with(&format!("{name}:2: loss is '2', and may be 0 to 1")), "{at_once}");
-        assert!(at_once.contains(&format!("\n{name}:2: delay_ms is '-1'")), "{at_once}");
-        assert!(said(&vec![b'#'; MAX_BYTES as usize + 1]).contains("more than 8388608 bytes"));
+        assert_eq!(message(b"time_s,loss,delay_ms\n0,0,0\n\xff"), format!("{name}:3: must be text in UTF-8"));
+        let two = message(b"time_s,loss,delay_ms\n0,2,-1\n");
+        assert!(two.starts_with(&format!("{name}:2: loss is '2', but must be 0 to 1")), "{two}");
+        assert!(two.contains(&format!("\n{name}:2: delay_ms is '-1'")), "{two}");
+        assert!(message(&vec![b'#'; MAX_BYTES as usize + 1]).contains("more than 8388608 bytes"));
         let missing = Trace::load("/nowhere/a.csv".as_ref()).expect_err("no file").to_string();
         assert!(missing.contains("/nowhere/a.csv: No such file"), "{missing}");
     }
@@ -350,7 +350,7 @@ mod tests {
     fn the_last_row_lasts_as_long_as_the_one_before_it() {
         let trace = Trace::parse("time_s,loss,delay_ms\n0,0,0\n3,1,0\n4,0.5,0\n").expect("a trace");
         assert_eq!(trace.length_ns(), 5_000_000_000);
-        // 3 s of nothing, 1 s of all and 1 s of half.
+        // 3 s without loss, 1 s of full loss and 1 s of half.
         assert!((trace.mean_loss() - 1.5 / 5.0).abs() < 1e-12);
         let fast = trace.at_speed(4.0);
         assert_eq!(
@@ -364,7 +364,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_read_to_an_end(text in "[0-9a-z_,.#\\-\n ]{0,300}", valid: bool) {
+        fn parsing_any_text_terminates(text in "[0-9a-z_,.#\\-\n ]{0,300}", valid: bool) {
             let text = if valid { format!("time_s,loss,delay_ms\n0,0,0\n{text}") } else { text };
             match Trace::parse(&text) {
                 Ok(trace) => {

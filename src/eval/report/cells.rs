@@ -1,4 +1,4 @@
-//! Runs put together: repetitions of the same scenario in the same setting are a cell.
+//! Groups runs: the repetitions of a scenario in the same setting are a cell.
 
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
@@ -8,7 +8,7 @@ use super::paper;
 use super::record::{Folder, Run};
 use crate::eval::statistics::{Distribution, Estimate};
 
-/// Where scenarios are run: what doesn't depend on the scenario.
+/// The part of a setting that does not depend on the scenario: library, test bed and switch.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
     /// `fast`, `cyclone` or `rust`.
@@ -19,7 +19,7 @@ pub struct Place {
     pub switch: String,
 }
 
-/// The paper's library first, and its test bed before ours.
+/// Orders the paper's library first, and the paper's kind of test bed before network namespaces.
 impl Ord for Place {
     fn cmp(&self, other: &Self) -> Ordering {
         let rank = |place: &Self| {
@@ -44,7 +44,7 @@ impl PartialOrd for Place {
 }
 
 impl Place {
-    /// The library as people know it.
+    /// The product name of the library.
     pub fn library_name(&self) -> &str {
         match self.library.as_str() {
             "fast" => "Fast DDS",
@@ -54,7 +54,7 @@ impl Place {
         }
     }
 
-    /// The test bed and the host between, in words.
+    /// The test bed and the switch, in words.
     pub fn bed_name(&self) -> String {
         let bed = match self.bed.as_str() {
             "netns" => "network namespaces",
@@ -69,13 +69,13 @@ impl Place {
         format!("{bed}, {switch}")
     }
 
-    /// All of it in a line.
+    /// Library, test bed and switch, in words.
     pub fn name(&self) -> String {
         format!("{}, {}", self.library_name(), self.bed_name())
     }
 }
 
-/// A reading of Table I, in words.
+/// The name of a reading of Table I, in words.
 pub fn reading_name(reading: &str) -> &str {
     match reading {
         "as-printed" => "as printed",
@@ -90,42 +90,42 @@ pub struct Cell {
     pub scenario: String,
     pub title: String,
     pub place: Place,
-    /// `None` where nothing is lost by Table I.
+    /// `None` if no link loses packets by Table I.
     pub reading: Option<String>,
-    /// With the bridge or without.
+    /// Whether the scenario has the bridge.
     pub bridge: bool,
     pub level: String,
-    /// Whether a run of it is a smoke run.
+    /// Whether a run of the cell is a smoke run.
     pub quick: bool,
-    /// Places of its runs in [`Results::runs`].
+    /// Indices of its runs in [`Results::runs`].
     pub runs: Vec<usize>,
-    /// In the same order.
+    /// The figures of these runs, in the same order.
     pub measures: Vec<Measures>,
 }
 
 impl Cell {
-    /// A figure's median over the repetitions and how sure it is; `None` where no run has it.
+    /// A figure's median over the repetitions with its confidence interval; `None` if no run has the figure.
     pub fn estimate(&self, figure: impl Fn(&Measures) -> Option<f64>) -> Option<Estimate> {
         Estimate::of(self.measures.iter().filter_map(figure))
     }
 
-    /// The median of a figure.
+    /// The median of a figure over the repetitions.
     pub fn median(&self, figure: impl Fn(&Measures) -> Option<f64>) -> Option<f64> {
         self.estimate(figure).map(|estimate| estimate.median)
     }
 
-    /// A quantile of the critical latency in milliseconds: its median over repetitions.
+    /// A quantile of the critical latency in milliseconds, as the median over repetitions.
     pub fn critical_ms(&self, q: f64) -> Option<f64> {
         self.median(|one| one.critical_ms.quantile(q))
     }
 
-    /// A count over all repetitions.
+    /// The sum of a count over all repetitions.
     pub fn total(&self, count: impl Fn(&Measures) -> usize) -> usize {
         self.measures.iter().map(count).sum()
     }
 }
 
-/// All that a folder of results shows.
+/// All runs of a folder of results, grouped into cells.
 pub struct Results {
     pub runs: Vec<Run>,
     pub unusable: Vec<(String, String)>,
@@ -133,7 +133,7 @@ pub struct Results {
 }
 
 impl Results {
-    /// Puts the runs together.
+    /// Groups the runs of a folder and computes their figures.
     pub fn new(folder: Folder) -> Self {
         let mut cells: BTreeMap<(Place, Option<String>, String), Cell> = BTreeMap::new();
         for (index, run) in folder.runs.iter().enumerate() {
@@ -162,18 +162,18 @@ impl Results {
         Self { runs: folder.runs, unusable: folder.unusable, cells }
     }
 
-    /// All cells, by place, reading and scenario.
+    /// All cells, sorted by place, reading and scenario.
     pub fn cells(&self) -> impl Iterator<Item = &Cell> {
         self.cells.values()
     }
 
-    /// Where anything was run.
+    /// The places of all runs.
     pub fn places(&self) -> BTreeSet<&Place> {
         self.cells.keys().map(|(place, _, _)| place).collect()
     }
 
-    /// The readings that were run at a place. Where nothing but scenarios without loss were, the one as
-    /// printed stands for them.
+    /// The readings that were run at a place. If only scenarios without loss were run, the reading as
+    /// printed.
     pub fn readings(&self, place: &Place) -> Vec<String> {
         let of_place = self.cells.keys().filter(|(known, _, _)| known == place);
         let mut readings: Vec<String> = of_place.filter_map(|(_, reading, _)| reading.clone()).collect();
@@ -185,13 +185,14 @@ impl Results {
         readings
     }
 
-    /// A scenario at a place, in a reading; one without loss belongs to every reading.
+    /// Finds the cell of a scenario; a scenario without loss belongs to every reading.
     pub fn cell(&self, place: &Place, reading: &str, scenario: &str) -> Option<&Cell> {
         let key = |reading: Option<&str>| (place.clone(), reading.map(str::to_owned), scenario.to_owned());
         self.cells.get(&key(Some(reading))).or_else(|| self.cells.get(&key(None)))
     }
 
-    /// What was run at a place in a reading, what has no reading included: baselines first, by severity.
+    /// The cells at a place in a reading, including those without a reading: in the order of the paper's
+    /// tables, then by name.
     pub fn cells_of(&self, place: &Place, reading: &str) -> Vec<&Cell> {
         let of_setting =
             |cell: &&Cell| cell.place == *place && cell.reading.as_deref().unwrap_or(reading) == reading;
@@ -207,8 +208,8 @@ impl Results {
         cells
     }
 
-    /// The setting that is nearest to the paper's: Fast DDS, as run, with a host between that reassembles
-    /// fragments; the first of what there is.
+    /// The setting of the results that is nearest to the paper's: Fast DDS, Table I as run, a switch that
+    /// reassembles fragments.
     pub fn nearest_to_paper(&self) -> Option<(&Place, String)> {
         let settings = self
             .places()
@@ -219,7 +220,7 @@ impl Results {
         })
     }
 
-    /// Critical latencies of all repetitions of a cell.
+    /// The critical latencies of all repetitions of a cell.
     pub fn pooled_critical_ms(&self, cell: &Cell) -> Distribution {
         let all = cell.measures.iter().flat_map(|one| one.critical_ms.values());
         Distribution::new(all.copied())
@@ -230,7 +231,7 @@ impl Results {
         self.cells().any(|cell| cell.quick)
     }
 
-    /// Whether any of it was made up for a test.
+    /// Whether any run is synthetic test data.
     pub fn any_synthetic(&self) -> bool {
         self.runs.iter().any(|run| run.manifest.synthetic)
     }

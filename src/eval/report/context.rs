@@ -1,4 +1,4 @@
-//! What surrounds the figures: on what they were measured, with what, and what is doubtful or missing.
+//! The context of the figures: machine and software of the runs, warnings, and missing runs.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, UNIX_EPOCH};
@@ -8,22 +8,22 @@ use super::format;
 use super::paper;
 use super::record::{Manifest, Run};
 
-/// Facts and warnings, as texts.
+/// Texts about the runs of a report.
 pub struct Context {
-    /// The folder in a line.
+    /// One line about the number of runs and their settings.
     pub summary: String,
-    /// What a reader must know before any figure.
+    /// Warnings that apply to the whole report.
     pub warnings: Vec<String>,
-    /// Each with its values, of which there are several where runs differ.
+    /// Name and values of each fact; several values if runs differ.
     pub facts: Vec<(&'static str, Vec<String>)>,
-    /// Runs that say of themselves that they are doubtful.
-    pub doubts: Vec<String>,
-    /// Scenarios of the paper that were not run somewhere.
+    /// Problems that were recorded in the manifests of runs.
+    pub problems: Vec<String>,
+    /// Scenarios of the paper that were not run in a setting.
     pub not_run: Vec<String>,
 }
 
 impl Context {
-    /// Collects them.
+    /// Collects the context of all results.
     pub fn of(results: &Results) -> Self {
         let mut warnings = Vec::new();
         if results.any_synthetic() {
@@ -31,25 +31,28 @@ impl Context {
         }
         if results.any_quick() {
             warnings.push(
-                "Smoke runs (--quick): they show that the evaluation works; no figure means anything."
+                "Smoke runs (--quick): they show that the evaluation works; their figures have no meaning."
                     .to_owned(),
             );
         }
-        let doubts: Vec<String> = results
+        let problems: Vec<String> = results
             .runs
             .iter()
             .flat_map(|run| {
                 run.manifest.problems.iter().map(|problem| format!("{}: {problem}", run.manifest.run))
             })
             .collect();
-        if !doubts.is_empty() {
-            warnings
-                .push(format!("{} remarks of runs about themselves: see \"Doubtful\" below.", doubts.len()));
+        if !problems.is_empty() {
+            warnings.push(format!(
+                "{} problems were recorded during runs: see \"Problems of runs\" below.",
+                problems.len()
+            ));
         }
         if !results.unusable.is_empty() {
             warnings.push(format!("{} runs failed or could not be read.", results.unusable.len()));
         }
-        Self { summary: summary(results), warnings, facts: facts(results), doubts, not_run: not_run(results) }
+        let (summary, facts, not_run) = (summary(results), facts(results), not_run(results));
+        Self { summary, warnings, facts, problems, not_run }
     }
 }
 
@@ -66,8 +69,8 @@ fn summary(results: &Results) -> String {
         (least, most) => format!("{least} to {most} times"),
     };
     format!(
-        "{} runs: {cells} experiments, each {}, with {} on {}. Each figure stands above the paper's value \
-         and how far it is from that.",
+        "{} runs: {cells} experiments, each {}, with {} on {}. Below a figure are the paper's value and the \
+         deviation from it.",
         results.runs.len(),
         repetitions,
         joined(libraries),
@@ -76,7 +79,7 @@ fn summary(results: &Results) -> String {
 }
 
 fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
-    /// More different values of a fact than these are told as a number.
+    /// The largest number of different values of a fact that are listed; further ones are only counted.
     const SHOWN: usize = 8;
     let distinct = |of: &dyn Fn(&Run) -> Vec<String>| {
         let mut values: Vec<String> = Vec::new();
@@ -109,12 +112,12 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
         ),
         ("System", one(|run| format!("{}, kernel {}", run.manifest.machine.os, run.manifest.machine.kernel))),
         ("Load average before a run", vec![load(results)]),
-        ("CPU time that the hypervisor kept (steal)", vec![stolen(results)]),
+        ("CPU time that the hypervisor took (steal)", vec![stolen(results)]),
         (
             "Commit",
             one(|run| {
                 let software = &run.manifest.software;
-                let changes = if software.modified { ", with changes" } else { "" };
+                let changes = if software.modified { ", with uncommitted changes" } else { "" };
                 format!(
                     "{}{changes} (version {})",
                     software.commit.as_deref().unwrap_or("not from a checkout"),
@@ -135,7 +138,7 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
                 outcomes.collect()
             }),
         ),
-        ("Traces of links, and what was lost", distinct(&|run| traces(&run.manifest))),
+        ("Traces of links, and their losses", distinct(&|run| traces(&run.manifest))),
         (
             "Seeds of the links",
             distinct(&|run| {
@@ -164,7 +167,7 @@ fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
     facts
 }
 
-/// What the links of a run lost that followed a trace, beside what the trace loses of the packets that came.
+/// The losses of a run's links that followed a trace, with the expected losses.
 fn traces(manifest: &Manifest) -> Vec<String> {
     let outcomes = manifest.links.iter().filter_map(|link| {
         let outcome = link.impairment.as_ref()?;
@@ -174,7 +177,7 @@ fn traces(manifest: &Manifest) -> Vec<String> {
             [outcome.lost as f64 / outcome.judged as f64, outcome.loss_expected, 1.96 * error]
                 .map(format::percent);
         Some(format!(
-            "{} {} by {}: {lost} of {} packets, expected {expected} ± {error}",
+            "{} {} by {}: {lost} of {} packets lost, expected {expected} ± {error}",
             manifest.run, link.name, trace.file, outcome.judged
         ))
     });
@@ -206,12 +209,12 @@ fn stolen(results: &Results) -> String {
     let most = stolen().fold(0.0, f64::max);
     let of = match results.runs.len() - stolen().count() {
         0 => String::new(),
-        unknown => format!(", not recorded of {unknown} runs"),
+        unknown => format!(", not recorded in {unknown} runs"),
     };
     format!("{} to {} %{of}", format::number(least, 0), format::number(most, 0))
 }
 
-/// Scenarios of the paper that were not run at a place where others were.
+/// Lists the paper's scenarios that are missing in a setting in which other scenarios were run.
 fn not_run(results: &Results) -> Vec<String> {
     let mut missing = Vec::new();
     for place in results.places() {

@@ -1,10 +1,10 @@
-//! The figures as CSV, for programs.
+//! Writes the figures and verdicts as CSV.
 
 use super::cells::Results;
 use super::metrics::{METRICS, paper_value};
 use super::verdict::Finding;
 
-/// A line for each run, a column for each figure.
+/// Writes `runs.csv`: a line for each run, a column for each figure.
 pub fn runs(results: &Results) -> String {
     let mut columns =
         vec!["run", "scenario", "library", "reading", "bed", "switch", "repetition", "quick", "synthetic"];
@@ -32,7 +32,7 @@ pub fn runs(results: &Results) -> String {
     text
 }
 
-/// A line for each figure of each scenario in each setting, over its repetitions.
+/// Writes `figures.csv`: a line for each figure of each scenario in each setting, over its repetitions.
 pub fn figures(results: &Results) -> String {
     const COLUMNS: [&str; 14] = [
         "scenario",
@@ -79,7 +79,7 @@ pub fn figures(results: &Results) -> String {
     text
 }
 
-/// A line for each criterion of each verdict.
+/// Writes `verdicts.csv`: a line for each criterion of each verdict.
 pub fn verdicts(findings: &[Finding]) -> String {
     const COLUMNS: [&str; 7] = ["hypothesis", "title", "verdict", "rule", "where", "found", "holds"];
     let mut text = line(COLUMNS.map(str::to_owned));
@@ -102,13 +102,13 @@ pub fn verdicts(findings: &[Finding]) -> String {
 }
 
 fn optional(value: Option<f64>) -> String {
-    // Six digits behind the point are a nanosecond of what is in milliseconds.
+    // Six decimals of a value in milliseconds are a nanosecond.
     value
         .map(|value| format!("{:.6}", value).trim_end_matches('0').trim_end_matches('.').to_owned())
         .unwrap_or_default()
 }
 
-/// A line, its fields quoted where RFC 4180 asks for it.
+/// Writes a line; quotes fields where RFC 4180 requires it.
 fn line(fields: impl IntoIterator<Item = String>) -> String {
     let quoted: Vec<String> = fields
         .into_iter()
@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fields_are_quoted_where_they_must() {
+    fn fields_are_quoted_where_required() {
         assert_eq!(line(["a".into(), "b, c".into(), "say \"d\"".into()]), "a,\"b, c\",\"say \"\"d\"\"\"\n");
         let numbers = [Some(1.5), Some(30.0), Some(1e-9), Some(1_200.0), None].map(optional);
         assert_eq!(numbers, ["1.5", "30", "0", "1200", ""]);

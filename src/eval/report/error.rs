@@ -1,31 +1,31 @@
-//! What can go wrong with a report, in the words of someone who has to mend it.
+//! The error type of the report.
 
 use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why there is no report, or why a run is not in it.
+/// Why a report cannot be written, or why a run is not in it.
 #[derive(Debug)]
 pub enum ReportError {
     /// A file or folder could not be read or written.
     File {
-        /// Which one.
+        /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A file does not say what docs/eval-results.md promises.
+    /// The content of a file does not follow docs/eval-results.md.
     Content {
-        /// Which one.
+        /// The file.
         path: PathBuf,
         /// The line, counted from 1; 0 for the whole file.
         line: usize,
         /// What is wrong with it.
         problem: String,
     },
-    /// There is nothing to report.
+    /// A folder has no results.
     NoRuns {
-        /// The folder that was looked in.
+        /// The folder.
         folder: PathBuf,
     },
 }
@@ -49,7 +49,7 @@ impl fmt::Display for ReportError {
             Self::Content { path, line, problem } => write!(f, "{}:{line}: {problem}", path.display()),
             Self::NoRuns { folder } => write!(
                 f,
-                "{} has no finished run; `adaptive-bridge-eval run` or `matrix` makes some",
+                "{} has no finished run; first record some with `adaptive-bridge-eval run` or `matrix`",
                 folder.display()
             ),
         }

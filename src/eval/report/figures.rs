@@ -1,4 +1,4 @@
-//! The report's figures.
+//! Draws the report's figures.
 
 use super::cells::{Cell, Place, Results};
 use super::measures::{backlog, remote_hosts};
@@ -10,7 +10,7 @@ use crate::eval::statistics::{Distribution, sliding_rate};
 const LEVELS: [(&str, &str); 4] =
     [("Clean", "clean"), ("Mild", "mild"), ("Moderate", "moderate"), ("Strong", "strong")];
 
-/// Figure 4: critical p95 and publisher rate by impairment, with and without the bridge.
+/// Draws Figure 4: critical p95 and publisher rate by impairment, with and without the bridge.
 pub fn figure_4(results: &Results, place: &Place, reading: &str) -> [String; 2] {
     let series = |name,
                   class,
@@ -60,7 +60,8 @@ pub fn figure_4(results: &Results, place: &Place, reading: &str) -> [String; 2] 
     ]
 }
 
-/// Figure 5: cumulative distributions of the critical latency, without and with the bridge, on the same axis.
+/// Draws Figure 5: cumulative distributions of the critical latency, without and with the bridge, on the same
+/// axis.
 pub fn figure_5(results: &Results, place: &Place, reading: &str) -> [String; 2] {
     let curves = |variant: &str| -> Vec<Curve> {
         let curve = |(name, level): &(&'static str, &'static str)| {
@@ -81,7 +82,7 @@ pub fn figure_5(results: &Results, place: &Place, reading: &str) -> [String; 2] 
     ]
 }
 
-/// What happened in a run.
+/// Draws the time line of a run.
 pub fn timeline(run: &Run) -> String {
     let manifest = &run.manifest;
     let mut panels = vec![rates(run), latencies(run), calls(run)];
@@ -97,19 +98,20 @@ pub fn timeline(run: &Run) -> String {
             strips.push(Strip { title: format!("Mode of lane {lane}"), changes });
         }
     }
-    let done = run.events.iter().filter(|event| matches!(event.event.as_str(), "stop" | "continue" | "kill"));
+    let signals =
+        run.events.iter().filter(|event| matches!(event.event.as_str(), "stop" | "continue" | "kill"));
     Timeline {
         label: &format!("Time line of {}", manifest.run),
         end_s: run.length_s(),
         impaired: run.impaired_spans(),
-        events: done.map(|event| (event.at_s, format!("{} {}", event.event, event.subject))).collect(),
+        events: signals.map(|event| (event.at_s, format!("{} {}", event.event, event.subject))).collect(),
         panels,
         strips,
     }
     .draw()
 }
 
-/// The run of a cell whose time line is shown: the first.
+/// The run of a cell whose time line is shown: the first repetition.
 pub fn shown_run<'a>(results: &'a Results, cell: &Cell) -> Option<&'a Run> {
     cell.runs.first().and_then(|index| results.runs.get(*index))
 }
@@ -226,7 +228,7 @@ fn fragment_memory(run: &Run) -> Option<Panel<'static>> {
         .map(|one| (one.at_s, one.fragment_memory_bytes as f64 / 1024.0))
         .collect();
     points.iter().any(|point| point.1 > 0.0).then_some(Panel {
-        title: "Incomplete datagrams at the host between, KiB",
+        title: "Memory of incomplete datagrams at the switch, KiB",
         lines: vec![Line { name: "memory", class: "third", points }],
         logarithmic: false,
         at_least: 10.0,
@@ -234,7 +236,7 @@ fn fragment_memory(run: &Run) -> Option<Panel<'static>> {
     })
 }
 
-/// A figure of what happened in each second of the window; a second without anything is a gap.
+/// Computes a figure of the points in each second of the window; a second without points is a gap (NaN).
 fn per_second(
     run: &Run,
     points: impl Iterator<Item = (f64, f64)>,

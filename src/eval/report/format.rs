@@ -1,10 +1,10 @@
-//! Figures as people read them.
+//! Formats figures for the tables and plots of the report.
 
 use std::fmt::Write as _;
 
 use crate::eval::statistics::Estimate;
 
-/// A number with so many decimals, and commas between thousands.
+/// Formats a number with this many decimals, and commas between thousands.
 pub fn number(value: f64, decimals: usize) -> String {
     let text = format!("{:.decimals$}", value.abs());
     let (whole, fraction) = text.split_once('.').unwrap_or((&text, ""));
@@ -22,7 +22,7 @@ pub fn number(value: f64, decimals: usize) -> String {
     if value < 0.0 && !is_zero { format!("−{grouped}") } else { grouped }
 }
 
-/// Milliseconds, as precise as the paper's tables: two decimals below 10, one below 100.
+/// Formats milliseconds with the precision of the paper's tables: two decimals below 10, one below 100.
 pub fn ms(value: f64) -> String {
     let decimals = if value.abs() < 9.995 {
         2
@@ -34,18 +34,18 @@ pub fn ms(value: f64) -> String {
     number(value, decimals)
 }
 
-/// Hertz, with the paper's one decimal.
+/// Formats hertz with one decimal, as in the paper.
 pub fn hz(value: f64) -> String {
     number(value, 1)
 }
 
-/// A count.
+/// Formats a count.
 pub fn count(value: f64) -> String {
     // The median of an even number of repetitions may lie between two counts.
     number(value, usize::from(value.fract() != 0.0))
 }
 
-/// Bytes, in the largest unit of which it is at least one.
+/// Formats bytes in the largest unit that gives at least 1.
 pub fn bytes(value: f64) -> String {
     for (unit, size) in [("GiB", 1_073_741_824.0), ("MiB", 1_048_576.0), ("KiB", 1024.0)] {
         if value >= size {
@@ -55,12 +55,12 @@ pub fn bytes(value: f64) -> String {
     format!("{} B", number(value, 0))
 }
 
-/// A share as percent.
+/// Formats a share as percent.
 pub fn percent(share: f64) -> String {
     format!("{} %", number(share * 100.0, if share.abs() < 0.1 { 1 } else { 0 }))
 }
 
-/// How far a figure is from the paper's.
+/// Formats the deviation of a figure from the paper's, as difference or ratio.
 pub fn deviation(ours: f64, paper: f64, shown: fn(f64) -> String) -> String {
     let difference = ours - paper;
     if shown(ours) == shown(paper) {
@@ -78,13 +78,14 @@ pub fn deviation(ours: f64, paper: f64, shown: fn(f64) -> String) -> String {
     }
 }
 
-/// The interval of an estimate; nothing for a single value, nor where its ends look like the median.
+/// Formats the interval of an estimate; `None` for a single value, and if both ends are formatted as the
+/// median is.
 pub fn interval(estimate: &Estimate, shown: fn(f64) -> String) -> Option<String> {
     let [low, median, high] = [estimate.low, estimate.median, estimate.high].map(shown);
     (estimate.count > 1 && (low != median || high != median)).then(|| format!("{low} to {high}"))
 }
 
-/// Text within XML: markup and quotes replaced, control characters as well.
+/// Escapes text for XML: replaces markup, quotes and control characters.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for char in text.chars() {
@@ -95,7 +96,7 @@ pub fn escape(text: &str) -> String {
             '"' => escaped.push_str("&quot;"),
             '\'' => escaped.push_str("&#39;"),
             '\n' | '\t' => escaped.push(' '),
-            // Neither control characters nor what ends the Unicode planes may be in XML.
+            // XML forbids control characters and the noncharacters U+FFFE and U+FFFF.
             char if char.is_control() || matches!(char, '\u{fffe}' | '\u{ffff}') => escaped.push('\u{fffd}'),
             char => escaped.push(char),
         }
@@ -108,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_as_in_the_paper() {
+    fn numbers_have_the_format_of_the_paper() {
         assert_eq!(ms(15_013.2), "15,013");
         assert_eq!(
             (ms(0.654), ms(9.999), ms(99.96), ms(12.34)),
@@ -125,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn deviations_by_hand() {
+    fn deviations_are_differences_or_ratios() {
         for (ours, paper, expected) in [
             (1.55, 1.55, "same"),
             (1.24, 1.55, "−20 %"),
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_in_a_text_is_markup() {
+    fn markup_and_control_characters_are_escaped() {
         assert_eq!(escape("<a b='c'>&\"\u{1b}\n"), "&lt;a b=&#39;c&#39;&gt;&amp;&quot;\u{fffd} ");
     }
 }

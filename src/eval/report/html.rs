@@ -1,5 +1,5 @@
-//! The report as one HTML file: inline style and SVG, no scripts, nothing that is loaded from elsewhere. It
-//! is also well-formed XML.
+//! Writes the report as one HTML file with inline style and SVG, without scripts and external resources. The
+//! file is also well-formed XML.
 
 use std::fmt::Write as _;
 
@@ -12,29 +12,29 @@ use super::verdict::{Finding, Verdict, mechanism};
 
 const STYLE: &str = include_str!("style.css");
 
-/// How figures are computed, for those who doubt them.
+/// The section on how figures are computed.
 const METHOD: [&str; 7] = [
-    "Latency is from the stamp that the publisher puts into the sample just before its publish call to the \
-     moment the subscriber has it in hand, both on the same clock. A sample belongs to the measured window \
-     by its stamp.",
-    "The rate is that of attempts to publish, over windows of 5 s that slide by 1 s and lie wholly within \
-     the measured window: mean and population standard deviation over these windows, as the paper defines \
-     them.",
-    "Percentiles are interpolated linearly between the two nearest values. A cumulative distribution has the \
-     samples of all repetitions.",
-    "Of several repetitions the median is shown, with the interval of order statistics that contains the \
-     true median with 95 % confidence. With fewer than six repetitions no such interval exists; then \
-     smallest to largest is shown, which contains it with 94 % confidence for five, 75 % for three, 50 % for \
-     two.",
-    "A critical sample is lost when the publisher's writer took it and the subscriber never had it, and late \
-     when it came after the next one was due.",
-    "Samples held: those that the publisher's writer took and the remote subscriber has not yet received in \
-     order; a RELIABLE writer must keep at least these.",
-    "The applied loss is that of the packets that the impaired links judged, with the standard error of a \
-     correlated chain.",
+    "Latency is the time from the stamp that the publisher puts into the sample just before its publish call \
+     to the reception by the subscriber's program, both on the same clock. A sample belongs to the measured \
+     window by its stamp.",
+    "The rate is that of attempts to publish, over windows of 5 s that slide by 1 s and lie completely \
+     within the measured window: mean and population standard deviation over these windows, as the paper \
+     defines them.",
+    "Percentiles are interpolated linearly between the two nearest values. A cumulative distribution \
+     contains the samples of all repetitions.",
+    "For several repetitions the median is shown, with the interval of order statistics that contains the \
+     true median with 95 % confidence. With fewer than six repetitions no such interval exists; then the \
+     range from the smallest to the largest value is shown, which contains the true median with 94 % \
+     confidence for five, 75 % for three, 50 % for two.",
+    "A critical sample is lost if the publisher's writer accepted it and the subscriber never received it, \
+     and late if it was received after the next one was due.",
+    "Samples held: those that the publisher's writer accepted and the remote subscriber has not yet received \
+     in order; a RELIABLE writer must keep at least these.",
+    "The applied loss is that of the packets that arrived at the impaired links while they were on, with the \
+     standard error of a correlated chain.",
 ];
 
-/// Writes the page.
+/// Writes the report as HTML.
 pub fn page(results: &Results, findings: &[Finding], context: &Context) -> String {
     let mut page = String::new();
     let _ = write!(
@@ -45,9 +45,9 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
          <title>Adaptive Bridge: evaluation</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n"
     );
     header(&mut page, context);
-    glance(&mut page, results, findings);
+    verdicts(&mut page, results, findings);
     settings(&mut page, results);
-    cross(&mut page, results);
+    both_libraries(&mut page, results);
     page.push_str("<h2 id=\"table-1\">Impairment</h2>\n");
     for reading in ["as-printed", "as-run"] {
         table(&mut page, &tables::table_i(results, reading));
@@ -73,8 +73,8 @@ fn header(page: &mut String, context: &Context) {
     }
 }
 
-fn glance(page: &mut String, results: &Results, findings: &[Finding]) {
-    if let Some(text) = tables::in_short(results) {
+fn verdicts(page: &mut String, results: &Results, findings: &[Finding]) {
+    if let Some(text) = tables::summary_sentence(results) {
         let _ = writeln!(page, "<p class=\"short\">{}</p>", escape(&text));
     }
     page.push_str("<h2 id=\"verdicts\">Verdicts</h2>\n<div class=\"cards\">\n");
@@ -103,7 +103,8 @@ const fn verdict_class(verdict: Verdict) -> &'static str {
     }
 }
 
-/// Tables and figures of each setting. The one nearest to the paper's is open, the others are a touch away.
+/// Writes tables and figures of each setting. The setting nearest to the paper's is expanded, the others are
+/// collapsed.
 fn settings(page: &mut String, results: &Results) {
     page.push_str("<h2 id=\"settings\">Tables II and III, Figures 4 and 5</h2>\n");
     let nearest = results.nearest_to_paper();
@@ -125,14 +126,14 @@ fn setting(page: &mut String, results: &Results, place: &Place, reading: &str, i
         escape(&place.bed_name()),
     );
     table(page, &tables::table_ii(results, place, reading));
-    let why: Vec<(&Cell, String)> = ["mild", "moderate", "strong"]
+    let causes: Vec<(&Cell, String)> = ["mild", "moderate", "strong"]
         .iter()
         .filter_map(|level| results.cell(place, reading, &format!("baseline_{level}")))
         .filter_map(|cell| Some((cell, mechanism(cell)?)))
         .collect();
-    if !why.is_empty() {
-        page.push_str("<p>Why, as the baselines' own figures tell:</p>\n<ul>\n");
-        for (cell, text) in why {
+    if !causes.is_empty() {
+        page.push_str("<p>The causes, from the figures of the baselines:</p>\n<ul>\n");
+        for (cell, text) in causes {
             let _ = writeln!(page, "<li><b>{}</b>: {}</li>", escape(&cell.scenario), escape(&text));
         }
         page.push_str("</ul>\n");
@@ -146,7 +147,7 @@ fn setting(page: &mut String, results: &Results, place: &Place, reading: &str, i
     figure(page, "Figure 5, top: critical latency, no bridge", &baseline);
     figure(page, "Figure 5, bottom: critical latency with the bridge", &bridge);
     page.push_str("</div>\n");
-    table(page, &tables::beyond(results, place, reading));
+    table(page, &tables::publisher_and_critical(results, place, reading));
     table(page, &tables::remote(results, place, reading));
     let usage = tables::usage(results, place, reading);
     if !usage.rows.is_empty() {
@@ -159,7 +160,8 @@ fn setting(page: &mut String, results: &Results, place: &Place, reading: &str, i
 }
 
 fn timelines(page: &mut String, results: &Results, place: &Place, reading: &str) {
-    /// Shown at once, as they tell the story: the baseline at its worst, the bridge then, and the toggle.
+    /// The scenarios whose time lines are not collapsed: the strongest loss without and with the bridge, and
+    /// the toggle.
     const OPEN: [&str; 3] = ["baseline_strong", "bridge_strong", "bridge_toggle"];
     page.push_str(
         "<h3>Time lines</h3>\n<p>The first repetition of each scenario; shaded while the link is \
@@ -188,7 +190,7 @@ fn timelines(page: &mut String, results: &Results, place: &Place, reading: &str)
     }
 }
 
-fn cross(page: &mut String, results: &Results) {
+fn both_libraries(page: &mut String, results: &Results) {
     let mut beds: Vec<(&str, &str)> =
         results.places().into_iter().map(|place| (place.bed.as_str(), place.switch.as_str())).collect();
     beds.sort_unstable();
@@ -204,7 +206,7 @@ fn cross(page: &mut String, results: &Results) {
 }
 
 fn rules(page: &mut String, findings: &[Finding]) {
-    page.push_str("<h2 id=\"rules\">How the verdicts come about</h2>\n");
+    page.push_str("<h2 id=\"rules\">How the verdicts are computed</h2>\n");
     for (index, finding) in findings.iter().enumerate() {
         let _ = writeln!(
             page,
@@ -232,7 +234,7 @@ fn rules(page: &mut String, findings: &[Finding]) {
             page.push_str("</tbody></table></div>\n");
         }
         if !finding.missing.is_empty() {
-            page.push_str("<p>Not run, and needed for the whole verdict:</p>\n<ul class=\"missing\">\n");
+            page.push_str("<p>Not run, but needed for a full verdict:</p>\n<ul class=\"missing\">\n");
             for one in &finding.missing {
                 let _ = writeln!(page, "<li>{}</li>", escape(one));
             }
@@ -243,19 +245,19 @@ fn rules(page: &mut String, findings: &[Finding]) {
 }
 
 fn runs(page: &mut String, results: &Results, context: &Context) {
-    page.push_str("<h2 id=\"runs\">What was run, on what</h2>\n<dl>\n");
-    for (what, values) in &context.facts {
-        let _ = writeln!(page, "<dt>{}</dt>", escape(what));
+    page.push_str("<h2 id=\"runs\">Runs, machine and software</h2>\n<dl>\n");
+    for (name, values) in &context.facts {
+        let _ = writeln!(page, "<dt>{}</dt>", escape(name));
         for value in values {
             let _ = writeln!(page, "<dd>{}</dd>", escape(value));
         }
     }
     page.push_str("</dl>\n");
-    list(page, "Doubtful", &context.doubts);
+    list(page, "Problems of runs", &context.problems);
     let unusable: Vec<String> =
         results.unusable.iter().map(|(name, reason)| format!("{name}: {reason}")).collect();
     list(page, "Failed or unreadable", &unusable);
-    list(page, "Of the paper's scenarios, not run", &context.not_run);
+    list(page, "Scenarios of the paper that were not run", &context.not_run);
     let _ = writeln!(page, "<details><summary>All {} runs</summary>\n<ul>", results.runs.len());
     for run in &results.runs {
         let _ = writeln!(page, "<li>{}</li>", escape(&run.manifest.run));

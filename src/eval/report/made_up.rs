@@ -1,4 +1,4 @@
-//! Runs made up for unit tests, with figures that are known beforehand.
+//! Synthetic runs for unit tests, with known figures.
 
 use serde_json::json;
 
@@ -9,26 +9,27 @@ use super::record::{
 };
 use crate::eval::statistics::{Change, Reception};
 
-/// What a made-up run is to show.
+/// The properties of a synthetic run.
 #[derive(Clone)]
 pub struct MadeUp {
     pub scenario: &'static str,
     pub library: &'static str,
-    /// Empty for none.
+    /// The reading of Table I; empty for none.
     pub reading: &'static str,
     pub switch: &'static str,
     pub quick: bool,
     pub length_s: u32,
     pub rate_hz: f64,
-    /// Of every critical sample but the slowest tenth, and of these.
+    /// Latency of nine critical samples in ten.
     pub latency_ms: f64,
+    /// Latency of every tenth critical sample.
     pub tail_ms: f64,
-    /// So many samples in the middle of the run do not reach the critical subscriber.
+    /// The number of samples in the middle of the run that the critical subscriber does not receive.
     pub lost: u64,
     pub lane_bytes_per_s: u64,
     pub wire_bytes_per_s: u64,
     pub fragments_per_s: u64,
-    /// Seconds from each toggle to the classifier's answer.
+    /// Seconds from each toggle to the classifier's reaction.
     pub reaction_s: Option<f64>,
     pub toggles: Vec<(f64, bool)>,
 }
@@ -94,7 +95,7 @@ impl MadeUp {
         .unwrap()
     }
 
-    /// The run.
+    /// Creates the run.
     pub fn run(&self) -> Run {
         let manifest = self.manifest();
         let count = (f64::from(self.length_s) * self.rate_hz) as u64;
@@ -169,7 +170,7 @@ impl MadeUp {
     }
 }
 
-/// What these runs show together.
+/// Groups synthetic runs into results.
 pub fn results(runs: &[MadeUp]) -> Results {
     Results::new(Folder { runs: runs.iter().map(MadeUp::run).collect(), unusable: Vec::new() })
 }

@@ -1,4 +1,4 @@
-//! The report as Markdown: verdicts and tables, without figures.
+//! Writes the report as Markdown: verdicts and tables, without figures.
 
 use std::fmt::Write as _;
 
@@ -7,13 +7,13 @@ use super::context::Context;
 use super::tables::{self, Field, Table};
 use super::verdict::{Finding, mechanism};
 
-/// Writes the page.
+/// Writes the report as Markdown.
 pub fn page(results: &Results, findings: &[Finding], context: &Context) -> String {
     let mut page = format!("# Adaptive Bridge: evaluation\n\n{}\n", plain(&context.summary));
     for warning in &context.warnings {
         let _ = write!(page, "\n**{}**\n", plain(warning));
     }
-    if let Some(text) = tables::in_short(results) {
+    if let Some(text) = tables::summary_sentence(results) {
         let _ = write!(page, "\n{}\n", plain(&text));
     }
     page.push_str("\n## Verdicts\n\n");
@@ -36,7 +36,7 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
                 }
             }
             table(&mut page, &tables::table_iii(results, place, &reading));
-            table(&mut page, &tables::beyond(results, place, &reading));
+            table(&mut page, &tables::publisher_and_critical(results, place, &reading));
             table(&mut page, &tables::remote(results, place, &reading));
         }
     }
@@ -53,7 +53,7 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
             }
         }
     }
-    page.push_str("\n## How the verdicts come about\n");
+    page.push_str("\n## How the verdicts are computed\n");
     for finding in findings {
         let _ =
             write!(page, "\n### {}: {}\n\n{}\n\n", finding.id, plain(&finding.title), plain(finding.claim));
@@ -68,14 +68,14 @@ pub fn page(results: &Results, findings: &[Finding], context: &Context) -> Strin
             let _ = write!(page, "\nNot run: {}.\n", missing.join("; "));
         }
     }
-    page.push_str("\n## What was run, on what\n\n");
-    for (what, values) in &context.facts {
+    page.push_str("\n## Runs, machine and software\n\n");
+    for (name, values) in &context.facts {
         let values: Vec<String> = values.iter().map(|value| plain(value)).collect();
-        let _ = writeln!(page, "- {}: {}", plain(what), values.join("; "));
+        let _ = writeln!(page, "- {}: {}", plain(name), values.join("; "));
     }
     let unusable = results.unusable.iter().map(|(name, reason)| format!("{name}: {reason}"));
     let lists = [
-        ("Doubtful", context.doubts.clone()),
+        ("Problems of runs", context.problems.clone()),
         ("Failed or unreadable", unusable.collect()),
         ("Not run", context.not_run.clone()),
     ];
@@ -114,7 +114,7 @@ fn field(field: &Field) -> String {
     text
 }
 
-/// Text that no markup is read into.
+/// Escapes text so that Markdown does not interpret it.
 fn plain(text: &str) -> String {
     let mut plain = String::with_capacity(text.len());
     for char in text.chars() {

@@ -1,4 +1,4 @@
-//! The figures of one run.
+//! Computes the figures of one run.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -8,73 +8,81 @@ use crate::eval::statistics::{
     received, share_in, sliding_rate,
 };
 
-/// A publish call that takes longer than this held its publisher up: half a period at the paper's 30 Hz.
+/// A publish call that takes longer than this counts as blocked: half a period at the paper's 30 Hz.
 pub const BLOCKED_MS: f64 = 1000.0 / 60.0;
 
-/// What a run showed. Latencies and rates are of samples whose attempt to publish is in the measured window.
+/// The figures of a run. Latencies and rates are of samples whose attempt to publish is in the measured
+/// window.
 #[derive(Clone, Debug, Default)]
 pub struct Measures {
-    /// Attempts to publish per second, mean over the paper's windows; of several publishers the slowest.
+    /// Attempts to publish per second, mean over the paper's windows; of several publishers, the slowest.
     pub rate_hz: Option<f64>,
-    /// Its standard deviation over these windows; of several publishers the largest.
+    /// Standard deviation of the rate over these windows; of several publishers, the largest.
     pub rate_std_hz: Option<f64>,
-    /// What `rate_hz` should be.
+    /// The configured rate of a publisher.
     pub nominal_hz: f64,
-    /// Attempts, and those of them that failed and that took longer than [`BLOCKED_MS`].
+    /// Attempts to publish.
     pub attempts: usize,
+    /// Attempts that failed.
     pub failed: usize,
+    /// Attempts that took longer than [`BLOCKED_MS`].
     pub blocked: usize,
-    /// Times of the publish call.
+    /// Durations of publish calls.
     pub call_ms: Distribution,
     /// Latencies of the critical subscribers.
     pub critical_ms: Distribution,
-    /// What they received of what was published.
+    /// Samples that the critical subscribers received and missed.
     pub critical: Received,
-    /// The longest time in which one of them received nothing.
+    /// The longest time in which a critical subscriber received no sample.
     pub critical_gap_ms: Option<f64>,
-    /// Latencies and receptions per second of the remote subscribers; of several the slowest.
+    /// Latencies of the remote subscribers.
     pub noncritical_ms: Distribution,
+    /// Receptions per second of a remote subscriber; of several, the slowest.
     pub noncritical_hz: Option<f64>,
-    /// Most samples that the writer had to hold for a remote subscriber of the publisher's own topic.
+    /// The largest number of samples that the writer had to hold for a remote subscriber of the publisher's
+    /// own topic.
     pub outstanding_max: Option<usize>,
-    /// Changes of the classifier's state, of all subscribers.
+    /// Transitions of the classifier, of all subscribers.
     pub transitions: Option<u64>,
-    /// What the classifier made of each switching of the link.
+    /// The classifier's reactions to toggles of the link.
     pub reactions: Vec<Reaction>,
     /// The share of the impaired time in which the noncritical lane was degraded.
     pub degraded_share: Option<f64>,
     /// Bytes of payload per second that the noncritical lanes sent while a link was impaired.
     pub lane_impaired_bytes_per_s: Option<f64>,
-    /// Bytes per second on the wire towards the remote hosts: while impaired, and in all.
+    /// Bytes per second on the wire to the remote hosts while a link was impaired.
     pub wire_impaired_bytes_per_s: Option<f64>,
+    /// Bytes per second on the wire to the remote hosts.
     pub wire_bytes_per_s: Option<f64>,
-    /// IP fragments towards the remote hosts.
+    /// IP fragments sent to the remote hosts.
     pub fragments_to_remote: Option<u64>,
-    /// Repair traffic: what readers asked for again, and heartbeats.
+    /// Repair requests (ACKNACK and NACK_FRAG) from the remote hosts.
     pub acknacks: Option<u64>,
+    /// Heartbeats to the remote hosts.
     pub heartbeats: Option<u64>,
-    /// The most memory that incomplete datagrams held at the host between, and datagrams given up there.
+    /// The largest memory of incomplete datagrams at the switch.
     pub fragment_memory_max_bytes: Option<u64>,
+    /// Incomplete datagrams that the switch discarded.
     pub reassembly_failed: Option<u64>,
-    /// Datagrams that hosts lost for want of a receive buffer: then the test bed itself was too slow.
+    /// Datagrams that hosts dropped because a receive buffer was full; if any, the test bed was too slow.
     pub udp_buffer_errors: Option<u64>,
-    /// Each process.
+    /// CPU time and memory of each process.
     pub usage: BTreeMap<String, Usage>,
-    /// Lanes whose samples were not all accounted for.
-    pub not_whole: Option<usize>,
+    /// Lanes of routes with samples that were neither forwarded nor counted under a drop reason.
+    pub unaccounted_lanes: Option<usize>,
 }
 
-/// What a process used.
+/// CPU time and memory of a process.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Usage {
     /// CPU time per time, in percent of one core.
     pub cpu_percent: f64,
-    /// The most resident memory.
+    /// The largest resident memory.
     pub rss_max_bytes: u64,
 }
 
 impl Measures {
-    /// Computes them.
+    /// Computes the figures of a run.
     pub fn of(run: &Run) -> Self {
         let mut measures = Self::default();
         measures.measure_publishers(run);
@@ -109,7 +117,7 @@ impl Measures {
         let mut latencies = Vec::new();
         for subscriber in run.of_role(Role::Critical) {
             let written = written_for(run, subscriber);
-            // Later than the next sample is due: a robot would rather have had that one.
+            // A sample is late once the next one is due, which is more useful to a robot.
             let late_ms = 1000.0 / subscriber.endpoint.rate_hz;
             let receptions = of_window(subscriber, &written);
             let one = received(written.iter().map(|(_, seq)| *seq), &receptions, late_ms);
@@ -134,7 +142,7 @@ impl Measures {
             let in_window = |at_s: f64| (0.0..run.length_s()).contains(&at_s);
             let received = subscriber.receptions.iter().filter(|reception| in_window(reception.at_s)).count();
             self.noncritical_hz = lower(self.noncritical_hz, Some(received as f64 / run.length_s()));
-            // A lane's writer is BEST_EFFORT and holds nothing.
+            // A lane's writer is BEST_EFFORT and holds no samples.
             if subscriber.endpoint.lane.is_none() {
                 let most = backlog(run, subscriber).into_iter().map(|(_, held)| held).max();
                 self.outstanding_max = self.outstanding_max.max(most);
@@ -145,7 +153,7 @@ impl Measures {
 
     fn measure_classifier(&mut self, run: &Run) {
         let Some(bridge) = &run.bridge else { return };
-        self.not_whole = Some(bridge.not_whole);
+        self.unaccounted_lanes = Some(bridge.unaccounted_lanes);
         self.lane_impaired_bytes_per_s = growth_per_s(&bridge.noncritical_bytes, &run.impaired_spans());
         if run.manifest.classifier != Some(true) {
             self.transitions = Some(0);
@@ -212,11 +220,10 @@ impl Measures {
                 self.acknacks = sum(self.acknacks, Some(grown));
             }
         }
-        let between = || run.kernel.iter().filter(|reading| reading.host == "switch");
-        self.fragment_memory_max_bytes = between().map(|reading| reading.fragment_memory_bytes).max();
-        if let (Some(first), Some(last)) = (between().next(), between().next_back()) {
-            let given_up = |reading: &super::record::KernelReading| reading.reassembly_failed;
-            self.reassembly_failed = Some(given_up(last).saturating_sub(given_up(first)));
+        let switch = || run.kernel.iter().filter(|reading| reading.host == "switch");
+        self.fragment_memory_max_bytes = switch().map(|reading| reading.fragment_memory_bytes).max();
+        if let (Some(first), Some(last)) = (switch().next(), switch().next_back()) {
+            self.reassembly_failed = Some(last.reassembly_failed.saturating_sub(first.reassembly_failed));
         }
         let mut errors: BTreeMap<&str, (u64, u64)> = BTreeMap::new();
         for reading in &run.kernel {
@@ -226,13 +233,13 @@ impl Measures {
         self.udp_buffer_errors = (!errors.is_empty()).then(|| errors.values().map(|span| span.1).sum());
     }
 
-    /// The slowest demotion, or promotion, that came at all, in seconds.
+    /// The slowest demotion (`impaired`) or promotion, in seconds; toggles without a reaction are ignored.
     pub fn slowest_reaction_s(&self, impaired: bool) -> Option<f64> {
         let of_kind = self.reactions.iter().filter(|reaction| reaction.impaired == impaired);
         of_kind.filter_map(|reaction| reaction.after_s).max_by(f64::total_cmp)
     }
 
-    /// What the processes of the bridge used together; `None` without a bridge.
+    /// The sum of CPU time and memory over the bridge's processes; `None` without a bridge.
     pub fn bridge_usage(&self) -> Option<Usage> {
         let of_bridge = |name: &&String| {
             matches!(name.as_str(), "up" | "ingress" | "control") || name.starts_with("egress-")
@@ -246,7 +253,7 @@ impl Measures {
     }
 }
 
-/// Hosts of remote subscribers, each once.
+/// Lists the hosts of remote subscribers without duplicates.
 pub fn remote_hosts(run: &Run) -> Vec<String> {
     let mut hosts: Vec<String> = run.of_role(Role::Slow).map(|one| one.endpoint.host.clone()).collect();
     hosts.sort();
@@ -254,8 +261,9 @@ pub fn remote_hosts(run: &Run) -> Vec<String> {
     hosts
 }
 
-/// Samples that the writer of a remote subscriber's topic had to hold for it, `(seconds, samples)`: right
-/// after each that was written, when they are most, and four times a second, as it may take none for long.
+/// Samples that the writer of a remote subscriber's topic had to hold for it, `(seconds, samples)`: just
+/// after each write, when the number is largest, and four times a second, as the writer may accept none for
+/// long.
 pub fn backlog(run: &Run, subscriber: &Subscribed) -> Vec<(f64, usize)> {
     let publishers = run.published.iter().filter(|one| one.endpoint.route == subscriber.endpoint.route);
     let attempts = publishers.flat_map(|publisher| &publisher.attempts);
@@ -274,7 +282,7 @@ fn in_window<'a>(publisher: &'a Published, run: &Run) -> impl Iterator<Item = &'
     publisher.attempts.iter().filter(move |attempt| (0.0..length_s).contains(&attempt.at_s))
 }
 
-/// Samples that the publisher of a subscriber's route wrote in the window, in order: time and number.
+/// Time and sequence number of the samples that the publisher of a subscriber's route wrote in the window.
 fn written_for(run: &Run, subscriber: &Subscribed) -> Vec<(f64, u64)> {
     let of_route = |one: &&Published| one.endpoint.route == subscriber.endpoint.route;
     let publishers = run.published.iter().filter(of_route);
@@ -282,18 +290,18 @@ fn written_for(run: &Run, subscriber: &Subscribed) -> Vec<(f64, u64)> {
     written.map(|attempt| (attempt.at_s, attempt.seq)).collect()
 }
 
-/// Receptions of these samples.
+/// A subscriber's receptions of these samples.
 fn of_window(subscriber: &Subscribed, written: &[(f64, u64)]) -> Vec<Reception> {
     let numbers: HashSet<u64> = written.iter().map(|(_, seq)| *seq).collect();
     subscriber.receptions.iter().filter(|reception| numbers.contains(&reception.seq)).copied().collect()
 }
 
-/// How much a counter grew per second within spans of time; `None` when it was not read often enough to tell.
+/// The growth of a counter per second within spans of time; `None` without two readings within a span.
 fn growth_per_s(points: &[(f64, u64)], spans: &[(f64, f64)]) -> Option<f64> {
     let (mut grown, mut over_s) = (0.0, 0.0);
     for pair in points.windows(2) {
         let [(from_s, from), (to_s, to)] = [pair[0], pair[1]];
-        // Readings are a second apart, and only those wholly within a span count.
+        // Readings are a second apart; only pairs completely within a span count.
         if to_s > from_s && spans.iter().any(|span| span.0 <= from_s && to_s <= span.1) {
             grown += to.saturating_sub(from) as f64;
             over_s += to_s - from_s;
@@ -312,7 +320,7 @@ fn usage(run: &Run) -> BTreeMap<String, Usage> {
         last_s = last_s.max(reading.at_s);
         let used = usage.entry(reading.process.clone()).or_default();
         used.rss_max_bytes = used.rss_max_bytes.max(reading.rss_bytes);
-        // The first reading of a process only says where it stands.
+        // The first reading of a process gives the initial value.
         if let Some(before) = last.insert((&reading.process, reading.pid), reading.cpu_ms) {
             used.cpu_percent += (reading.cpu_ms - before).max(0.0);
         }
@@ -350,7 +358,7 @@ mod tests {
     use crate::eval::report::record::ProcessReading;
 
     #[test]
-    fn figures_of_a_run_by_hand() {
+    fn figures_of_a_run_match_those_calculated_by_hand() {
         let run = MadeUp {
             scenario: "bridge_moderate",
             reading: "as-run",
@@ -366,8 +374,8 @@ mod tests {
         assert_eq!(measures.critical, Received { samples: 597, lost: 3, late: 60, ..Received::default() });
         assert_eq!(measures.critical_ms.quantile(0.5), Some(0.5));
         assert_eq!(measures.critical_ms.max(), Some(40.0));
-        // Three samples are missing after a late one: four periods, less what that one was later than the
-        // next.
+        // Three samples are missing after a late one: four periods, less the difference between the latencies
+        // of the late sample and the next.
         let gap_ms = measures.critical_gap_ms.unwrap();
         assert!((gap_ms - (4000.0 / 30.0 - 39.5)).abs() < 1e-6, "{gap_ms}");
         assert_eq!((measures.wire_bytes_per_s, measures.wire_impaired_bytes_per_s), (Some(1e4), Some(1e4)));
@@ -375,15 +383,15 @@ mod tests {
         assert_eq!(measures.transitions, Some(1));
         assert_eq!(measures.slowest_reaction_s(true), Some(5.0));
         assert_eq!(measures.slowest_reaction_s(false), None);
-        // Nothing is held for the subscriber of a lane.
+        // The writer of a lane holds no samples.
         assert_eq!(measures.outstanding_max, None);
         let baseline = MadeUp { tail_ms: 90.0, ..MadeUp::default() };
-        // The slow sample, and the two that were published while it was on its way.
+        // The slow sample, and the two that were published while it was in transit.
         assert_eq!(Measures::of(&baseline.run()).outstanding_max, Some(3));
     }
 
     #[test]
-    fn the_classifier_has_no_transitions_where_it_is_off() {
+    fn a_disabled_classifier_has_no_transitions() {
         let run = MadeUp { scenario: "bridge_ablation", reading: "as-run", ..MadeUp::default() };
         let measures = Measures::of(&run.run());
         assert_eq!((measures.transitions, measures.reactions.len()), (Some(0), 0));
@@ -391,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_was_started_again_has_the_time_of_both() {
+    fn cpu_time_of_a_restarted_process_is_the_sum_of_both() {
         let mut run = MadeUp::default().run();
         let reading = |at_s: f64, pid, cpu_ms| ProcessReading {
             at_s,
@@ -411,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn growth_is_of_whole_seconds_within_the_spans() {
+    fn growth_counts_whole_seconds_within_the_spans() {
         let points: Vec<(f64, u64)> =
             (0..10).map(|second| (f64::from(second) + 0.5, second as u64 * 100)).collect();
         assert_eq!(growth_per_s(&points, &[(0.0, 10.0)]), Some(100.0));

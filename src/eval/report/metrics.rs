@@ -1,11 +1,11 @@
-//! Every figure that has a name in the CSV files, in their order.
+//! The figures that the CSV files contain, in the order of their columns.
 
 use super::measures::Measures;
 use super::paper;
 
 /// A figure of a run.
 pub struct Metric {
-    /// Its column; the unit is part of it.
+    /// The name of its column, with the unit.
     pub key: &'static str,
     pub of: fn(&Measures) -> Option<f64>,
 }
@@ -14,7 +14,7 @@ const fn metric(key: &'static str, of: fn(&Measures) -> Option<f64>) -> Metric {
     Metric { key, of }
 }
 
-/// All of them. Keys may be added, and are not renamed without a line in the changelog.
+/// All figures. Keys may be added; a renamed key needs an entry in the changelog.
 pub const METRICS: [Metric; 36] = [
     metric("critical_p50_ms", |one| one.critical_ms.quantile(0.50)),
     metric("critical_p95_ms", |one| one.critical_ms.quantile(0.95)),
@@ -54,7 +54,7 @@ pub const METRICS: [Metric; 36] = [
     metric("bridge_rss_bytes", |one| one.bridge_usage().map(|usage| usage.rss_max_bytes as f64)),
 ];
 
-/// The paper's value of a figure, where it has one.
+/// The paper's value of a figure; `None` if the paper does not have it.
 pub fn paper_value(scenario: &str, library: &str, key: &str) -> Option<f64> {
     let cross = paper::TABLE_IV.iter().find(|row| row.scenario == scenario);
     match (library, key) {
@@ -85,7 +85,7 @@ mod tests {
         assert_eq!(paper_value("baseline_strong", "fast", "critical_p95_ms"), Some(15_043.0));
         assert_eq!(paper_value("bridge_toggle", "fast", "classifier_transitions"), Some(9.0));
         assert_eq!(paper_value("bridge_mild", "cyclone", "critical_p99_ms"), Some(1.9));
-        // The paper has no Table II of Cyclone DDS, and nothing of RustDDS.
+        // The paper has no Table II for Cyclone DDS, and no figures for RustDDS.
         assert_eq!(paper_value("baseline_strong", "cyclone", "critical_p95_ms"), None);
         assert_eq!(paper_value("bridge_mild", "rust", "critical_p99_ms"), None);
     }

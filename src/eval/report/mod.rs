@@ -1,5 +1,5 @@
-//! The report of a folder of results: the paper's tables and figures remade beside its own values, what it
-//! did not measure, and verdicts on its hypotheses.
+//! The report of a folder of results: the paper's tables and figures with our values beside the paper's,
+//! further figures that the paper does not have, and verdicts on its hypotheses.
 
 mod cells;
 mod context;
@@ -28,25 +28,25 @@ use cells::Results;
 use context::Context;
 use record::Folder;
 
-/// What was written.
+/// A summary of the written report, for the terminal.
 #[derive(Debug)]
 pub struct Written {
-    /// The files.
+    /// The paths of the written files.
     pub files: Vec<PathBuf>,
     /// The verdicts, a line each.
     pub verdicts: Vec<String>,
-    /// What a reader must know before any figure.
+    /// Warnings that apply to the whole report.
     pub warnings: Vec<String>,
-    /// Runs that are not in the report, and why.
+    /// Runs that are not in the report, with the reason.
     pub unusable: Vec<String>,
 }
 
 /// Reads the results in `results` and writes `report.html`, `report.md`, `figures.csv`, `runs.csv` and
-/// `verdicts.csv` into `out`, which is made if it isn't there.
+/// `verdicts.csv` into `out`, which is created if it does not exist.
 ///
 /// # Errors
-/// There are no results, or a file can't be read or written. A run that can't be read is told in the report,
-/// and is no error.
+/// There are no results, or a file cannot be read or written. A run that cannot be read is no error; the
+/// report lists it.
 pub fn write(results: &Path, out: &Path) -> Result<Written, ReportError> {
     let results = Results::new(Folder::read(results)?);
     let findings = verdict::findings(&results);

@@ -1,15 +1,15 @@
 //! The paper's own figures: "Adaptive Bridge: A Proxy-Based Decoupling Layer for Mitigating DDS
-//! Backpressure in ROS 2", Tables I to IV and the text of section V. Nothing else of the source has one of
-//! them.
+//! Backpressure in ROS 2", Tables I to IV and the text of section V. No other module of the report contains
+//! the paper's figures.
 
 use crate::eval::impairment::Level;
 
 /// A row of Table I, in percent.
 pub struct Impaired {
     pub level: Level,
-    /// Good to bad, bad to good, loss in good, loss in bad; `None` in the clean row.
+    /// From good to bad, from bad to good, loss in good, loss in bad; `None` in the clean row.
     pub parameters: Option<[f64; 4]>,
-    /// "Avg loss".
+    /// The column "Avg loss".
     pub loss_percent: f64,
 }
 
@@ -21,21 +21,21 @@ pub const TABLE_I: [Impaired; 4] = [
     Impaired { level: Level::Strong, parameters: Some([2.0, 10.0, 1.0, 50.0]), loss_percent: 9.2 },
 ];
 
-/// What the links of the paper's harness really lost, by the counters that it saved.
+/// The loss that the links of the paper's harness applied, by the counters that it saved.
 pub const LOSS_AS_RUN_PERCENT: [f64; 4] = [0.0, 28.0, 33.0, 42.0];
 
 /// A row of Table II or III, on Fast DDS.
 pub struct Row {
-    /// The scenario's name here.
+    /// The scenario's name in this harness.
     pub scenario: &'static str,
-    /// And there.
+    /// The scenario's name in the paper.
     pub title: &'static str,
     pub p50_ms: f64,
     pub p95_ms: f64,
     pub rate_hz: f64,
-    /// Table II; for Table III section V-B says 0.0 for all.
+    /// From Table II; for Table III, section V-B gives 0.0 for all.
     pub rate_std_hz: f64,
-    /// Table III.
+    /// From Table III.
     pub transitions: Option<u64>,
 }
 
@@ -82,7 +82,7 @@ pub struct CrossRow {
     pub scenario: &'static str,
     pub fast_p99_ms: f64,
     pub cyclone_p99_ms: f64,
-    /// On both.
+    /// The rate with both libraries.
     pub rate_hz: f64,
 }
 
@@ -90,7 +90,7 @@ const fn cross(scenario: &'static str, fast_p99_ms: f64, cyclone_p99_ms: f64) ->
     CrossRow { scenario, fast_p99_ms, cyclone_p99_ms, rate_hz: 30.0 }
 }
 
-/// Table IV.
+/// Table IV, "Cross-RMW Validation: Bridge Scenarios".
 pub const TABLE_IV: [CrossRow; 4] = [
     cross("bridge_clean", 1.7, 1.9),
     cross("bridge_mild", 1.8, 1.9),
@@ -98,16 +98,16 @@ pub const TABLE_IV: [CrossRow; 4] = [
     cross("bridge_strong", 1.8, 1.6),
 ];
 
-/// What the classifier saves of the noncritical bandwidth, section V-E.
+/// The share of the noncritical bandwidth that the classifier saves, section V-E.
 pub const SAVED_PERCENT: f64 = 70.0;
 
-/// By how much the bridge raises the clean p95, Tables II and III, in milliseconds.
+/// The increase of the clean p95 by the bridge, Tables II and III, in milliseconds.
 pub const CLEAN_P95_ADDED_MS: f64 = 1.51 - 0.95;
 
-/// Within what time the classifier answered a toggle, section V-E, in seconds.
+/// The longest time from a toggle to the classifier's reaction, section V-E, in seconds.
 pub const REACTION_S: f64 = 20.0;
 
-/// The row of Table II or III of a scenario.
+/// Finds the row of Table II or III of a scenario.
 pub fn row(scenario: &str) -> Option<&'static Row> {
     TABLE_II.iter().chain(&TABLE_III).find(|row| row.scenario == scenario)
 }
@@ -117,9 +117,9 @@ mod tests {
     use super::*;
     use crate::eval::impairment::Reading;
 
-    /// The parameters that the links use are those printed here, and give the printed loss.
+    /// The links use the parameters of Table I, and these give the printed loss.
     #[test]
-    fn table_i_is_what_the_links_run() {
+    fn the_links_use_the_parameters_of_table_i() {
         for (row, as_run) in TABLE_I.iter().zip(LOSS_AS_RUN_PERCENT) {
             let printed = row.level.model(Reading::AsPrinted);
             if let Some(percent) = row.parameters {
@@ -132,7 +132,7 @@ mod tests {
         }
     }
 
-    /// Figures that the abstract and the text repeat.
+    /// Checks figures that the abstract and the text repeat.
     #[test]
     fn the_tables_agree_with_the_text() {
         let strong = row("baseline_strong").unwrap();

@@ -1,4 +1,4 @@
-//! The report's tables, which HTML and Markdown both show.
+//! Builds the report's tables, which both HTML and Markdown show.
 
 use super::cells::{Cell, Place, Results, reading_name};
 use super::format::{self, deviation, interval};
@@ -9,7 +9,7 @@ use super::record::LinkOutcome;
 use crate::eval::impairment::{Level, Reading};
 use crate::eval::statistics::Estimate;
 
-/// A table.
+/// A table with title, note, header and rows.
 pub struct Table {
     pub title: String,
     pub note: String,
@@ -20,27 +20,27 @@ pub struct Table {
 /// A field of a table.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Field {
-    /// What was found.
+    /// The measured value, or a text.
     pub text: String,
     /// The interval over repetitions.
     pub interval: Option<String>,
     /// The paper's value.
     pub paper: Option<String>,
-    /// How far from it.
+    /// The deviation from the paper's value.
     pub deviation: Option<String>,
-    /// Whether there is nothing to show.
+    /// Whether there is no value.
     pub is_missing: bool,
 }
 
 impl Field {
-    /// Words.
+    /// Creates a field with a text.
     pub fn text(text: impl Into<String>) -> Self {
         Self { text: text.into(), ..Self::default() }
     }
 
-    /// Nothing, and why.
-    pub fn missing(why: &str) -> Self {
-        Self { text: why.to_owned(), is_missing: true, ..Self::default() }
+    /// Creates a field without a value, with the reason.
+    pub fn missing(reason: &str) -> Self {
+        Self { text: reason.to_owned(), is_missing: true, ..Self::default() }
     }
 
     fn with_paper(mut self, ours: Option<f64>, paper: Option<f64>, shown: fn(f64) -> String) -> Self {
@@ -50,7 +50,7 @@ impl Field {
     }
 }
 
-/// A figure: its key among the metrics, and how it is written.
+/// A column of a table: its title, the key of its metric, and the format of its values.
 struct Column {
     title: &'static str,
     key: &'static str,
@@ -85,7 +85,7 @@ fn estimated(estimate: &Estimate, shown: fn(f64) -> String) -> Field {
     Field { text: shown(estimate.median), interval: interval(estimate, shown), ..Field::default() }
 }
 
-/// Table I: what the links are to lose in a reading, and what they lost.
+/// Builds Table I: the parameters and expected losses of a reading, and the applied losses.
 pub fn table_i(results: &Results, reading: &str) -> Table {
     let model_of = if reading == "as-run" { Reading::AsRun } else { Reading::AsPrinted };
     let rows = paper::TABLE_I.iter().zip(paper::LOSS_AS_RUN_PERCENT).map(|(row, as_run)| {
@@ -111,11 +111,11 @@ pub fn table_i(results: &Results, reading: &str) -> Table {
     Table {
         title: format!("Table I, {}: impairment", reading_name(reading)),
         note: format!(
-            "{} Applied: packets lost of those that the links judged, over all seeds of this reading, \
-             with the 95 % interval of the correlated chain.",
+            "{} Applied loss: the share lost of the packets that arrived while a link was on, over all seeds \
+             of this reading, with the 95 % interval of the correlated chain.",
             if model_of == Reading::AsRun {
-                "The paper's harness passes the losses of the two states to netem in the wrong order, and \
-                 its own counters show what came of it; the paper's figures were measured so."
+                "The paper's harness passes the losses of the two states to netem in the wrong order, as its \
+                 counters show; the paper's figures were measured with these losses."
             } else {
                 "The parameters as the paper prints them."
             }
@@ -142,7 +142,7 @@ fn level_name(level: Level) -> &'static str {
     }
 }
 
-/// The loss that links of a level really applied.
+/// The loss that the links of a level applied, by their counters.
 fn applied(results: &Results, reading: &str, level: &str) -> Field {
     let (mut judged, mut lost, mut variance) = (0_u64, 0_u64, 0.0);
     let runs = results.runs.iter().map(|run| &run.manifest);
@@ -169,8 +169,8 @@ fn applied(results: &Results, reading: &str, level: &str) -> Field {
     }
 }
 
-/// Links whose losses have nothing to do with each other: of those with the same seed, whose losses are the
-/// same as far as they go, the one that judged the most packets.
+/// Selects links with independent losses. Links with the same seed have the same sequence of losses; of
+/// these, only the one with the most packets is selected.
 fn independent<'a>(links: impl Iterator<Item = &'a LinkOutcome>) -> Vec<&'a LinkOutcome> {
     let mut independent: Vec<&LinkOutcome> = Vec::new();
     for link in links {
@@ -183,31 +183,31 @@ fn independent<'a>(links: impl Iterator<Item = &'a LinkOutcome>) -> Vec<&'a Link
     independent
 }
 
-/// Table II: the baselines at a place.
+/// Builds Table II: the baselines at a place.
 pub fn table_ii(results: &Results, place: &Place, reading: &str) -> Table {
     let rows = &paper::TABLE_II;
     Table {
         title: "Table II: no bridge".to_owned(),
-        note: of_fast_only(place),
+        note: library_note(place),
         ..scenario_table(results, place, reading, rows, &[P50, P95, P99, RATE, RATE_STD])
     }
 }
 
-/// Table III: the bridge at a place.
+/// Builds Table III: the bridge scenarios at a place.
 pub fn table_iii(results: &Results, place: &Place, reading: &str) -> Table {
     let rows = &paper::TABLE_III;
     Table {
         title: "Table III: with the bridge".to_owned(),
-        note: of_fast_only(place),
+        note: library_note(place),
         ..scenario_table(results, place, reading, rows, &[P50, P95, P99, RATE, RATE_STD, TRANSITIONS])
     }
 }
 
-fn of_fast_only(place: &Place) -> String {
+fn library_note(place: &Place) -> String {
     if place.library == "fast" {
         String::new()
     } else {
-        "The paper has this table of Fast DDS only.".to_owned()
+        "The paper has this table for Fast DDS only.".to_owned()
     }
 }
 
@@ -234,7 +234,7 @@ fn scenario_table(
     }
 }
 
-/// Table IV: the bridge on both libraries, in a test bed with a switch.
+/// Builds Table IV: the bridge scenarios with both libraries, in one kind of test bed and switch.
 pub fn table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -> Table {
     let place =
         |library: &str| Place { library: library.to_owned(), bed: bed.to_owned(), switch: switch.to_owned() };
@@ -262,7 +262,7 @@ pub fn table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -> Ta
     }
 }
 
-/// Whether something was run that Table IV shows.
+/// Whether the results have a run for Table IV.
 pub fn has_table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -> bool {
     let shown = |cell: &Cell| {
         paper::TABLE_IV.iter().any(|row| row.scenario == cell.scenario)
@@ -272,8 +272,9 @@ pub fn has_table_iv(results: &Results, bed: &str, switch: &str, reading: &str) -
     results.cells().any(shown)
 }
 
-/// What the paper did not measure of the publisher and the critical subscriber, of every scenario at a place.
-pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
+/// Builds the table of the publisher's and critical subscriber's figures that the paper does not have, for
+/// every scenario at a place.
+pub fn publisher_and_critical(results: &Results, place: &Place, reading: &str) -> Table {
     const COLUMNS: [Column; 10] = [
         P95,
         Column::new("critical max, ms", "critical_max_ms", format::ms),
@@ -290,14 +291,14 @@ pub fn beyond(results: &Results, place: &Place, reading: &str) -> Table {
         results,
         place,
         reading,
-        "Publisher and critical subscriber, beyond the paper",
-        "Late: received when the next sample was due. Call: the publish call; blocked: longer than half a \
+        "Publisher and critical subscriber: further figures",
+        "Late: received after the next sample was due. Call: the publish call; blocked: longer than half a \
          period at 30 Hz.",
         &COLUMNS,
     )
 }
 
-/// What the remote subscriber got, of every scenario at a place.
+/// Builds the table of the remote subscriber's figures, for every scenario at a place.
 pub fn remote(results: &Results, place: &Place, reading: &str) -> Table {
     const COLUMNS: [Column; 10] = [
         Column::new("rate, Hz", "noncritical_rate_hz", format::hz),
@@ -316,8 +317,9 @@ pub fn remote(results: &Results, place: &Place, reading: &str) -> Table {
         place,
         reading,
         "Remote subscriber",
-        "Of several the slowest. The lane's bytes are the payload that it sends; on the wire are all protocols, probes \
-         and discovery too, less what the link lost. Repair requests: ACKNACK and NACK_FRAG of user data.",
+        "Of several remote subscribers, the slowest. The lane's bytes are the payload that it sends; bytes \
+         on the wire are those of all protocols, including probes and discovery, without those that the \
+         link lost. Repair requests: ACKNACK and NACK_FRAG of user data.",
         &COLUMNS,
     )
 }
@@ -344,7 +346,7 @@ fn every_scenario(
     }
 }
 
-/// What the processes used, of every bridge scenario at a place.
+/// Builds the table of CPU time and memory of the bridge's processes, for every bridge scenario at a place.
 pub fn usage(results: &Results, place: &Place, reading: &str) -> Table {
     let mut rows = Vec::new();
     for cell in results.cells_of(place, reading).into_iter().filter(|cell| cell.bridge) {
@@ -366,14 +368,14 @@ pub fn usage(results: &Results, place: &Place, reading: &str) -> Table {
     }
     Table {
         title: "CPU and memory of each process".to_owned(),
-        note: "CPU: percent of one core, mean over the run. Memory: the most that was resident.".to_owned(),
+        note: "CPU: percent of one core, mean over the run. Memory: the largest resident size.".to_owned(),
         columns: texts(&["scenario", "process", "CPU, %", "memory"]),
         rows,
     }
 }
 
-/// The hardest of the paper's impairments that was run without and with the bridge.
-fn hardest<'a>(
+/// The strongest of the paper's impairments that was run both without and with the bridge.
+fn strongest<'a>(
     results: &'a Results,
     place: &Place,
     reading: &str,
@@ -384,16 +386,16 @@ fn hardest<'a>(
     })
 }
 
-/// What the bridge changes, in a sentence: in the setting nearest to the paper's.
-pub fn in_short(results: &Results) -> Option<String> {
+/// Summarises the effect of the bridge in one sentence, for the setting nearest to the paper's.
+pub fn summary_sentence(results: &Results) -> Option<String> {
     let (place, reading) = results.nearest_to_paper()?;
-    let (level, without, with) = hardest(results, place, &reading)?;
+    let (level, without, with) = strongest(results, place, &reading)?;
     let rate = |cell: &Cell| cell.median(|one| one.rate_hz).map(format::hz);
     let gap =
         |cell: &Cell| cell.median(|one| one.critical_gap_ms).map(|gap_ms| format::number(gap_ms / 1e3, 2));
     Some(format!(
-        "{}, {level} loss {}: without the bridge the publisher comes to {} Hz, and the critical subscriber \
-         waits up to {} s for a sample; with it, {} Hz and {} s.",
+        "{}, {level} loss {}: without the bridge the publisher reaches {} Hz, and the critical subscriber \
+         waits up to {} s for a sample; with the bridge, {} Hz and {} s.",
         place.library_name(),
         reading_name(&reading),
         rate(without)?,
@@ -403,12 +405,12 @@ pub fn in_short(results: &Results) -> Option<String> {
     ))
 }
 
-/// What the bridge changes at each place in the hardest of the paper's impairments.
+/// Builds the table of the bridge's effect at each place, for the strongest of the paper's impairments.
 pub fn headline(results: &Results) -> Table {
     let mut rows = Vec::new();
     for place in results.places() {
         for reading in results.readings(place) {
-            let Some((level, without, with)) = hardest(results, place, &reading) else { continue };
+            let Some((level, without, with)) = strongest(results, place, &reading) else { continue };
             let change = |of: fn(&Measures) -> Option<f64>, shown: fn(f64) -> String| {
                 let one = |cell: &Cell| cell.median(of).map_or_else(|| "–".to_owned(), shown);
                 Field::text(format!("{} → {}", one(without), one(with)))
@@ -432,7 +434,9 @@ pub fn headline(results: &Results) -> Table {
     }
     Table {
         title: "Without → with the bridge".to_owned(),
-        note: "The hardest impairment that was run both ways. Medians over repetitions.".to_owned(),
+        note: "The strongest impairment that was run both without and with the bridge. Medians over \
+               repetitions."
+            .to_owned(),
         columns: texts(&[
             "where",
             "publisher, Hz",

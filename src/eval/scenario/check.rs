@@ -1,19 +1,19 @@
-//! What is wrong with a scenario that reads well.
+//! Checks the values of a scenario whose file has been parsed.
 
 use std::collections::BTreeSet;
 
 use super::{Action, Scenario, Variant};
 use crate::eval::impairment::Level;
 
-/// Names that are taken for hosts, endpoints and processes.
+/// Names of hosts, endpoints and processes that remote subscribers must not have.
 const RESERVED: [&str; 6] = ["publisher", "bridge", "critical", "switch", "up", "control"];
 
-/// Each value that can't be, with its key.
+/// Lists each invalid value with its key.
 pub(super) fn problems(scenario: &Scenario) -> Vec<String> {
     let mut found = Vec::new();
     let mut range = |key: &str, value: f64, min: f64, max: f64| {
         if !(min..=max).contains(&value) {
-            found.push(format!("{key} is {value}, and may be {min} to {max}"));
+            found.push(format!("{key} is {value}, but must be {min} to {max}"));
         }
     };
     range("duration_s", scenario.duration_s, 1.0, 86_400.0);
@@ -21,7 +21,7 @@ pub(super) fn problems(scenario: &Scenario) -> Vec<String> {
     let workload = &scenario.workload;
     range("workload.routes", workload.routes as f64, 1.0, 64.0);
     range("workload.rate_hz", workload.rate_hz, 0.1, 10_000.0);
-    // A sample has its stamps in the first 24 bytes.
+    // The first 24 bytes of a payload carry its sequence number and timestamps.
     range("workload.size_bytes", workload.size_bytes as f64, 24.0, 16_777_216.0);
     range("remotes", scenario.remotes.len() as f64, 1.0, 16.0);
     for (at, remote) in scenario.remotes.iter().enumerate() {
@@ -44,18 +44,16 @@ pub(super) fn problems(scenario: &Scenario) -> Vec<String> {
         let both = (remote.level != Level::Clean || remote.delay_ms > 0.0 || remote.jitter_ms > 0.0)
             && remote.trace.is_some();
         if both {
-            found.push(format!("remotes[{at}].trace takes the place of level, delay_ms and jitter_ms"));
+            found.push(format!("remotes[{at}].trace excludes level, delay_ms and jitter_ms"));
         }
         let both =
             (remote.return_delay_ms > 0.0 || remote.return_jitter_ms > 0.0) && remote.return_trace.is_some();
         if both {
-            found.push(format!(
-                "remotes[{at}].return_trace takes the place of return_delay_ms and return_jitter_ms"
-            ));
+            found.push(format!("remotes[{at}].return_trace excludes return_delay_ms and return_jitter_ms"));
         }
     }
     if scenario.switches.is_empty() {
-        found.push("switches is empty: plain, reassembling, or both".to_owned());
+        found.push("switches is empty, but must be plain, reassembling, or both".to_owned());
     }
     found.extend(workload_type(scenario));
     found.extend(names(scenario));
@@ -68,7 +66,7 @@ fn workload_type(scenario: &Scenario) -> Option<String> {
     let parts: Vec<&str> = message_type.split('/').collect();
     let word = |part: &&str| !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
     let good = parts.len() == 3 && parts[1] == "msg" && parts.iter().all(word);
-    (!good).then(|| format!("workload.message_type is '{message_type}', and may be pkg/msg/Name"))
+    (!good).then(|| format!("workload.message_type is '{message_type}', but must be pkg/msg/Name"))
 }
 
 fn names(scenario: &Scenario) -> Vec<String> {
@@ -76,19 +74,20 @@ fn names(scenario: &Scenario) -> Vec<String> {
     let mut seen = BTreeSet::new();
     for (at, remote) in scenario.remotes.iter().enumerate() {
         for (key, name) in [("name", &remote.name), ("lane", &remote.lane)] {
-            let begins = name.chars().next().is_some_and(|c| c.is_ascii_lowercase());
-            let rest = name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
-            if !begins || !rest || name.len() > 12 {
+            let first = name.chars().next().is_some_and(|c| c.is_ascii_lowercase());
+            let all = name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+            if !first || !all || name.len() > 12 {
                 found.push(format!(
-                    "remotes[{at}].{key} is '{name}', and may be 1 to 12 of a-z, 0-9 and _, a letter first"
+                    "remotes[{at}].{key} is '{name}', but must be 1 to 12 characters of a-z, 0-9 and _, a \
+                     letter first"
                 ));
             }
         }
         if RESERVED.contains(&remote.name.as_str()) || !seen.insert(&remote.name) {
-            found.push(format!("remotes[{at}].name is '{}', which is taken", remote.name));
+            found.push(format!("remotes[{at}].name is '{}', which is already in use", remote.name));
         }
         if remote.lane == "critical" {
-            found.push(format!("remotes[{at}].lane is critical, which is for the local subscriber"));
+            found.push(format!("remotes[{at}].lane is critical, which is reserved for the local subscriber"));
         }
     }
     found
@@ -98,8 +97,8 @@ fn events(scenario: &Scenario) -> Vec<String> {
     let endpoints: Vec<String> = (0..scenario.workload.routes)
         .flat_map(|route| {
             let remotes = scenario.remotes.iter().map(|remote| remote.name.as_str());
-            let who = ["publisher", "critical"].into_iter().chain(remotes);
-            who.map(move |who| scenario.endpoint_name(who, route)).collect::<Vec<_>>()
+            let names = ["publisher", "critical"].into_iter().chain(remotes);
+            names.map(move |name| scenario.endpoint_name(name, route)).collect::<Vec<_>>()
         })
         .collect();
     let bridge = match scenario.variant {
@@ -110,22 +109,23 @@ fn events(scenario: &Scenario) -> Vec<String> {
     for (at, event) in scenario.events.iter().enumerate() {
         let known: Vec<&String> = match event.action {
             action if action.is_of_link() => scenario.remotes.iter().map(|remote| &remote.name).collect(),
-            // Nobody would start `up` again.
+            // No process restarts the supervisor, `up`.
             Action::Kill => bridge.iter().filter(|name| *name != "up").collect(),
             _ => endpoints.iter().chain(&bridge).collect(),
         };
         if !known.contains(&&event.to) {
             let known: Vec<&str> = known.into_iter().map(String::as_str).collect();
-            let known = if known.is_empty() { "nobody".to_owned() } else { known.join(", ") };
-            found.push(format!(
-                "events[{at}].to is '{}', and {} can be done to {known}",
-                event.to,
-                event.action.name()
-            ));
+            let (to, action) = (&event.to, event.action.name());
+            found.push(if known.is_empty() {
+                format!("events[{at}].to is '{to}', but {action} has no possible target in this scenario")
+            } else {
+                let known = known.join(", ");
+                format!("events[{at}].to is '{to}', but the target of {action} must be one of {known}")
+            });
         }
     }
     if scenario.events.windows(2).any(|pair| pair[0].at_s > pair[1].at_s) {
-        found.push("events are not in the order of their time".to_owned());
+        found.push("events must be in the order of at_s".to_owned());
     }
     found
 }

@@ -1,5 +1,5 @@
-//! Scenarios: what is run, with what load, over what links, and what is done to it meanwhile. A YAML file
-//! each.
+//! Scenarios: a YAML file each that describes the endpoints of an experiment, their load, their links, and
+//! events during the run.
 
 mod check;
 mod trace;
@@ -18,48 +18,48 @@ use super::impairment::Level;
 /// The largest scenario file, in bytes.
 const MAX_BYTES: u64 = 65_536;
 
-/// One experiment, as its file describes it. config/scenarios/README.md documents every key.
+/// An experiment, read from its file. config/scenarios/README.md documents every key.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scenario {
-    /// The name of the file.
+    /// The file's name without extension.
     #[serde(skip)]
     pub name: String,
-    /// The file.
+    /// The file's text.
     #[serde(skip)]
     pub text: String,
-    /// What it is, in a line.
+    /// A one-line description.
     pub title: String,
     /// With or without the bridge.
     pub variant: Variant,
     /// Whether the bridge classifies its subscribers.
     #[serde(default = "yes")]
     pub classifier: bool,
-    /// The measured window, in seconds.
+    /// Length of the measured window, in seconds.
     pub duration_s: f64,
-    /// The same in a smoke run; events move with it.
+    /// Length of the measured window of a smoke run, in seconds; times of events are scaled with it.
     #[serde(default = "default_quick_s")]
     pub quick_s: f64,
-    /// The hosts between that it is run with.
+    /// The switches that the scenario is run with, one run each.
     #[serde(default = "plain_switch")]
     pub switches: Vec<Switch>,
-    /// What is published.
+    /// The publishers' load.
     #[serde(default)]
     pub workload: Workload,
-    /// The remote subscribers; the local, critical one is always there.
+    /// The remote subscribers; there is always a local, critical subscriber, too.
     pub remotes: Vec<Remote>,
-    /// What happens meanwhile.
+    /// Events during the measured window.
     #[serde(default)]
     pub events: Vec<Event>,
 }
 
-/// With or without the bridge.
+/// Whether a scenario runs with or without the bridge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Variant {
-    /// All subscribers read the publisher's topic.
+    /// Without the bridge: all subscribers read the publisher's topic.
     Baseline,
-    /// They read their lanes.
+    /// With the bridge: each subscriber reads the output of its lane.
     Bridge,
 }
 
@@ -73,18 +73,18 @@ impl Variant {
     }
 }
 
-/// The host between the hosts.
+/// The switch that connects the hosts of a test bed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Switch {
-    /// Passes packets on.
+    /// Forwards packets unchanged.
     Plain,
-    /// Puts fragments together with bridge netfilter and connection tracking, as a host of containers does.
+    /// Reassembles fragments (bridge netfilter and connection tracking), as a container host does.
     Reassembling,
 }
 
 impl Switch {
-    /// As the command line has it.
+    /// The name used on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Plain => "plain",
@@ -93,25 +93,25 @@ impl Switch {
     }
 }
 
-/// What is published.
+/// The samples that publishers write, and the histories of their readers.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Workload {
-    /// Topics, each with a publisher and all subscribers of its own.
+    /// Number of topics, each with its own publisher and subscribers.
     pub routes: usize,
-    /// Samples per second of each.
+    /// Samples per second of each publisher.
     pub rate_hz: f64,
     /// Bytes of a serialized sample.
     pub size_bytes: u64,
     /// ROS 2 message type, `pkg/msg/Name`.
     pub message_type: String,
-    /// History of remote subscribers of a baseline.
+    /// History of the remote subscribers of a baseline.
     pub slow_history: ReaderHistory,
     /// History of the local, critical subscriber.
     pub critical_history: ReaderHistory,
 }
 
-/// The paper's: a LaserScan at 30 Hz, of 720 rays.
+/// The paper's workload: a LaserScan of 720 rays at 30 Hz.
 impl Default for Workload {
     fn default() -> Self {
         Self {
@@ -126,7 +126,7 @@ impl Default for Workload {
 }
 
 impl Workload {
-    /// The name of the type in DDS.
+    /// The DDS name of the message type.
     pub fn dds_type(&self) -> String {
         let mut parts = self.message_type.split('/');
         let (package, name) = (parts.next().unwrap_or_default(), parts.next_back().unwrap_or_default());
@@ -134,7 +134,7 @@ impl Workload {
     }
 }
 
-/// HISTORY of a reader.
+/// The HISTORY QoS of a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ReaderHistory {
@@ -149,90 +149,90 @@ pub enum ReaderHistory {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Remote {
-    /// Its name, and that of its host.
+    /// Name of the subscriber and of its host.
     pub name: String,
-    /// The lane it reads where there is a bridge.
+    /// The lane whose output it reads when there is a bridge.
     #[serde(default = "noncritical")]
     pub lane: String,
-    /// What is lost on the way to it.
+    /// Loss of packets to it.
     #[serde(default = "clean")]
     pub level: Level,
-    /// Mean delay on the way to it.
+    /// Mean delay of packets to it.
     #[serde(default)]
     pub delay_ms: f64,
-    /// Its standard deviation.
+    /// Standard deviation of that delay.
     #[serde(default)]
     pub jitter_ms: f64,
-    /// Mean delay on the way back.
+    /// Mean delay of packets from it.
     #[serde(default)]
     pub return_delay_ms: f64,
-    /// Its standard deviation.
+    /// Standard deviation of that delay.
     #[serde(default)]
     pub return_jitter_ms: f64,
-    /// What is lost and how long it takes on the way to it, from time to time, in place of the above.
+    /// Trace of loss and delay of packets to it, instead of `level`, `delay_ms` and `jitter_ms`.
     #[serde(default)]
     pub trace: Option<TraceFile>,
-    /// The same on the way back.
+    /// Trace of packets from it, instead of `return_delay_ms` and `return_jitter_ms`.
     #[serde(default)]
     pub return_trace: Option<TraceFile>,
-    /// The bandwidth of the way to it.
+    /// Limit of the bandwidth towards it.
     #[serde(default)]
     pub cap_kbit_per_s: Option<u64>,
-    /// Whether all this is there from the beginning of the window, or only after an event.
+    /// Whether the link is impaired from the beginning of the window on, or only after an event.
     #[serde(default = "yes")]
     pub impaired_at_begin: bool,
 }
 
 impl Remote {
-    /// Whether packets towards it are lost or delayed by more than a cap.
+    /// Whether packets to it are lost or delayed, other than by a bandwidth limit.
     pub fn is_impaired(&self) -> bool {
         self.level != Level::Clean || self.delay_ms > 0.0 || self.jitter_ms > 0.0 || self.trace.is_some()
     }
 
-    /// Whether packets from it are delayed or lost.
+    /// Whether packets from it are lost or delayed.
     pub fn is_impaired_back(&self) -> bool {
         self.return_delay_ms > 0.0 || self.return_jitter_ms > 0.0 || self.return_trace.is_some()
     }
 }
 
-/// Something that is done at a time.
+/// An action of the harness at a time of the run.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Event {
     /// Seconds from the beginning of the window.
     pub at_s: f64,
-    /// What.
+    /// The action.
     #[serde(rename = "do")]
     pub action: Action,
-    /// To whom: a remote subscriber (its link, or its program), an endpoint, a process of the bridge.
+    /// The target: a remote subscriber (its link, or its program), an endpoint, or a process of the bridge.
     pub to: String,
 }
 
-/// What can be done.
+/// The kinds of actions of an [`Event`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Action {
-    /// The link is impaired as its remote subscriber says.
+    /// Impairs the link as its remote subscriber's settings define.
     LinkOn,
-    /// The link is clean.
+    /// Makes the link clean.
     LinkOff,
-    /// The link is cut.
+    /// Cuts the link.
     LinkDown,
-    /// SIGSTOP.
+    /// Sends SIGSTOP to a program.
     Stop,
-    /// SIGCONT.
+    /// Sends SIGCONT to a program.
     Continue,
-    /// SIGKILL, to a process of the bridge.
+    /// Sends SIGKILL to a process of the bridge.
     Kill,
 }
 
 impl Action {
-    /// Whether it is done to a link.
+    /// Whether the target is a link.
     pub const fn is_of_link(self) -> bool {
         matches!(self, Self::LinkOn | Self::LinkOff | Self::LinkDown)
     }
 
-    /// As the files have it.
+    /// The name used in scenarios and results.
     pub const fn name(self) -> &'static str {
         match self {
             Self::LinkOn => "link_on",
@@ -246,14 +246,15 @@ impl Action {
 }
 
 impl Scenario {
-    /// Reads a file.
+    /// Reads and checks a scenario file.
     ///
     /// # Errors
-    /// It can't be read, is no scenario, or has values that can't be; all of these are named.
+    /// The file cannot be read, is no scenario, or has invalid values; the error lists all of them.
     pub fn load(path: &Path) -> Result<Self, EvalError> {
         let size = fs::metadata(path).map_err(|error| EvalError::file(path, &error))?.len();
         if size > MAX_BYTES {
-            return Err(EvalError::new(format!("{}: {size} bytes are no scenario", path.display())));
+            let path = path.display();
+            return Err(EvalError::new(format!("{path}: {size} bytes, but must be at most {MAX_BYTES}")));
         }
         let text = fs::read_to_string(path).map_err(|error| EvalError::file(path, &error))?;
         let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
@@ -261,10 +262,10 @@ impl Scenario {
             .map_err(|problems| EvalError::new(format!("{}: {}", path.display(), problems.join("\n  "))))
     }
 
-    /// Reads a scenario of that name, whose files are in the present folder.
+    /// Parses a scenario's text. Paths of traces are relative to the current folder.
     ///
     /// # Errors
-    /// What is wrong with it: that it is no scenario, or every value that can't be.
+    /// The text is no scenario, or has invalid values; the error lists all of them.
     pub fn parse(name: &str, text: &str) -> Result<Self, Vec<String>> {
         Self::parse_in(Path::new(""), name, text)
     }
@@ -277,10 +278,10 @@ impl Scenario {
         if problems.is_empty() { Ok(scenario) } else { Err(problems) }
     }
 
-    /// All scenarios of a folder, by name.
+    /// Reads all scenarios of a folder, sorted by name.
     ///
     /// # Errors
-    /// The folder can't be read, has none, or one of them is wrong.
+    /// The folder cannot be read, has no scenarios, or one of them is invalid.
     pub fn load_all(folder: &Path) -> Result<Vec<Self>, EvalError> {
         let entries = fs::read_dir(folder).map_err(|error| EvalError::file(folder, &error))?;
         let mut paths: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
@@ -292,12 +293,12 @@ impl Scenario {
         paths.iter().map(|path| Self::load(path)).collect()
     }
 
-    /// Whether something is lost by a row of Table I, of which there are two readings.
+    /// Whether a link loses packets by a row of Table I, of which there are two readings.
     pub fn has_readings(&self) -> bool {
         self.remotes.iter().any(|remote| remote.level != Level::Clean)
     }
 
-    /// The lanes that the bridge has.
+    /// The names of the bridge's lanes.
     pub fn lanes(&self) -> Vec<String> {
         let fixed = ["critical", "noncritical"].map(str::to_owned);
         let remote: BTreeSet<String> = self.remotes.iter().map(|remote| remote.lane.clone()).collect();
@@ -305,21 +306,21 @@ impl Scenario {
         fixed.iter().cloned().chain(own).collect()
     }
 
-    /// The processes of the bridge: its `up` and the roles.
+    /// The names of the bridge's processes: the supervisor (`up`) and the roles.
     pub fn bridge_processes(&self) -> Vec<String> {
         let lanes = self.lanes().into_iter().map(|lane| format!("egress-{lane}"));
         let roles = ["up", "ingress", "control"].into_iter().map(str::to_owned);
         roles.chain(lanes).collect()
     }
 
-    /// The name of a route.
+    /// The name of a route, by its number.
     pub fn route_name(&self, route: usize) -> String {
         if route == 0 { "scan".to_owned() } else { format!("scan_{}", route + 1) }
     }
 
-    /// The name of an endpoint of a route: plain of the first one.
-    pub fn endpoint_name(&self, who: &str, route: usize) -> String {
-        if route == 0 { who.to_owned() } else { format!("{who}-{}", route + 1) }
+    /// The name of an endpoint of a route; those of the first route have no number.
+    pub fn endpoint_name(&self, name: &str, route: usize) -> String {
+        if route == 0 { name.to_owned() } else { format!("{name}-{}", route + 1) }
     }
 }
 
@@ -347,7 +348,7 @@ fn clean() -> Level {
 mod tests {
     use super::*;
 
-    const LEAST: &str = "title: a\nvariant: bridge\nduration_s: 10\nremotes:\n  - {name: slow}\n";
+    const MINIMAL: &str = "title: a\nvariant: bridge\nduration_s: 10\nremotes:\n  - {name: slow}\n";
 
     fn scenarios() -> Vec<Scenario> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/config/scenarios");
@@ -355,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn every_scenario_of_the_paper_is_there_and_all_are_valid() {
+    fn every_scenario_of_the_paper_exists_and_all_are_valid() {
         let scenarios = scenarios();
         let find = |name: &str| scenarios.iter().find(|it| it.name == name).expect(name);
         for level in Level::ALL {
@@ -382,16 +383,16 @@ mod tests {
     }
 
     #[test]
-    fn the_least_is_the_papers_workload_on_the_plain_switch() {
-        let scenario = Scenario::parse("a", LEAST).expect("valid");
+    fn defaults_are_the_papers_workload_on_the_plain_switch() {
+        let scenario = Scenario::parse("a", MINIMAL).expect("valid");
         assert_eq!((scenario.switches, scenario.workload.rate_hz), (vec![Switch::Plain], 30.0));
         assert_eq!(Workload::default().dds_type(), "sensor_msgs::msg::dds_::LaserScan_");
-        assert!(!Scenario::parse("a", LEAST).expect("valid").has_readings());
+        assert!(!Scenario::parse("a", MINIMAL).expect("valid").has_readings());
     }
 
     #[test]
-    fn lanes_and_processes_are_those_of_the_remote_subscribers() {
-        let text = LEAST.replace("{name: slow}", "{name: slow}\n  - {name: laptop, lane: rviz}");
+    fn lanes_and_processes_include_those_of_the_remote_subscribers() {
+        let text = MINIMAL.replace("{name: slow}", "{name: slow}\n  - {name: laptop, lane: rviz}");
         let scenario = Scenario::parse("a", &text).expect("valid");
         assert_eq!(scenario.lanes(), ["critical", "noncritical", "rviz"]);
         assert!(scenario.bridge_processes().contains(&"egress-rviz".to_owned()));
@@ -401,27 +402,31 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_all_at_once() {
-        for (from, to, said) in [
-            ("duration_s: 10", "duration_s: 0", "duration_s is 0, and may be 1 to 86400"),
+    fn all_mistakes_are_listed() {
+        for (from, to, message) in [
+            ("duration_s: 10", "duration_s: 0", "duration_s is 0, but must be 1 to 86400"),
             ("duration_s: 10", "duration_s: .nan", "duration_s is NaN"),
             ("variant: bridge", "variant: bridges", "bridges"),
             ("title: a", "titel: a", "titel"),
-            ("{name: slow}", "{name: bridge}", "remotes[0].name is 'bridge', which is taken"),
-            ("{name: slow}", "{name: 'a b'}", "remotes[0].name is 'a b', and may be"),
-            ("{name: slow}", "{name: slow}\n  - {name: slow}", "remotes[1].name is 'slow', which is taken"),
-            ("{name: slow}", "{name: slow, lane: critical}", "which is for the local subscriber"),
+            ("{name: slow}", "{name: bridge}", "remotes[0].name is 'bridge', which is already in use"),
+            ("{name: slow}", "{name: 'a b'}", "remotes[0].name is 'a b', but must be"),
+            (
+                "{name: slow}",
+                "{name: slow}\n  - {name: slow}",
+                "remotes[1].name is 'slow', which is already in use",
+            ),
+            ("{name: slow}", "{name: slow, lane: critical}", "reserved for the local subscriber"),
             ("{name: slow}", "{name: slow, delay_ms: -1}", "remotes[0].delay_ms is -1"),
             ("{name: slow}", "{name: slow, cap_kbit_per_s: 1}", "remotes[0].cap_kbit_per_s is 1"),
             (
                 "{name: slow}",
                 "{name: slow, jitter_ms: 1, trace: {file: Cargo.toml}}",
-                "remotes[0].trace takes the place of level, delay_ms and jitter_ms",
+                "remotes[0].trace excludes level, delay_ms and jitter_ms",
             ),
             (
                 "{name: slow}",
                 "{name: slow, return_delay_ms: 1, return_trace: {file: Cargo.toml}}",
-                "remotes[0].return_trace takes the place of return_delay_ms and return_jitter_ms",
+                "remotes[0].return_trace excludes return_delay_ms and return_jitter_ms",
             ),
             ("{name: slow}", "{name: slow, trace: {file: Cargo.toml}}", "Cargo.toml:1: there is no header"),
             ("{name: slow}", "{name: slow, trace: {file: nowhere.csv}}", "nowhere.csv: No such file"),
@@ -431,22 +436,26 @@ mod tests {
             ("title: a", "title: a\nworkload: {message_type: LaserScan}", "workload.message_type"),
             ("title: a", "title: a\nevents: [{at_s: 11, do: stop, to: slow}]", "events[0].at_s is 11"),
             ("title: a", "title: a\nevents: [{at_s: 1, do: kill, to: up}]", "events[0].to is 'up'"),
-            ("title: a", "title: a\nevents: [{at_s: 1, do: kill, to: slow}]", "kill can be done to ingress"),
+            (
+                "title: a",
+                "title: a\nevents: [{at_s: 1, do: kill, to: slow}]",
+                "the target of kill must be one of ingress",
+            ),
             (
                 "title: a",
                 "title: a\nevents: [{at_s: 1, do: link_on, to: critical}]",
-                "link_on can be done to slow",
+                "the target of link_on must be one of slow",
             ),
             (
                 "title: a",
                 "title: a\nevents: [{at_s: 2, do: stop, to: slow}, {at_s: 1, do: stop, to: slow}]",
-                "not in the order",
+                "must be in the order of at_s",
             ),
         ] {
-            let problems = Scenario::parse("a", &LEAST.replace(from, to)).expect_err(to).join("\n");
-            assert!(problems.contains(said), "{to}: {problems}");
+            let problems = Scenario::parse("a", &MINIMAL.replace(from, to)).expect_err(to).join("\n");
+            assert!(problems.contains(message), "{to}: {problems}");
         }
-        let text = LEAST.replace("duration_s: 10", "duration_s: 0").replace("slow", "up");
+        let text = MINIMAL.replace("duration_s: 10", "duration_s: 0").replace("slow", "up");
         assert_eq!(Scenario::parse("a", &text).expect_err("two problems").len(), 2);
         assert!(Scenario::parse("a", "").is_err());
         assert!(Scenario::load("/nowhere/a.yaml".as_ref()).is_err());

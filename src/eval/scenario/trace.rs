@@ -1,4 +1,4 @@
-//! The traces of links that a scenario names.
+//! The trace files of a scenario's links.
 
 use std::path::{Path, PathBuf};
 
@@ -7,22 +7,22 @@ use serde::Deserialize;
 use super::{Remote, Scenario};
 use crate::eval::impairment::Trace;
 
-/// A trace of a link, as a scenario names it.
+/// A scenario's reference to a trace file.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TraceFile {
-    /// The file, from the scenario's folder.
+    /// Path of the file, relative to the scenario's folder.
     pub file: PathBuf,
-    /// Whether it begins anew at its end, rather than stay in its last row.
+    /// Whether the trace restarts at its end instead of staying in its last row.
     #[serde(default)]
     pub repeat: bool,
-    /// What the file said when the scenario was read: runs that are hours apart are of the same trace.
+    /// The file's text when the scenario was read, so that all runs of a matrix use the same trace.
     #[serde(skip)]
     pub text: String,
 }
 
 impl TraceFile {
-    /// Reads the file; yields what is wrong with it.
+    /// Reads and checks the file.
     fn read(&mut self, folder: &Path) -> Result<(), String> {
         let path = folder.join(&self.file);
         let (_, text) = Trace::load(&path).map_err(|error| error.to_string())?;
@@ -31,31 +31,33 @@ impl TraceFile {
     }
 }
 
-/// Which way of a link a trace is of.
+/// Direction of a link: packets to the remote subscriber.
 pub const FORWARD: &str = "forward";
-/// The way back.
+/// Direction of a link: packets from the remote subscriber.
 pub const RETURN: &str = "return";
 
 impl Remote {
-    /// The trace of a way, `forward` or `return`.
+    /// The trace of a direction, `forward` or `return`.
     pub fn trace_of(&self, direction: &str) -> Option<&TraceFile> {
         if direction == FORWARD { self.trace.as_ref() } else { self.return_trace.as_ref() }
     }
 
-    /// The name that the trace of a way has among the results.
+    /// The file name in the results of the trace of a direction.
     pub fn trace_name(&self, direction: &str) -> String {
         format!("trace-{}-{direction}.csv", self.name)
     }
 }
 
 impl Scenario {
-    /// All traces, with the names that they have among the results.
+    /// All traces, with their file names in the results.
     pub fn traces(&self) -> impl Iterator<Item = (String, &TraceFile)> {
-        let ways = self.remotes.iter().flat_map(|remote| [FORWARD, RETURN].map(|way| (remote, way)));
-        ways.filter_map(|(remote, way)| Some((remote.trace_name(way), remote.trace_of(way)?)))
+        let directions = self.remotes.iter().flat_map(|remote| [FORWARD, RETURN].map(|it| (remote, it)));
+        directions.filter_map(|(remote, direction)| {
+            Some((remote.trace_name(direction), remote.trace_of(direction)?))
+        })
     }
 
-    /// Reads the files of all traces; yields what is wrong with them.
+    /// Reads the files of all traces; returns their mistakes.
     pub(super) fn read_traces(&mut self, folder: &Path) -> Vec<String> {
         let files = self.remotes.iter_mut().flat_map(|remote| [&mut remote.trace, &mut remote.return_trace]);
         files.flatten().filter_map(|file| file.read(folder).err()).collect()
@@ -72,7 +74,7 @@ mod tests {
     const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/config/scenarios");
 
     #[test]
-    fn the_file_is_found_from_the_scenario_and_kept_as_it_was_read() {
+    fn the_path_is_relative_to_the_scenario_and_the_text_is_kept() {
         let folder = tempfile::tempdir().expect("a folder");
         let rows = "time_s,loss,delay_ms\n0,0.5,1\n";
         fs::create_dir(folder.path().join("links")).expect("a folder");
@@ -88,12 +90,12 @@ mod tests {
         let slow = &scenario.remotes[0];
         assert!(slow.is_impaired_back() && !slow.is_impaired());
         assert!(slow.trace_of(FORWARD).is_none() && slow.trace_of(RETURN).is_some_and(|it| !it.repeat));
-        let gone = Scenario::load(&path).expect_err("the trace has gone").to_string();
-        assert!(gone.contains("mine.yaml") && gone.contains("links/a.csv: No such file"), "{gone}");
+        let error = Scenario::load(&path).expect_err("the trace was removed").to_string();
+        assert!(error.contains("mine.yaml") && error.contains("links/a.csv: No such file"), "{error}");
     }
 
     #[test]
-    fn the_drive_is_what_its_formula_says() {
+    fn the_drive_trace_follows_its_formula() {
         let scenario = Scenario::load(&Path::new(FOLDER).join("bridge_drive.yaml")).expect("a scenario");
         let text = &scenario.remotes[0].trace.as_ref().expect("a trace").text;
         let rows: Vec<&str> = text.lines().filter(|line| !line.starts_with('#')).skip(1).collect();
@@ -104,7 +106,7 @@ mod tests {
             format!("{t},{loss:.4},{:.1},{:.1}", 2.0 + 40.0 * loss, 1.0 + 10.0 * loss)
         });
         assert_eq!(rows, of_formula.collect::<Vec<_>>());
-        // Twice in the window, without a jump between.
+        // The window contains the trace twice.
         let trace = Trace::parse(text).unwrap_or_else(|problems| panic!("{problems:?}"));
         assert_eq!((trace.length_ns(), scenario.duration_s), (120_000_000_000, 240.0));
     }

@@ -1,20 +1,20 @@
-//! Quantiles and the cumulative distribution of what was measured.
+//! Quantiles and the cumulative distribution of measured values.
 
-/// Values in ascending order.
+/// A distribution of measured values, kept in ascending order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Distribution {
     sorted: Vec<f64>,
 }
 
 impl Distribution {
-    /// Of these values; what is no finite number is left out.
+    /// Creates a distribution of these values; ignores values that are not finite.
     pub fn new(values: impl IntoIterator<Item = f64>) -> Self {
         let mut sorted: Vec<f64> = values.into_iter().filter(|value| value.is_finite()).collect();
         sorted.sort_by(f64::total_cmp);
         Self { sorted }
     }
 
-    /// How many values there are.
+    /// The number of values.
     pub fn count(&self) -> usize {
         self.sorted.len()
     }
@@ -24,8 +24,8 @@ impl Distribution {
         &self.sorted
     }
 
-    /// The value below which a share `q` of the others lies, 0 to 1: between two of them it is interpolated
-    /// linearly (type 7 of Hyndman and Fan, what numpy and R do by default). `None` without values.
+    /// The quantile `q`, 0 to 1, with linear interpolation between values (type 7 of Hyndman and Fan, the
+    /// default of numpy and R). `None` without values.
     pub fn quantile(&self, q: f64) -> Option<f64> {
         let last = self.sorted.len().checked_sub(1)?;
         let at = q.clamp(0.0, 1.0) * last as f64;
@@ -44,7 +44,7 @@ impl Distribution {
         (!self.sorted.is_empty()).then(|| self.sorted.iter().sum::<f64>() / self.sorted.len() as f64)
     }
 
-    /// How many values are above `limit`.
+    /// The number of values above `limit`.
     pub fn above(&self, limit: f64) -> usize {
         self.sorted.len() - self.sorted.partition_point(|value| *value <= limit)
     }
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_are_those_calculated_by_hand() {
+    fn quantiles_match_those_calculated_by_hand() {
         let values = Distribution::new([40.0, 10.0, 30.0, 20.0]);
         for (q, expected) in [(0.0, 10.0), (0.5, 25.0), (0.25, 17.5), (0.95, 38.5), (1.0, 40.0)] {
             assert_eq!(values.quantile(q), Some(expected), "{q}");
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_and_tail_of_one_to_a_thousand() {
+    fn median_and_tail_of_one_to_a_thousand() {
         let values = Distribution::new((1..=1001).map(f64::from));
         assert_eq!(values.quantile(0.5), Some(501.0));
         assert_eq!(values.quantile(0.95), Some(951.0));
@@ -95,14 +95,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_has_no_quantile_and_what_is_no_number_is_nothing() {
+    fn values_that_are_not_finite_are_ignored_and_an_empty_distribution_has_no_quantile() {
         let none = Distribution::new([f64::NAN, f64::INFINITY]);
         assert_eq!((none.count(), none.quantile(0.5), none.mean(), none.max()), (0, None, None, None));
         assert!(none.curve(10).is_empty());
     }
 
     #[test]
-    fn the_curve_ends_at_the_largest_value_with_all_of_them() {
+    fn the_curve_ends_at_the_largest_value_with_a_share_of_one() {
         let values = Distribution::new([4.0, 1.0, 3.0, 2.0]);
         assert_eq!(values.curve(10), [(1.0, 0.25), (2.0, 0.5), (3.0, 0.75), (4.0, 1.0)]);
         assert_eq!(Distribution::new([5.0]).curve(10), [(5.0, 1.0)]);
@@ -122,7 +122,7 @@ mod tests {
             let [low, high] = [a.min(b), a.max(b)].map(|q| values.quantile(q).unwrap());
             prop_assert!(low <= high);
             prop_assert!(values.quantile(0.0).unwrap() <= low && high <= values.max().unwrap());
-            // No more than the share above it is above a quantile.
+            // At most the share 1 - q of the values is above the quantile q.
             let above = values.above(high) as f64;
             prop_assert!(above <= (1.0 - a.max(b)) * (values.count() - 1) as f64 + 1.0);
         }

@@ -1,8 +1,8 @@
-//! What is computed from the records of runs. Pure: numbers in, numbers out.
+//! Figures computed from the records of runs. Pure: numbers in, numbers out.
 //!
-//! Times are seconds since the run began to be measured; latencies and gaps are in the unit of what is handed
-//! in. Every definition that the paper gives is followed (section IV-D), and where it gives none the choice
-//! is told beside the function.
+//! Times are seconds since the start of the measured window; latencies and gaps have the unit of the
+//! arguments. Definitions are the paper's where it gives them (section IV-D); otherwise the function's
+//! comment gives the choice.
 
 mod distribution;
 mod repetitions;

@@ -1,17 +1,17 @@
-//! Medians over repetitions of a run, and how sure they are.
+//! Medians over repetitions of a run, and their confidence intervals.
 
-/// The wanted confidence.
+/// The required confidence of an interval.
 const CONFIDENCE: f64 = 0.95;
 
 /// The median of a figure over repetitions, and an interval that contains the true median with a known
 /// probability.
 ///
-/// The interval is that of order statistics: between the `k`-th smallest and the `k`-th largest of `n`
-/// independent values lies the median with the probability `1 - 2 P(Binomial(n, 1/2) < k)`, whatever the
-/// distribution. Of these the narrowest is taken that is sure by at least 95 %. From six values on there is
-/// one; with fewer even smallest to largest is less sure, and then it is that, with `confidence` saying how
-/// sure: 94 % for five values, 75 % for three, nothing for one. A bootstrap would give narrower intervals of
-/// three values, which are wrong far more often than they say.
+/// The interval is that of order statistics: the median lies between the `k`-th smallest and the `k`-th
+/// largest of `n` independent values with the probability `1 - 2 P(Binomial(n, 1/2) < k)`, whatever the
+/// distribution. The narrowest of these intervals with a confidence of at least 95 % is used. With fewer than
+/// six values there is none; then the interval is from the smallest to the largest value, and `confidence` is
+/// its lower confidence: 94 % for five values, 75 % for three, 0 for one. A bootstrap would give narrower
+/// intervals of three values, whose real confidence is far below the nominal one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
     /// The median.
@@ -26,12 +26,12 @@ pub struct Estimate {
     pub min: f64,
     /// The largest value.
     pub max: f64,
-    /// How many values there are.
+    /// The number of values.
     pub count: usize,
 }
 
 impl Estimate {
-    /// Of a figure's values, one for each repetition; `None` without values.
+    /// Estimates the median from a figure's values, one for each repetition; `None` without values.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let mut sorted: Vec<f64> = values.into_iter().filter(|value| value.is_finite()).collect();
         sorted.sort_by(f64::total_cmp);
@@ -42,14 +42,14 @@ impl Estimate {
         Some(Self { median, low: sorted[rank], high: sorted[count - 1 - rank], confidence, min, max, count })
     }
 
-    /// Whether the interval is as sure as it should be.
-    pub fn is_sure(&self) -> bool {
+    /// Whether the interval's confidence is at least 95 %.
+    pub fn is_confident(&self) -> bool {
         self.confidence >= CONFIDENCE
     }
 }
 
-/// How many of the smallest and of the largest of `count` values lie outside the interval, and how sure it
-/// is.
+/// Returns how many of the smallest and of the largest of `count` values lie outside the interval, and the
+/// interval's confidence.
 fn rank(count: usize) -> (usize, f64) {
     let n = count as f64;
     // P(Binomial(n, 1/2) = k), from k = 0 on.
@@ -77,10 +77,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn intervals_are_those_of_printed_tables() {
+    fn intervals_match_printed_tables() {
         // Number of values, rank of the lower end counted from 1, confidence in percent (tables of the
-        // median's
-        // interval in textbooks of nonparametric statistics).
+        // median's interval in textbooks of nonparametric statistics).
         for (count, expected, percent) in [
             (6, 1, 96.9),
             (7, 1, 98.4),
@@ -96,13 +95,13 @@ mod tests {
     }
 
     #[test]
-    fn few_values_have_a_range_that_says_how_little_it_is_sure() {
+    fn fewer_than_six_values_give_their_range_with_its_lower_confidence() {
         for (count, confidence) in [(1, 0.0), (2, 0.5), (3, 0.75), (4, 0.875), (5, 0.9375)] {
             assert_eq!(rank(count), (0, confidence), "{count}");
         }
         let three = Estimate::of([3.0, 1.0, 2.0]).unwrap();
         assert_eq!((three.median, three.low, three.high, three.count), (2.0, 1.0, 3.0, 3));
-        assert!(!three.is_sure());
+        assert!(!three.is_confident());
         assert_eq!(Estimate::of([f64::NAN]), None);
         assert_eq!(Estimate::of([1.0, 2.0]).unwrap().median, 1.5);
     }
@@ -111,13 +110,13 @@ mod tests {
     fn nine_values_by_hand() {
         let estimate = Estimate::of((1..=9).map(f64::from)).unwrap();
         assert_eq!((estimate.median, estimate.low, estimate.high), (5.0, 2.0, 8.0));
-        assert!(estimate.is_sure());
+        assert!(estimate.is_confident());
         assert_eq!((estimate.min, estimate.max), (1.0, 9.0));
     }
 
-    /// The interval keeps its promise for a distribution that is nothing like the normal one.
+    /// The interval has its nominal confidence for a distribution that is far from normal.
     #[test]
-    fn the_interval_contains_the_median_as_often_as_it_says() {
+    fn the_interval_contains_the_median_with_its_nominal_confidence() {
         let mut random = Pcg64::new(7, 11);
         let latency = rand_distr::Exp::new(1.0).unwrap();
         for count in [3, 5, 9] {
@@ -128,9 +127,9 @@ mod tests {
                     (estimate.low..=estimate.high).contains(&2.0_f64.ln())
                 })
                 .count();
-            let (share, promised) = (hits as f64 / f64::from(trials), rank(count).1);
-            let four_deviations = 4.0 * (promised * (1.0 - promised) / f64::from(trials)).sqrt();
-            assert!((share - promised).abs() < four_deviations, "{count}: {share} of {promised}");
+            let (share, nominal) = (hits as f64 / f64::from(trials), rank(count).1);
+            let four_deviations = 4.0 * (nominal * (1.0 - nominal) / f64::from(trials)).sqrt();
+            assert!((share - nominal).abs() < four_deviations, "{count}: {share} of {nominal}");
         }
     }
 
@@ -142,7 +141,7 @@ mod tests {
             let one = Estimate::of(values.iter().copied()).unwrap();
             prop_assert!(one.min <= one.low && one.low <= one.median);
             prop_assert!(one.median <= one.high && one.high <= one.max);
-            prop_assert_eq!(one.is_sure(), values.len() >= 6);
+            prop_assert_eq!(one.is_confident(), values.len() >= 6);
         }
     }
 }

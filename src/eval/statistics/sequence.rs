@@ -1,34 +1,34 @@
-//! What of a numbered stream arrived, when, and what did not.
+//! Received, lost, late, repeated and reordered samples of a numbered stream.
 
 use std::collections::{HashMap, HashSet};
 
 /// A sample that a subscriber received.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reception {
-    /// When, in seconds.
+    /// Time of the reception, in seconds.
     pub at_s: f64,
-    /// The publisher's number of it.
+    /// The sequence number that the publisher gave the sample.
     pub seq: u64,
-    /// From the stamp in the message to its reception, in milliseconds.
+    /// From the source timestamp to the reception, in milliseconds.
     pub latency_ms: f64,
 }
 
-/// What a subscriber received of what was published.
+/// Counts of the samples that a subscriber received and missed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Received {
-    /// Samples, each counted once.
+    /// Received samples, each counted once.
     pub samples: usize,
-    /// Samples that the writer took and the subscriber never got.
+    /// Samples that the writer accepted and the subscriber never received.
     pub lost: usize,
-    /// Samples that came more than once, and how often.
+    /// Receptions of samples that had been received before.
     pub repeated: usize,
-    /// Samples that came after a later one.
+    /// Samples received after a later one.
     pub reordered: usize,
-    /// Samples that came later than `late_ms` after their stamp.
+    /// Samples received more than `late_ms` after their source timestamp.
     pub late: usize,
 }
 
-/// Compares `receptions`, in the order in which they came, with the numbers that the writer took.
+/// Compares `receptions`, in their order of arrival, with the sequence numbers that the writer accepted.
 pub fn received(written: impl IntoIterator<Item = u64>, receptions: &[Reception], late_ms: f64) -> Received {
     let mut seen = HashSet::with_capacity(receptions.len());
     let mut found = Received::default();
@@ -47,8 +47,8 @@ pub fn received(written: impl IntoIterator<Item = u64>, receptions: &[Reception]
     found
 }
 
-/// The longest time without an event, in seconds: between two of them, before the first and after the last,
-/// from `from_s` to `to_s`.
+/// The longest time without an event from `from_s` to `to_s`, in seconds, including the times before the
+/// first and after the last event.
 pub fn longest_silence_s(times_s: impl IntoIterator<Item = f64>, from_s: f64, to_s: f64) -> f64 {
     let mut times: Vec<f64> = times_s.into_iter().filter(|time| (from_s..=to_s).contains(time)).collect();
     times.push(to_s);
@@ -62,9 +62,9 @@ pub fn longest_silence_s(times_s: impl IntoIterator<Item = f64>, from_s: f64, to
     longest
 }
 
-/// How many of the samples `written`, `(time in seconds, number)` in order, a subscriber has not received in
-/// order at each of the times `at_s`, ascending: those from the first on that is missing. A RELIABLE writer
-/// that keeps all has to hold at least these for it.
+/// The number of samples that are outstanding for a subscriber at each of the ascending times `at_s`: those
+/// of `written`, `(time in seconds, sequence number)` in order, from the first missing one on. A RELIABLE
+/// writer with KEEP_ALL history has to retain at least these for the subscriber.
 pub fn outstanding(written: &[(f64, u64)], receptions: &[Reception], at_s: &[f64]) -> Vec<usize> {
     let mut arrivals: HashMap<u64, f64> = HashMap::with_capacity(receptions.len());
     for reception in receptions {
@@ -81,8 +81,8 @@ pub fn outstanding(written: &[(f64, u64)], receptions: &[Reception], at_s: &[f64
         .collect();
     at_s.iter()
         .map(|time| {
-            let begun = written.partition_point(|(written_at, _)| written_at <= time);
-            begun.saturating_sub(in_order_at.partition_point(|arrived| arrived <= time))
+            let written_before = written.partition_point(|(written_at, _)| written_at <= time);
+            written_before.saturating_sub(in_order_at.partition_point(|arrived| arrived <= time))
         })
         .collect()
 }
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn lost_late_repeated_and_reordered_are_told_apart() {
+    fn lost_late_repeated_and_reordered_samples_are_counted_separately() {
         let receptions = [
             reception(1, 1.0),
             reception(3, 40.0),
@@ -108,14 +108,14 @@ mod tests {
             reception(9, 1.0),
         ];
         let found = received(1..=6, &receptions, 33.3);
-        // 4 and 6 never came; 9 was never said to be written, yet it is a sample.
+        // 4 and 6 did not arrive; 9 is not in `written` but counts as received.
         assert_eq!(found, Received { samples: 5, lost: 2, repeated: 1, reordered: 1, late: 2 });
         assert_eq!(received([], &[], 1.0), Received::default());
         assert_eq!(received([0, 1], &[], 1.0).lost, 2);
     }
 
     #[test]
-    fn silence_is_also_at_both_ends() {
+    fn silence_includes_both_ends_of_the_window() {
         assert_eq!(longest_silence_s([1.0, 2.0, 5.0], 0.0, 6.0), 3.0);
         assert_eq!(longest_silence_s([5.0, 4.0], 0.0, 6.0), 4.0);
         assert_eq!(longest_silence_s([1.0], 0.0, 6.0), 5.0);
@@ -124,12 +124,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_outstanding_begins_at_the_first_that_is_missing() {
+    fn outstanding_samples_start_at_the_first_missing_one() {
         let written = [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)];
         let at = |at_s, seq| Reception { at_s, seq, latency_ms: 0.0 };
         let receptions = [at(1.5, 1), at(3.5, 3), at(4.5, 2), at(4.6, 3)];
         let found = outstanding(&written, &receptions, &[0.0, 1.0, 1.5, 2.0, 3.6, 4.0, 4.5, 9.0]);
-        // 3 came before 2 and waits for it; 4 never comes.
+        // 3 arrives before 2 and waits for it; 4 never arrives.
         assert_eq!(found, [0, 1, 0, 1, 2, 3, 1, 1]);
         assert_eq!(outstanding(&[], &receptions, &[1.0]), [0]);
     }

@@ -1,34 +1,34 @@
-//! Changes of states and modes: how many, how soon after what brought them about, and for how long.
+//! Changes of states and modes: their number, their delay after a cause, and the time in a state.
 
-/// A change to a state.
+/// A record of a state from a time on.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Change<S> {
-    /// When, in seconds.
+    /// The time, in seconds.
     pub at_s: f64,
-    /// To which.
+    /// The state from then on.
     pub to: S,
 }
 
-/// How many changes there are; a state that is told again is none, and neither is the first, which is only
-/// where the record begins. So counts the paper's harness.
+/// The number of transitions to another state. The first record is none, nor is a record of the same state
+/// again. The paper's harness counts in the same way.
 pub fn transitions<S: PartialEq>(changes: &[Change<S>]) -> usize {
     changes.windows(2).filter(|pair| pair[0].to != pair[1].to).count()
 }
 
-/// What followed a toggle of the link.
+/// The reaction of the classifier to a toggle of the link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reaction {
     /// When the link was switched, in seconds.
     pub toggled_at_s: f64,
-    /// Whether the link was impaired then (or else mended).
+    /// Whether the toggle impaired the link; otherwise it restored the link.
     pub impaired: bool,
-    /// From then to the state that answers it, in seconds; 0 when it was there already; `None` when it did
-    /// not come before the next toggle or the end of the run.
+    /// Time from the toggle to the expected state, in seconds; 0 if that was the state before; `None` if it
+    /// was not reached before the next toggle or the end of the run.
     pub after_s: Option<f64>,
 }
 
-/// How soon after each toggle, `(time, whether impaired)` in order, the state was `demoted` or `promoted`, as
-/// the toggle asks for. What changed between a reaction and the next toggle is not looked at.
+/// Finds how soon after each toggle, `(time, whether impaired)` in order, the state was the expected one:
+/// `demoted` after an impairment, otherwise `promoted`. Later changes before the next toggle are ignored.
 pub fn reactions<S: PartialEq>(
     toggles: &[(f64, bool)],
     changes: &[Change<S>],
@@ -41,13 +41,13 @@ pub fn reactions<S: PartialEq>(
         .enumerate()
         .map(|(index, &(toggled_at_s, impaired))| {
             let until = toggles.get(index + 1).map_or(end_s, |next| next.0);
-            let wanted = if impaired { demoted } else { promoted };
+            let expected = if impaired { demoted } else { promoted };
             let before = changes.iter().rev().find(|change| change.at_s <= toggled_at_s);
-            let after_s = if before.is_some_and(|change| change.to == *wanted) {
+            let after_s = if before.is_some_and(|change| change.to == *expected) {
                 Some(0.0)
             } else {
                 let within = |change: &&Change<S>| change.at_s > toggled_at_s && change.at_s < until;
-                let first = changes.iter().filter(within).find(|change| change.to == *wanted);
+                let first = changes.iter().filter(within).find(|change| change.to == *expected);
                 first.map(|change| change.at_s - toggled_at_s)
             };
             Reaction { toggled_at_s, impaired, after_s }
@@ -55,8 +55,8 @@ pub fn reactions<S: PartialEq>(
         .collect()
 }
 
-/// The share of the time from `from_s` to `to_s` that was spent in a state, 0 to 1; what is before the first
-/// change is spent in none.
+/// The share of the time from `from_s` to `to_s` that was spent in a state, 0 to 1. The time before the first
+/// record counts for no state.
 pub fn share_in<S: PartialEq>(changes: &[Change<S>], state: &S, from_s: f64, to_s: f64) -> f64 {
     let mut spent = 0.0;
     for (index, change) in changes.iter().enumerate() {
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn each_toggle_has_the_first_right_answer_before_the_next() {
+    fn the_reaction_is_the_first_expected_state_before_the_next_toggle() {
         let states = changes(&[
             (0.0, 'u'),
             (3.0, 'c'),
@@ -101,14 +101,14 @@ mod tests {
         let after: Vec<Option<f64>> = found.iter().map(|reaction| reaction.after_s).collect();
         assert_eq!(after, [Some(12.0), Some(11.5), None]);
         assert_eq!(found[0], Reaction { toggled_at_s: 60.0, impaired: true, after_s: Some(12.0) });
-        // Already there.
+        // The state was the expected one before the toggle.
         let found = reactions(&[(10.0, false)], &states, &'n', &'c', 60.0);
         assert_eq!(found[0].after_s, Some(0.0));
         assert_eq!(reactions(&[(1.0, true)], &[], &'n', &'c', 60.0)[0].after_s, None);
     }
 
     #[test]
-    fn time_in_a_state_by_hand() {
+    fn the_share_of_time_in_a_state_matches_that_calculated_by_hand() {
         let modes = changes(&[(0.0, 'n'), (20.0, 'd'), (80.0, 'n')]);
         assert_eq!(share_in(&modes, &'d', 0.0, 100.0), 0.6);
         assert_eq!(share_in(&modes, &'d', 10.0, 30.0), 0.5);

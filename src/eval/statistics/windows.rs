@@ -3,14 +3,14 @@
 /// The paper's window, in seconds.
 pub const WINDOW_S: f64 = 5.0;
 
-/// By how much the window slides, in seconds. The paper does not say; a second tells stalls of one second
-/// apart, and a finer step changes the standard deviation by less than it varies between runs.
+/// The step of the sliding window, in seconds. The paper does not give it; a step of a second separates
+/// stalls of one second, and a finer step changes the standard deviation by less than it varies between runs.
 const STEP_S: f64 = 1.0;
 
-/// What rounding may do to a border between windows, in seconds.
+/// Tolerance for rounding errors at the borders of windows, in seconds.
 const BORDER_S: f64 = 1e-6;
 
-/// Mean and population standard deviation of what a sliding window saw.
+/// Mean and population standard deviation of values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
     /// The mean.
@@ -20,7 +20,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Of these values; `None` without any.
+    /// Computes mean and standard deviation of these values; `None` without values.
     pub fn of(values: impl IntoIterator<Item = f64> + Clone) -> Option<Self> {
         let count = values.clone().into_iter().count() as f64;
         if count == 0.0 {
@@ -32,7 +32,7 @@ impl Spread {
     }
 }
 
-/// Rates of a sliding window.
+/// The rates in the positions of a sliding window.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RateOverTime {
     /// The middle of each window in seconds, and the rate in it in Hz.
@@ -40,18 +40,18 @@ pub struct RateOverTime {
 }
 
 impl RateOverTime {
-    /// Mean and standard deviation over the windows; `None` for a run shorter than one.
+    /// Mean and standard deviation over the windows; `None` for a run shorter than a window.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(self.points.iter().map(|point| point.1))
     }
 }
 
-/// The rate of events at `times_s` over windows of [`WINDOW_S`] that slide by a second and lie wholly within
-/// `from_s` and `to_s`.
+/// Computes the rate of events at `times_s` over windows of [`WINDOW_S`] that slide by a second and lie
+/// completely between `from_s` and `to_s`.
 ///
-/// The first window begins half a `period_s` before the first event, if there is one: where windows begin at
-/// events, whether an event at the border falls into the one or the next is chance, and the most regular of
-/// publishers gets a standard deviation of its own.
+/// The first window starts half a `period_s` before the first event, if there is one. If windows started at
+/// events, it would be chance whether an event at the border falls into one window or the next, and even a
+/// perfectly regular publisher would have a standard deviation above 0.
 pub fn sliding_rate(times_s: &[f64], from_s: f64, to_s: f64, period_s: f64) -> RateOverTime {
     let mut times: Vec<f64> = times_s.iter().copied().filter(|time| (from_s..to_s).contains(time)).collect();
     times.sort_by(f64::total_cmp);
@@ -70,8 +70,8 @@ pub fn sliding_rate(times_s: &[f64], from_s: f64, to_s: f64, period_s: f64) -> R
     RateOverTime { points }
 }
 
-/// The mean of a quantity that keeps each value of `(time, value)` until the next, from `from_s` to `to_s`;
-/// `None` when nothing is known of that time.
+/// The time-weighted mean, from `from_s` to `to_s`, of a quantity that keeps each value of `(time, value)`
+/// until the next; `None` when no value applies to that time.
 pub fn mean_level(points: &[(f64, f64)], from_s: f64, to_s: f64) -> Option<f64> {
     let (mut sum, mut known_s) = (0.0, 0.0);
     for (index, (time, value)) in points.iter().enumerate() {
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_publisher_that_keeps_its_rate_has_it_without_deviation() {
+    fn a_regular_publisher_has_its_rate_without_deviation() {
         let rate = sliding_rate(&regular(30.0, 0.01, 120.0), 0.0, 120.0, 1.0 / 30.0);
         let spread = rate.spread().unwrap();
         assert!((spread.mean - 30.0).abs() < 1e-9, "{spread:?}");
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_is_in_the_windows_that_contain_it() {
+    fn a_stall_lowers_the_rate_of_the_windows_that_contain_it() {
         // 10 Hz for 5 s, nothing for 5 s, 10 Hz for 5 s.
         let mut times = regular(10.0, 0.05, 5.0);
         times.extend(regular(10.0, 10.05, 15.0));
@@ -124,13 +124,13 @@ mod tests {
     fn silence_counts_and_a_run_shorter_than_a_window_has_no_rate() {
         assert_eq!(sliding_rate(&[], 0.0, 10.0, 0.1).spread(), Some(Spread { mean: 0.0, deviation: 0.0 }));
         assert_eq!(sliding_rate(&[1.0, 2.0], 0.0, 4.9, 1.0).spread(), None);
-        // What is outside of the run is not of it.
+        // Events outside of the run are ignored.
         let rate = sliding_rate(&[-1.0, 2.5, 11.0], 0.0, 5.0, 5.0);
         assert_eq!(rate.points, [(2.5, 0.2)]);
     }
 
     #[test]
-    fn a_level_is_weighted_by_how_long_it_held() {
+    fn a_level_is_weighted_by_its_duration() {
         let points = [(0.0, 10.0), (4.0, 3.0), (8.0, 10.0)];
         assert_eq!(mean_level(&points, 0.0, 10.0), Some((40.0 + 12.0 + 20.0) / 10.0));
         assert_eq!(mean_level(&points, 4.0, 8.0), Some(3.0));
@@ -141,19 +141,19 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_phase_and_no_rate_makes_a_regular_publisher_unsteady(
+        fn a_regular_publisher_has_no_deviation_at_any_phase_and_rate(
             rate_hz in 1_u32..=200, phase in 0.0..1.0_f64, to_s in 6.0..40.0_f64,
         ) {
             let rate_hz = f64::from(rate_hz);
             let times = regular(rate_hz, phase / rate_hz, to_s);
             let spread = sliding_rate(&times, 0.0, to_s, 1.0 / rate_hz).spread().unwrap();
-            // The last window may end behind the last event by less than a period.
+            // The last window may end less than a period after the last event.
             prop_assert!(spread.deviation <= 0.1, "{spread:?}");
             prop_assert!((spread.mean - rate_hz).abs() <= 0.2, "{spread:?}");
         }
 
         #[test]
-        fn rates_are_never_more_than_all_events_and_in_order(
+        fn rates_are_in_order_and_at_most_those_of_all_events(
             times in proptest::collection::vec(0.0..60.0_f64, 0..400), to_s in 1.0..60.0_f64,
         ) {
             let rate = sliding_rate(&times, 0.0, to_s, 0.1);

@@ -1,12 +1,12 @@
-//! The messages of the kernel's packet queue (linux/netfilter/nfnetlink_queue.h) over netlink: the few that
-//! bind a queue, hand a packet over, and say what becomes of it. Pure: bytes in, bytes out.
+//! The netlink messages of the kernel's packet queue (linux/netfilter/nfnetlink_queue.h) that bind a queue,
+//! deliver packets and return verdicts. Pure: bytes in, bytes out.
 //!
-//! Headers of netlink are in the machine's byte order, what is in an attribute is in the network's.
+//! Netlink headers are in the machine's byte order, values of attributes in network byte order.
 
 use super::super::link::Arrival;
 
 const HEADER_BYTES: usize = 16;
-/// `struct nfgenmsg`: family, version, and the number of the queue.
+/// Size of `struct nfgenmsg`: family, version, and the number of the queue.
 const QUEUE_HEADER_BYTES: usize = 4;
 const ATTRIBUTE_HEADER_BYTES: usize = 4;
 
@@ -28,29 +28,30 @@ const COPY_PACKET: u8 = 2;
 const PACKET_HEADER: u16 = 1;
 const VERDICT_HEADER: u16 = 2;
 const PAYLOAD: u16 = 10;
-/// An attribute's type without its flags.
+/// Mask of an attribute's type without its flags.
 const TYPE_MASK: u16 = 0x3fff;
 
 const VERDICT_DROP: u32 = 0;
 const VERDICT_ACCEPT: u32 = 1;
 
-/// Of an IPv4 packet the header without options is enough: length, and whether it is a fragment.
+/// Bytes of each packet that the kernel copies: the IPv4 header without options, for length and fragment
+/// bits.
 pub(super) const COPIED_BYTES: u32 = 20;
-/// `MF` and the offset, in the fourth word of the header's halves (RFC 791).
+/// Mask of `MF` and the fragment offset, in the fourth 16-bit word of the IPv4 header (RFC 791).
 const FRAGMENT_MASK: u16 = 0x3fff;
 
-/// Asks for the queue.
+/// Builds the request to listen on a queue.
 pub(super) fn bind(queue: u16, sequence: u32) -> Vec<u8> {
-    // Command, padding, and a protocol family that is not looked at any more.
+    // Command, padding, and a protocol family that the kernel ignores.
     config(queue, sequence, CONFIG_COMMAND, &[COMMAND_BIND, 0, 0, 0])
 }
 
-/// Sets how many packets may wait in the kernel for a verdict.
+/// Builds the request to limit the packets that wait in the kernel for a verdict.
 pub(super) fn set_max_length(queue: u16, sequence: u32, packets: u32) -> Vec<u8> {
     config(queue, sequence, CONFIG_MAX_LENGTH, &packets.to_be_bytes())
 }
 
-/// Sets that the first [`COPIED_BYTES`] of each packet are handed over.
+/// Builds the request to deliver the first [`COPIED_BYTES`] of each packet.
 pub(super) fn set_copy(queue: u16, sequence: u32) -> Vec<u8> {
     let [a, b, c, d] = COPIED_BYTES.to_be_bytes();
     config(queue, sequence, CONFIG_PARAMETERS, &[a, b, c, d, COPY_PACKET])
@@ -86,7 +87,7 @@ fn put(
     messages.extend(kind.to_ne_bytes());
     messages.extend(flags.to_ne_bytes());
     messages.extend(sequence.to_ne_bytes());
-    // To the kernel; from whom it knows.
+    // The port id: 0, as the kernel knows the sender.
     messages.extend(0_u32.to_ne_bytes());
     // Any family, version 0.
     messages.extend([0, 0]);
@@ -102,19 +103,19 @@ fn put(
 pub(super) enum Message {
     /// A packet that waits for a verdict.
     Packet(Arrival),
-    /// The answer to a request: 0, or what is wrong.
+    /// The answer to a request.
     Answer {
-        /// Of the request.
+        /// The sequence number of the request.
         sequence: u32,
-        /// As in errno(3).
+        /// 0 for success, otherwise a value of errno(3).
         error: i32,
     },
     /// Something else, or something malformed.
     Other,
 }
 
-/// The messages of one datagram. What is malformed is [`Message::Other`], and ends it where its length can't
-/// be told.
+/// Parses the messages of one datagram. A malformed message is [`Message::Other`]; it is the last one if its
+/// length is invalid.
 pub(super) fn messages(datagram: &[u8]) -> impl Iterator<Item = Message> {
     let mut rest = datagram;
     std::iter::from_fn(move || {
@@ -152,7 +153,7 @@ fn parse(message: &[u8]) -> Option<Message> {
     }
 }
 
-/// The value of an attribute.
+/// Returns the value of the first attribute of this kind.
 fn attribute(mut attributes: &[u8], kind: u16) -> Option<&[u8]> {
     loop {
         let bytes = usize::from(u16_at(attributes, 0)?);
@@ -178,7 +179,7 @@ mod tests {
 
     use super::*;
 
-    /// A packet as the kernel hands it over: an attribute of no interest, then header and payload.
+    /// A packet as the kernel delivers it: an attribute that is ignored, then header and payload.
     fn packet(id: u32, payload: &[u8]) -> Vec<u8> {
         let mut message = Vec::new();
         put(&mut message, TYPE_PACKET, 0, 0, 7, (5, &[0, 0, 0, 2]));
@@ -224,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn the_messages_that_set_up_a_queue_are_whole_and_padded() {
+    fn requests_that_set_up_a_queue_have_valid_lengths_and_padding() {
         for (message, attribute_bytes, kind) in [
             (bind(7, 1), 8_u16, CONFIG_COMMAND),
             (set_max_length(7, 2, 100), 8, CONFIG_MAX_LENGTH),
@@ -238,9 +239,9 @@ mod tests {
     }
 
     #[test]
-    fn packets_and_fragments_are_read() {
+    fn packets_and_fragments_are_parsed() {
         let mut datagram = Vec::new();
-        // Whole; whole and not to be fragmented; the first fragment; the last one.
+        // Whole; whole with DF set; the first fragment; the last one.
         for (id, flags) in [(1, 0), (2, 0x4000), (3, 0x2000), (4, 0x00b9)] {
             datagram.extend(packet(id, &ipv4(1500, flags)));
         }
@@ -252,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_is_read() {
+    fn an_answer_is_parsed() {
         let mut message = Vec::new();
         put(&mut message, TYPE_ERROR, 0, 77, 0, (0, &[]));
         message[HEADER_BYTES..HEADER_BYTES + 4].copy_from_slice(&(-1_i32).to_ne_bytes());
@@ -262,7 +263,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_read_to_an_end(
+        fn parsing_any_bytes_terminates(
             mut datagram in proptest::collection::vec(any::<u8>(), 0..200),
             changes in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..8),
             valid: bool,

@@ -1,4 +1,4 @@
-//! The link in user space: the kernel queues each packet of a source, and the link says what becomes of it.
+//! The back end in user space: the kernel queues each packet of a source, and [`Link`] decides its verdict.
 
 mod messages;
 mod rules;
@@ -23,33 +23,33 @@ use super::link::{Counters, Fate, HELD_MAX, Impairment, Link, LinkState};
 use crate::clock;
 use crate::model::MonotonicNs;
 
-/// How many packets may wait in the kernel for a verdict: those on their way, and those not read yet. Linux
-/// 6.18 lets 65,536 wait at most.
+/// The largest number of packets that wait in the kernel for a verdict: those in transit, and those not read
+/// yet. Linux 6.18 limits it to 65,536.
 const QUEUE_MAX: u32 = 5 * HELD_MAX as u32;
-/// Room for so many that are not read yet, so that nothing is lost but what the link loses. The default of
-/// some 200 KB holds about 250 packets, less than one large sample has fragments.
+/// The socket's receive buffer: room for packets not read yet, so that only the link loses packets. The
+/// default of some 200 KB holds about 250 packets, fewer than the fragments of one large sample.
 const RECEIVE_BUFFER_BYTES: usize = 64 << 20;
-/// Packets in a turn, so that delays that are over are not kept waiting.
+/// The largest number of packets read in a turn, so that delayed packets that are due do not wait long.
 const TURN_PACKETS: usize = 256;
-/// A packet of which the first bytes are copied takes a few hundred.
+/// The buffer of a datagram: a packet of which the kernel copies the first bytes needs a few hundred bytes.
 const DATAGRAM_BYTES: usize = 8 << 10;
-/// The answer to a request comes at once.
+/// How long to wait for the answer to a request, which the kernel sends at once.
 const ANSWER_TIMEOUT_MS: u16 = 5_000;
 
 /// An impairment by NFQUEUE. Dropping it removes the rule first and then closes the queue.
 pub struct Nfqueue {
-    // In this order: without the rule nothing more comes to the queue.
+    // Dropped in this order: once the rule is removed, no further packet enters the queue.
     _rule: Rule,
     queue: Queue,
     link: Link,
 }
 
 impl Nfqueue {
-    /// Begins to impair what the present network namespace receives from `source`, or of that only what it
-    /// passes on to `destination`. What a former one that has died has left is removed.
+    /// Starts to impair the packets that the current network namespace receives from `source`; with a
+    /// `destination`, only those that it forwards there. Removes the rules that killed processes have left.
     ///
     /// # Errors
-    /// The machine can't, or another program listens on the queue.
+    /// netfilter refused the rule or the queue, or another program listens on the queue.
     pub fn open(
         source: Ipv4Addr,
         destination: Option<Ipv4Addr>,
@@ -57,7 +57,7 @@ impl Nfqueue {
         impairment: &Impairment,
     ) -> Result<Self, ImpairmentError> {
         rules::remove_stale()?;
-        // First the listener, so that a rule of ours without one is always stale.
+        // The listener before the rule, so that a rule of the harness without a listener is always stale.
         let queue = Queue::open(queue)?;
         let rule = Rule::install(source, destination, queue.number)?;
         Ok(Self { _rule: rule, queue, link: Link::new(impairment) })
@@ -86,12 +86,12 @@ impl Backend for Nfqueue {
         let mut verdicts = Vec::new();
         for _ in 0..TURN_PACKETS {
             let Some(bytes) = self.queue.receive(&mut datagram)? else { break };
-            // For each: by the time of the turn's begin, a packet that came within it would leave too early,
-            // by 0.12 ms of 5 when that was seen.
+            // Read for each datagram: with the time of the turn's start, a packet that arrived during the
+            // turn would leave too early (0.12 ms of a delay of 5 ms, measured).
             let now = clock::monotonic();
             for message in messages::messages(&datagram[..bytes]) {
-                // An answer here is to a verdict on a packet that the kernel has given up, as its interface
-                // has gone.
+                // An answer here belongs to a verdict on a packet that the kernel has discarded, because its
+                // interface was removed.
                 let Message::Packet(arrival) = message else { continue };
                 let accept = match self.link.arrive(arrival, now) {
                     Fate::Hold => continue,
@@ -140,7 +140,7 @@ impl Backend for Nfqueue {
     }
 }
 
-/// A queue that we listen on.
+/// A kernel queue of packets with this process as its listener.
 struct Queue {
     socket: OwnedFd,
     number: u16,
@@ -152,7 +152,7 @@ impl Queue {
         let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
         let protocol = SockProtocol::NetlinkNetFilter;
         let socket = socket(AddressFamily::Netlink, SockType::Raw, flags, protocol).map_err(refused)?;
-        // Beyond the system's limit where that is allowed, otherwise up to it.
+        // Above the system's limit where the process may, otherwise up to it.
         if setsockopt(&socket, sockopt::RcvBufForce, &RECEIVE_BUFFER_BYTES).is_err() {
             setsockopt(&socket, sockopt::RcvBuf, &RECEIVE_BUFFER_BYTES).map_err(refused)?;
         }
@@ -167,7 +167,7 @@ impl Queue {
             queue.send(&request)?;
             match queue.answer(sequence)? {
                 Errno::UnknownErrno => {}
-                // So it says to who may not, and to who comes second.
+                // The kernel returns EPERM both without the right and when another process listens.
                 Errno::EPERM if rules::is_listened(number) => {
                     return Err(ImpairmentError::QueueTaken { queue: number });
                 }
@@ -177,7 +177,7 @@ impl Queue {
         Ok(queue)
     }
 
-    /// Waits for the answer to a request; `UnknownErrno` (0) is yes.
+    /// Waits for the kernel's answer to a request; `UnknownErrno` (0) means success.
     fn answer(&self, request: u32) -> Result<Errno, ImpairmentError> {
         let refused = |error: Errno| ImpairmentError::system("the answer of netfilter", error);
         let mut datagram = [0; DATAGRAM_BYTES];
@@ -199,7 +199,7 @@ impl Queue {
         }
     }
 
-    /// The next datagram; `None` when there is none at present.
+    /// Receives the next datagram; `None` when there is none.
     fn receive(&self, datagram: &mut [u8]) -> Result<Option<usize>, ImpairmentError> {
         loop {
             return match recv(self.socket.as_raw_fd(), datagram, MsgFlags::empty()) {

@@ -1,32 +1,33 @@
-//! From values to places, and where the marks stand.
+//! Axes of plots: map values to coordinates, and choose the marks.
 
-/// A scale from values to units of the drawing.
+/// A linear or logarithmic scale from values to coordinates.
 #[derive(Clone, Copy, Debug)]
 pub struct Axis {
     logarithmic: bool,
     low: f64,
     high: f64,
-    /// Where `low` and `high` are drawn.
+    /// Coordinate of `low`.
     from: f64,
+    /// Coordinate of `high`.
     to: f64,
 }
 
 impl Axis {
-    /// A linear scale.
+    /// Creates a linear scale.
     pub fn linear((low, high): (f64, f64), (from, to): (f64, f64)) -> Self {
         Self { logarithmic: false, low, high: if high > low { high } else { low + 1.0 }, from, to }
     }
 
-    /// A logarithmic scale over whole decades that hold both values.
+    /// Creates a logarithmic scale over whole decades that contain both values.
     pub fn decades((low, high): (f64, f64), (from, to): (f64, f64)) -> Self {
-        /// What is smaller is drawn here: a hundredth of a microsecond for milliseconds.
+        /// The smallest value of a scale: for milliseconds, a hundredth of a microsecond.
         const SMALLEST: f64 = 1e-5;
         let low = 10_f64.powf(low.max(SMALLEST).log10().floor());
         let high = 10_f64.powf(high.max(SMALLEST).log10().ceil()).max(low * 10.0);
         Self { logarithmic: true, low, high, from, to }
     }
 
-    /// Where a value is drawn; what is beyond the scale is drawn at its end.
+    /// The coordinate of a value; a value outside the scale is drawn at the scale's end.
     pub fn at(&self, value: f64) -> f64 {
         let share = if self.logarithmic {
             (value.max(self.low) / self.low).log10() / (self.high / self.low).log10()
@@ -36,7 +37,7 @@ impl Axis {
         self.from + share.clamp(0.0, 1.0) * (self.to - self.from)
     }
 
-    /// Values with a mark: at most about `most`, round ones.
+    /// The round values that get a mark, about `most` at most.
     pub fn marks(&self, most: usize) -> Vec<f64> {
         let most = most.max(1) as f64;
         if self.logarithmic {
@@ -64,7 +65,7 @@ impl Axis {
     }
 }
 
-/// Without what rounding left behind.
+/// Formats a value with three significant digits, without trailing zeros.
 fn round(value: f64) -> String {
     let decimals =
         if value == 0.0 { 0 } else { (2 - value.abs().log10().floor() as i32).clamp(0, 6) as usize };
@@ -93,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn values_have_their_places() {
+    fn values_map_to_coordinates() {
         let axis = Axis::decades((1.0, 1000.0), (30.0, 0.0));
         assert_eq!(
             [0.0, 1.0, 10.0, 1000.0, 1e9].map(|value| axis.at(value).round()),
@@ -101,7 +102,7 @@ mod tests {
         );
         let axis = Axis::linear((0.0, 10.0), (100.0, 200.0));
         assert_eq!([-1.0, 0.0, 2.5, 11.0].map(|value| axis.at(value)), [100.0, 100.0, 125.0, 200.0]);
-        // A scale without an extent has one all the same.
+        // A scale of equal limits is extended.
         assert!(Axis::linear((3.0, 3.0), (0.0, 1.0)).at(3.0).is_finite());
         assert_eq!(Axis::decades((0.0, 0.0), (0.0, 1.0)).at(0.0), 0.0);
     }

@@ -1,4 +1,4 @@
-//! Bars by impairment (Figure 4 of the paper).
+//! Bar charts by impairment (Figure 4 of the paper).
 
 use super::axis::Axis;
 use super::frame::{Entry, LEFT, RIGHT, grid_y, legend};
@@ -7,7 +7,7 @@ use crate::eval::statistics::Estimate;
 
 const HEIGHT: f64 = 170.0;
 
-/// Bars of a kind: one for each group, `None` where nothing was run.
+/// A series of bars, one for each group; `None` if it was not run.
 pub struct Series<'a> {
     pub name: &'a str,
     pub class: &'a str,
@@ -16,21 +16,21 @@ pub struct Series<'a> {
     pub paper: Vec<Option<f64>>,
 }
 
-/// What is drawn.
+/// A bar chart.
 pub struct Bars<'a> {
-    /// For those who can't see it.
+    /// The text alternative for screen readers.
     pub label: &'a str,
     pub groups: Vec<&'a str>,
     pub series: Vec<Series<'a>>,
     pub logarithmic: bool,
-    /// A dashed line, such as the rate that is aimed at.
+    /// The value of a dashed line, such as the nominal rate.
     pub target: Option<f64>,
-    /// How values are written above the bars.
+    /// Formats the values above the bars.
     pub shown: fn(f64) -> String,
 }
 
 impl Bars<'_> {
-    /// The drawing. A thin line through a bar's end is the interval over repetitions.
+    /// Draws the chart. A thin line through a bar's end is the interval over repetitions.
     pub fn draw(&self) -> String {
         let mut svg = Svg::default();
         let mut entries: Vec<Entry> = self
@@ -85,7 +85,7 @@ impl Bars<'_> {
                     svg.line("whisker", (middle, low), (middle, high));
                     above = high;
                 }
-                // The mark of the paper may be where the text would be.
+                // Move the text above the paper's mark if they would overlap.
                 if let Some(mark) =
                     paper.map(|paper| axis.at(paper)).filter(|mark| (above - TEXT..=above).contains(mark))
                 {

@@ -7,19 +7,18 @@ use crate::eval::statistics::Distribution;
 
 const HEIGHT: f64 = 190.0;
 
-/// Points of a curve: more than one for each unit of the frame's width shows nothing more.
+/// Points of a curve: about one for each unit of the frame's width; more would not be visible.
 const POINTS: usize = 400;
 
-/// A curve.
+/// The distribution of a curve, with its name and style.
 pub struct Curve<'a> {
     pub name: &'a str,
     pub class: &'a str,
     pub latencies_ms: Distribution,
 }
 
-/// The curves over a logarithmic axis that reaches from `range_ms` to `range_ms`, so that two plots can be
-/// compared. Below them is the share of samples that came within a time; the tail of the last percent is
-/// where the curves leave the top.
+/// Draws cumulative distributions: the share of samples with at most a latency. The logarithmic axis covers
+/// `range_ms`, so that two plots with the same range can be compared.
 pub fn cdf(label: &str, curves: &[Curve], range_ms: (f64, f64)) -> String {
     let mut svg = Svg::default();
     let names: Vec<Entry> =
@@ -34,7 +33,7 @@ pub fn cdf(label: &str, curves: &[Curve], range_ms: (f64, f64)) -> String {
         let mut points = Vec::with_capacity(2 * POINTS);
         for (value, share) in curve.latencies_ms.curve(POINTS) {
             let (at, level) = (x.at(value), y.at(share));
-            // Steps: a share is reached at its value and not before.
+            // Steps: the share increases at its value, not before.
             let before = points.last().map_or(bottom, |point: &(f64, f64)| point.1);
             points.push((at, before));
             points.push((at, level));

@@ -1,24 +1,24 @@
-//! What plots have in common: a frame with marks, and a legend.
+//! Common parts of plots: grid lines with labels, and a legend.
 
 use super::axis::Axis;
 use super::svg::{Anchor, Svg, TEXT, WIDTH, text_width};
 
-/// Left and right of the frame.
+/// The left and right edge of the frame.
 pub const LEFT: f64 = 52.0;
 pub const RIGHT: f64 = WIDTH - 18.0;
 
-/// Room below a frame for the labels of its marks and of its axis.
+/// Height below a frame for the labels of its marks and of its axis.
 pub const BELOW: f64 = 2.0 * TEXT + 14.0;
 
 /// An entry of a legend: a text and the class of its swatch.
 pub struct Entry<'a> {
     pub text: &'a str,
     pub class: &'a str,
-    /// Drawn as a line, or else as a filled square.
+    /// Whether the swatch is a line; otherwise it is a filled square.
     pub is_line: bool,
 }
 
-/// Draws a legend from the top on, in as many lines as it takes; yields where it ends.
+/// Draws a legend below `top`, in as many lines as needed; returns the y coordinate of its end.
 pub fn legend(svg: &mut Svg, top: f64, entries: &[Entry]) -> f64 {
     const SWATCH: f64 = 22.0;
     const GAP: f64 = 14.0;
@@ -40,7 +40,7 @@ pub fn legend(svg: &mut Svg, top: f64, entries: &[Entry]) -> f64 {
     y + 9.0
 }
 
-/// Horizontal grid lines with their labels at the left.
+/// Draws horizontal grid lines with their labels at the left.
 pub fn grid_y(svg: &mut Svg, axis: &Axis, most: usize) {
     for mark in axis.marks(most) {
         let y = axis.at(mark);
@@ -49,7 +49,7 @@ pub fn grid_y(svg: &mut Svg, axis: &Axis, most: usize) {
     }
 }
 
-/// Vertical grid lines with their labels below, and what the axis is of.
+/// Draws vertical grid lines with their labels below, and the title of the axis.
 pub fn grid_x(svg: &mut Svg, axis: &Axis, most: usize, (top, bottom): (f64, f64), title: &str) {
     for mark in axis.marks(most) {
         let x = axis.at(mark);

@@ -1,4 +1,4 @@
-//! Plots as inline SVG. Written here, as no small library does what the report needs
+//! Draws plots as inline SVG, without a library, as no small one has what the report needs
 //! (docs/decisions/0008-report.md).
 
 mod axis;

@@ -1,47 +1,47 @@
-//! The few elements of SVG that the plots need. Colours and line styles are classes, so that the page's style
-//! sheet can show the same plot in dark and in light.
+//! Writes the SVG elements that the plots need. Colours and line styles are classes, so that the page's style
+//! sheet has a dark and a light mode for the same plot.
 
 use std::fmt::{Display, Write as _};
 
 use super::super::format::escape;
 
-/// The width of every plot in its own units. At the width of a phone's screen, some 340 pixels, a text of
-/// [`TEXT`] units still is 9 pixels high.
+/// The width of every plot in its own units. On a phone's screen, about 340 pixels wide, a text of [`TEXT`]
+/// units is 9 pixels high.
 pub const WIDTH: f64 = 480.0;
 
 /// The height of all text but headings, which are a unit larger.
 pub const TEXT: f64 = 13.0;
 
-/// How wide a text of so many characters is, about: with a typical sans-serif font of that size.
+/// Estimates the width of a text in a typical sans-serif font.
 pub fn text_width(text: &str) -> f64 {
     text.chars().count() as f64 * TEXT * 0.54
 }
 
-/// Where a text is put.
+/// The alignment of a text relative to its point.
 #[derive(Clone, Copy)]
 pub enum Anchor {
-    /// It begins here.
+    /// The text starts at the point.
     Start,
-    /// It is centred here.
+    /// The text is centred at the point.
     Middle,
-    /// It ends here.
+    /// The text ends at the point.
     End,
 }
 
-/// A drawing that grows.
+/// An SVG drawing to which elements are added.
 #[derive(Default)]
 pub struct Svg {
     body: String,
 }
 
 impl Svg {
-    /// A line.
+    /// Adds a line.
     pub fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
         let [x1, y1, x2, y2] = [from.0, from.1, to.0, to.1].map(short);
         self.put(format_args!(r#"<line class="{class}" x1="{x1}" y1="{y1}" x2="{x2}" y2="{y2}"/>"#));
     }
 
-    /// Lines from point to point.
+    /// Adds a polyline.
     pub fn polyline(&mut self, class: &str, points: &[(f64, f64)]) {
         let mut list = String::new();
         for (index, (x, y)) in points.iter().enumerate() {
@@ -51,7 +51,7 @@ impl Svg {
         self.put(format_args!(r#"<polyline class="{class}" points="{list}"/>"#));
     }
 
-    /// A rectangle; `tip` is shown by browsers when it is pointed at.
+    /// Adds a rectangle; browsers show `tip` when the pointer is over it.
     pub fn rect(&mut self, class: &str, corner: (f64, f64), size: (f64, f64), tip: Option<&str>) {
         let [x, y, width, height] = [corner.0, corner.1, size.0.max(0.0), size.1.max(0.0)].map(short);
         let attributes = format!(r#"class="{class}" x="{x}" y="{y}" width="{width}" height="{height}""#);
@@ -61,7 +61,7 @@ impl Svg {
         }
     }
 
-    /// A text whose baseline is at the point.
+    /// Adds a text whose baseline is at the point.
     pub fn text(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
         let anchor = match anchor {
             Anchor::Start => "start",
@@ -75,7 +75,7 @@ impl Svg {
         ));
     }
 
-    /// The whole drawing, [`WIDTH`] wide; `label` tells those who can't see it what it shows.
+    /// Returns the SVG element, [`WIDTH`] wide; `label` is the text alternative for screen readers.
     pub fn finish(self, height: f64, label: &str) -> String {
         let (width, height) = (short(WIDTH), short(height));
         let attributes =
@@ -88,13 +88,13 @@ impl Svg {
     }
 }
 
-/// A coordinate with a tenth of a unit, which no screen can tell from more.
+/// Formats a coordinate with one decimal; more would not be visible.
 fn short(value: f64) -> String {
     let tenths = (value * 10.0).round();
     if !tenths.is_finite() {
         return "0".to_owned();
     }
-    // No "-0".
+    // Adding 0.0 turns -0.0 into 0.0.
     format!("{}", (tenths + 0.0) / 10.0)
 }
 
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn elements_are_closed_short_and_escaped() {
+    fn elements_are_closed_and_escaped_with_rounded_coordinates() {
         let mut svg = Svg::default();
         svg.line("a", (0.04, -0.04), (1.0, f64::NAN));
         svg.polyline("b", &[(1.234, 2.0), (3.0, 4.06)]);

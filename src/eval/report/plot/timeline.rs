@@ -1,4 +1,4 @@
-//! What happened during a run, over time: several quantities above each other, one time axis.
+//! Time lines of runs: panels of several quantities above each other, with one time axis.
 
 use super::axis::Axis;
 use super::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
@@ -12,41 +12,41 @@ const STRIP: f64 = 20.0;
 pub struct Line<'a> {
     pub name: &'a str,
     pub class: &'a str,
-    /// Seconds and value; a value that isn't finite leaves a gap.
+    /// Seconds and value; a value that is not finite is a gap.
     pub points: Vec<(f64, f64)>,
 }
 
-/// A quantity over time.
+/// A panel: a quantity over time.
 pub struct Panel<'a> {
     pub title: &'a str,
     pub lines: Vec<Line<'a>>,
     pub logarithmic: bool,
-    /// The axis reaches at least here.
+    /// The axis covers at least this value.
     pub at_least: f64,
     pub target: Option<f64>,
 }
 
-/// States over time, as coloured bars.
+/// A strip: states over time, as coloured bars.
 pub struct Strip<'a> {
     pub title: String,
     pub changes: &'a [Change<String>],
 }
 
-/// What is drawn.
+/// A time line of a run.
 pub struct Timeline<'a> {
-    /// For those who can't see it.
+    /// The text alternative for screen readers.
     pub label: &'a str,
     pub end_s: f64,
-    /// Shaded: when the link was impaired.
+    /// Spans of time in which the link was impaired, drawn shaded.
     pub impaired: Vec<(f64, f64)>,
-    /// Things that were done, as marks with a word.
+    /// Events, drawn as marks with a text.
     pub events: Vec<(f64, String)>,
     pub panels: Vec<Panel<'a>>,
     pub strips: Vec<Strip<'a>>,
 }
 
 impl Timeline<'_> {
-    /// The drawing.
+    /// Draws the time line.
     pub fn draw(&self) -> String {
         let mut svg = Svg::default();
         let x = Axis::linear((0.0, self.end_s), (LEFT, RIGHT));
@@ -143,7 +143,7 @@ impl Timeline<'_> {
     }
 }
 
-/// The class of a state or mode; what is unknown looks like nothing known.
+/// The style class of a state or mode; unknown states are grey.
 fn state_class(state: &str) -> &'static str {
     match state {
         "critical" | "normal" => "good",

@@ -1,4 +1,4 @@
-//! `manifest.json` of a run: what of it the report needs. docs/eval-results.md describes every key.
+//! Reads the keys of a run's `manifest.json` that the report needs. docs/eval-results.md describes every key.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,10 +8,10 @@ use serde::Deserialize;
 
 use super::super::error::ReportError;
 
-/// The only format there is.
+/// The format of manifests that this program reads.
 const FORMAT: u32 = 1;
 
-/// What was run, where, and with what.
+/// The manifest of a run: its settings, machine, software, endpoints and links.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Manifest {
     pub run: String,
@@ -38,12 +38,12 @@ pub struct Manifest {
     pub links: Vec<LinkRecord>,
     #[serde(default)]
     pub problems: Vec<String>,
-    /// Set in data that no harness recorded, as in tests: the report says so wherever it says anything.
+    /// Whether the data are synthetic, as in tests; the report warns about them.
     #[serde(default)]
     pub synthetic: bool,
 }
 
-/// Where it ran.
+/// The machine of a run.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 pub struct Machine {
     pub kernel: String,
@@ -52,11 +52,11 @@ pub struct Machine {
     pub memory_bytes: u64,
     pub os: String,
     pub load_before: f64,
-    /// None in runs of before it was recorded.
+    /// `None` in older runs, which did not record it.
     pub stolen_percent: Option<f64>,
 }
 
-/// What it ran with.
+/// The software of a run.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 pub struct Software {
     pub version: String,
@@ -81,13 +81,13 @@ pub struct Endpoint {
     pub environment: BTreeMap<String, String>,
 }
 
-/// What an endpoint is to the robot.
+/// The role of an endpoint.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// The sensor.
+    /// A publisher, such as a sensor.
     Publisher,
-    /// The local subscriber that must not miss anything.
+    /// A local subscriber that must not miss samples.
     Critical,
     /// A remote subscriber.
     Slow,
@@ -104,12 +104,12 @@ pub struct LinkRecord {
     pub impairment: Option<LinkOutcome>,
 }
 
-/// What a link said at its end.
+/// The final output of a link's process.
 #[derive(Clone, Debug, Deserialize)]
 pub struct LinkOutcome {
     pub backend: String,
     pub reason: String,
-    /// None where the back end takes none.
+    /// `None` if the back end has no seed.
     pub seed: Option<u64>,
     pub delay_ms: f64,
     pub judged: u64,
@@ -130,19 +130,22 @@ impl Manifest {
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
         let path = folder.join("manifest.json");
         let text = fs::read_to_string(&path).map_err(ReportError::file(&path))?;
-        // The format first, so that a newer one is not taken for a broken one.
+        // Check the format first, so that a newer manifest is not reported as invalid.
         let Format { format } = from_json(&path, &text)?;
         if format != FORMAT {
-            let problem = format!("format {format}, and this program knows {FORMAT}: use the one of the run");
+            let problem = format!(
+                "format {format}, but this program reads format {FORMAT}: use the version that recorded it"
+            );
             return Err(ReportError::content(&path, 0, problem));
         }
         let manifest: Self = from_json(&path, &text)?;
         if manifest.end_ns <= manifest.begin_ns {
             return Err(ReportError::content(&path, 0, "end_ns is not after begin_ns"));
         }
-        // Names become those of files.
+        // Names of endpoints are used as file names.
         if let Some(bad) = manifest.endpoints.iter().find(|one| one.name.contains(['/', '\0'])) {
-            return Err(ReportError::content(&path, 0, format!("'{}' is no name of an endpoint", bad.name)));
+            let problem = format!("'{}' is not a valid name of an endpoint", bad.name);
+            return Err(ReportError::content(&path, 0, problem));
         }
         Ok(manifest)
     }
@@ -152,10 +155,10 @@ impl Manifest {
         (self.end_ns - self.begin_ns) as f64 / 1e9
     }
 
-    /// A time of the run's files in seconds since the window began.
+    /// Converts a time of the run's files to seconds since the start of the window.
     pub fn seconds(&self, time_ns: u64) -> f64 {
-        // Monotonic nanoseconds of a machine that has been up for a month are above 2^51: the difference is
-        // taken before the conversion, so that none is rounded.
+        // Monotonic nanoseconds of a machine that has been up for a month are above 2^51: subtract before the
+        // conversion, so that nothing is rounded.
         if time_ns >= self.begin_ns {
             (time_ns - self.begin_ns) as f64 / 1e9
         } else {
@@ -171,5 +174,5 @@ struct Format {
 
 fn from_json<'a, T: Deserialize<'a>>(path: &Path, text: &'a str) -> Result<T, ReportError> {
     serde_json::from_str(text)
-        .map_err(|error| ReportError::content(path, error.line(), format!("no manifest: {error}")))
+        .map_err(|error| ReportError::content(path, error.line(), format!("invalid manifest: {error}")))
 }

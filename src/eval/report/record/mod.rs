@@ -1,5 +1,5 @@
-//! The records of finished runs, as docs/eval-results.md describes them. Times become seconds since the
-//! measured window began.
+//! Reads the records of finished runs, described in docs/eval-results.md. Converts times to seconds since the
+//! start of the measured window.
 
 mod manifest;
 mod status;
@@ -14,7 +14,7 @@ pub use status::BridgeRecord;
 use super::error::ReportError;
 use crate::eval::statistics::Reception;
 
-/// All that is known of a run.
+/// The records of a run.
 #[derive(Clone, Debug)]
 pub struct Run {
     pub manifest: Manifest,
@@ -40,7 +40,7 @@ pub struct Published {
 #[derive(Clone, Debug)]
 pub struct Subscribed {
     pub endpoint: Endpoint,
-    /// In the order in which they came.
+    /// In the order of arrival.
     pub receptions: Vec<Reception>,
 }
 
@@ -53,7 +53,7 @@ pub struct Attempt {
     pub ok: bool,
 }
 
-/// Something that the harness did.
+/// An event that the harness recorded.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
     pub at_s: f64,
@@ -69,7 +69,7 @@ pub struct WireReading {
     pub to_host_bytes: u64,
 }
 
-/// Counters of RTPS messages at a port of the switch.
+/// Counters of RTPS messages at the interface of a host.
 #[derive(Clone, Debug)]
 pub struct RtpsReading {
     pub at_s: f64,
@@ -81,7 +81,7 @@ pub struct RtpsReading {
     pub user_acknack: u64,
 }
 
-/// Counters of the kernel of a host.
+/// Counters of a host's kernel.
 #[derive(Clone, Debug)]
 pub struct KernelReading {
     pub at_s: f64,
@@ -91,7 +91,7 @@ pub struct KernelReading {
     pub udp_buffer_errors: u64,
 }
 
-/// What a process used.
+/// CPU time and memory of a process.
 #[derive(Clone, Debug)]
 pub struct ProcessReading {
     pub at_s: f64,
@@ -101,16 +101,16 @@ pub struct ProcessReading {
     pub rss_bytes: u64,
 }
 
-/// What a folder of results has.
+/// The runs of a folder of results.
 pub struct Folder {
-    /// In the order of their names.
+    /// Readable runs, sorted by name.
     pub runs: Vec<Run>,
-    /// Runs that could not be read, and those that failed: name and reason.
+    /// Name and reason of runs that could not be read, and of runs that failed.
     pub unusable: Vec<(String, String)>,
 }
 
 impl Folder {
-    /// Reads the results in `folder`. A run that can't be read is told and left out.
+    /// Reads the results in `folder`. A run that cannot be read is listed in `unusable`.
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
         let mut runs = Vec::new();
         let mut unusable = Vec::new();
@@ -135,7 +135,7 @@ fn name_of(path: &Path) -> String {
     path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Folders in a folder, by name; none where there is no such folder.
+/// Lists the folders in a folder, sorted by name; empty if the folder does not exist.
 fn folders(folder: &Path) -> Result<Vec<PathBuf>, ReportError> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -181,11 +181,11 @@ impl Run {
             Ok(Event { at_s, event: row.text(1).to_owned(), subject: row.text(2).to_owned() })
         })?;
         let wire =
-            table::read_if_there(&folder.join("wire.csv"), ["time_ns", "port", "to_host_bytes"], |row| {
+            table::read_if_exists(&folder.join("wire.csv"), ["time_ns", "port", "to_host_bytes"], |row| {
                 let (at_s, port) = (seconds(row.number(0)?), row.text(1).to_owned());
                 Ok(WireReading { at_s, port, to_host_bytes: row.number(2)? })
             })?;
-        let rtps = table::read_if_there(
+        let rtps = table::read_if_exists(
             &folder.join("rtps.csv"),
             ["time_ns", "port", "direction", "fragments", "user_data", "user_heartbeat", "user_acknack"],
             |row| {
@@ -200,7 +200,7 @@ impl Run {
                 })
             },
         )?;
-        let kernel = table::read_if_there(
+        let kernel = table::read_if_exists(
             &folder.join("kernel.csv"),
             ["time_ns", "host", "fragment_memory_bytes", "reassembly_failed", "udp_buffer_errors"],
             |row| {
@@ -213,7 +213,7 @@ impl Run {
                 })
             },
         )?;
-        let processes = table::read_if_there(
+        let processes = table::read_if_exists(
             &folder.join("processes.csv"),
             ["time_ns", "process", "pid", "cpu_ms", "rss_bytes"],
             |row| {
@@ -240,16 +240,17 @@ impl Run {
         self.manifest.length_s()
     }
 
-    /// When links were switched, `(seconds, whether impaired)`; what happens to several at once is one
+    /// Toggles of links, `(seconds, whether impaired)`; switching several links at the same time is one
     /// toggle.
     pub fn toggles(&self) -> Vec<(f64, bool)> {
-        /// The harness switches the links of a host one after the other.
+        /// Events closer than this are simultaneous: the harness switches the links of a host one after the
+        /// other.
         const AT_ONCE_S: f64 = 1.0;
         let mut toggles: Vec<(f64, bool)> = Vec::new();
         for event in &self.events {
             let impaired = match event.event.as_str() {
                 "link_down" => true,
-                // Of a link that only ever is cut, `on` is its sound state.
+                // A link without loss and delay, which is only ever cut, is clean when it is on.
                 "link_on" => self.is_lossy(),
                 "link_off" => false,
                 _ => continue,
@@ -268,7 +269,7 @@ impl Run {
         outcomes.into_iter().any(|link| link.loss_expected > 0.0 || link.delay_ms > 0.0)
     }
 
-    /// When some link was impaired, `(from, to)` in seconds within the window.
+    /// Spans of time in which a link was impaired, `(from, to)` in seconds within the window.
     pub fn impaired_spans(&self) -> Vec<(f64, f64)> {
         let mut spans = Vec::new();
         let mut since = None;

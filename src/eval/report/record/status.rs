@@ -1,4 +1,4 @@
-//! `status.jsonl` of a run with the bridge: its states and modes over time.
+//! Reads `status.jsonl` of a run with the bridge: states and modes over time.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -10,29 +10,29 @@ use super::super::error::ReportError;
 use super::Manifest;
 use crate::eval::statistics::Change;
 
-/// What the bridge said of itself during a run.
+/// The bridge's status over a run.
 #[derive(Clone, Debug, Default)]
 pub struct BridgeRecord {
-    /// States of each subscriber, by its id.
+    /// The record of each subscriber, by its id.
     pub subscribers: Vec<(String, SubscriberRecord)>,
     /// Modes that each lane applied.
     pub lanes: Vec<(String, Vec<Change<String>>)>,
     /// Modes of the safety supervisor.
     pub safety: Vec<Change<String>>,
-    /// Bytes of payload that the noncritical lanes have handed to DDS, `(seconds, bytes)`.
+    /// Bytes of payload that the noncritical lanes have published, `(seconds, bytes)`.
     pub noncritical_bytes: Vec<(f64, u64)>,
-    /// Lanes of routes whose samples were not all accounted for, forwarded or dropped for a name, at the end.
-    pub not_whole: usize,
+    /// Lanes of routes with samples that were neither forwarded nor counted under a drop reason at the end.
+    pub unaccounted_lanes: usize,
 }
 
-/// What the classifier made of a subscriber.
+/// The classifier's states of a subscriber.
 #[derive(Clone, Debug, Default)]
 pub struct SubscriberRecord {
-    /// Its states.
+    /// The states over time.
     pub states: Vec<Change<String>>,
-    /// Changes of its state within the window, by the classifier's own counter.
+    /// Transitions within the window, by the classifier's own counter.
     pub transitions: u64,
-    /// The counter when the window began.
+    /// The classifier's counter at the start of the window.
     counted_before: Option<u64>,
 }
 
@@ -42,7 +42,7 @@ struct Line {
     status: Status,
 }
 
-/// What of docs/status-json.md is needed here.
+/// The keys of the status (docs/status-json.md) that the report needs.
 #[derive(Deserialize)]
 struct Status {
     #[serde(default)]
@@ -86,7 +86,7 @@ struct RouteLane {
     whole: bool,
 }
 
-/// Reads the file in `folder`; there is none in a baseline.
+/// Reads the file in `folder`; returns `None` if it does not exist, as in a baseline.
 pub fn read(folder: &Path, manifest: &Manifest) -> Result<Option<BridgeRecord>, ReportError> {
     let path = folder.join("status.jsonl");
     let text = match fs::read_to_string(&path) {
@@ -97,7 +97,7 @@ pub fn read(folder: &Path, manifest: &Manifest) -> Result<Option<BridgeRecord>, 
     let mut record = BridgeRecord::default();
     for (index, line) in text.lines().enumerate() {
         let Line { time_ns, status } = serde_json::from_str(line)
-            .map_err(|error| ReportError::content(&path, index + 1, format!("no status: {error}")))?;
+            .map_err(|error| ReportError::content(&path, index + 1, format!("invalid status: {error}")))?;
         record.add(manifest.seconds(time_ns), manifest.length_s(), status);
     }
     Ok(Some(record))
@@ -115,23 +115,23 @@ impl BridgeRecord {
         }
         for subscriber in status.subscribers {
             let record = entry(&mut self.subscribers, &subscriber.id);
-            // The status is of up to a second after the change, and says how long ago that was.
+            // The status is up to a second later than the transition, and gives the time since then.
             let since_s = subscriber.state_since_s.clamp(0.0, 1e9);
             change(&mut record.states, at_s - since_s, subscriber.state);
             if at_s < length_s {
-                // Readings before the window tell where the counter began.
+                // The last reading before the window gives the counter's initial value.
                 if at_s <= 0.0 || record.counted_before.is_none() {
                     record.counted_before = Some(subscriber.transitions);
                 }
                 let before = record.counted_before.unwrap_or_default();
-                // A control process that was started anew counts from 0.
+                // A restarted control process counts from 0.
                 record.transitions = subscriber.transitions.saturating_sub(before);
             }
         }
         let lanes = || status.routes.iter().flat_map(|route| &route.lanes);
         let noncritical = lanes().filter(|lane| lane.lane != "critical");
         self.noncritical_bytes.push((at_s, noncritical.map(|lane| lane.forwarded_bytes).sum()));
-        self.not_whole = lanes().filter(|lane| !lane.whole).count();
+        self.unaccounted_lanes = lanes().filter(|lane| !lane.whole).count();
     }
 }
 
@@ -145,7 +145,7 @@ fn entry<'a, T: Default>(list: &'a mut Vec<(String, T)>, name: &str) -> &'a mut 
 
 fn change(changes: &mut Vec<Change<String>>, at_s: f64, to: String) {
     if changes.last().is_none_or(|last| last.to != to) {
-        // Never before the change that came first.
+        // The times of changes must ascend.
         let at_s = changes.last().map_or(at_s, |last| at_s.max(last.at_s));
         changes.push(Change { at_s, to });
     }

@@ -1,4 +1,4 @@
-//! The CSV files of a run: a header line, commas, no quotes.
+//! Reads the CSV files of a run: a header line, commas, no quotes.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use super::super::error::ReportError;
 
-/// A line of a CSV file, with the columns that were asked for.
+/// The requested columns of a line of a CSV file.
 pub struct Row<'a, const N: usize> {
     path: &'a Path,
     line: usize,
@@ -16,21 +16,22 @@ pub struct Row<'a, const N: usize> {
 }
 
 impl<'a, const N: usize> Row<'a, N> {
-    /// The text of a column, by its place among those asked for.
+    /// The text of a column, by its index in the requested columns.
     pub fn text(&self, column: usize) -> &'a str {
         self.fields[column]
     }
 
-    /// The number in a column.
+    /// Parses the number in a column.
     pub fn number<T: FromStr>(&self, column: usize) -> Result<T, ReportError> {
         self.fields[column].parse().map_err(|_| {
-            let problem = format!("{} is '{}', no number", self.columns[column], self.fields[column]);
+            let (column, text) = (self.columns[column], self.fields[column]);
+            let problem = format!("{column} is '{text}', but must be a number");
             ReportError::content(self.path, self.line, problem)
         })
     }
 }
 
-/// What `read` makes of each row of a file; columns that are not asked for may be there.
+/// Reads a file and converts each row with `read`. The file may have further columns.
 pub fn read<T, const N: usize>(
     path: &Path,
     columns: [&str; N],
@@ -51,7 +52,7 @@ pub fn read<T, const N: usize>(
         fields.clear();
         fields.extend(line.split(','));
         if fields.len() != header.len() {
-            let problem = format!("{} fields, and the header has {}", fields.len(), header.len());
+            let problem = format!("{} fields, but the header has {}", fields.len(), header.len());
             return Err(ReportError::content(path, index + 2, problem));
         }
         rows.push(read(Row { path, line: index + 2, columns, fields: places.map(|place| fields[place]) })?);
@@ -59,8 +60,8 @@ pub fn read<T, const N: usize>(
     Ok(rows)
 }
 
-/// [`read`], of a file that need not be there.
-pub fn read_if_there<T, const N: usize>(
+/// Like [`read`], but returns no rows if the file does not exist.
+pub fn read_if_exists<T, const N: usize>(
     path: &Path,
     columns: [&str; N],
     row: impl FnMut(Row<N>) -> Result<T, ReportError>,
@@ -90,16 +91,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_its_line() {
+    fn mistakes_are_reported_with_their_line() {
         assert_eq!(rows("seq\n1\n"), Err("a.csv:1: there is no column what".to_owned()));
         assert_eq!(rows(""), Err("a.csv:1: there is no column seq".to_owned()));
-        assert_eq!(rows("seq,what\n1,a\n2\n"), Err("a.csv:3: 1 fields, and the header has 2".to_owned()));
-        assert_eq!(rows("seq,what\n-1,a\n"), Err("a.csv:2: seq is '-1', no number".to_owned()));
+        assert_eq!(rows("seq,what\n1,a\n2\n"), Err("a.csv:3: 1 fields, but the header has 2".to_owned()));
+        assert_eq!(rows("seq,what\n-1,a\n"), Err("a.csv:2: seq is '-1', but must be a number".to_owned()));
     }
 
     #[test]
-    fn a_file_may_be_missing_where_that_is_allowed() {
-        let none = read_if_there(Path::new("/nowhere/a.csv"), ["seq"], |row| row.number::<u64>(0));
+    fn an_optional_file_may_be_missing() {
+        let none = read_if_exists(Path::new("/nowhere/a.csv"), ["seq"], |row| row.number::<u64>(0));
         assert!(none.unwrap().is_empty());
     }
 }

@@ -1,13 +1,13 @@
-//! H1: without a bridge, one lossy link degrades everybody.
+//! H1: without a bridge, one lossy link degrades the publisher and the critical subscriber.
 
 use super::{Criterion, Finding, Verdict, missing, place_name};
 use crate::eval::report::cells::{Cell, Place, Results, reading_name};
 use crate::eval::report::format;
 
-/// The rate is degraded when this share of the clean baseline's is gone.
+/// The rate is degraded if it is lower than the clean baseline's by at least this share.
 const RATE_LOST: f64 = 0.05;
 
-/// The critical latency is degraded when its p95 is this many times that of the clean baseline.
+/// The critical latency is degraded if its p95 is at least this many times that of the clean baseline.
 const LATENCY_TIMES: f64 = 10.0;
 
 const LEVELS: [&str; 3] = ["baseline_mild", "baseline_moderate", "baseline_strong"];
@@ -15,20 +15,20 @@ const LEVELS: [&str; 3] = ["baseline_mild", "baseline_moderate", "baseline_stron
 const CLAIM: &str = "Without a bridge, bursty loss at one remote subscriber degrades the publisher's rate \
                      and the critical subscriber's latency. Rule: in each impaired baseline the rate is at \
                      least 5 % below the clean baseline's, and the critical p95 at least ten times the clean \
-                     baseline's. Confirmed where both hold for mild, moderate and strong loss with Fast DDS, \
-                     as the paper reports; partly where some of it holds.";
+                     baseline's. Confirmed if both hold for mild, moderate and strong loss with Fast DDS, as \
+                     the paper reports; partly confirmed if at least one of them holds somewhere.";
 
-/// What was found at a place.
+/// The levels of loss that degrade rate and latency at a place.
 struct AtPlace {
     place: Place,
     rate: Vec<&'static str>,
     latency: Vec<&'static str>,
     levels: usize,
-    /// The longest time that the critical subscriber was without a sample, at the worst level.
+    /// The longest time without a sample at the critical subscriber, over all levels.
     gap_ms: f64,
 }
 
-/// What the runs of one reading say.
+/// Computes the verdict for one reading.
 pub fn finding(results: &Results, reading: &str) -> Finding {
     let (mut criteria, mut places) = (Vec::new(), Vec::new());
     for place in results.places() {
@@ -66,7 +66,7 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
     };
     let sentences: Vec<String> = places.iter().map(AtPlace::sentence).collect();
     let because = match verdict {
-        Verdict::NotTested => "No impaired baseline was run beside a clean one.".to_owned(),
+        Verdict::NotTested => "An impaired and a clean baseline in the same setting were not run.".to_owned(),
         Verdict::NotSeen => format!("Not all levels were run. {}", sentences.join(" ")),
         _ => sentences.join(" "),
     };
@@ -77,7 +77,10 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
         .filter(|one| one.contains(reading_name(reading)) || one.contains("clean"));
     Finding {
         id: "H1",
-        title: format!("Without a bridge, one lossy link degrades all: Table I {}", reading_name(reading)),
+        title: format!(
+            "Without a bridge, one lossy link degrades the publisher and the critical subscriber: Table I {}",
+            reading_name(reading)
+        ),
         claim: CLAIM,
         verdict,
         because,
@@ -93,7 +96,7 @@ impl AtPlace {
             count if count == self.levels && count > 1 => "at every level".to_owned(),
             _ => format!("at {}", levels.join(" and ")),
         };
-        let switch = if self.place.switch == "plain" { "" } else { ", fragments reassembled between" };
+        let switch = if self.place.switch == "plain" { "" } else { ", switch that reassembles fragments" };
         let place = format!("{}, {}{switch}", self.place.library_name(), self.place.bed);
         format!(
             "{place}: rate degraded {}, critical latency {}; longest time without a critical sample {} s.",
@@ -104,7 +107,7 @@ impl AtPlace {
     }
 }
 
-/// Whether rate and latency are degraded.
+/// Checks whether rate and latency are degraded.
 fn judge(clean: &Cell, cell: &Cell) -> Option<[Criterion; 2]> {
     let (clean_hz, hz) = (clean.median(|one| one.rate_hz)?, cell.median(|one| one.rate_hz)?);
     let (clean_ms, p95_ms) = (clean.critical_ms(0.95)?, cell.critical_ms(0.95)?);
@@ -125,7 +128,7 @@ fn judge(clean: &Cell, cell: &Cell) -> Option<[Criterion; 2]> {
     ])
 }
 
-/// Why a baseline showed what it showed, from its figures.
+/// Explains the degradation of a baseline, or its absence, from its figures.
 pub fn mechanism(cell: &Cell) -> Option<String> {
     let attempts = cell.total(|one| one.attempts);
     let held = cell.median(|one| one.outstanding_max.map(|held| held as f64))?;
@@ -135,7 +138,7 @@ pub fn mechanism(cell: &Cell) -> Option<String> {
     let (failed, blocked) = (cell.total(|one| one.failed), cell.total(|one| one.blocked));
     let held = format::count(held);
     let memory = cell.median(|one| one.fragment_memory_max_bytes.map(|bytes| bytes as f64)).unwrap_or(0.0);
-    let given_up = cell.median(|one| one.reassembly_failed.map(|count| count as f64)).unwrap_or(0.0);
+    let discarded = cell.median(|one| one.reassembly_failed.map(|count| count as f64)).unwrap_or(0.0);
     let mut text = if failed + blocked == 0 {
         format!(
             "The writer's history did not fill: at most {held} samples waited for the remote subscriber, and \
@@ -155,21 +158,20 @@ pub fn mechanism(cell: &Cell) -> Option<String> {
         .filter(|_| failed > 0)
     {
         text += &format!(
-            " While calls fail, nothing is sent to anybody: the critical subscriber was without a sample for \
-             up to {} s, and each sample that the writer took reached it within {} ms.",
+            " While calls fail, the publisher sends no samples: the critical subscriber was without a sample \
+             for up to {} s, and each sample that the writer took reached it within {} ms.",
             format::number(gap_ms / 1e3, 1),
             format::ms(max_ms)
         );
     }
-    if memory > 0.0 || given_up > 0.0 {
+    if memory > 0.0 || discarded > 0.0 {
         text += &format!(
-            " Incomplete datagrams took up to {} at the host between, which gave up {} of them.",
+            " Incomplete datagrams took up to {} of memory at the switch, which discarded {} of them.",
             format::bytes(memory),
-            format::count(given_up)
+            format::count(discarded)
         );
     } else {
-        text +=
-            " The host between held no fragments, so that nothing of the critical path was dropped there.";
+        text += " The switch held no fragments, so it dropped nothing of the critical path.";
     }
     Some(text)
 }

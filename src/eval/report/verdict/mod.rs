@@ -1,8 +1,8 @@
-//! Verdicts on the paper's hypotheses (section IV-A), computed from the data by rules that are part of them.
+//! Verdicts on the paper's hypotheses (section IV-A), computed from the runs by rules that the report lists.
 //!
-//! A verdict is of what was run. It can come out as not confirmed, and what was not run is never confirmed.
+//! A verdict can be "not confirmed", and a hypothesis whose scenarios were not run is never confirmed.
 
-mod below;
+mod below_dds;
 mod h1;
 mod h2;
 mod h3;
@@ -13,25 +13,25 @@ pub use h1::mechanism;
 
 use super::cells::{Cell, Results};
 
-/// What became of a hypothesis.
+/// The verdict on a hypothesis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// All that it takes was run, and holds.
+    /// All required scenarios were run, and all rules hold.
     Confirmed,
-    /// Some of it holds, and some doesn't.
+    /// Some rules hold, and some do not.
     Partly,
-    /// It was run, and doesn't hold.
+    /// The required scenarios were run, and no rule holds.
     NotConfirmed,
-    /// What was run holds; not all that it takes was run.
+    /// All rules hold in the scenarios that were run, but some required scenarios were not run.
     Incomplete,
-    /// Nothing of it was seen; not all that it takes was run.
+    /// No rule holds in the scenarios that were run, but some required scenarios were not run.
     NotSeen,
-    /// What it takes was not run, or only as a smoke run.
+    /// No required scenario was run, or only smoke runs.
     NotTested,
 }
 
 impl Verdict {
-    /// In words.
+    /// The verdict in words.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
@@ -44,36 +44,36 @@ impl Verdict {
     }
 }
 
-/// Something that was looked at, in one place.
+/// The check of a rule in one scenario and setting.
 #[derive(Clone, Debug)]
 pub struct Criterion {
-    /// What has to hold; criteria of the same rule are judged together.
+    /// The rule; it holds if all criteria with the same text hold.
     pub rule: String,
-    /// Where.
+    /// The scenario and setting.
     pub place: String,
-    /// What was found.
+    /// The measured values.
     pub found: String,
     pub holds: bool,
 }
 
-/// A hypothesis, and what the data say of it.
+/// A hypothesis with its verdict and the checked criteria.
 #[derive(Clone, Debug)]
 pub struct Finding {
-    /// Such as `H1`.
+    /// Identifier of the hypothesis, such as `H1`.
     pub id: &'static str,
     pub title: String,
-    /// What it claims, and by which rule it is judged.
+    /// The claim and its rules.
     pub claim: &'static str,
     pub verdict: Verdict,
-    /// Why, in a sentence or a few.
+    /// The reason for the verdict, in one or more sentences.
     pub because: String,
     pub criteria: Vec<Criterion>,
-    /// What would have to be run for a full verdict.
+    /// Scenarios that must be run for a full verdict.
     pub missing: Vec<String>,
 }
 
 impl Finding {
-    /// Judges by all criteria: each rule holds where it holds everywhere.
+    /// Computes the verdict from all criteria: a rule holds if it holds everywhere.
     fn judged(
         id: &'static str,
         title: &str,
@@ -97,9 +97,9 @@ impl Finding {
             _ => Verdict::NotConfirmed,
         };
         let because = if rules.is_empty() {
-            "Nothing of what it takes was run.".to_owned()
+            "None of the required scenarios was run.".to_owned()
         } else if broken.is_empty() {
-            format!("{}, in all {} places that were looked at.", rules_text(rules.len()), criteria.len())
+            format!("{}, in all {} places that were checked.", rules_text(rules.len()), criteria.len())
         } else {
             let sentences: Vec<String> = broken.iter().map(|rule| broken_text(rule, &criteria)).collect();
             sentences.join(" ")
@@ -116,7 +116,7 @@ fn rules_text(count: usize) -> String {
     }
 }
 
-/// A rule that does not hold, where not, and what was found at the first of these places.
+/// Describes a rule that does not hold: in how many places, and the values at the first of them.
 fn broken_text(rule: &str, criteria: &[Criterion]) -> String {
     let of_rule = || criteria.iter().filter(|criterion| criterion.rule == rule);
     let broken: Vec<&Criterion> = of_rule().filter(|criterion| !criterion.holds).collect();
@@ -124,14 +124,14 @@ fn broken_text(rule: &str, criteria: &[Criterion]) -> String {
     format!("That {rule} does not hold in {} of {} places{first}.", broken.len(), of_rule().count())
 }
 
-/// What the data say of each hypothesis, in their order. A smoke run says nothing.
+/// Computes the verdicts on all hypotheses. Smoke runs give no verdict.
 pub fn findings(results: &Results) -> Vec<Finding> {
     let mut findings = vec![
         h1::finding(results, "as-printed"),
         h1::finding(results, "as-run"),
         h2::finding(results),
         h3::finding(results),
-        below::finding(results),
+        below_dds::finding(results),
     ];
     if results.any_quick() {
         for finding in findings.iter_mut().filter(|finding| finding.verdict != Verdict::NotTested) {
@@ -142,7 +142,7 @@ pub fn findings(results: &Results) -> Vec<Finding> {
     findings
 }
 
-/// Scenarios of the paper that were not run in each library and reading: what a full verdict takes.
+/// Lists the scenarios that were not run in each library and reading, which a full verdict requires.
 fn missing(results: &Results, scenarios: &[&str]) -> Vec<String> {
     let mut missing = Vec::new();
     for (library, name) in [("fast", "Fast DDS"), ("cyclone", "Cyclone DDS")] {
@@ -166,7 +166,7 @@ fn missing(results: &Results, scenarios: &[&str]) -> Vec<String> {
     missing
 }
 
-/// Where a criterion was looked at, with the reading where there is one.
+/// The name of a criterion's scenario and setting, with the reading if there is one.
 fn place_name(cell: &Cell) -> String {
     let reading = cell.reading.as_deref().map(super::cells::reading_name).map(|name| format!(", {name}"));
     format!("{}{}, {}", cell.scenario, reading.unwrap_or_default(), cell.place.name())

@@ -1,4 +1,4 @@
-//! Verdicts on runs whose figures are known.
+//! Tests of verdicts on synthetic runs.
 
 use super::*;
 use crate::eval::report::made_up::{MadeUp, results};
@@ -18,7 +18,7 @@ fn baselines(reading: &'static str, rate_hz: f64, tail_ms: f64) -> Vec<MadeUp> {
 }
 
 #[test]
-fn h1_is_confirmed_for_the_reading_in_which_all_of_it_was_seen() {
+fn h1_is_confirmed_for_the_reading_in_which_all_rules_hold() {
     let runs = baselines("as-run", 20.0, 12_000.0);
     let [printed, run] = [finding(&runs, 0), finding(&runs, 1)];
     assert_eq!((printed.verdict, run.verdict), (Verdict::NotTested, Verdict::Confirmed), "{run:?}");
@@ -28,13 +28,13 @@ fn h1_is_confirmed_for_the_reading_in_which_all_of_it_was_seen() {
         "{}",
         run.because
     );
-    // What was not run on the other library is told.
+    // Runs that are missing on the other library are listed.
     assert!(run.missing.contains(&"baseline_strong as run on Cyclone DDS".to_owned()), "{:?}", run.missing);
     assert!(!run.missing.iter().any(|one| one.contains("as printed")), "{:?}", run.missing);
 }
 
 #[test]
-fn h1_is_partly_confirmed_or_not() {
+fn h1_is_partly_confirmed_or_not_confirmed() {
     assert_eq!(finding(&baselines("as-run", 20.0, 0.9), 1).verdict, Verdict::Partly);
     let none = finding(&baselines("as-printed", 30.0, 0.95), 0);
     assert_eq!(none.verdict, Verdict::NotConfirmed);
@@ -42,13 +42,13 @@ fn h1_is_partly_confirmed_or_not() {
     // The limits: 5 % of the rate, ten times the latency.
     assert_eq!(finding(&baselines("as-run", 28.6, 8.9), 1).verdict, Verdict::NotConfirmed);
     assert_eq!(finding(&baselines("as-run", 28.4, 9.1), 1).verdict, Verdict::Confirmed);
-    // With one level only nothing can be refuted, and without a clean run nothing said.
+    // One level is not enough for "not confirmed", and without a clean run there is no verdict.
     let some: Vec<MadeUp> = baselines("as-run", 30.0, 0.9).into_iter().take(2).collect();
     assert_eq!(finding(&some, 1).verdict, Verdict::NotSeen);
     assert_eq!(finding(&baselines("as-run", 20.0, 12_000.0)[1..], 1).verdict, Verdict::NotTested);
 }
 
-/// All that H2 and H3 take.
+/// All runs that H2 and H3 require.
 fn bridges() -> Vec<MadeUp> {
     let mut runs = Vec::new();
     for library in ["fast", "cyclone"] {
@@ -86,7 +86,7 @@ fn change(runs: &mut [MadeUp], scenario: &str, change: impl Fn(&mut MadeUp)) {
 }
 
 #[test]
-fn h2_is_confirmed_where_all_of_it_was_run_and_holds() {
+fn h2_is_confirmed_if_all_scenarios_were_run_and_all_rules_hold() {
     let found = finding(&bridges(), 2);
     assert_eq!(found.verdict, Verdict::Confirmed, "{found:?}");
     assert!(found.missing.is_empty());
@@ -129,7 +129,7 @@ fn each_rule_of_h2_can_fail() {
 }
 
 #[test]
-fn h3_takes_what_the_lane_sends_and_every_toggle() {
+fn h3_depends_on_the_bytes_that_the_lane_sends_and_on_every_toggle() {
     let found = finding(&bridges(), 3);
     assert_eq!(found.verdict, Verdict::Confirmed, "{found:?}");
     assert!(found.criteria.iter().any(|one| one.found.starts_with("70 % saved")), "{:?}", found.criteria);
@@ -141,11 +141,11 @@ fn h3_takes_what_the_lane_sends_and_every_toggle() {
     let mut slow = bridges();
     change(&mut slow, "bridge_toggle", |run| run.reaction_s = Some(19.9));
     assert_eq!(finding(&slow, 3).verdict, Verdict::Confirmed);
-    // Later than the next toggle is never.
+    // A reaction after the next toggle does not count.
     change(&mut slow, "bridge_toggle", |run| run.reaction_s = Some(21.0));
     let found = finding(&slow, 3);
     assert_eq!(found.verdict, Verdict::Partly);
-    assert!(found.because.contains("not answered at all"), "{}", found.because);
+    assert!(found.because.contains("no reaction to"), "{}", found.because);
 }
 
 #[test]
@@ -163,7 +163,7 @@ fn lanes_that_send_fragments_are_coupled_below_dds() {
 }
 
 #[test]
-fn a_smoke_run_says_nothing() {
+fn a_smoke_run_gives_no_verdict() {
     let mut runs = bridges();
     runs.extend(baselines("as-run", 20.0, 12_000.0));
     change(&mut runs, "bridge_mild", |run| run.quick = true);
@@ -171,15 +171,13 @@ fn a_smoke_run_says_nothing() {
 }
 
 #[test]
-fn the_mechanism_is_told_by_the_figures() {
+fn the_mechanism_follows_from_the_figures() {
     let all = results(&baselines("as-run", 30.0, 0.9));
     let cell = all.cells().find(|cell| cell.scenario == "baseline_mild").unwrap();
     let text = mechanism(cell).unwrap();
     assert!(text.starts_with("The writer's history did not fill: at most"), "{text}");
-    assert!(text.ends_with(
-        "The host between held no fragments, so that nothing of the critical path was dropped there."
-    ));
-    // A lane's writer holds nothing for anybody.
+    assert!(text.ends_with("The switch held no fragments, so it dropped nothing of the critical path."));
+    // A lane's writer is BEST_EFFORT and holds no samples.
     let all = results(&bridges());
     assert!(all.cells().filter(|cell| cell.bridge).all(|cell| mechanism(cell).is_none()));
 }

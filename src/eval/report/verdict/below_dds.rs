@@ -1,34 +1,34 @@
-//! Not in the paper: that the lanes are not coupled below DDS either.
+//! Verdict on a claim that the paper does not make: lanes are not coupled below DDS by IP fragments.
 
 use super::{Criterion, Finding, place_name};
 use crate::eval::report::cells::{Cell, Results};
 use crate::eval::report::format;
 
-const CLAIM: &str = "Not a hypothesis of the paper: lanes are not coupled by IP fragments either, which a \
-                     host between may have to hold for all of them. Rules, for each bridge scenario with \
-                     loss: no IP fragment is sent towards a remote subscriber (seen on the wire), and the \
-                     host between gives up no datagram.";
+const CLAIM: &str = "Not a hypothesis of the paper: the lanes are not coupled by IP fragments either, for \
+                     which a switch that reassembles them may have one memory for all lanes. Rules, for each \
+                     bridge scenario with loss: no IP fragment is sent to a remote subscriber (captured at \
+                     its host), and the switch discards no incomplete datagram.";
 
-/// What the runs say.
+/// Computes the verdict.
 pub fn finding(results: &Results) -> Finding {
     let mut criteria = Vec::new();
     for cell in results.cells().filter(|cell| cell.bridge && cell.reading.is_some()) {
-        criteria.extend(none(cell, "no fragment is sent towards a remote subscriber", "fragments", |one| {
+        criteria.extend(none(cell, "no fragment is sent to a remote subscriber", "fragments", |one| {
             one.fragments_to_remote
         }));
-        // A plain switch puts nothing together.
+        // A plain switch reassembles nothing.
         if cell.place.switch == "reassembling" {
             criteria.extend(none(
                 cell,
-                "the host between gives up no datagram",
-                "datagrams given up",
+                "the switch discards no incomplete datagram",
+                "datagrams discarded",
                 |one| one.reassembly_failed,
             ));
         }
     }
     let mut missing = Vec::new();
-    if !criteria.iter().any(|criterion| criterion.rule.starts_with("the host between")) {
-        missing.push("a bridge scenario with loss and a host between that reassembles fragments".to_owned());
+    if !criteria.iter().any(|criterion| criterion.rule.starts_with("the switch")) {
+        missing.push("a bridge scenario with loss and a switch that reassembles fragments".to_owned());
     }
     Finding::judged("Below DDS", "No coupling by IP fragments", CLAIM, criteria, missing)
 }
