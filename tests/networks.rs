@@ -9,6 +9,7 @@ mod support;
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL};
 use support::bridge::Bridge;
@@ -327,6 +328,25 @@ fn an_outage_of_17_s_ends_with_the_link() {
 fn a_long_outage_ends_with_the_link() {
     let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());
     outage("a_long_outage_ends_with_the_link", seconds.unwrap_or(60));
+}
+
+/// A laptop that sleeps for longer than every lease: its programs stop, and its link is down. The programs run
+/// again before the link is up.
+#[test]
+fn a_suspended_laptop_is_served_again() {
+    let Some(bed) = bed("a_suspended_laptop_is_served_again") else { return };
+    let laptop = bed.host("slow").clone();
+    let scene = Scene::start(&bed, "slow", &LIBRARIES);
+    laptop.signal_all(Signal::SIGSTOP);
+    laptop.set_link(false);
+    std::thread::sleep(Duration::from_secs(25));
+    scene.local_go_on(15);
+    laptop.signal_all(Signal::SIGCONT);
+    std::thread::sleep(Duration::from_secs(1));
+    scene.served_again(&bed, "25 s of suspend", || laptop.set_link(true));
+    wait_nothing_away(&bed);
+    scene.end(&bed);
+    bed.end();
 }
 
 #[test]

@@ -283,6 +283,15 @@ impl Host {
         ip(&format!("-n {} link set {} {state}", self.switch, self.port));
     }
 
+    /// Sends a signal to every process on the host.
+    pub fn signal_all(&self, signal: Signal) {
+        let pids =
+            try_run("ip", &["netns", "pids", &self.namespace]).unwrap_or_else(|error| panic!("{error}"));
+        for pid in pids.split_whitespace() {
+            kill(Pid::from_raw(pid.parse().expect("a process id")), signal).expect("a process of ours");
+        }
+    }
+
     /// From now on loses datagrams that arrive, each with that probability (0 to 1; 0 ends it). The kernel's
     /// random numbers are not seeded.
     pub fn lose_incoming(&self, probability: f64) {

@@ -2023,7 +2023,7 @@ impl Writer {
       // Regular stateful writer behavior
       // All readers have acked up to this point (SequenceNumber). BestEffort ones
       // never do, and are owed nothing: counting them would keep every
-      // announcement of the participant, one each 3 s, up to the resource limit.
+      // announcement of the participant, one each 2 s, up to the resource limit.
       let acked_by_all_readers = self
         .readers
         .values()
