@@ -1,4 +1,5 @@
-//! Network interfaces of this host and peers on other hosts that are away: looks, logs and shows.
+//! Absences of this host's network interfaces and of peers on other hosts: detection, log messages, records
+//! on the boards.
 
 use std::net::IpAddr;
 
@@ -11,10 +12,11 @@ use crate::model::{AbsenceKind, AbsenceRecord, FixedText, MAX_ABSENCES, Monotoni
 use crate::policy::{Absence, AbsenceEvent, AbsenceWatch, Whereabouts};
 use crate::shm::{BoardWriter, Boards};
 
-/// Watches, and writes the table.
+/// Detects absences and writes their table to the boards.
 pub(super) struct Absences {
     watch: AbsenceWatch,
-    places: Vec<BoardWriter<AbsenceRecord>>,
+    /// One for each row of the table.
+    writers: Vec<BoardWriter<AbsenceRecord>>,
 }
 
 impl Absences {
@@ -27,21 +29,21 @@ impl Absences {
         });
         let mut absences = Self {
             watch: AbsenceWatch::new(configured),
-            places: (0..MAX_ABSENCES).map(|place| boards.absence_writer(place)).collect(),
+            writers: (0..MAX_ABSENCES).map(|index| boards.absence_writer(index)).collect(),
         };
-        absences.show();
+        absences.write_table();
         absences
     }
 
-    /// Takes in what discovery says of a network. `is_of_bridge` tells, by DDS name and whether it is
-    /// published, the topics whose peers count.
-    pub fn take_in(
+    /// Handles a discovery event of a network. `is_bridge_topic` returns whether peers of a topic are
+    /// watched; its arguments are the DDS name and whether the peer publishes.
+    pub fn handle(
         &mut self,
         network: usize,
         change: &Discovery,
-        is_of_bridge: impl Fn(&str, bool) -> bool,
+        is_bridge_topic: impl Fn(&str, bool) -> bool,
         participant: &Participant,
-        own: &[IpAddr],
+        own_addresses: &[IpAddr],
         now: MonotonicNs,
     ) {
         let (endpoint, publishes) = match change {
@@ -53,33 +55,33 @@ impl Absences {
             }
             Discovery::Incompatible { .. } => return,
         };
-        let is_remote = endpoint.location.whereabouts(own) == Whereabouts::Remote;
-        if participant.owns(endpoint.guid) || !is_remote || !is_of_bridge(&endpoint.topic, publishes) {
+        let is_remote = endpoint.location.whereabouts(own_addresses) == Whereabouts::Remote;
+        if participant.owns(endpoint.guid) || !is_remote || !is_bridge_topic(&endpoint.topic, publishes) {
             return;
         }
         if let Some(host) = endpoint.location.host() {
-            // As ROS 2 names it.
+            // The ROS 2 name of the topic.
             let topic = endpoint.topic.strip_prefix("rt").unwrap_or(&endpoint.topic);
             self.watch.found(network, endpoint.guid, topic, publishes, host, now);
         }
     }
 
-    /// Names the nodes of a network's peers.
+    /// Looks up the node names of a network's peers.
     pub fn name_nodes(&mut self, network: usize, graph: &GraphWatch) {
         self.watch.name_nodes(network, |endpoint| graph.node_of(endpoint));
     }
 
-    /// Looks at the interfaces; logs what has changed, and shows it.
-    pub fn look(&mut self, now: MonotonicNs) {
+    /// Reads the state of the interfaces, logs changes and updates the table.
+    pub fn update(&mut self, now: MonotonicNs) {
         match dds::interfaces() {
             Ok(present) => self.watch.look(&present, now),
-            Err(error) => warn!(%error, "network interfaces are not known"),
+            Err(error) => warn!(%error, "cannot read the network interfaces"),
         }
         while let Some(event) = self.watch.poll() {
             match event {
                 AbsenceEvent::Away(absence) => {
                     let Absence { name, detail, .. } = &absence;
-                    let host = host_of(&absence);
+                    let host = host_text(&absence);
                     match absence.kind {
                         AbsenceKind::Interface => {
                             warn!(
@@ -96,7 +98,7 @@ impl Absences {
                 AbsenceEvent::Back(absence) => {
                     let back_at = absence.back_at.unwrap_or(now);
                     let away_s = back_at.since(absence.since) as f64 / 1e9;
-                    let (name, host) = (&absence.name, host_of(&absence));
+                    let (name, host) = (&absence.name, host_text(&absence));
                     match absence.kind {
                         AbsenceKind::Interface => {
                             info!(interface = name, address = host, away_s, "a network interface is back")
@@ -106,27 +108,27 @@ impl Absences {
                 }
             }
         }
-        self.show();
+        self.write_table();
     }
 
-    fn show(&mut self) {
+    fn write_table(&mut self) {
         let absences = self.watch.absences();
-        for (number, place) in self.places.iter_mut().enumerate() {
+        for (number, writer) in self.writers.iter_mut().enumerate() {
             let record = absences.get(number).map_or_else(AbsenceRecord::default, |absence| AbsenceRecord {
                 since: absence.since,
                 back_at: absence.back_at.unwrap_or_default(),
                 kind: absence.kind as u64,
                 name: FixedText::new(&absence.name),
-                host: FixedText::new(&host_of(absence)),
+                host: FixedText::new(&host_text(absence)),
                 detail: FixedText::new(&absence.detail),
             });
-            if *place.get() != record {
-                place.update(|shown| *shown = record);
+            if *writer.get() != record {
+                writer.update(|written| *written = record);
             }
         }
     }
 }
 
-fn host_of(absence: &Absence) -> String {
+fn host_text(absence: &Absence) -> String {
     absence.host.map_or_else(String::new, |host| host.to_string())
 }

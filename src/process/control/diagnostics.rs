@@ -1,7 +1,7 @@
-//! What control tells the ROS 2 graph and the metrics page about the bridge.
+//! Diagnostics of the bridge: decisions and reports published as ROS 2 topics, and the metrics page.
 //!
-//! Decisions are published as they are made. The report of everything is made by a thread of its own, so that
-//! to read all boards and to encode them delays neither a probe nor a policy.
+//! Decisions are published as they are made. A separate thread makes the reports, so that reading and
+//! encoding all boards delays neither a probe nor a policy.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -23,7 +23,7 @@ use crate::policy::LinkReading;
 use crate::shm::Boards;
 use crate::telemetry::{self, Decision, MetricsServer, Report, Snapshot};
 
-/// As ROS 2 nodes publish diagnostics, and as `diagnostic_aggregator` subscribes.
+/// The QoS with which ROS 2 nodes publish diagnostics and `diagnostic_aggregator` subscribes to them.
 const QOS: QosProfile = QosProfile {
     reliability: Reliability::Reliable,
     history: History::KeepLast { depth: 10 },
@@ -32,23 +32,24 @@ const QOS: QosProfile = QosProfile {
     deadline_ms: None,
 };
 
-/// Unacknowledged messages at most: who does not read them does not get them.
+/// Unacknowledged messages that a writer retains; older ones are evicted, and a slow reader misses them.
 const WINDOW_SAMPLES: usize = 64;
 
-/// States are told again so often, for those who come late.
+/// Interval at which all states are published again, for subscribers that join late.
 const STATES_MS: u64 = 1_000;
 
-/// Publishes decisions, and reports in a thread of its own.
+/// Publishes decisions, and reports from a separate thread.
 pub(super) struct Diagnostics {
     enabled: bool,
     decisions: RawWriter,
-    states_at: MonotonicNs,
+    next_states_at: MonotonicNs,
     shared: Arc<Shared>,
     reporter: Option<JoinHandle<()>>,
 }
 
-/// What the reporting thread is told.
+/// State that control shares with the reporting thread.
 struct Shared {
+    /// Set when the thread has to end.
     end: AtomicBool,
     settings: Mutex<Settings>,
 }
@@ -59,7 +60,7 @@ impl Shared {
     }
 }
 
-/// The reporting thread's own.
+/// State of the reporting thread.
 struct Reporter {
     boards: Boards,
     array: RawWriter,
@@ -75,33 +76,33 @@ impl Diagnostics {
         participant: &mut Participant,
     ) -> Result<Self, RoleError> {
         let shared = Arc::new(Shared { end: AtomicBool::new(false), settings: Mutex::new(settings.clone()) });
-        // All of them, also while diagnostics are off: a reload may switch them on.
+        // Creates all writers even while diagnostics are off: a reload may switch them on.
         let mut writer =
             |topic: &str, dds_type| participant.create_writer(topic, dds_type, &QOS, WINDOW_SAMPLES);
         let decisions = writer(&dds_topic(telemetry::DECISION_TOPIC), telemetry::STRING_TYPE)?;
         let array = writer(&dds_topic(telemetry::DIAGNOSTICS_TOPIC), telemetry::DIAGNOSTIC_ARRAY_TYPE)?;
         let json = writer(&settings.diagnostics.topic.to_dds(), telemetry::STRING_TYPE)?;
-        // The bridge can do without its page.
+        // A failed metrics page does not stop the bridge.
         let metrics = settings.diagnostics.metrics.as_ref().and_then(|listener| {
-            MetricsServer::start(listener).inspect_err(|error| error!(%error, "no metrics page")).ok()
+            MetricsServer::start(listener).inspect_err(|error| error!(%error, "metrics are not served")).ok()
         });
-        let reporting =
+        let reporting_thread =
             Reporter { boards: boards.clone(), array, json, metrics, shared: Arc::clone(&shared) };
         let thread = std::thread::Builder::new().name("report".to_owned());
-        let reporter = Some(thread.spawn(move || reporting.run())?);
+        let reporter = Some(thread.spawn(move || reporting_thread.run())?);
         let enabled = settings.diagnostics.enabled;
-        Ok(Self { enabled, decisions, states_at: MonotonicNs(0), shared, reporter })
+        Ok(Self { enabled, decisions, next_states_at: MonotonicNs(0), shared, reporter })
     }
 
-    /// Applies a configuration.
-    pub fn adopt(&mut self, settings: &Settings) {
+    /// Applies a reloaded configuration.
+    pub fn apply(&mut self, settings: &Settings) {
         self.enabled = settings.diagnostics.enabled;
         *self.shared.settings.lock().unwrap_or_else(PoisonError::into_inner) = settings.clone();
     }
 
-    /// A subscriber changed its state.
-    pub fn decision(&self, change: &Change, settings: &Settings) {
-        self.say(&Decision {
+    /// Publishes the change of a subscriber's state.
+    pub fn publish_change(&self, change: &Change, settings: &Settings) {
+        self.publish_decision(&Decision {
             subscriber_id: &change.subscriber,
             lane: settings.lanes[change.lane].name.as_str(),
             state: change.transition.to,
@@ -113,27 +114,27 @@ impl Diagnostics {
         });
     }
 
-    /// The states of all subscribers, once a second.
-    pub fn states(&mut self, subscribers: &Subscribers, settings: &Settings, now: MonotonicNs) {
-        if now < self.states_at {
+    /// Publishes the states of all subscribers, once a second.
+    pub fn publish_states(&mut self, subscribers: &Subscribers, settings: &Settings, now: MonotonicNs) {
+        if now < self.next_states_at {
             return;
         }
-        self.states_at = now.plus_ms(STATES_MS);
-        for shown in subscribers.iter(settings) {
-            self.say(&Decision {
-                subscriber_id: shown.id,
-                lane: shown.lane,
-                state: shown.state,
-                previous_state: shown.previous_state,
-                reason: shown.reason,
-                rtt_ms: shown.reading.rtt_mean_ms,
-                loss: loss(shown.reading),
+        self.next_states_at = now.plus_ms(STATES_MS);
+        for subscriber in subscribers.iter(settings) {
+            self.publish_decision(&Decision {
+                subscriber_id: subscriber.id,
+                lane: subscriber.lane,
+                state: subscriber.state,
+                previous_state: subscriber.previous_state,
+                reason: subscriber.reason,
+                rtt_ms: subscriber.reading.rtt_mean_ms,
+                loss: loss(subscriber.reading),
                 time: clock::wall(),
             });
         }
     }
 
-    fn say(&self, decision: &Decision<'_>) {
+    fn publish_decision(&self, decision: &Decision<'_>) {
         if self.enabled {
             write(&self.decisions, decision.payload());
         }
@@ -154,25 +155,25 @@ impl Drop for Diagnostics {
 
 impl Reporter {
     fn run(self) {
-        let mut former: Option<Snapshot> = None;
-        let mut report_at = clock::monotonic();
+        let mut previous: Option<Snapshot> = None;
+        let mut next_report_at = clock::monotonic();
         while !self.shared.end.load(Ordering::Relaxed) {
             let now = clock::monotonic();
-            if now < report_at {
-                // Until then, or until it is to end.
-                std::thread::park_timeout(Duration::from_nanos(report_at.since(now)));
+            if now < next_report_at {
+                // Until the next report, or until `drop` wakes the thread.
+                std::thread::park_timeout(Duration::from_nanos(next_report_at.since(now)));
                 continue;
             }
             let settings = self.shared.settings();
-            report_at = now.plus_ms(settings.diagnostics.publish_interval_ms);
+            next_report_at = now.plus_ms(settings.diagnostics.publish_interval_ms);
             match Snapshot::read(&self.boards, &settings) {
                 Ok(snapshot) => {
-                    if let Some(former) = &former {
-                        self.publish(snapshot.since(former), settings.diagnostics.enabled);
+                    if let Some(previous) = &previous {
+                        self.publish(snapshot.since(previous), settings.diagnostics.enabled);
                     }
-                    former = Some(snapshot);
+                    previous = Some(snapshot);
                 }
-                Err(error) => warn!(%error, "no diagnostics this time"),
+                Err(error) => warn!(%error, "cannot read the boards; this report is skipped"),
             }
         }
     }
@@ -190,12 +191,12 @@ impl Reporter {
     }
 }
 
-/// Whoever does not read what was written before does not get this either; the next message says all anew.
+/// Writes a message. One that the DDS library refuses is dropped: the next message repeats the whole state.
 fn write(writer: &RawWriter, payload: Bytes) {
     if let Err(error) =
         writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::from_wall(clock::wall()))
     {
-        debug!(%error, "diagnostics not published");
+        debug!(%error, "cannot publish a diagnostics message");
     }
 }
 
@@ -204,6 +205,6 @@ fn loss(reading: &LinkReading) -> Option<f64> {
 }
 
 fn dds_topic(topic: &str) -> String {
-    // A ROS 2 topic's DDS name (design.ros2.org, "Topic and Service name mapping to DDS").
+    // The DDS name of a ROS 2 topic (design.ros2.org, "Topic and Service name mapping to DDS").
     format!("rt{topic}")
 }

@@ -1,5 +1,5 @@
-//! Readers on other hosts that reach past the bridge, the nodes of the inputs' publishers and of the outputs'
-//! readers, and which of these miss samples.
+//! Monitoring of remote endpoints: intruders (remote readers that bypass the bridge), the node names of input
+//! publishers and output readers, and the output readers that miss samples.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
@@ -18,46 +18,47 @@ use crate::model::{
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
 use crate::shm::{BoardWriter, Boards};
 
-/// The nodes and the losses of the outputs' readers are looked at so often.
-const READERS_MS: u64 = 1_000;
+/// Interval of updating node names, absences and the losses of the outputs' readers.
+const ENDPOINTS_MS: u64 = 1_000;
 
-/// The log names a reader that misses samples at most so often.
+/// Minimum time between two log messages about the same reader that misses samples.
 const OVERRUN_REPEAT_MS: u64 = 10_000;
 
-/// One network that is watched.
-struct Watched {
+/// The endpoints of one network.
+struct WatchedNetwork {
     watch: IntruderWatch,
     graph: GraphWatch,
-    /// The outputs there, by DDS name: lane and route.
+    /// The outputs on this network, by DDS name: lane and route.
     outputs: BTreeMap<String, (usize, usize)>,
-    /// The input topics there, by DDS name.
+    /// The input topics on this network, by DDS name.
     inputs: BTreeSet<String>,
-    /// The readers of the outputs and the writers of the inputs, with their places.
+    /// The readers of the outputs and the writers of the inputs, with their locations.
     endpoints: Vec<(Guid, Location)>,
 }
 
-/// Samples that one reader missed, as far as the log says.
+/// Overrun samples of one reader that were already logged.
 struct LoggedOverrun {
     reader: Guid,
     samples: u64,
-    warn_at: MonotonicNs,
+    next_warning_at: MonotonicNs,
 }
 
-/// Guards the input topics and the critical outputs.
-pub(super) struct Guard {
+/// Monitors remote readers and writers of the bridge's topics on all networks.
+pub(super) struct EndpointMonitor {
     /// One for each network, in the order of the participants.
-    networks: Vec<Watched>,
+    networks: Vec<WatchedNetwork>,
     absences: Absences,
     overruns: Vec<LoggedOverrun>,
-    named: Vec<BoardWriter<NamedEndpoint>>,
-    readers_at: MonotonicNs,
-    own: Vec<IpAddr>,
-    places: Vec<BoardWriter<IntruderRecord>>,
-    shown: usize,
+    endpoint_writers: Vec<BoardWriter<NamedEndpoint>>,
+    next_update_at: MonotonicNs,
+    own_addresses: Vec<IpAddr>,
+    intruder_writers: Vec<BoardWriter<IntruderRecord>>,
+    /// Intruders in the table on the boards.
+    intruder_count: usize,
     boards: Boards,
 }
 
-impl Guard {
+impl EndpointMonitor {
     pub fn open(
         boards: &Boards,
         settings: &Settings,
@@ -71,10 +72,12 @@ impl Guard {
             let mut inputs = BTreeSet::new();
             if network == 0 {
                 inputs.extend(settings.routes.iter().map(|route| route.input_topic.to_dds()));
-                guarded.extend(settings.routes.iter().enumerate().map(|(route, settings_of)| GuardedTopic {
-                    topic: settings_of.input_topic.clone(),
-                    guarded: Guarded::Input,
-                    instead: instead(settings, route),
+                guarded.extend(settings.routes.iter().enumerate().map(|(route, route_settings)| {
+                    GuardedTopic {
+                        topic: route_settings.input_topic.clone(),
+                        guarded: Guarded::Input,
+                        instead: noncritical_output(settings, route),
+                    }
                 }));
             }
             for (lane, configured) in settings.lanes.iter().enumerate() {
@@ -89,11 +92,11 @@ impl Guard {
                     guarded.push(GuardedTopic {
                         topic: output.topic.clone(),
                         guarded: Guarded::CriticalOutput,
-                        instead: instead(settings, output.route),
+                        instead: noncritical_output(settings, output.route),
                     });
                 }
             }
-            watched.push(Watched {
+            watched.push(WatchedNetwork {
                 watch: IntruderWatch::new(guarded),
                 graph: participant.watch_graph()?,
                 outputs,
@@ -101,57 +104,62 @@ impl Guard {
                 endpoints: Vec::new(),
             });
         }
-        let mut named: Vec<_> =
-            (0..MAX_NAMED_ENDPOINTS).map(|place| boards.named_endpoint_writer(place)).collect();
-        for place in &mut named {
-            place.update(|record| *record = NamedEndpoint::default());
+        let mut endpoint_writers: Vec<_> =
+            (0..MAX_NAMED_ENDPOINTS).map(|index| boards.named_endpoint_writer(index)).collect();
+        for writer in &mut endpoint_writers {
+            writer.update(|record| *record = NamedEndpoint::default());
         }
-        let mut places: Vec<_> = (0..MAX_INTRUDERS).map(|place| boards.intruder_writer(place)).collect();
-        for place in &mut places {
-            place.update(|record| *record = IntruderRecord::default());
+        let mut intruder_writers: Vec<_> =
+            (0..MAX_INTRUDERS).map(|index| boards.intruder_writer(index)).collect();
+        for writer in &mut intruder_writers {
+            writer.update(|record| *record = IntruderRecord::default());
         }
         Ok(Self {
             networks: watched,
             absences: Absences::new(boards, settings),
             overruns: Vec::new(),
-            named,
-            readers_at: MonotonicNs(0),
-            own: Vec::new(),
-            places,
-            shown: 0,
+            endpoint_writers,
+            next_update_at: MonotonicNs(0),
+            own_addresses: Vec::new(),
+            intruder_writers,
+            intruder_count: 0,
             boards: boards.clone(),
         })
     }
 
-    /// Intruders in the table.
-    pub fn shown(&self) -> usize {
-        self.shown
+    /// The number of intruders in the table on the boards.
+    pub fn intruder_count(&self) -> usize {
+        self.intruder_count
     }
 
-    /// Intruders seen since control came up.
-    pub fn seen(&self) -> u64 {
+    /// The number of intruders seen since control started.
+    pub fn intruders_seen(&self) -> u64 {
         let counts = self.networks.iter().map(|network| network.watch.counts());
         counts.map(|counts| counts.told + counts.untold).sum()
     }
 
-    /// Takes in what discovery says; warns of what is new.
-    pub fn keep_house(&mut self, participants: &mut [Participant], settings: &Settings, now: MonotonicNs) {
+    /// Handles discovery events and logs new intruders; once a second also updates node names, absences and
+    /// overruns.
+    pub fn housekeeping(&mut self, participants: &mut [Participant], settings: &Settings, now: MonotonicNs) {
         let mut changed = false;
         for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
             let mut are_addresses_current = false;
             while let Some(change) = participant.poll_discovery() {
-                // Anew for what discovery says: an endpoint of this host that is announced again after a
-                // change of the host's address would be taken for a remote one.
+                // Reads the addresses once for each batch of events: after a change of this host's address, a
+                // local endpoint that is announced again would otherwise be taken for a remote one.
                 if !are_addresses_current {
                     are_addresses_current = true;
                     match dds::host_addresses() {
-                        Ok(own) => self.own = own,
+                        Ok(addresses) => self.own_addresses = addresses,
                         Err(error) => {
-                            warn!(%error, "this host's addresses are not known: who is remote cannot be told")
+                            warn!(
+                                %error,
+                                "cannot read this host's addresses; local endpoints may be taken for remote ones"
+                            )
                         }
                     }
                 }
-                let is_of_bridge = |topic: &str, publishes: bool| {
+                let is_bridge_topic = |topic: &str, publishes: bool| {
                     if publishes {
                         network.inputs.iter().any(|input| input == topic)
                     } else {
@@ -159,11 +167,11 @@ impl Guard {
                     }
                 };
                 if let Discovery::ParticipantGone { .. } = change {
-                    // Its node is not known any more once it is gone.
+                    // Before `network.handle` removes the participant's nodes from the graph.
                     self.absences.name_nodes(number, &network.graph);
                 }
-                self.absences.take_in(number, &change, is_of_bridge, participant, &self.own, now);
-                network.take_in(change, participant, &self.own, now);
+                self.absences.handle(number, &change, is_bridge_topic, participant, &self.own_addresses, now);
+                network.handle(change, participant, &self.own_addresses, now);
             }
             network.graph.poll();
             self.absences.name_nodes(number, &network.graph);
@@ -171,26 +179,27 @@ impl Guard {
                 changed = true;
                 match event {
                     IntruderEvent::Appeared(intruder) => warn!("{intruder}"),
-                    IntruderEvent::Left(intruder) => info!("gone: {intruder}"),
-                    IntruderEvent::Returned(intruder) => info!("back: {intruder}"),
+                    IntruderEvent::Left(intruder) => info!("intruder left: {intruder}"),
+                    IntruderEvent::Returned(intruder) => info!("intruder returned: {intruder}"),
                 }
             }
         }
         if changed {
-            self.show();
+            self.write_intruders();
         }
-        if now >= self.readers_at {
-            self.readers_at = now.plus_ms(READERS_MS);
-            self.name_endpoints();
+        if now >= self.next_update_at {
+            self.next_update_at = now.plus_ms(ENDPOINTS_MS);
+            self.write_endpoints();
             self.log_overruns(settings, now);
-            self.absences.look(now);
+            self.absences.update(now);
         }
     }
 
-    fn show(&mut self) {
+    /// Writes the table of intruders to the boards.
+    fn write_intruders(&mut self) {
         let present: Vec<_> = self.networks.iter().flat_map(|network| network.watch.present()).collect();
-        self.shown = present.len().min(self.places.len());
-        for (number, place) in self.places.iter_mut().enumerate() {
+        self.intruder_count = present.len().min(self.intruder_writers.len());
+        for (number, writer) in self.intruder_writers.iter_mut().enumerate() {
             let record = present.get(number).map_or_else(IntruderRecord::default, |intruder| {
                 let host = intruder.host.map_or_else(|| "another host".to_owned(), |host| host.to_string());
                 IntruderRecord {
@@ -201,22 +210,22 @@ impl Guard {
                     since: intruder.since,
                 }
             });
-            place.update(|shown| *shown = record);
+            writer.update(|written| *written = record);
         }
     }
 
-    /// Shows the nodes of the inputs' publishers and of the outputs' readers.
-    fn name_endpoints(&mut self) {
-        let named = self.networks.iter().flat_map(Watched::named_endpoints);
-        let mut named = named.chain(std::iter::repeat(NamedEndpoint::default()));
-        for (place, endpoint) in self.named.iter_mut().zip(&mut named) {
-            if *place.get() != endpoint {
-                place.update(|shown| *shown = endpoint);
+    /// Writes the nodes of the inputs' publishers and of the outputs' readers to the boards.
+    fn write_endpoints(&mut self) {
+        let endpoints = self.networks.iter().flat_map(WatchedNetwork::named_endpoints);
+        let mut endpoints = endpoints.chain(std::iter::repeat(NamedEndpoint::default()));
+        for (writer, endpoint) in self.endpoint_writers.iter_mut().zip(&mut endpoints) {
+            if *writer.get() != endpoint {
+                writer.update(|written| *written = endpoint);
             }
         }
     }
 
-    /// Warns of each reader that missed samples since it was warned of.
+    /// Logs each reader that has missed samples since its last log message.
     fn log_overruns(&mut self, settings: &Settings, now: MonotonicNs) {
         let mut matched = Vec::new();
         for (lane, configured) in settings.lanes.iter().enumerate() {
@@ -226,25 +235,25 @@ impl Guard {
                     matched.push(record.reader);
                     let logged = match self.overruns.iter().position(|logged| logged.reader == record.reader)
                     {
-                        Some(place) => &mut self.overruns[place],
+                        Some(index) => &mut self.overruns[index],
                         None if record.overrun == 0 => continue,
                         None => {
                             self.overruns.push(LoggedOverrun {
                                 reader: record.reader,
                                 samples: 0,
-                                warn_at: now,
+                                next_warning_at: now,
                             });
                             let last = self.overruns.len() - 1;
                             &mut self.overruns[last]
                         }
                     };
                     let missed = record.overrun.saturating_sub(logged.samples);
-                    if missed == 0 || now < logged.warn_at {
+                    if missed == 0 || now < logged.next_warning_at {
                         continue;
                     }
                     logged.samples = record.overrun;
-                    logged.warn_at = now.plus_ms(OVERRUN_REPEAT_MS);
-                    let reader = self.networks.iter().find_map(|network| network.name_of(record.reader));
+                    logged.next_warning_at = now.plus_ms(OVERRUN_REPEAT_MS);
+                    let reader = self.networks.iter().find_map(|network| network.reader_name(record.reader));
                     warn!(
                         lane = configured.name.as_str(),
                         route = settings.routes[output.route].id.as_str(),
@@ -253,7 +262,7 @@ impl Guard {
                         missed,
                         unacknowledged = record.unacknowledged,
                         reason = "reader_overrun",
-                        "a subscriber does not keep up and missed samples; the other subscribers have them"
+                        "a subscriber does not keep up and missed samples; the other subscribers received them"
                     );
                 }
             }
@@ -262,19 +271,26 @@ impl Guard {
     }
 }
 
-impl Watched {
-    fn take_in(&mut self, change: Discovery, participant: &Participant, own: &[IpAddr], now: MonotonicNs) {
+impl WatchedNetwork {
+    /// Handles a discovery event of this network.
+    fn handle(
+        &mut self,
+        change: Discovery,
+        participant: &Participant,
+        own_addresses: &[IpAddr],
+        now: MonotonicNs,
+    ) {
         match change {
             Discovery::Reader(reader) if !participant.owns(reader.guid) => {
                 if self.outputs.contains_key(&reader.topic) {
-                    self.note(&reader);
+                    self.remember(&reader);
                 }
-                self.watch.found(reader.guid, &reader.topic, &reader.location, own, now);
+                self.watch.found(reader.guid, &reader.topic, &reader.location, own_addresses, now);
             }
             Discovery::Writer(writer)
                 if !participant.owns(writer.guid) && self.inputs.contains(&writer.topic) =>
             {
-                self.note(&writer);
+                self.remember(&writer);
             }
             Discovery::WriterGone(guid) => self.endpoints.retain(|(writer, _)| *writer != guid),
             Discovery::ReaderGone(guid) => {
@@ -290,15 +306,15 @@ impl Watched {
         }
     }
 
-    /// Records where an endpoint is. Of more than can be shown, those that came first stay.
-    fn note(&mut self, endpoint: &Endpoint) {
+    /// Remembers the location of an endpoint, unless [`MAX_NAMED_ENDPOINTS`] others are remembered already.
+    fn remember(&mut self, endpoint: &Endpoint) {
         self.endpoints.retain(|(guid, _)| *guid != endpoint.guid);
         if self.endpoints.len() < MAX_NAMED_ENDPOINTS {
             self.endpoints.push((endpoint.guid, endpoint.location.clone()));
         }
     }
 
-    /// The inputs' publishers and the outputs' readers with their nodes and hosts.
+    /// Iterates over the inputs' publishers and the outputs' readers, with their nodes and hosts.
     fn named_endpoints(&self) -> impl Iterator<Item = NamedEndpoint> {
         self.endpoints.iter().map(|(guid, location)| NamedEndpoint {
             endpoint: *guid,
@@ -307,8 +323,8 @@ impl Watched {
         })
     }
 
-    /// A reader of an output by its node and host; `None` for a reader that discovery has not reported.
-    fn name_of(&self, reader: Guid) -> Option<String> {
+    /// The node and host of an output's reader, as text; `None` if discovery has not reported the reader.
+    fn reader_name(&self, reader: Guid) -> Option<String> {
         let (guid, location) = self.endpoints.iter().find(|(guid, _)| *guid == reader)?;
         let node = self.graph.node_of(*guid).map_or_else(|| guid.to_string(), str::to_owned);
         Some(match location.host() {
@@ -318,8 +334,8 @@ impl Watched {
     }
 }
 
-/// The route's output on a noncritical lane.
-fn instead(settings: &Settings, route: usize) -> Option<crate::model::TopicName> {
+/// The output topic of a route on a noncritical lane.
+fn noncritical_output(settings: &Settings, route: usize) -> Option<crate::model::TopicName> {
     let noncritical = settings.lanes.iter().filter(|lane| lane.class == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
     outputs.find(|output| output.route == route).map(|output| output.topic.clone())

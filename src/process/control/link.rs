@@ -1,4 +1,4 @@
-//! The probes of one network: a writer of requests, a reader of responses, and the probes under way.
+//! The probes of one network: the writer of requests, the reader of responses, and the probes already sent.
 
 use std::collections::VecDeque;
 
@@ -13,14 +13,14 @@ use crate::config::Settings;
 use crate::dds::{Participant, RawWriter, ReaderQos, Take};
 use crate::model::{Encapsulation, FixedText, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp};
 
-/// Responses that may wait for control; with 64 responders at 5 Hz it is three seconds' worth.
-const RESPONSES_WAITING: u32 = 1024;
+/// History depth of the response reader: the responses of 64 responders at 5 Hz for three seconds.
+const RESPONSE_DEPTH: u32 = 1024;
 
-/// Probes that are remembered, so that a late or a second response is told from one to no probe at all: 100 s
-/// at 5 Hz.
-const PROBES_REMEMBERED: usize = 512;
+/// Probes that a link remembers, to distinguish a late or repeated response from an unsolicited one: 100 s at
+/// 5 Hz.
+const REMEMBERED_PROBES: usize = 512;
 
-/// A probe that was sent.
+/// A probe request that was sent.
 #[derive(Clone, Debug)]
 pub(super) struct Probe {
     pub seq: u64,
@@ -29,28 +29,28 @@ pub(super) struct Probe {
 }
 
 impl Probe {
-    /// Random, so that nobody who has not seen the probe can answer it.
+    /// The probe's id; random, so that only a responder that received the request can answer it.
     fn id(&self) -> ProbeId {
         ProbeId::Text(format!("{:016x}", self.id))
     }
 }
 
-/// A response that is believed, to a probe that was sent.
+/// An accepted response to a probe that was sent.
 pub(super) struct Response {
     pub responder_id: String,
     pub seq: u64,
     pub arrived_at: MonotonicNs,
 }
 
-/// Responses that did not authenticate or answer no probe, by reason.
+/// The numbers of invalid responses, by reason.
 #[derive(Debug, Default)]
-pub(super) struct Doubts {
+pub(super) struct InvalidResponses {
     pub refused: RefusalCounts,
-    /// Accepted all the same, because the trust mode is permissive.
+    /// Accepted because the trust mode is permissive.
     pub accepted: RefusalCounts,
 }
 
-/// The probes of one network.
+/// Sends the probes of one network and receives the responses.
 pub(super) struct Link {
     writer: RawWriter,
     inbox: Inbox,
@@ -66,21 +66,22 @@ impl Link {
         let probes = &settings.probes;
         let writer =
             participant.create_writer(&probes.request_topic.to_dds(), PROBE_TYPE, &PROBE_WRITER_QOS, 8)?;
-        let qos = ReaderQos { depth: RESPONSES_WAITING, ..PROBE_READER_QOS };
+        let qos = ReaderQos { depth: RESPONSE_DEPTH, ..PROBE_READER_QOS };
         let reader = participant.create_reader(&probes.response_topic.to_dds(), PROBE_TYPE, &qos)?;
         Ok(Self {
             writer,
             inbox: Inbox::new(reader),
             sender_id: sender_id(settings),
-            probes: VecDeque::with_capacity(PROBES_REMEMBERED),
+            probes: VecDeque::with_capacity(REMEMBERED_PROBES),
             next_seq: 1,
             scratch: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
         })
     }
 
-    /// Sends the next probe; `None` when it could not be sent.
+    /// Sends the next probe; `None` if it could not be sent.
     pub fn send(&mut self, trust: &mut Trust) -> Option<&Probe> {
-        // Without randomness a forger could guess; better no probe at all. The kernel always has some.
+        // A predictable id could be forged, so that no probe is sent without random numbers. In practice the
+        // kernel always has them.
         let id = getrandom::u64().ok()?;
         let probe = Probe { seq: self.next_seq, sent_at: clock::monotonic(), id };
         let mut request = ProbeRequest {
@@ -93,44 +94,44 @@ impl Link {
         trust.sign(&mut request);
         self.writer.write(request.encode(), Encapsulation::CDR_LE, SourceTimestamp::NONE).ok()?;
         self.next_seq += 1;
-        if self.probes.len() == PROBES_REMEMBERED {
+        if self.probes.len() == REMEMBERED_PROBES {
             self.probes.pop_front();
         }
         self.probes.push_back(probe);
         self.probes.back()
     }
 
-    /// The probe of that number and those after it.
-    pub fn since(&self, seq: u64) -> impl Iterator<Item = &Probe> {
+    /// Iterates over the remembered probes from number `seq` on.
+    pub fn probes_since(&self, seq: u64) -> impl Iterator<Item = &Probe> {
         self.probes.iter().filter(move |probe| probe.seq >= seq)
     }
 
-    /// The next response that is believed; what is not is counted. At most `budget` messages are looked at,
-    /// and it is counted down, so that a flood cannot hold up what else control does.
+    /// Returns the next accepted response, and counts invalid ones. Each message reduces `budget` by one and
+    /// the function returns at zero, so that a flood of messages does not delay the rest of control's turn.
     pub fn receive(
         &mut self,
         trust: &mut Trust,
-        doubts: &mut Doubts,
+        invalid: &mut InvalidResponses,
         budget: &mut usize,
     ) -> Option<Response> {
         while *budget > 0 {
             let scratch = &mut self.scratch;
             let mut encapsulation = Encapsulation::CDR_LE;
-            let take = self.inbox.take(&mut |payload, its_encapsulation| {
+            let take = self.inbox.take(&mut |payload, sample_encapsulation| {
                 scratch.clear();
-                // One byte more than is read tells that it is too long.
+                // One byte beyond the limit lets `decode` detect an oversized message.
                 scratch.extend_from_slice(&payload[..payload.len().min(MAX_MESSAGE_BYTES + 1)]);
-                encapsulation = its_encapsulation;
+                encapsulation = sample_encapsulation;
             });
             match take {
                 Take::Empty => return None,
-                Take::Malformed => doubts.refused.add(ProbeRefusal::Malformed),
+                Take::Malformed => invalid.refused.add(ProbeRefusal::Malformed),
                 Take::Sample(_) => {
                     let arrived_at = clock::monotonic();
                     match self.check(encapsulation, trust) {
-                        Ok((response, doubt)) => {
-                            if let Some(reason) = doubt {
-                                doubts.accepted.add(reason);
+                        Ok((response, tolerated)) => {
+                            if let Some(reason) = tolerated {
+                                invalid.accepted.add(reason);
                             }
                             *budget -= 1;
                             return Some(Response {
@@ -139,7 +140,7 @@ impl Link {
                                 arrived_at,
                             });
                         }
-                        Err(reason) => doubts.refused.add(reason),
+                        Err(reason) => invalid.refused.add(reason),
                     }
                 }
             }
@@ -148,26 +149,27 @@ impl Link {
         None
     }
 
-    /// The message in the scratch buffer, and why it should not be believed where it is all the same.
+    /// Checks the message in the scratch buffer. The second value is the reason for which trust mode
+    /// `default_deny` would have refused the response; `None` for an authentic one.
     fn check(
         &self,
         encapsulation: Encapsulation,
         trust: &mut Trust,
     ) -> Result<(ProbeResponse, Option<ProbeRefusal>), ProbeRefusal> {
         let response = ProbeResponse::decode(&self.scratch, encapsulation)?;
-        // Before the signature, because it is cheaper, and because a response to somebody else's probe on a
-        // shared topic is nothing to warn about.
+        // Checked before the signature: it is cheaper, and a response to another bridge's probe on a shared
+        // topic must not be reported as badly signed.
         let known = self.probes.binary_search_by_key(&response.seq, |probe| probe.seq);
-        let probe = known.ok().and_then(|place| self.probes.get(place));
+        let probe = known.ok().and_then(|index| self.probes.get(index));
         if probe.is_none_or(|probe| probe.id() != response.probe_id) {
             return Err(ProbeRefusal::Unsolicited);
         }
-        let doubt = trust.check(&response, clock::wall())?;
-        Ok((response, doubt))
+        let tolerated = trust.check(&response, clock::wall())?;
+        Ok((response, tolerated))
     }
 }
 
-/// How responders tell this bridge from another.
+/// The id by which responders distinguish this bridge from others: instance and host name.
 fn sender_id(settings: &Settings) -> String {
     let host = nix::unistd::gethostname().ok().and_then(|name| name.into_string().ok()).unwrap_or_default();
     let id: String = format!("{}@{host}", settings.instance).chars().filter(|c| !c.is_control()).collect();

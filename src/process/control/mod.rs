@@ -1,8 +1,8 @@
-//! Control: probes every subscriber's host, classifies it, decides each lane's mode, watches the health of
-//! all the others, publishes diagnostics.
+//! The control process: probes and classifies the subscribers, decides each lane's mode, monitors the health
+//! of the other processes, publishes diagnostics.
 //!
-//! Nothing of the data plane waits for it. What it decides stands on the policy board, which it confirms ten
-//! times a second; when it no longer does, the lanes fall back to safe modes by themselves.
+//! The data plane never waits for control. Control writes its decisions to the policy board and confirms them
+//! ten times a second; when the confirmations stop, the lanes fall back to safe modes by themselves.
 
 mod absences;
 mod diagnostics;
@@ -31,20 +31,20 @@ use crate::model::{
 use crate::policy::{LaneDecision, LaneReason, safety_floor};
 use crate::shm::{BoardWriter, ProcessRole};
 use diagnostics::Diagnostics;
-use intruders::Guard;
-use link::{Doubts, Link};
+use intruders::EndpointMonitor;
+use link::{InvalidResponses, Link};
 use safety::Supervision;
 use subscribers::Subscribers;
 
-/// Responses looked at in a turn, of all links together. A flood waits for the next turn, and what it
-/// overwrites in the DDS reader meanwhile is its own.
+/// Responses that control handles in one turn, of all links together. The rest of a flood waits in the DDS
+/// reader, where it overwrites its own messages.
 const RESPONSES_PER_TURN: usize = 2048;
 
-/// Runs the control process until `stop` is requested. `secret` is the one that stands in the configuration
-/// file, if one does.
+/// Runs the control process until `stop` is requested. `secret` is the secret in the configuration file, if
+/// the file contains one.
 ///
 /// # Errors
-/// Control runs already, or shared memory or DDS cannot be had.
+/// Another control process of the instance is running, or shared memory or DDS is not available.
 pub fn control(
     settings: &Settings,
     secret: Option<&InlineSecret>,
@@ -70,29 +70,29 @@ pub fn control(
 
 struct Control {
     settings: Settings,
-    /// The number of each lane's network.
+    /// For each lane, the index of its network in `links` and `participants`.
     link_of_lane: Vec<usize>,
-    /// Before the participants: the DDS library wants its readers and writers gone first.
+    /// Declared before the participants: the DDS library requires readers and writers to be dropped first.
     links: Vec<Link>,
     diagnostics: Diagnostics,
-    guard: Guard,
-    /// The first is that of the input network.
+    endpoints: EndpointMonitor,
+    /// One for each network; the first is on the input network.
     participants: Vec<Participant>,
     role: Role,
     record: BoardWriter<ControlRecord>,
-    /// `None` when the secret cannot be had: then nobody is probed.
+    /// `None` if the secret cannot be loaded: then control sends no probes.
     trust: Option<Trust>,
     subscribers: Subscribers,
     supervision: Supervision,
-    doubts: Doubts,
-    refused: RefusalWatch,
-    accepted: RefusalWatch,
-    /// What was decided last for each lane, to tell a change.
-    decided: Vec<String>,
-    probe_at: MonotonicNs,
-    evaluate_at: MonotonicNs,
-    supervise_at: MonotonicNs,
-    housekeeping_at: MonotonicNs,
+    invalid_responses: InvalidResponses,
+    refused_log: RefusalWatch,
+    accepted_log: RefusalWatch,
+    /// The last decision for each lane as text, to log changes only.
+    decisions: Vec<String>,
+    next_probe_at: MonotonicNs,
+    next_evaluation_at: MonotonicNs,
+    next_supervision_at: MonotonicNs,
+    next_housekeeping_at: MonotonicNs,
 }
 
 impl Control {
@@ -101,8 +101,8 @@ impl Control {
         secret: Option<&InlineSecret>,
         reloads: ReloadRequests,
     ) -> Result<Self, RoleError> {
-        let how = &settings.control_scheduling;
-        let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", how)?;
+        let scheduling = &settings.control_scheduling;
+        let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", scheduling)?;
         let (networks, link_of_lane) = networks(settings);
         let mut participants = Vec::with_capacity(networks.len());
         for network in &networks {
@@ -112,12 +112,13 @@ impl Control {
                 node_name: "control".to_owned(),
                 graph_gid_bytes: settings.graph_gid_bytes,
             };
-            // One participant at most can be said goodbye for by a successor.
+            // Only the first participant joins through the role: the health board records one participant,
+            // which a restarted control disposes of if its predecessor was killed.
             let opened =
                 if participants.is_empty() { role.join(&options)? } else { Participant::open(&options)? };
             participants.push(opened);
         }
-        // Also while probing is off: it can be switched on by a reload.
+        // Opens the links even while probing is off: a reload may switch it on.
         let links = participants.iter_mut().map(|participant| Link::open(participant, settings));
         let links = links.collect::<Result<_, _>>()?;
         let now = clock::monotonic();
@@ -128,94 +129,102 @@ impl Control {
         Ok(Self {
             subscribers: Subscribers::new(&role.boards, settings, &link_of_lane, now),
             supervision: Supervision::new(&role.boards, settings, now),
-            guard: Guard::open(&role.boards, settings, &mut participants)?,
+            endpoints: EndpointMonitor::open(&role.boards, settings, &mut participants)?,
             diagnostics: Diagnostics::open(&role.boards, settings, &mut participants[0])?,
-            trust: trust(settings, secret),
+            trust: load_trust(settings, secret),
             settings: settings.clone(),
             link_of_lane,
             links,
             participants,
             record,
-            doubts: Doubts::default(),
-            refused: RefusalWatch::of_refused(),
-            accepted: RefusalWatch::of_accepted(),
-            decided: vec![String::new(); settings.lanes.len()],
-            probe_at: now,
-            evaluate_at: now,
-            supervise_at: now,
-            housekeeping_at: now,
+            invalid_responses: InvalidResponses::default(),
+            refused_log: RefusalWatch::of_refused(),
+            accepted_log: RefusalWatch::of_accepted(),
+            decisions: vec![String::new(); settings.lanes.len()],
+            next_probe_at: now,
+            next_evaluation_at: now,
+            next_supervision_at: now,
+            next_housekeeping_at: now,
             role,
         })
     }
 
-    /// Does what is due, and says when the next is.
+    /// Does the work that is due and returns when the next work is due.
     fn turn(&mut self) -> MonotonicNs {
         let now = clock::monotonic();
-        self.subscribers.awake(now);
+        self.subscribers.note_awake(now);
         self.receive();
-        if now >= self.probe_at {
+        if now >= self.next_probe_at {
             self.probe();
-            self.probe_at = next(self.probe_at, self.settings.probes.rate_hz, now);
+            self.next_probe_at = next_due(self.next_probe_at, self.settings.probes.rate_hz, now);
         }
-        let is_due = now >= self.evaluate_at || now >= self.supervise_at || now >= self.housekeeping_at;
-        if now >= self.evaluate_at {
+        let is_due = now >= self.next_evaluation_at
+            || now >= self.next_supervision_at
+            || now >= self.next_housekeeping_at;
+        if now >= self.next_evaluation_at {
             self.evaluate(now);
-            self.evaluate_at = next(self.evaluate_at, self.settings.classifier.evaluate_rate_hz, now);
+            let rate_hz = self.settings.classifier.evaluate_rate_hz;
+            self.next_evaluation_at = next_due(self.next_evaluation_at, rate_hz, now);
         }
-        if now >= self.supervise_at {
+        if now >= self.next_supervision_at {
             self.supervision.evaluate(&self.role.boards, &self.settings, now);
-            self.supervise_at = next(self.supervise_at, self.settings.safety.evaluate_rate_hz, now);
+            let rate_hz = self.settings.safety.evaluate_rate_hz;
+            self.next_supervision_at = next_due(self.next_supervision_at, rate_hz, now);
         }
         if is_due {
             self.decide(now);
         }
-        if now >= self.housekeeping_at {
-            self.keep_house(now);
-            self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
+        if now >= self.next_housekeeping_at {
+            self.housekeeping(now);
+            self.next_housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
         }
-        [self.probe_at, self.evaluate_at, self.supervise_at].into_iter().fold(self.housekeeping_at, Ord::min)
+        let others = [self.next_probe_at, self.next_evaluation_at, self.next_supervision_at];
+        others.into_iter().fold(self.next_housekeeping_at, Ord::min)
     }
 
-    /// Sleeps until a response arrives, or until then at most.
+    /// Sleeps until a response arrives, or until `until` at the latest.
     fn sleep(&mut self, until: MonotonicNs) {
         let wait_ns = until.since(clock::monotonic());
         if wait_ns > 0 {
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
-        self.subscribers.asleep(until);
+        self.subscribers.note_asleep(until);
     }
 
+    /// Handles the responses that have arrived.
     fn receive(&mut self) {
         let Some(trust) = &mut self.trust else { return };
         let mut budget = RESPONSES_PER_TURN;
-        let (mut doubts, mut late, mut accepted) = (Doubts::default(), RefusalCounts::default(), 0);
+        let (mut invalid, mut late, mut accepted) =
+            (InvalidResponses::default(), RefusalCounts::default(), 0);
         for (number, link) in self.links.iter_mut().enumerate() {
-            while let Some(response) = link.receive(trust, &mut doubts, &mut budget) {
-                match self.subscribers.answered(number, link, &response, &self.settings) {
+            while let Some(response) = link.receive(trust, &mut invalid, &mut budget) {
+                match self.subscribers.on_response(number, link, &response, &self.settings) {
                     Ok(()) => accepted += 1,
-                    // It is what a bad link does, and counted as loss: nothing to warn of.
+                    // Expected on a bad link and already counted as loss: not logged.
                     Err(ProbeRefusal::Late) => late.add(ProbeRefusal::Late),
-                    Err(reason) => doubts.refused.add(reason),
+                    Err(reason) => invalid.refused.add(reason),
                 }
             }
         }
-        let counts = [&doubts.refused, &doubts.accepted, &late];
+        let counts = [&invalid.refused, &invalid.accepted, &late];
         if accepted > 0 || counts.iter().any(|counts| counts.total() > 0) {
             self.record.update(|record| {
                 record.responses_accepted += accepted;
                 counts.iter().for_each(|counts| record.refused.merge(counts));
             });
-            self.doubts.refused.merge(&doubts.refused);
-            self.doubts.accepted.merge(&doubts.accepted);
+            self.invalid_responses.refused.merge(&invalid.refused);
+            self.invalid_responses.accepted.merge(&invalid.accepted);
         }
     }
 
+    /// Sends one probe on each network.
     fn probe(&mut self) {
         let Some(trust) = self.trust.as_mut().filter(|_| self.settings.probes.enabled) else { return };
         let mut sent = 0;
         for (number, link) in self.links.iter_mut().enumerate() {
             if let Some(probe) = link.send(trust) {
-                self.subscribers.sent(number, probe.seq, probe.sent_at);
+                self.subscribers.on_probe_sent(number, probe.seq, probe.sent_at);
                 sent += 1;
             }
         }
@@ -224,39 +233,40 @@ impl Control {
         }
     }
 
-    /// One evaluation of the subscribers.
+    /// Evaluates all subscribers and publishes the results.
     fn evaluate(&mut self, now: MonotonicNs) {
         for change in self.subscribers.evaluate(&self.settings, now) {
-            self.diagnostics.decision(&change, &self.settings);
+            self.diagnostics.publish_change(&change, &self.settings);
         }
-        self.subscribers.show(&self.settings);
-        self.diagnostics.states(&self.subscribers, &self.settings, now);
+        self.subscribers.write_table(&self.settings);
+        self.diagnostics.publish_states(&self.subscribers, &self.settings, now);
     }
 
-    /// Writes, or confirms, what each lane is to do.
+    /// Writes or confirms the policy of each lane.
     fn decide(&mut self, now: MonotonicNs) {
-        let decisions: Vec<_> = (0..self.settings.lanes.len()).map(|lane| self.decision(lane)).collect();
-        // All of them under one lock, ten times a second.
+        let decisions: Vec<_> = (0..self.settings.lanes.len()).map(|lane| self.decide_lane(lane)).collect();
+        // One lock for the policies of all lanes.
         let policies = match self.role.boards.policies() {
             Ok(policies) => policies,
             Err(error) => {
-                error!(%error, "policies not written");
+                error!(%error, "cannot write the policies");
                 self.role.failed();
                 return;
             }
         };
         for (lane, (mode, safety_floor)) in decisions.into_iter().enumerate() {
-            policies.set(lane, now, |former| LanePolicy {
+            policies.set(lane, now, |previous| LanePolicy {
                 mode: mode as u8,
                 safety_floor: safety_floor as u8,
                 written_at: now,
-                ..former
+                ..previous
             });
         }
     }
 
-    /// The mode of a lane, and the one that safety demands at least. Says so when they are others.
-    fn decision(&mut self, lane: usize) -> (LaneMode, LaneMode) {
+    /// Decides the mode of a lane and the safety floor (the mildest mode that the safety supervisor allows).
+    /// Logs changes.
+    fn decide_lane(&mut self, lane: usize) -> (LaneMode, LaneMode) {
         let class = self.settings.lanes[lane].class;
         let decision = self.subscribers.lane_mode(&self.settings, lane);
         let safety_floor = safety_floor(
@@ -266,82 +276,83 @@ impl Control {
             &self.settings.safety.rules,
         );
         let text = decision_text(&decision, safety_floor, self.supervision.mode());
-        if self.decided[lane] != text {
-            info!(lane = self.settings.lanes[lane].name.as_str(), "control decides: {text}");
-            self.decided[lane] = text;
+        if self.decisions[lane] != text {
+            info!(lane = self.settings.lanes[lane].name.as_str(), "control decided: {text}");
+            self.decisions[lane] = text;
         }
         (decision.mode, safety_floor)
     }
 
-    /// Shows what was found and decided for the bridge as a whole.
-    fn show(&mut self) {
-        let shown = ControlRecord {
+    /// Writes the state of the whole bridge to control's record on the boards.
+    fn write_record(&mut self) {
+        let record = ControlRecord {
             safety: self.supervision.mode() as u8,
             safety_since: self.supervision.since(),
             safety_transitions: self.supervision.transitions(),
             safety_reason: FixedText::new(self.supervision.reason()),
             subscribers: self.subscribers.count() as u64,
-            intruders: self.guard.shown() as u64,
-            intruders_seen: self.guard.seen(),
+            intruders: self.endpoints.intruder_count() as u64,
+            intruders_seen: self.endpoints.intruders_seen(),
             classifies: u8::from(
                 self.settings.classifier.enabled && self.settings.probes.enabled && self.trust.is_some(),
             ),
             without_secret: u8::from(self.trust.is_none()),
             ..*self.record.get()
         };
-        if shown != *self.record.get() {
-            self.record.update(|record| *record = shown);
+        if record != *self.record.get() {
+            self.record.update(|written| *written = record);
         }
     }
 
-    fn keep_house(&mut self, now: MonotonicNs) {
+    /// Applies a reload, handles discovery, and updates logs, health and status.
+    fn housekeeping(&mut self, now: MonotonicNs) {
         if let Some(Configuration { settings, inline_secret }) = self.role.reload() {
             self.settings = settings.clone();
-            self.trust = trust(settings, inline_secret.as_ref());
-            self.subscribers.adopt(&self.settings, &self.link_of_lane, now);
-            // With the modes that follow from it, and not an evaluation later.
-            self.subscribers.show(&self.settings);
-            self.diagnostics.adopt(&self.settings);
+            self.trust = load_trust(settings, inline_secret.as_ref());
+            self.subscribers.apply(&self.settings, &self.link_of_lane, now);
+            // At once, together with the resulting modes, instead of at the next evaluation.
+            self.subscribers.write_table(&self.settings);
+            self.diagnostics.apply(&self.settings);
             self.decide(now);
         }
-        self.guard.keep_house(&mut self.participants, &self.settings, now);
-        self.refused.look(&self.doubts.refused, now);
-        self.accepted.look(&self.doubts.accepted, now);
-        self.show();
+        self.endpoints.housekeeping(&mut self.participants, &self.settings, now);
+        self.refused_log.look(&self.invalid_responses.refused, now);
+        self.accepted_log.look(&self.invalid_responses.accepted, now);
+        self.write_record();
         self.role.turned(self.supervision.mode() as u8, 0);
-        // The first turn is over, and with it everything is there.
+        // Only the first call has an effect: control has completed its first turn.
         self.role.ready();
-        self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decided, line));
+        self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decisions, line));
     }
 }
 
-/// What control found and decided, in a line for the service manager.
-fn describe(record: &ControlRecord, settings: &Settings, decided: &[String], line: &mut String) {
+/// Writes the status line for the service manager: safety mode, subscribers, decisions for the lanes.
+fn describe(record: &ControlRecord, settings: &Settings, decisions: &[String], line: &mut String) {
     // Writing to a String cannot fail.
     let _ = write!(line, "safety mode {}; {} subscribers", record.safety(), record.subscribers);
-    let lanes = settings.lanes.iter().zip(decided);
-    write_list(line, "; lanes:", lanes.map(|(lane, decided)| format!("{} {decided}", lane.name)));
+    let lanes = settings.lanes.iter().zip(decisions);
+    write_list(line, "; lanes:", lanes.map(|(lane, decision)| format!("{} {decision}", lane.name)));
 }
 
-/// Control does more than to probe, and goes on without it.
-fn trust(settings: &Settings, secret: Option<&InlineSecret>) -> Option<Trust> {
+/// Loads the secret. Without it control runs on, but sends no probes.
+fn load_trust(settings: &Settings, secret: Option<&InlineSecret>) -> Option<Trust> {
     match Trust::load(&settings.security, secret) {
         Ok(trust) => Some(trust),
         Err(error) => {
-            error!("nobody is probed, so that every subscriber stays as it is: {error}");
+            error!("no subscriber is probed, so that every subscriber keeps its state: {error}");
             None
         }
     }
 }
 
-/// The next instant of something periodic. What was missed is not made up for.
-fn next(due: MonotonicNs, rate_hz: f64, now: MonotonicNs) -> MonotonicNs {
+/// The next instant of periodic work that was due at `due`. Missed periods are skipped.
+fn next_due(due: MonotonicNs, rate_hz: f64, now: MonotonicNs) -> MonotonicNs {
     let period_ns = (1e9 / rate_hz).round() as u64;
     let next = due.plus_ns(period_ns);
     if next > now { next } else { now.plus_ns(period_ns) }
 }
 
-/// The networks that control joins, that of the input first, and the number of each lane's.
+/// The networks that control joins, the input network first, and the index of each lane's network.
 fn networks(settings: &Settings) -> (Vec<DdsNetwork>, Vec<usize>) {
     let mut networks = vec![settings.input.clone()];
     let mut of_lane = Vec::with_capacity(settings.lanes.len());
@@ -374,9 +385,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn something_periodic_keeps_its_beat_and_makes_up_for_nothing() {
+    fn periodic_work_keeps_its_period_and_skips_missed_ones() {
         let at = |ms| MonotonicNs(0).plus_ms(ms);
-        assert_eq!(next(at(1_000), 5.0, at(1_003)), at(1_200));
-        assert_eq!(next(at(1_000), 5.0, at(9_000)), at(9_200));
+        assert_eq!(next_due(at(1_000), 5.0, at(1_003)), at(1_200));
+        assert_eq!(next_due(at(1_000), 5.0, at(9_000)), at(9_200));
     }
 }

@@ -1,4 +1,4 @@
-//! What the safety supervisor goes by, read off the boards.
+//! Input of the safety supervisor, read from the boards, and the resulting safety mode.
 
 use tracing::{info, warn};
 
@@ -9,32 +9,32 @@ use crate::policy::{
 };
 use crate::shm::{Boards, ProcessRole, Stage};
 
-/// What was read of one process at the last evaluation.
+/// The counters of one process at the previous evaluation.
 #[derive(Default)]
-struct Former {
-    /// Whether it was there.
-    seen: bool,
+struct PreviousCounters {
+    /// Whether the process was running.
+    was_running: bool,
     starts: u64,
     errors: ErrorCounts,
     caught_up: u64,
 }
 
-/// The supervisor and what it compares with.
+/// The safety supervisor and the counters with which it compares the next reading.
 pub(super) struct Supervision {
     supervisor: SafetySupervisor,
     since: MonotonicNs,
     reason: String,
     critical_trouble: bool,
-    ingress: Former,
-    lanes: Vec<Former>,
+    ingress: PreviousCounters,
+    lanes: Vec<PreviousCounters>,
     source_lags: Vec<SourceLag>,
     dds_in: Vec<LatencyHistogram>,
-    /// Of each lane and route: from ingress to the lane, and within the lane.
-    on_the_way: Vec<Vec<(LatencyHistogram, LatencyHistogram)>>,
+    /// For each lane and route, the latencies from shared memory to the lane and from the lane to the writer.
+    lane_latencies: Vec<Vec<(LatencyHistogram, LatencyHistogram)>>,
 }
 
 impl Supervision {
-    /// Begins with what the boards show now: what was before is not judged.
+    /// Starts with the present counters of the boards; errors before that are not evaluated.
     pub fn new(boards: &Boards, settings: &Settings, now: MonotonicNs) -> Self {
         let routes = settings.routes.len();
         let mut supervision = Self {
@@ -42,44 +42,44 @@ impl Supervision {
             since: now,
             reason: String::new(),
             critical_trouble: false,
-            ingress: Former::default(),
-            lanes: settings.lanes.iter().map(|_| Former::default()).collect(),
+            ingress: PreviousCounters::default(),
+            lanes: settings.lanes.iter().map(|_| PreviousCounters::default()).collect(),
             source_lags: vec![SourceLag::new(); routes],
             dds_in: vec![LatencyHistogram::default(); routes],
-            on_the_way: vec![vec![Default::default(); routes]; settings.lanes.len()],
+            lane_latencies: vec![vec![Default::default(); routes]; settings.lanes.len()],
         };
-        supervision.load(boards, settings, now);
+        supervision.read_loads(boards, settings, now);
         supervision
     }
 
-    /// The mode.
+    /// The safety mode.
     pub fn mode(&self) -> SafetyMode {
         self.supervisor.mode()
     }
 
-    /// When it was entered.
+    /// When the safety mode was entered.
     pub fn since(&self) -> MonotonicNs {
         self.since
     }
 
-    /// Changes of the mode.
+    /// The number of changes of the safety mode.
     pub fn transitions(&self) -> u64 {
         self.supervisor.transitions()
     }
 
-    /// What brought it about; empty in normal mode.
+    /// The cause of the safety mode; empty in normal mode.
     pub fn reason(&self) -> &str {
         &self.reason
     }
 
-    /// Whether the critical path has trouble of its own.
+    /// Whether a process of the critical path is in trouble.
     pub fn critical_trouble(&self) -> bool {
         self.critical_trouble
     }
 
-    /// One evaluation.
+    /// Reads the boards, evaluates the safety mode and logs a change.
     pub fn evaluate(&mut self, boards: &Boards, settings: &Settings, now: MonotonicNs) {
-        let loads = self.load(boards, settings, now);
+        let loads = self.read_loads(boards, settings, now);
         let inputs = SafetyInputs { processes: &loads };
         let decision = self.supervisor.evaluate(&inputs, &settings.safety.rules, now);
         self.critical_trouble = decision.critical_trouble;
@@ -95,11 +95,12 @@ impl Supervision {
             };
             warn!(from, to, reason = self.reason, "safety mode changed: {what}");
         } else {
-            info!(from, to, "safety mode changed: every lane goes on");
+            info!(from, to, "safety mode changed: all lanes forward again");
         }
     }
 
-    fn load<'a>(
+    /// Reads the loads of ingress and of the lanes that are running.
+    fn read_loads<'a>(
         &mut self,
         boards: &Boards,
         settings: &'a Settings,
@@ -109,14 +110,14 @@ impl Supervision {
         let published: Vec<u64> = (0..settings.routes.len())
             .map(|route| boards.ingress(route).map_or(0, |counters| counters.published))
             .collect();
-        loads.extend(self.ingress(boards, settings, now));
+        loads.extend(self.read_ingress(boards, settings, now));
         for (lane, configured) in settings.lanes.iter().enumerate() {
-            loads.extend(self.lane(boards, lane, configured, &published, now));
+            loads.extend(self.read_lane(boards, lane, configured, &published, now));
         }
         loads
     }
 
-    fn ingress<'a>(
+    fn read_ingress<'a>(
         &mut self,
         boards: &Boards,
         settings: &Settings,
@@ -140,12 +141,12 @@ impl Supervision {
             }
         }
         let total = ErrorCounts { pool_exhausted, ..ErrorCounts::default() };
-        let (silent_ms, errors) = self.ingress.look(boards, ProcessRole::Ingress, total, now)?;
+        let (silent_ms, errors) = self.ingress.advance(boards, ProcessRole::Ingress, total, now)?;
         let load = ProcessLoad::idle("ingress", TrafficClass::Critical);
         Some(ProcessLoad { silent_ms, errors, source_lag_ms, ..load })
     }
 
-    fn lane<'a>(
+    fn read_lane<'a>(
         &mut self,
         boards: &Boards,
         lane: usize,
@@ -161,21 +162,22 @@ impl Supervision {
             let drops = |reason| counters.drops.get(reason);
             total.write_failed += drops(DropReason::WriteFailed);
             total.queue_overflow += drops(DropReason::QueueOverflow);
-            queued = queued.max(in_queue(&counters, published[output.route]));
+            queued = queued.max(queued_samples(&counters, published[output.route]));
             waiting = waiting.max(counters.waiting);
             caught_up += counters.caught_up;
-            let lag_ms = self.writer_lag_ms(boards, lane, output.route, configured.class);
+            let lag_ms = self.read_writer_lag_ms(boards, lane, output.route, configured.class);
             writer_lag_ms = match (writer_lag_ms, lag_ms) {
                 (Some(one), Some(other)) => Some(one.max(other)),
                 (one, other) => one.or(other),
             };
         }
-        let former = &mut self.lanes[lane];
-        // What a lane catches up with has waited for it, and says nothing about how fast it is now.
-        if std::mem::replace(&mut former.caught_up, caught_up) != caught_up {
+        let previous = &mut self.lanes[lane];
+        // Samples with which the lane catches up waited while it was down; their latency is not its present
+        // speed.
+        if std::mem::replace(&mut previous.caught_up, caught_up) != caught_up {
             writer_lag_ms = None;
         }
-        let (silent_ms, errors) = former.look(boards, ProcessRole::Egress(lane), total, now)?;
+        let (silent_ms, errors) = previous.advance(boards, ProcessRole::Egress(lane), total, now)?;
         let is_critical = configured.class == TrafficClass::Critical;
         Some(ProcessLoad {
             silent_ms,
@@ -188,9 +190,9 @@ impl Supervision {
         })
     }
 
-    /// p99 from shared memory to the writer since the last evaluation. What a sample waits in shared memory
-    /// for a noncritical lane is its wait for a token, and no lag.
-    fn writer_lag_ms(
+    /// p99 of the latency from shared memory to the writer since the previous evaluation. For a noncritical
+    /// lane without the time in shared memory, where samples wait for a token.
+    fn read_writer_lag_ms(
         &mut self,
         boards: &Boards,
         lane: usize,
@@ -198,9 +200,9 @@ impl Supervision {
         class: TrafficClass,
     ) -> Option<f64> {
         let read = (boards.histogram(Stage::Shm(lane), route), boards.histogram(Stage::DdsOut(lane), route));
-        let former = &mut self.on_the_way[lane][route];
-        let (shm, dds_out) = (read.0.since(&former.0), read.1.since(&former.1));
-        *former = read;
+        let previous = &mut self.lane_latencies[lane][route];
+        let (shm, dds_out) = (read.0.since(&previous.0), read.1.since(&previous.1));
+        *previous = read;
         let ms = |window: &LatencyHistogram| window.quantile_ns(0.99).map(|ns| ns as f64 / 1e6);
         match class {
             TrafficClass::Critical => Some(ms(&shm)? + ms(&dds_out)?),
@@ -209,10 +211,10 @@ impl Supervision {
     }
 }
 
-impl Former {
-    /// Since when a process is silent, and its errors since the last look; `None` while it is not there: it
-    /// never was, or has ended in good order.
-    fn look(
+impl PreviousCounters {
+    /// Stores the present counters; returns for how long the process is silent and its errors since the
+    /// previous call. `None` while the process is not expected to run: it never started, or ended normally.
+    fn advance(
         &mut self,
         boards: &Boards,
         role: ProcessRole,
@@ -220,54 +222,54 @@ impl Former {
         now: MonotonicNs,
     ) -> Option<(u64, ErrorCounts)> {
         let health = boards.health(role)?;
-        let there = health.pid != 0 && health.ended == 0;
-        let grown = |now: u64, before: u64| now.saturating_sub(before);
+        let is_running = health.pid != 0 && health.ended == 0;
+        let increase = |now: u64, before: u64| now.saturating_sub(before);
         let before = std::mem::replace(&mut self.errors, total);
         let starts = std::mem::replace(&mut self.starts, health.starts);
-        if !there || !std::mem::replace(&mut self.seen, there) {
-            self.seen = there;
-            // The first look: what was before is not judged.
-            return there.then(|| (now.since(health.alive_at) / 1_000_000, ErrorCounts::default()));
+        if !is_running || !std::mem::replace(&mut self.was_running, is_running) {
+            self.was_running = is_running;
+            // The first reading of this process: earlier errors are not evaluated.
+            return is_running.then(|| (now.since(health.alive_at) / 1_000_000, ErrorCounts::default()));
         }
         let errors = ErrorCounts {
-            write_failed: grown(total.write_failed, before.write_failed),
-            pool_exhausted: grown(total.pool_exhausted, before.pool_exhausted),
-            queue_overflow: grown(total.queue_overflow, before.queue_overflow),
-            restarts: grown(health.starts, starts),
+            write_failed: increase(total.write_failed, before.write_failed),
+            pool_exhausted: increase(total.pool_exhausted, before.pool_exhausted),
+            queue_overflow: increase(total.queue_overflow, before.queue_overflow),
+            restarts: increase(health.starts, starts),
         };
         Some((now.since(health.alive_at) / 1_000_000, errors))
     }
 }
 
-/// Samples that ingress has published and the lane has not taken.
-fn in_queue(counters: &LaneCounters, published: u64) -> u64 {
+/// The number of samples that ingress has published and the lane has not taken.
+fn queued_samples(counters: &LaneCounters, published: u64) -> u64 {
     if counters.last_sequence == 0 { 0 } else { published.saturating_sub(counters.last_sequence) }
 }
 
-/// What is wrong, in a sentence that fits the board.
+/// The cause of a safety mode, as a sentence that fits into [`FixedText`](crate::model::FixedText).
 fn cause_text(cause: &SafetyCause) -> String {
-    let who = cause.who.as_str();
+    let process = cause.who.as_str();
     match cause.trouble {
         SafetyTrouble::Queue { queued, capacity } => {
-            // A lane that is stopped misses more than its queue holds.
+            // A stopped lane can fall behind by more samples than its queue holds.
             let queued = queued.min(capacity);
-            format!("{who}: {queued} of {capacity} samples wait in shared memory")
+            format!("{process}: {queued} of {capacity} samples wait in shared memory")
         }
         SafetyTrouble::Waiting { samples, limit } => {
-            format!("{who}: {samples} samples wait, more than {limit}")
+            format!("{process}: {samples} samples wait, more than {limit}")
         }
         SafetyTrouble::SourceLag { lag_ms, limit_ms } => {
-            format!("{who}: {lag_ms:.0} ms from source to shared memory (limit {limit_ms:.0})")
+            format!("{process}: {lag_ms:.0} ms from source to shared memory (limit {limit_ms:.0})")
         }
         SafetyTrouble::WriterLag { lag_ms, limit_ms } => {
-            format!("{who}: {lag_ms:.0} ms from shared memory to the writer (limit {limit_ms:.0})")
+            format!("{process}: {lag_ms:.0} ms from shared memory to the writer (limit {limit_ms:.0})")
         }
         SafetyTrouble::Errors { per_s, limit_per_s } => {
-            format!("{who}: {per_s:.1} errors per second (limit {limit_per_s})")
+            format!("{process}: {per_s:.1} errors per second (limit {limit_per_s})")
         }
         SafetyTrouble::Silent { silent_ms, limit_ms } => {
             format!(
-                "{who}: has not turned for {:.1} s (limit {:.1})",
+                "{process}: no turn of its main loop for {:.1} s (limit {:.1})",
                 silent_ms as f64 / 1e3,
                 limit_ms as f64 / 1e3
             )

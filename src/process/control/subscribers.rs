@@ -1,4 +1,5 @@
-//! The subscribers that control follows: one window and one classifier each, and what the boards show of it.
+//! The subscribers that control probes: a probe window and a classifier for each, and their table on the
+//! boards.
 
 use tracing::{info, trace, warn};
 
@@ -13,33 +14,33 @@ use crate::policy::{
 };
 use crate::shm::{BoardWriter, Boards};
 
-/// Who decides on a subscriber's state.
+/// What determines a subscriber's state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Judge {
+enum StateSource {
     Classifier,
     Override,
     /// The classifier is switched off.
-    Nobody,
+    Unclassified,
 }
 
-impl Judge {
-    /// Why a subscriber is in the state in which this one found it.
-    const fn reason_at_first(self, former: Self) -> &'static str {
-        match (self, former) {
+impl StateSource {
+    /// The reason of a subscriber's state until this source changes it.
+    const fn initial_reason(self, previous: Self) -> &'static str {
+        match (self, previous) {
             (Self::Override, _) => "forced by the configuration (overrides)",
-            (Self::Nobody, _) => "not classified (classifier.enabled is false)",
-            (Self::Classifier, Self::Override) => "as the former override left it",
+            (Self::Unclassified, _) => "not classified (classifier.enabled is false)",
+            (Self::Classifier, Self::Override) => "unchanged since the previous override ended",
             (Self::Classifier, _) => "not enough probes answered yet",
         }
     }
 }
 
-/// One subscriber.
+/// A subscriber and what control knows about it.
 struct Subscriber {
     id: String,
     lane: usize,
-    /// The number of the link on which it answers: that of its lane's network, or the one on which it was
-    /// first heard.
+    /// The index of the link on which its responses count: that of its lane's network, or the link of its
+    /// first response.
     link: usize,
     listed: bool,
     window: ProbeWindow,
@@ -48,14 +49,14 @@ struct Subscriber {
     /// The state before the last change.
     previous: Option<SubscriberState>,
     since: MonotonicNs,
-    judge: Judge,
+    source: StateSource,
     reason: String,
     warnings: SubscriberWarnings,
-    /// Those that are shown, as `SubscriberWarning`'s bits.
-    warned: u8,
+    /// Active warnings, as the bits of `SubscriberWarning`.
+    warning_bits: u8,
 }
 
-/// A change of state, for those who listen.
+/// A change of a subscriber's state, to be published.
 #[derive(Clone, Debug)]
 pub(super) struct Change {
     pub subscriber: String,
@@ -65,8 +66,8 @@ pub(super) struct Change {
     pub reason: String,
 }
 
-/// A subscriber as it is shown.
-pub(super) struct Shown<'a> {
+/// The published properties of a subscriber.
+pub(super) struct SubscriberView<'a> {
     pub id: &'a str,
     pub lane: &'a str,
     pub state: SubscriberState,
@@ -75,35 +76,35 @@ pub(super) struct Shown<'a> {
     pub reason: &'a str,
 }
 
-/// All subscribers, listed ones first.
+/// All subscribers that control probes.
 pub(super) struct Subscribers {
     list: Vec<Subscriber>,
-    /// When control was last seen to run, or until when it means to sleep.
-    awake_at: MonotonicNs,
-    /// The place of each in the table on the board is its place in the list.
-    places: Vec<BoardWriter<SubscriberRecord>>,
+    /// When control last ran, or the end of its present sleep.
+    expected_awake_at: MonotonicNs,
+    /// One for each row of the table on the boards, in the order of `list`.
+    writers: Vec<BoardWriter<SubscriberRecord>>,
 }
 
 impl Subscribers {
-    /// The listed ones. `link_of_lane` gives the number of the link of each lane.
+    /// Starts with the listed subscribers. `link_of_lane` has the index of each lane's link.
     pub fn new(boards: &Boards, settings: &Settings, link_of_lane: &[usize], now: MonotonicNs) -> Self {
         let mut subscribers = Self {
             list: Vec::with_capacity(MAX_SUBSCRIBERS),
-            awake_at: now,
-            places: (0..MAX_SUBSCRIBERS).map(|place| boards.subscriber_writer(place)).collect(),
+            expected_awake_at: now,
+            writers: (0..MAX_SUBSCRIBERS).map(|index| boards.subscriber_writer(index)).collect(),
         };
-        subscribers.adopt(settings, link_of_lane, now);
-        // What a predecessor left.
-        for place in &mut subscribers.places {
-            place.update(|record| *record = SubscriberRecord::default());
+        subscribers.apply(settings, link_of_lane, now);
+        // Clears the records of a previous control process.
+        for writer in &mut subscribers.writers {
+            writer.update(|record| *record = SubscriberRecord::default());
         }
-        subscribers.show(settings);
+        subscribers.write_table(settings);
         subscribers
     }
 
-    /// Applies a configuration: lanes, windows, who is listed. Subscribers that are known keep what is known
-    /// of them.
-    pub fn adopt(&mut self, settings: &Settings, link_of_lane: &[usize], now: MonotonicNs) {
+    /// Applies a configuration: lanes, windows, listed subscribers. Known subscribers keep their windows and
+    /// states.
+    pub fn apply(&mut self, settings: &Settings, link_of_lane: &[usize], now: MonotonicNs) {
         let probes = &settings.probes;
         for subscriber in &mut self.list {
             subscriber.window.set_limits(probes.window_size, probes.timeout_ms);
@@ -111,7 +112,7 @@ impl Subscribers {
             let lane = lane_of(settings, &subscriber.id);
             if lane != subscriber.lane {
                 if link_of_lane[lane] != subscriber.link {
-                    // Answers to what is under way would come on a link that is its own no longer.
+                    // Responses to outstanding probes would arrive on the previous link and would not count.
                     subscriber.window.stopped(now, now);
                 }
                 (subscriber.lane, subscriber.link) = (lane, link_of_lane[lane]);
@@ -123,10 +124,10 @@ impl Subscribers {
                 continue;
             }
             if self.list.len() == MAX_SUBSCRIBERS
-                && let Some(place) = self.list.iter().position(|known| !known.listed)
+                && let Some(unlisted) = self.list.iter().position(|known| !known.listed)
             {
-                // Whoever made up the others cannot keep a listed one out.
-                self.list.remove(place);
+                // A listed subscriber takes the place of an unlisted one, whose id may be made up.
+                self.list.remove(unlisted);
             }
             if self.list.len() < MAX_SUBSCRIBERS {
                 let lane = lane_of(settings, id);
@@ -135,48 +136,51 @@ impl Subscribers {
         }
     }
 
-    /// A probe was sent on a link.
-    pub fn sent(&mut self, link: usize, seq: u64, at: MonotonicNs) {
-        self.awake(at);
-        // With the answers, a recording of the link: `RUST_LOG=adaptive_bridge::process::control=trace`.
+    /// Records a probe that was sent on a link.
+    pub fn on_probe_sent(&mut self, link: usize, seq: u64, at: MonotonicNs) {
+        self.note_awake(at);
+        // Together with the responses a recording of the link:
+        // `RUST_LOG=adaptive_bridge::process::control=trace`.
         trace!(link, seq, sent_at_ms = at.0 / 1_000_000, "probe sent");
         for subscriber in self.list.iter_mut().filter(|subscriber| subscriber.link == link) {
             subscriber.window.sent(seq, at);
         }
     }
 
-    /// Control runs. If it has not for much longer than it meant to, then what was under way says nothing.
-    /// It may be stopped anywhere, so that this is asked whenever the windows are told of something.
-    pub fn awake(&mut self, now: MonotonicNs) {
-        if now.since(self.awake_at) > STOPPED_NS {
+    /// Records that control is running. If it was paused for more than [`STOPPED_NS`] beyond its sleep, the
+    /// probes of that time count neither as answered nor as lost. Called before every change of the windows,
+    /// because control can be stopped at any point.
+    pub fn note_awake(&mut self, now: MonotonicNs) {
+        if now.since(self.expected_awake_at) > STOPPED_NS {
             for subscriber in &mut self.list {
-                subscriber.window.stopped(self.awake_at, now);
+                subscriber.window.stopped(self.expected_awake_at, now);
             }
         }
-        self.awake_at = now;
+        self.expected_awake_at = now;
     }
 
-    /// Control means to sleep until then.
-    pub fn asleep(&mut self, until: MonotonicNs) {
-        self.awake_at = until;
+    /// Records that control sleeps until `until`.
+    pub fn note_asleep(&mut self, until: MonotonicNs) {
+        self.expected_awake_at = until;
     }
 
-    /// Takes in a response that is believed.
-    pub fn answered(
+    /// Handles an accepted response that arrived on link `link_index`.
+    pub fn on_response(
         &mut self,
-        number: usize,
+        link_index: usize,
         link: &Link,
         response: &Response,
         settings: &Settings,
     ) -> Result<(), ProbeRefusal> {
-        self.awake(response.arrived_at);
-        let place = match self.list.iter().position(|known| known.id == response.responder_id) {
-            Some(place) => place,
-            None => self.welcome(number, link, response, settings)?,
+        self.note_awake(response.arrived_at);
+        let index = match self.list.iter().position(|known| known.id == response.responder_id) {
+            Some(index) => index,
+            None => self.add_unlisted(link_index, link, response, settings)?,
         };
-        let subscriber = &mut self.list[place];
-        // One that is in several of our networks answers on each of them; only one of them is its lane's.
-        if subscriber.link != number {
+        let subscriber = &mut self.list[index];
+        // A responder that is in several networks of the bridge responds on each; only its lane's network
+        // counts.
+        if subscriber.link != link_index {
             return Ok(());
         }
         match subscriber.window.answered(response.seq, response.arrived_at) {
@@ -195,17 +199,17 @@ impl Subscribers {
         }
     }
 
-    /// One who is not known yet.
-    fn welcome(
+    /// Adds the subscriber of a responder that is not known yet; returns its index in the list.
+    fn add_unlisted(
         &mut self,
-        number: usize,
+        link_index: usize,
         link: &Link,
         response: &Response,
         settings: &Settings,
     ) -> Result<usize, ProbeRefusal> {
         let id = &response.responder_id;
         if settings.classifier.subscriber_id.is_some() {
-            // It names the only one that counts; those that are listed beside it are known already.
+            // The only accepted responders are this one and the listed ones, which are known already.
             return Err(ProbeRefusal::NotTheSubscriber);
         }
         if self.list.len() == MAX_SUBSCRIBERS {
@@ -215,17 +219,18 @@ impl Subscribers {
         info!(
             subscriber = id,
             lane = settings.lanes[lane].name.as_str(),
-            "a responder that is not listed under `subscribers`"
+            "added a responder that is not listed under `subscribers`"
         );
-        let mut subscriber = Subscriber::new(id, lane, number, false, settings, response.arrived_at);
-        for probe in link.since(response.seq) {
+        let mut subscriber = Subscriber::new(id, lane, link_index, false, settings, response.arrived_at);
+        for probe in link.probes_since(response.seq) {
             subscriber.window.sent(probe.seq, probe.sent_at);
         }
         self.list.push(subscriber);
         Ok(self.list.len() - 1)
     }
 
-    /// One evaluation of every subscriber. Forgets those that left.
+    /// Evaluates every subscriber and returns the changes of state. Removes silent subscribers that are not
+    /// listed.
     pub fn evaluate(&mut self, settings: &Settings, now: MonotonicNs) -> Vec<Change> {
         let mut changes = Vec::new();
         let warning_thresholds = WarningThresholds {
@@ -236,21 +241,21 @@ impl Subscribers {
         };
         for subscriber in &mut self.list {
             subscriber.reading = subscriber.window.reading(now);
-            subscriber.warned = subscriber.warnings.read(&warning_thresholds, &subscriber.reading);
+            subscriber.warning_bits = subscriber.warnings.read(&warning_thresholds, &subscriber.reading);
             let forced = settings.overrides.get(&subscriber.id).copied();
-            let judge = match forced {
-                Some(_) => Judge::Override,
-                None if settings.classifier.enabled => Judge::Classifier,
-                None => Judge::Nobody,
+            let source = match forced {
+                Some(_) => StateSource::Override,
+                None if settings.classifier.enabled => StateSource::Classifier,
+                None => StateSource::Unclassified,
             };
-            // Also where the state stays: a reason that no longer holds is worse than none.
-            let former = std::mem::replace(&mut subscriber.judge, judge);
-            if former != judge {
-                judge.reason_at_first(former).clone_into(&mut subscriber.reason);
+            // Updates the reason even if the state stays the same, so that no outdated reason is shown.
+            let previous = std::mem::replace(&mut subscriber.source, source);
+            if previous != source {
+                source.initial_reason(previous).clone_into(&mut subscriber.reason);
             }
             let thresholds = &settings.classifier.thresholds;
-            let transition = match judge {
-                Judge::Nobody => subscriber.classifier.unclassified(thresholds),
+            let transition = match source {
+                StateSource::Unclassified => subscriber.classifier.unclassified(thresholds),
                 _ => subscriber.classifier.evaluate(&subscriber.reading, thresholds, forced),
             };
             let Some(transition) = transition else { continue };
@@ -267,18 +272,18 @@ impl Subscribers {
             });
         }
         self.list.retain(|subscriber| {
-            // One that was never heard has been listed until now.
-            let left = !subscriber.listed
+            // An unlisted subscriber without any response was listed until the last reload.
+            let is_removed = !subscriber.listed
                 && subscriber.window.heard_at().is_none_or(|heard_at| is_forgotten(heard_at, now));
-            if left {
-                info!(subscriber = subscriber.id, "silent and not listed: forgotten");
+            if is_removed {
+                info!(subscriber = subscriber.id, "removed a subscriber that is silent and not listed");
             }
-            !left
+            !is_removed
         });
         changes
     }
 
-    /// The mode that the subscribers of a lane give it, and why.
+    /// The mode of a lane that follows from the states of its subscribers, and the reason.
     pub fn lane_mode(&self, settings: &Settings, lane: usize) -> LaneDecision<'_> {
         let thresholds = &settings.classifier.thresholds;
         let states = self
@@ -290,28 +295,28 @@ impl Subscribers {
         lane_mode(settings.lanes[lane].class, enabled, states, &settings.safety.rules)
     }
 
-    /// Places taken in the table.
+    /// The number of subscribers.
     pub fn count(&self) -> usize {
         self.list.len()
     }
 
-    /// Writes the table.
-    pub fn show(&mut self, settings: &Settings) {
+    /// Writes the table of subscribers to the boards.
+    pub fn write_table(&mut self, settings: &Settings) {
         let thresholds = &settings.classifier.thresholds;
-        for (place, subscriber) in self.places.iter_mut().zip(&self.list) {
+        for (writer, subscriber) in self.writers.iter_mut().zip(&self.list) {
             let record = subscriber.record(subscriber.classifier.state(thresholds));
-            if record != *place.get() {
-                place.update(|shown| *shown = record);
+            if record != *writer.get() {
+                writer.update(|written| *written = record);
             }
         }
     }
 
-    /// What is known of each.
-    pub fn iter<'a>(&'a self, settings: &'a Settings) -> impl Iterator<Item = Shown<'a>> {
+    /// Iterates over the published properties of all subscribers.
+    pub fn iter<'a>(&'a self, settings: &'a Settings) -> impl Iterator<Item = SubscriberView<'a>> {
         let thresholds = &settings.classifier.thresholds;
         self.list.iter().map(|subscriber| {
             let state = subscriber.classifier.state(thresholds);
-            Shown {
+            SubscriberView {
                 id: &subscriber.id,
                 lane: settings.lanes[subscriber.lane].name.as_str(),
                 state,
@@ -335,10 +340,10 @@ impl Subscriber {
             reading: LinkReading::default(),
             previous: None,
             since: now,
-            judge: Judge::Classifier,
-            reason: Judge::Classifier.reason_at_first(Judge::Nobody).to_owned(),
+            source: StateSource::Classifier,
+            reason: StateSource::Classifier.initial_reason(StateSource::Unclassified).to_owned(),
             warnings: SubscriberWarnings::default(),
-            warned: 0,
+            warning_bits: 0,
         }
     }
 
@@ -358,34 +363,38 @@ impl Subscriber {
             state: state as u8,
             forced: u8::from(self.classifier.is_forced()),
             listed: u8::from(self.listed),
-            warnings: self.warned,
+            warnings: self.warning_bits,
             reserved: [0; 4],
             reason: FixedText::new(&self.reason),
         }
     }
 }
 
-/// Whether the configuration knows it.
+/// Whether the configuration lists a subscriber.
 fn is_listed(settings: &Settings, id: &str) -> bool {
     settings.subscribers.contains_key(id) || settings.classifier.subscriber_id.as_deref() == Some(id)
 }
 
-/// The number of a subscriber's lane: as configured, else `noncritical`, which is always there.
+/// The index of a subscriber's lane: the configured lane, or else `noncritical`, which always exists.
 fn lane_of(settings: &Settings, id: &str) -> usize {
     let by_name = |name: &str| settings.lanes.iter().position(|lane| lane.name.as_str() == name);
     let configured = settings.subscribers.get(id).and_then(|lane| by_name(lane.as_str()));
     configured.or_else(|| by_name("noncritical")).unwrap_or(settings.lanes.len() - 1)
 }
 
-/// Why, in a sentence that fits the board.
+/// The reason of a transition, as a sentence that fits into [`FixedText`].
 fn reason_text(reason: &TransitionReason) -> String {
     let numbers = |reading: &LinkReading| {
         let rtt = reading.rtt_mean_ms.map_or("no answer".to_owned(), |ms| format!("RTT {ms:.1} ms"));
         format!("{rtt}, loss {:.1} % of {}", reading.loss * 100.0, reading.settled)
     };
     match reason {
-        TransitionReason::Override => Judge::Override.reason_at_first(Judge::Classifier).to_owned(),
-        TransitionReason::Unclassified => Judge::Nobody.reason_at_first(Judge::Classifier).to_owned(),
+        TransitionReason::Override => {
+            StateSource::Override.initial_reason(StateSource::Classifier).to_owned()
+        }
+        TransitionReason::Unclassified => {
+            StateSource::Unclassified.initial_reason(StateSource::Classifier).to_owned()
+        }
         TransitionReason::Demoted { reading, .. } => {
             format!("impaired ({}): {}", reason.label(), numbers(reading))
         }
@@ -405,7 +414,7 @@ fn log(subscriber: &Subscriber, transition: &Transition, settings: &Settings) {
             from,
             to,
             reason = subscriber.reason,
-            "subscriber's state changed"
+            "subscriber state changed"
         );
     }
 }

@@ -1,29 +1,30 @@
-//! What a responder makes of a request: an answer, or a count.
+//! Handling of requests by a responder: each is answered, or refused and counted.
 
 use super::message::{ProbeRequest, ProbeResponse};
 use super::trust::Trust;
 use crate::model::{Encapsulation, Guid, MonotonicNs, ProbeRefusal, RefusalCounts, WallNs};
 use crate::policy::SenderLimits;
 
-/// Bridges that are served at once, each at the full rate. More on one network exist on no robot we know.
+/// Bridges that are served at the same time, each at the full rate. No known robot network has more.
 const MAX_SENDERS: usize = 64;
 
-/// Decides about requests. Time is an argument; memory is bounded whatever arrives.
+/// Checks requests and makes the responses. Time is an argument; memory is bounded for any input.
 #[derive(Debug)]
 pub struct Answers {
     responder_id: String,
     trust: Trust,
     limits: SenderLimits<Guid>,
-    /// Requests that were answered.
+    /// The number of answered requests.
     pub answered: u64,
-    /// Requests that were refused.
+    /// The numbers of refused requests, by reason.
     pub refused: RefusalCounts,
-    /// Requests that were answered only because the trust mode is permissive.
+    /// The numbers of requests that were answered only because the trust mode is permissive, by reason.
     pub accepted_anyway: RefusalCounts,
 }
 
 impl Answers {
-    /// Answers in the name of `responder_id`, at most `max_rate_hz` times a second to each sender.
+    /// Creates the request handling of the responder `responder_id`, which answers each sender at most
+    /// `max_rate_hz` times a second.
     pub fn new(responder_id: &str, trust: Trust, max_rate_hz: u32, now: MonotonicNs) -> Self {
         Self {
             responder_id: responder_id.to_owned(),
@@ -35,11 +36,11 @@ impl Answers {
         }
     }
 
-    /// Whether to look at a request that the DDS writer `writer` sent, before anything is computed for it.
-    /// One that is beyond its sender's rate is counted.
+    /// Whether a request of the DDS writer `writer` is within its sender's rate; called before the request is
+    /// decoded. A request beyond the rate is counted as refused.
     ///
-    /// A sender is known by its writer and not by the `sender_id` in its requests, which whoever forges them
-    /// shares with the bridge that they are made to look like.
+    /// A sender is identified by its DDS writer and not by the `sender_id` of its requests: forged requests
+    /// carry the id of a real bridge and would use up that bridge's rate.
     pub fn is_within_rate(&mut self, writer: Guid, now: MonotonicNs) -> bool {
         let allowed = self.limits.allow(writer, now);
         if !allowed {
@@ -48,18 +49,19 @@ impl Answers {
         allowed
     }
 
-    /// The request that was received at `received`, if it is to be answered. One that is refused is counted.
+    /// Decodes and checks a request that was received at `received`; `None` if it is refused, which is
+    /// counted.
     pub fn judge(
         &mut self,
         payload: &[u8],
         encapsulation: Encapsulation,
         received: WallNs,
     ) -> Option<ProbeRequest> {
-        let judged = ProbeRequest::decode(payload, encapsulation)
-            .and_then(|request| self.trust.check(&request, received).map(|doubt| (request, doubt)));
-        match judged {
-            Ok((request, doubt)) => {
-                if let Some(reason) = doubt {
+        let checked = ProbeRequest::decode(payload, encapsulation)
+            .and_then(|request| self.trust.check(&request, received).map(|tolerated| (request, tolerated)));
+        match checked {
+            Ok((request, tolerated)) => {
+                if let Some(reason) = tolerated {
                     self.accepted_anyway.add(reason);
                 }
                 Some(request)
@@ -71,13 +73,13 @@ impl Answers {
         }
     }
 
-    /// A sample that the DDS library could not read.
+    /// Counts a sample that the DDS library could not read.
     pub fn count_malformed(&mut self) {
         self.refused.add(ProbeRefusal::Malformed);
     }
 
-    /// The response to a request that was received at `received`; it is begun at `begun` and leaves at
-    /// `sent`. Signed, if responses are.
+    /// Makes the response to a request that was received at `received`. `begun` and `sent` are the times at
+    /// which the response is started and sent. The response is signed if a secret is configured.
     pub fn respond(
         &mut self,
         request: ProbeRequest,
@@ -108,8 +110,8 @@ mod tests {
 
     const WALL: WallNs = WallNs(1_763_000_000_000_000_000);
 
-    /// A responder, and a bridge that has the same secret.
-    fn sides(secret: Option<&std::path::Path>, trust_mode: TrustMode) -> (Answers, Trust) {
+    /// A responder and the signing of a bridge with the same secret.
+    fn responder_and_bridge(secret: Option<&std::path::Path>, trust_mode: TrustMode) -> (Answers, Trust) {
         let security = Security {
             trust_mode,
             enable_probe_hmac: secret.is_some(),
@@ -123,7 +125,7 @@ mod tests {
     }
 
     fn unsigned() -> (Answers, Trust) {
-        sides(None, TrustMode::DefaultDeny)
+        responder_and_bridge(None, TrustMode::DefaultDeny)
     }
 
     fn request(sender: &str, seq: u64) -> ProbeRequest {
@@ -141,16 +143,16 @@ mod tests {
     }
 
     impl Answers {
-        fn ask(&mut self, request: &ProbeRequest) -> bool {
+        fn accepts(&mut self, request: &ProbeRequest) -> bool {
             self.judge(&request.encode(), Encapsulation::CDR_LE, WALL).is_some()
         }
     }
 
     #[test]
-    fn a_response_repeats_the_request_and_has_three_times() {
+    fn a_response_echoes_the_request_and_has_three_timestamps() {
         let (mut answers, _) = unsigned();
-        let asked = answers.judge(&request("robot", 7).encode(), Encapsulation::CDR_LE, WALL).unwrap();
-        let response = answers.respond(asked, WallNs(1), WallNs(2), WallNs(3));
+        let accepted = answers.judge(&request("robot", 7).encode(), Encapsulation::CDR_LE, WALL).unwrap();
+        let response = answers.respond(accepted, WallNs(1), WallNs(2), WallNs(3));
         let expected = ProbeResponse {
             seq: 7,
             probe_id: ProbeId::Text("robot-7".to_owned()),
@@ -164,37 +166,37 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_counted_and_leaves_others_their_rate() {
+    fn a_flood_of_one_sender_is_counted_and_does_not_limit_another_sender() {
         let (mut answers, _) = unsigned();
-        let mut looked_at = [0_u64; 2];
+        let mut allowed = [0_u64; 2];
         for ms in 0..10_000 {
-            looked_at[0] += u64::from(answers.is_within_rate(Guid([1; 16]), at_ms(ms)));
+            allowed[0] += u64::from(answers.is_within_rate(Guid([1; 16]), at_ms(ms)));
             if ms % 200 == 0 {
-                looked_at[1] += u64::from(answers.is_within_rate(Guid([2; 16]), at_ms(ms)));
+                allowed[1] += u64::from(answers.is_within_rate(Guid([2; 16]), at_ms(ms)));
             }
         }
-        assert!((190..=210).contains(&looked_at[0]), "{looked_at:?}");
-        assert_eq!(looked_at[1], 50);
-        assert_eq!(answers.refused.get(ProbeRefusal::RateLimited), 10_000 - looked_at[0]);
+        assert!((190..=210).contains(&allowed[0]), "{allowed:?}");
+        assert_eq!(allowed[1], 50);
+        assert_eq!(answers.refused.get(ProbeRefusal::RateLimited), 10_000 - allowed[0]);
     }
 
     #[test]
-    fn forged_and_repeated_requests_are_counted_and_change_nothing() {
+    fn forged_and_replayed_requests_are_refused_and_counted() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("secret");
         std::fs::write(&path, "a secret of the bridge's own").unwrap();
-        let (mut answers, mut bridge) = sides(Some(&path), TrustMode::DefaultDeny);
+        let (mut answers, mut bridge) = responder_and_bridge(Some(&path), TrustMode::DefaultDeny);
         let mut first = request("robot", 0);
         bridge.sign(&mut first);
-        assert!(answers.ask(&first));
+        assert!(answers.accepts(&first));
         for seq in 1..1_000 {
-            assert!(!answers.ask(&first));
-            assert!(!answers.ask(&request("robot", seq)));
+            assert!(!answers.accepts(&first));
+            assert!(!answers.accepts(&request("robot", seq)));
             let forged = ProbeRequest { signature: first.signature, ..request("robot", seq) };
-            assert!(!answers.ask(&forged));
+            assert!(!answers.accepts(&forged));
             let mut good = request("robot", seq);
             bridge.sign(&mut good);
-            assert!(answers.ask(&good), "{seq}");
+            assert!(answers.accepts(&good), "{seq}");
         }
         for reason in [ProbeRefusal::Replayed, ProbeRefusal::Unsigned, ProbeRefusal::BadSignature] {
             assert_eq!(answers.refused.get(reason), 999, "{reason}");
@@ -203,12 +205,12 @@ mod tests {
     }
 
     #[test]
-    fn permissive_answers_and_counts() {
+    fn trust_mode_permissive_answers_and_counts_unsigned_requests() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("secret");
         std::fs::write(&path, "a secret of the bridge's own").unwrap();
-        let (mut answers, _) = sides(Some(&path), TrustMode::Permissive);
-        assert!(answers.ask(&request("robot", 1)));
+        let (mut answers, _) = responder_and_bridge(Some(&path), TrustMode::Permissive);
+        assert!(answers.accepts(&request("robot", 1)));
         assert_eq!((answers.refused.total(), answers.accepted_anyway.get(ProbeRefusal::Unsigned)), (0, 1));
     }
 }

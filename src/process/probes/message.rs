@@ -1,5 +1,6 @@
-//! Requests and responses: JSON in a `std_msgs/String`, with the fields of the original package. `nonce` and
-//! `hmac` are ours. Fields that a reader does not know are skipped, so that old and new sides work together.
+//! Encoding of probe requests and responses: JSON in a `std_msgs/String`, with the fields of the original
+//! package and, added by this one, `nonce` and `hmac`. Unknown fields are ignored, so that older and newer
+//! versions work together.
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
@@ -11,16 +12,17 @@ use crate::telemetry::{STRING_TYPE, string_message};
 /// The DDS type of both topics.
 pub const PROBE_TYPE: &str = STRING_TYPE;
 
-/// The largest message that is read, in bytes of its serialized payload.
+/// The largest message that is decoded, in bytes of its serialized payload.
 pub const MAX_MESSAGE_BYTES: usize = 4096;
 
-/// The one version of the protocol there is.
+/// The only version of the protocol.
 const VERSION: u64 = 1;
 
-/// Times and sequence numbers go up to here, so that every language can hold them in a signed integer.
+/// The largest time or sequence number, so that every language can store them in a signed 64-bit integer.
 const MAX_NUMBER: u64 = i64::MAX as u64;
 
-/// What tells one probe from another. We send text. A control that numbers its probes gets a number back.
+/// Identifies a probe. This package sends text; a number, which the original package may send, is returned as
+/// a number.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ProbeId {
@@ -48,7 +50,7 @@ impl std::fmt::Display for ProbeId {
     }
 }
 
-/// What shows that a message is of somebody who has the secret, and not a repetition.
+/// Proves that the sender of a message has the secret and that the message is no replay.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Signature {
     /// Differs in every message.
@@ -57,41 +59,41 @@ pub struct Signature {
     pub hmac: [u8; 32],
 }
 
-/// A probe.
+/// A probe request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ProbeRequest {
-    /// The probe's number with its sender.
+    /// The sequence number of the probe, counted by its sender.
     pub seq: u64,
-    /// When it was sent, by the sender's wall clock.
+    /// When it was sent, in the sender's wall-clock time.
     pub send_time: WallNs,
-    /// The bridge that asks.
+    /// The id of the bridge that sends it.
     pub sender_id: String,
-    /// To be repeated in the response.
+    /// The id of the probe, which the response repeats.
     pub probe_id: ProbeId,
-    /// `None` where it is unsigned, or carries something that is no signature.
+    /// `None` if it is unsigned or its signature is malformed.
     pub signature: Option<Signature>,
 }
 
-/// The answer to a probe. Its times are of the responder's wall clock.
+/// The response to a probe. Its times are the responder's wall-clock times.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ProbeResponse {
-    /// Of the request.
+    /// The sequence number in the request.
     pub seq: u64,
-    /// Of the request.
+    /// The probe id in the request.
     pub probe_id: ProbeId,
     /// When the request was received.
     pub recv_time: WallNs,
-    /// When the response was begun.
+    /// When the responder started the response.
     pub reply_time: WallNs,
     /// When the response was sent.
     pub response_send_time: WallNs,
-    /// Who answers.
+    /// The id of the responder.
     pub responder_id: String,
-    /// `None` where it is unsigned, or carries something that is no signature.
+    /// `None` if it is unsigned or its signature is malformed.
     pub signature: Option<Signature>,
 }
 
-/// `v` alone: what else a message of another version holds is not for us to judge.
+/// Only the version of a message: the other fields of an unsupported version are not checked.
 #[derive(Deserialize)]
 struct Version {
     v: u64,
@@ -126,12 +128,12 @@ struct ResponseFields<'a> {
 }
 
 impl ProbeRequest {
-    /// Reads a request from a sample's payload and encapsulation. Nothing of its signature is checked.
+    /// Decodes a request from a sample's payload and encapsulation, without checking its signature.
     ///
     /// # Errors
-    /// Oversized, malformed or of another version.
+    /// The message is oversized, malformed or of another version.
     pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
-        let fields: RequestFields<'_> = read(payload, encapsulation)?;
+        let fields: RequestFields<'_> = parse(payload, encapsulation)?;
         let is_valid = [fields.seq, fields.send_time_ns].iter().all(|number| *number <= MAX_NUMBER)
             && is_probe_id(&fields.sender_id)
             && fields.probe_id.is_valid();
@@ -147,10 +149,10 @@ impl ProbeRequest {
         })
     }
 
-    /// The payload of a sample, of encapsulation [`Encapsulation::CDR_LE`].
+    /// Encodes the message as the payload of a sample with encapsulation [`Encapsulation::CDR_LE`].
     pub fn encode(&self) -> Bytes {
         let (nonce, hmac) = signature_fields(self.signature);
-        write(&RequestFields {
+        serialize(&RequestFields {
             v: VERSION,
             seq: self.seq,
             send_time_ns: self.send_time.0,
@@ -163,12 +165,12 @@ impl ProbeRequest {
 }
 
 impl ProbeResponse {
-    /// Reads a response from a sample's payload and encapsulation. Nothing of its signature is checked.
+    /// Decodes a response from a sample's payload and encapsulation, without checking its signature.
     ///
     /// # Errors
-    /// Oversized, malformed or of another version.
+    /// The message is oversized, malformed or of another version.
     pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
-        let fields: ResponseFields<'_> = read(payload, encapsulation)?;
+        let fields: ResponseFields<'_> = parse(payload, encapsulation)?;
         let numbers = [fields.seq, fields.recv_time_ns, fields.reply_time_ns, fields.response_send_time_ns];
         let is_valid = numbers.iter().all(|number| *number <= MAX_NUMBER)
             && is_probe_id(&fields.responder_id)
@@ -187,10 +189,10 @@ impl ProbeResponse {
         })
     }
 
-    /// The payload of a sample, of encapsulation [`Encapsulation::CDR_LE`].
+    /// Encodes the message as the payload of a sample with encapsulation [`Encapsulation::CDR_LE`].
     pub fn encode(&self) -> Bytes {
         let (nonce, hmac) = signature_fields(self.signature);
-        write(&ResponseFields {
+        serialize(&ResponseFields {
             v: VERSION,
             seq: self.seq,
             probe_id: self.probe_id.clone(),
@@ -204,7 +206,7 @@ impl ProbeResponse {
     }
 }
 
-fn read<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation) -> Result<T, ProbeRefusal> {
+fn parse<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation) -> Result<T, ProbeRefusal> {
     if payload.len() > MAX_MESSAGE_BYTES {
         return Err(ProbeRefusal::Oversized);
     }
@@ -216,13 +218,14 @@ fn read<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation)
     serde_json::from_str(json).map_err(|_| ProbeRefusal::Malformed)
 }
 
-fn write(fields: &impl Serialize) -> Bytes {
-    // Numbers and texts under keys that are texts: none of this can fail.
+fn serialize(fields: &impl Serialize) -> Bytes {
+    // Cannot fail: the fields are numbers and strings, and all keys are strings.
     string_message(&serde_json::to_string(fields).unwrap_or_default())
 }
 
-/// The text of a `std_msgs/String`, in any encapsulation in which a final type is plain (RTPS 2.5 table 10.3,
-/// and XTypes 1.3 table 60, which numbers CDR2 otherwise). Up to three bytes of padding may follow.
+/// Decodes the text of a `std_msgs/String`, in any encapsulation that uses plain CDR for a final type (RTPS
+/// 2.5 table 10.3, and XTypes 1.3 table 60, which has other numbers for CDR2). Up to three bytes of padding
+/// may follow.
 fn decode_string(payload: &[u8], encapsulation: Encapsulation) -> Option<&str> {
     let (length, rest) = payload.split_first_chunk::<4>()?;
     let length = match encapsulation.representation() {
@@ -235,7 +238,8 @@ fn decode_string(payload: &[u8], encapsulation: Encapsulation) -> Option<&str> {
     if padding.len() > 3 { None } else { std::str::from_utf8(text).ok() }
 }
 
-/// Where signatures are not looked at, one of another making does no harm: it counts as none.
+/// Parses a signature. A malformed one is treated as absent, so that a receiver that checks no signatures
+/// accepts the message.
 fn signature(nonce: &Value, hmac: &Value) -> Option<Signature> {
     Some(Signature { nonce: from_hex(nonce.as_str()?)?, hmac: from_hex(hmac.as_str()?)? })
 }
@@ -246,14 +250,15 @@ fn signature_fields(signature: Option<Signature>) -> (Value, Value) {
     })
 }
 
-/// Bytes as lowercase hexadecimal digits.
+/// Formats bytes as lowercase hexadecimal digits.
 pub(super) fn to_hex(bytes: &[u8]) -> String {
     const DIGITS: [u8; 16] = *b"0123456789abcdef";
     let digits = bytes.iter().flat_map(|byte| [byte >> 4, byte & 15]);
     digits.map(|digit| char::from(DIGITS[usize::from(digit)])).collect()
 }
 
-/// Only lowercase: the nonce is signed as it is written, so there must be one way to write it.
+/// Parses lowercase hexadecimal digits only: the signature covers the nonce as text, which must be
+/// unambiguous.
 fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     let digit = |byte: u8| match byte {
         b'0'..=b'9' => Some(byte - b'0'),
@@ -300,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_the_original_are_read() {
+    fn messages_of_the_original_package_are_decoded() {
         assert_eq!(request(REQUEST), Ok(expected()));
         let response = ProbeResponse::decode(&cdr(RESPONSE), Encapsulation::CDR_LE).unwrap();
         assert_eq!((response.seq, response.probe_id.to_string().as_str()), (7, "p-7"));
@@ -310,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unsigned_message_has_the_fields_of_the_original_and_no_others() {
+    fn an_unsigned_message_has_exactly_the_fields_of_the_original_package() {
         let keys = |bytes: Bytes| -> Vec<String> {
             let json: Value =
                 serde_json::from_str(decode_string(&bytes, Encapsulation::CDR_LE).unwrap()).unwrap();
@@ -331,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn every_plain_encapsulation_is_read_in_its_byte_order() {
+    fn every_plain_encapsulation_is_decoded_in_its_byte_order() {
         let little = cdr(REQUEST);
         let mut big = little.clone();
         big[..4].reverse();
@@ -346,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_string_is_malformed() {
+    fn a_payload_that_is_not_a_string_message_is_malformed() {
         let whole = cdr(REQUEST);
         for wrong in [
             vec![],
@@ -362,13 +367,13 @@ mod tests {
         }
         let padded = [&whole[..], &[0; 3]].concat();
         assert_eq!(ProbeRequest::decode(&padded, Encapsulation::CDR_LE), Ok(expected()));
-        let mut no_utf8 = whole;
-        no_utf8[70] = 0xff;
-        assert_eq!(ProbeRequest::decode(&no_utf8, Encapsulation::CDR_LE), Err(ProbeRefusal::Malformed));
+        let mut invalid_utf8 = whole;
+        invalid_utf8[70] = 0xff;
+        assert_eq!(ProbeRequest::decode(&invalid_utf8, Encapsulation::CDR_LE), Err(ProbeRefusal::Malformed));
     }
 
     #[test]
-    fn a_message_is_refused_for_what_is_wrong_with_it() {
+    fn an_invalid_message_is_refused_with_the_right_reason() {
         let with = |from: &str, to: &str| {
             assert!(REQUEST.contains(from), "{from}");
             request(&REQUEST.replace(from, to))
@@ -405,14 +410,14 @@ mod tests {
     }
 
     #[test]
-    fn a_message_has_at_most_4_kib() {
+    fn a_message_of_more_than_4_kib_is_refused() {
         let with_spaces = |bytes: usize| format!("{REQUEST}{}", " ".repeat(bytes - 5 - REQUEST.len()));
         assert_eq!(request(&with_spaces(4096)), Ok(expected()));
         assert_eq!(request(&with_spaces(4097)), Err(ProbeRefusal::Oversized));
     }
 
     #[test]
-    fn unknown_fields_and_foreign_signatures_are_skipped() {
+    fn unknown_fields_and_malformed_signatures_are_ignored() {
         for field in [
             r#""zone": {"a": [1, 2]}"#,
             r#""hmac": "swordfish", "nonce": 7"#,
@@ -424,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_comes_back_as_a_number() {
+    fn a_numeric_probe_id_is_encoded_as_a_number() {
         let numbered = request(&REQUEST.replace("\"p-7\"", "12")).unwrap();
         assert_eq!(numbered.probe_id, ProbeId::Number(12));
         assert!(numbered.encode().windows(14).any(|part| part == b"\"probe_id\":12}"));
@@ -441,7 +446,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_encoded_is_decoded(
+        fn messages_are_the_same_after_encoding_and_decoding(
             seq in 0..=MAX_NUMBER,
             time in 0..=MAX_NUMBER,
             id in "[^\\p{C}]{1,31}",
@@ -474,7 +479,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_read_or_refused(bytes: Vec<u8>, id in 0_u8..=0x15) {
+        fn decoding_any_bytes_does_not_panic(bytes: Vec<u8>, id in 0_u8..=0x15) {
             let _ = ProbeRequest::decode(&bytes, Encapsulation([0, id, 0, 0]));
             let _ = ProbeResponse::decode(&bytes, Encapsulation([0, id, 0, 0]));
         }

@@ -1,4 +1,4 @@
-//! The probe protocol: its messages as they are on the wire, and who is believed (docs/probe-protocol.md).
+//! The probe protocol: encoding, signing and checking of its messages (docs/probe-protocol.md).
 
 mod answers;
 mod message;
@@ -15,10 +15,10 @@ pub use secret::{Secret, SecretError};
 pub use trust::{Signed, Trust};
 pub use watch::RefusalWatch;
 
-/// Messages that may wait for whoever reads them: those of 64 senders at once.
+/// History depth of the readers: one message each of 64 senders that send at the same time.
 const PROBE_DEPTH: u32 = 64;
 
-/// What a writer of either topic offers.
+/// QoS of the writers of both topics.
 pub const PROBE_WRITER_QOS: QosProfile = QosProfile {
     reliability: Reliability::BestEffort,
     history: History::KeepLast { depth: 1 },
@@ -27,7 +27,7 @@ pub const PROBE_WRITER_QOS: QosProfile = QosProfile {
     deadline_ms: None,
 };
 
-/// What a reader of either topic asks for.
+/// QoS of the readers of both topics.
 pub const PROBE_READER_QOS: ReaderQos = ReaderQos {
     reliability: Reliability::BestEffort,
     durability: Durability::Volatile,

@@ -1,4 +1,4 @@
-//! The shared secret: where it comes from, and that it goes nowhere.
+//! The shared secret of probe messages: loads it and signs with it, without ever printing it.
 
 use std::fmt;
 use std::fs::File;
@@ -12,37 +12,37 @@ use tracing::warn;
 
 use crate::config::{InlineSecret, SecretSource};
 
-/// The longest file of a secret. Its first line is all that is wanted.
+/// The largest size of a secret file, of which only the first line is used.
 const MAX_FILE_BYTES: u64 = 4096;
 
-/// A shorter secret can be found by trying, from a single recorded message.
+/// The length below which a secret can be found by brute force, from a single recorded message.
 const STRONG_BYTES: usize = 16;
 
-/// Why there is no secret. Nothing of it is repeated here, even where it is wrong.
+/// Why the secret could not be loaded. No variant contains any part of a secret.
 #[derive(Debug)]
 pub enum SecretError {
-    /// None is configured, and one is needed.
+    /// A secret is required and none is configured.
     NotConfigured,
     /// The file cannot be read.
     Unreadable {
-        /// The file.
+        /// The path of the file.
         path: PathBuf,
-        /// Why.
-        what: String,
+        /// What is wrong, as the rest of a sentence: "cannot be read: …".
+        problem: String,
     },
     /// The file's first line is empty.
     EmptyFile {
-        /// The file.
+        /// The path of the file.
         path: PathBuf,
     },
-    /// The environment variable is not set, or empty.
+    /// The environment variable is not set or is empty.
     EmptyVariable {
-        /// Its name.
+        /// The name of the variable.
         name: String,
     },
     /// `security.hmac_secret` of the configuration file is empty.
     EmptyInline,
-    /// The operating system has no random numbers for nonces.
+    /// The operating system provides no random numbers for nonces.
     NoRandomness(getrandom::Error),
 }
 
@@ -50,36 +50,36 @@ impl fmt::Display for SecretError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NotConfigured => f.write_str(
-                "security.enable_probe_hmac is true, and there is no secret: name a file with \
-                 security.hmac_secret_file, or set enable_probe_hmac to false",
+                "security.enable_probe_hmac is true, but no secret is configured: set \
+                 security.hmac_secret_file to a file with the secret, or set enable_probe_hmac to false",
             ),
-            Self::Unreadable { path, what } => write!(
+            Self::Unreadable { path, problem } => write!(
                 f,
-                "the secret's file {} {what}; security.hmac_secret_file names it, and its first line is the \
+                "the secret file {} {problem}; security.hmac_secret_file must name a file whose first line is the \
                  secret",
                 path.display()
             ),
             Self::EmptyFile { path } => write!(
                 f,
-                "the first line of the secret's file {0} is empty; make a secret with `openssl rand -hex 32 \
-                 > {0}`, the same one for the bridge and its responders",
+                "the first line of the secret file {0} is empty; create a secret with `openssl rand -hex 32 \
+                 > {0}`, and give the bridge and its responders the same file",
                 path.display()
             ),
             Self::EmptyVariable { name } => write!(
                 f,
-                "the environment variable {name}, which security.hmac_secret_env names, is not set or \
+                "the environment variable {name}, which security.hmac_secret_env names, is not set or is \
                  empty; set it to the secret"
             ),
-            Self::EmptyInline => f.write_str("security.hmac_secret of the configuration file is empty"),
-            Self::NoRandomness(error) => write!(f, "no random numbers to sign with: {error}"),
+            Self::EmptyInline => f.write_str("security.hmac_secret in the configuration file is empty"),
+            Self::NoRandomness(error) => write!(f, "cannot get random numbers for signatures: {error}"),
         }
     }
 }
 
 impl std::error::Error for SecretError {}
 
-/// A shared secret, ready to sign with. It cannot be printed, and the secret itself is not kept: only the
-/// state of the hash function that it leads to.
+/// A shared secret, ready for signing. It cannot be printed; only the resulting state of the hash function is
+/// kept, not the secret itself.
 #[derive(Clone)]
 pub struct Secret(Hmac<Sha256>);
 
@@ -90,15 +90,15 @@ impl fmt::Debug for Secret {
 }
 
 impl Secret {
-    /// A secret of these bytes; `None` of none.
+    /// Makes a secret of these bytes; `None` if there are none.
     pub fn new(secret: &[u8]) -> Option<Self> {
         if secret.is_empty() { None } else { Hmac::new_from_slice(secret).ok().map(Self) }
     }
 
-    /// Fetches the secret. `inline` is the one that stands in the configuration file.
+    /// Loads the secret from its source. `inline` is the secret in the configuration file, if any.
     ///
     /// # Errors
-    /// It is not where it should be, or empty.
+    /// The source cannot be read, or the secret is empty.
     pub fn load(source: &SecretSource, inline: Option<&InlineSecret>) -> Result<Self, SecretError> {
         let (secret, empty) = match source {
             SecretSource::File(path) => (first_line(path)?, SecretError::EmptyFile { path: path.to_owned() }),
@@ -112,7 +112,7 @@ impl Secret {
             }
         };
         if (1..STRONG_BYTES).contains(&secret.len()) {
-            warn!("the secret of the probes has less than {STRONG_BYTES} bytes and can be guessed");
+            warn!("the secret of the probes has fewer than {STRONG_BYTES} bytes and can be guessed");
         }
         Self::new(&secret).ok_or(empty)
     }
@@ -122,25 +122,25 @@ impl Secret {
         self.0.clone().chain_update(text).finalize().into_bytes().into()
     }
 
-    /// Whether this is the HMAC-SHA-256 of that text. Takes the same time wherever they differ.
+    /// Whether `hmac` is the HMAC-SHA-256 of `text`, compared in constant time.
     pub fn verify(&self, text: &str, hmac: &[u8; 32]) -> bool {
         self.0.clone().chain_update(text).verify_slice(hmac).is_ok()
     }
 }
 
-/// The first line of a file, without its end.
+/// Reads the first line of a file, without its line break.
 fn first_line(path: &Path) -> Result<Vec<u8>, SecretError> {
-    let unreadable = |what: String| SecretError::Unreadable { path: path.to_owned(), what };
+    let unreadable = |problem: String| SecretError::Unreadable { path: path.to_owned(), problem };
     let cannot = |error: std::io::Error| unreadable(format!("cannot be read: {error}"));
     let metadata = std::fs::metadata(path).map_err(cannot)?;
-    // Of a pipe or a device nobody knows whether it ever ends.
+    // Reading a pipe or a device may never end.
     if !metadata.is_file() {
         return Err(unreadable("is not a regular file".to_owned()));
     }
     if metadata.permissions().mode() & 0o007 != 0 {
         warn!(
             file = %path.display(),
-            "every user of this machine may read or change the secret; mend it with chmod o="
+            "every user of this machine can read or change the secret file; fix it with `chmod o=`"
         );
     }
     let mut bytes = Vec::new();
@@ -161,7 +161,7 @@ mod tests {
 
     /// RFC 4231, test case 2.
     #[test]
-    fn the_hmac_is_that_of_the_standard() {
+    fn the_hmac_matches_the_test_vector_of_rfc_4231() {
         let secret = Secret::new(b"Jefe").unwrap();
         let hmac = secret.sign("what do ya want for nothing?");
         assert_eq!(hmac[..4], [0x5b, 0xdc, 0xc1, 0x46]);
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_names_the_place_and_never_the_secret() {
+    fn an_error_names_the_source_and_never_the_secret() {
         let error = |source| Secret::load(&source, None).unwrap_err().to_string();
         let missing = error(SecretSource::File("/nonexistent/secret".into()));
         assert!(missing.contains("/nonexistent/secret") && missing.contains("hmac_secret_file"), "{missing}");
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_secret_in_the_configuration_file_is_read_from_there() {
+    fn a_secret_in_the_configuration_file_is_loaded() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("config.yaml");
         let topics = "topics: [{id: scan, input_topic: /scan}]\n";

@@ -1,4 +1,4 @@
-//! Who is believed: signing what is sent, and checking what is received (docs/probe-protocol.md).
+//! Authentication of probe messages: signs sent messages and checks received ones (docs/probe-protocol.md).
 
 use std::fmt::Write as _;
 
@@ -8,23 +8,23 @@ use crate::config::{InlineSecret, Security, TrustMode};
 use crate::model::{ProbeRefusal, WallNs};
 use crate::policy::{Admission, ReplayGuard};
 
-/// Signed messages remembered: those of twice the default window, 30 s, of 50 senders at 20 Hz. They take
-/// 1.5 MiB.
-const REMEMBERED: usize = 65_536;
+/// Nonces remembered to detect replays: those of 50 senders at 20 Hz within twice the default window of 30 s.
+/// They take 1.5 MiB.
+const REMEMBERED_NONCES: usize = 65_536;
 
 /// A message that can be signed.
 pub trait Signed {
-    /// The text that is signed: the kind of message, the version, each field, and the nonce, every one on a
-    /// line of its own. No field can hold a line's end.
+    /// The text that is signed: the kind of message, the version, each field, and the nonce, each on a
+    /// separate line. No field can contain a line break.
     fn signed_text(&self, nonce: &[u8; 16]) -> String;
 
-    /// When it was sent, by its sender's wall clock.
+    /// When the message was sent, in its sender's wall-clock time.
     fn sent_at(&self) -> WallNs;
 
-    /// The signature it carries.
+    /// The signature of the message.
     fn signature(&self) -> Option<Signature>;
 
-    /// Gives it a signature.
+    /// Adds a signature to the message.
     fn set_signature(&mut self, signature: Signature);
 }
 
@@ -82,7 +82,7 @@ impl Signed for ProbeResponse {
     }
 }
 
-/// Each on a line of its own, without an end of the last.
+/// Joins fields with line breaks.
 fn lines(fields: &[&dyn std::fmt::Display]) -> String {
     let mut text = String::with_capacity(512);
     for (number, field) in fields.iter().enumerate() {
@@ -96,26 +96,26 @@ fn lines(fields: &[&dyn std::fmt::Display]) -> String {
 /// Signs and checks the probe messages of one process.
 #[derive(Debug)]
 pub struct Trust {
-    /// `None` where nothing is signed.
+    /// `None` if messages are not signed.
     secret: Option<Secret>,
-    /// [`TrustMode::Off`] where nothing is checked.
+    /// [`TrustMode::Off`] if messages are not checked.
     mode: TrustMode,
     replays: ReplayGuard,
     nonces: Nonces,
 }
 
 impl Trust {
-    /// What the configuration asks for. Without `enable_probe_hmac` nothing is signed or checked, whatever
-    /// the trust mode is; with it, the trust mode says what becomes of messages that do not authenticate.
-    /// `inline` is the secret that stands in the configuration file.
+    /// Loads the secret and the trust mode of a configuration. Without `enable_probe_hmac` messages are
+    /// neither signed nor checked in any trust mode; with it, the trust mode determines how unauthenticated
+    /// messages are handled. `inline` is the secret in the configuration file, if any.
     ///
     /// # Errors
-    /// A secret is needed and cannot be had.
+    /// A secret is required and cannot be loaded.
     pub fn load(security: &Security, inline: Option<&InlineSecret>) -> Result<Self, SecretError> {
         let secret = match (&security.secret, security.enable_probe_hmac) {
             (_, false) => None,
             (Some(source), true) => Some(Secret::load(source, inline)?),
-            // Nothing is checked, so that nothing need be signed.
+            // Messages are not checked, so that they need no signature.
             (None, true) if security.trust_mode == TrustMode::Off => None,
             (None, true) => return Err(SecretError::NotConfigured),
         };
@@ -125,9 +125,9 @@ impl Trust {
 
     fn new(secret: Option<Secret>, mode: TrustMode, replay_window_ms: u64, nonces: Nonces) -> Self {
         let mode = if secret.is_some() { mode } else { TrustMode::Off };
-        // Without a check nothing is remembered.
-        let room = if mode == TrustMode::Off { 1 } else { REMEMBERED };
-        Self { secret, mode, replays: ReplayGuard::new(replay_window_ms, room), nonces }
+        // Without checks no nonce is remembered; 1 is the smallest capacity.
+        let capacity = if mode == TrustMode::Off { 1 } else { REMEMBERED_NONCES };
+        Self { secret, mode, replays: ReplayGuard::new(replay_window_ms, capacity), nonces }
     }
 
     /// Whether messages are signed.
@@ -135,12 +135,12 @@ impl Trust {
         self.secret.is_some()
     }
 
-    /// What becomes of messages that do not authenticate; [`TrustMode::Off`] also where nothing is signed.
+    /// How unauthenticated messages are handled; [`TrustMode::Off`] also if messages are not signed.
     pub fn mode(&self) -> TrustMode {
         self.mode
     }
 
-    /// Signs a message, where messages are signed. It must not be changed afterwards.
+    /// Signs a message if a secret is configured. The message must not be changed afterwards.
     pub fn sign(&mut self, message: &mut impl Signed) {
         if let Some(secret) = &self.secret {
             let nonce = self.nonces.next();
@@ -149,11 +149,11 @@ impl Trust {
         }
     }
 
-    /// Whether a message is believed. `Ok` with a reason is one that is accepted all the same, because the
-    /// trust mode is permissive: to be counted and logged.
+    /// Checks whether a message is accepted. `Ok` with a reason means that the message is not authentic and
+    /// is accepted only because the trust mode is permissive; the caller counts and logs it.
     ///
     /// # Errors
-    /// It is refused: unsigned, badly signed, expired or replayed.
+    /// The message is refused: it is unsigned, badly signed, expired or replayed.
     pub fn check(
         &mut self,
         message: &impl Signed,
@@ -180,8 +180,8 @@ fn authenticate(
     if !secret.verify(&message.signed_text(&signature.nonce), &signature.hmac) {
         return Err(ProbeRefusal::BadSignature);
     }
-    // Only now, so that nobody without the secret can make us remember anything. One guard is enough for all
-    // senders: those that get here share the secret.
+    // After the signature check, so that a sender without the secret cannot fill the memory of nonces. One
+    // guard serves all senders: all that pass the check share the secret.
     match replays.admit(signature.nonce, message.sent_at(), now) {
         Admission::Fresh => Ok(()),
         Admission::Replayed => Err(ProbeRefusal::Replayed),
@@ -189,7 +189,7 @@ fn authenticate(
     }
 }
 
-/// Numbers that no other message has: eight random bytes of this process, and a counter.
+/// Generates unique nonces: eight random bytes of this process and a counter.
 #[derive(Debug)]
 struct Nonces {
     process: [u8; 8],
@@ -252,9 +252,9 @@ mod tests {
         message
     }
 
-    /// The texts of docs/probe-protocol.md. They are a contract with responders of other people's.
+    /// The layout of docs/probe-protocol.md, which responders of other vendors rely on.
     #[test]
-    fn the_signed_texts_are_these() {
+    fn signed_texts_have_the_documented_layout() {
         let nonce = [0xab; 16];
         let digits = "ab".repeat(16);
         let expected = format!("probe_request\n1\n7\n{}\nbridge\np-7\n{digits}", NOW.0);
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn the_examples_of_the_protocol_page_are_right() {
+    fn the_examples_of_the_protocol_page_are_correct() {
         let page = include_str!("../../../docs/probe-protocol.md");
         let secret = Secret::new(b"swordfish").unwrap();
         let nonce = std::array::from_fn(|index| index as u8);
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signed_message_is_believed_once() {
+    fn a_signed_message_is_accepted_once() {
         let mut trust = trust("swordfish", TrustMode::DefaultDeny);
         let message = signed("swordfish", request());
         assert_eq!(trust.check(&message, NOW), Ok(None));
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_authenticate_is_refused_by_its_name() {
+    fn an_unauthenticated_message_is_refused_with_the_right_reason() {
         let mut trust = trust("swordfish", TrustMode::DefaultDeny);
         assert_eq!(trust.check(&request(), NOW), Err(ProbeRefusal::Unsigned));
         assert_eq!(trust.check(&signed("trout", request()), NOW), Err(ProbeRefusal::BadSignature));
@@ -322,7 +322,7 @@ mod tests {
         let mut nonce = good.clone();
         nonce.signature.as_mut().unwrap().nonce[0] ^= 1;
         assert_eq!(trust.check(&nonce, NOW), Err(ProbeRefusal::BadSignature));
-        // None of it has used the message up.
+        // The refused variants have not used up the nonce of the genuine message.
         assert_eq!(trust.check(&good, NOW), Ok(None));
         for now in [0, NOW.0 - WINDOW_MS * 1_000_000 - 1, NOW.0 + WINDOW_MS * 1_000_000 + 1, u64::MAX] {
             let fresh = signed("swordfish", request());
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_is_no_response_even_with_the_same_fields() {
+    fn the_signed_texts_of_requests_and_responses_differ_in_the_first_line() {
         assert_ne!(
             request().signed_text(&[0; 16]).lines().next(),
             response().signed_text(&[0; 16]).lines().next()
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn permissive_names_what_it_accepts() {
+    fn trust_mode_permissive_accepts_and_returns_the_reason() {
         let mut trust = trust("swordfish", TrustMode::Permissive);
         assert_eq!(trust.check(&request(), NOW), Ok(Some(ProbeRefusal::Unsigned)));
         assert_eq!(trust.check(&signed("trout", request()), NOW), Ok(Some(ProbeRefusal::BadSignature)));
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn off_and_unsigned_look_at_nothing() {
+    fn without_a_secret_or_in_trust_mode_off_nothing_is_checked() {
         for mut trust in [trust("swordfish", TrustMode::Off), trust("", TrustMode::DefaultDeny)] {
             assert_eq!(trust.check(&request(), NOW), Ok(None));
             assert_eq!(trust.check(&signed("trout", request()), WallNs(0)), Ok(None));
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn the_configuration_decides() {
+    fn the_configuration_selects_the_secret_and_the_trust_mode() {
         let security = |enable_probe_hmac, secret, trust_mode| Security {
             trust_mode,
             enable_probe_hmac,
@@ -369,7 +369,7 @@ mod tests {
         };
         let missing = || Some(SecretSource::File("/nonexistent".into()));
         let load = |security: Security| Trust::load(&security, None);
-        // As the original's default file has it.
+        // The defaults of the original package.
         let unsigned = load(security(false, None, TrustMode::DefaultDeny)).unwrap();
         assert!(!unsigned.signs() && unsigned.mode() == TrustMode::Off);
         assert!(!load(security(false, missing(), TrustMode::DefaultDeny)).unwrap().signs());

@@ -1,37 +1,38 @@
-//! Refusals in the log: each reason with its count, and not more often than an operator can read.
+//! Log messages about refused probe messages: each reason with its count, at a limited rate.
 
 use tracing::warn;
 
 use crate::model::{MonotonicNs, ProbeRefusal, RefusalCounts};
 
-/// A reason is logged at once when it is new, and at most every 10 s while it goes on.
+/// Minimum time between two log messages with the same reason; the first one is logged at once.
 const REPEAT_MS: u64 = 10_000;
 
-/// Watches the counts of what was refused, or of what a permissive trust mode accepted all the same.
+/// Logs increases of the counts of refused messages, or of messages that only trust mode `permissive`
+/// accepted.
 #[derive(Debug)]
 pub struct RefusalWatch {
     logged: [u64; ProbeRefusal::COUNT],
     next_at: [MonotonicNs; ProbeRefusal::COUNT],
-    what: &'static str,
+    subject: &'static str,
 }
 
 impl RefusalWatch {
-    /// Of messages that were refused.
+    /// A log of refused messages.
     pub fn of_refused() -> Self {
         Self::new("probe messages refused")
     }
 
-    /// Of messages that were accepted although they do not authenticate.
+    /// A log of messages that were accepted although they are not authentic.
     pub fn of_accepted() -> Self {
-        Self::new("probe messages accepted that do not authenticate (security.trust_mode: permissive)")
+        Self::new("unauthenticated probe messages accepted (security.trust_mode: permissive)")
     }
 
-    fn new(what: &'static str) -> Self {
+    fn new(subject: &'static str) -> Self {
         let next_at = [MonotonicNs(0); ProbeRefusal::COUNT];
-        Self { logged: [0; ProbeRefusal::COUNT], next_at, what }
+        Self { logged: [0; ProbeRefusal::COUNT], next_at, subject }
     }
 
-    /// Logs what is new in `counts`.
+    /// Logs the increases of `counts` since they were last logged.
     pub fn look(&mut self, counts: &RefusalCounts, now: MonotonicNs) {
         for (reason, count) in counts.iter() {
             let index = reason as usize;
@@ -39,7 +40,7 @@ impl RefusalWatch {
             if new == 0 || now < self.next_at[index] {
                 continue;
             }
-            warn!(reason = reason.label(), count = new, "{}: {}", self.what, reason.meaning());
+            warn!(reason = reason.label(), count = new, "{}: {}", self.subject, reason.meaning());
             self.logged[index] = count;
             self.next_at[index] = now.plus_ms(REPEAT_MS);
         }
