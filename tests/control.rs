@@ -1,7 +1,7 @@
-//! Control on a bridge that runs: the shipped binary, subscribers on hosts of their own with a responder
-//! beside each, links that lose and delay, and samples that flow all the while.
+//! Control in a running bridge: the shipped binary, subscribers on separate hosts with a responder each,
+//! links that lose and delay packets, and a continuous flow of samples.
 //!
-//! The critical subscriber gets each sample whatever happens; that ends every test.
+//! Every test ends with the assertion that the critical subscriber has received each sample.
 
 mod support;
 
@@ -12,21 +12,21 @@ use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, ReaderQos, Take};
 use adaptive_bridge::model::{Durability, Reliability};
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE, is_whole_and_quiet, outputs};
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE, is_accounted_and_idle, outputs};
 use support::impairment::Impairment;
 use support::netns::Host;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::Process;
 
-/// Where the paper's figures don't matter: a window of 2 s in place of 10, and a patience with answers that a
-/// busy machine needs. What decides is loss.
+/// Settings for tests that do not depend on the paper's values: a window of 2 s instead of 10, and RTT limits
+/// that a busy machine does not exceed, so that only loss changes a state.
 const QUICK: &str = "probes: {rate_hz: 10, window_size: 20, timeout_ms: 2000}\n\
                      classifier: {evaluate_rate_hz: 5, demote_rtt_ms: 500, promote_rtt_ms: 400}\n";
 
-/// A link as bad as the worst of the paper's evaluation was when it was run.
+/// The strongest impairment of the paper's evaluation, as it was run.
 const STRONG: &str = "--level strong --reading as-run --delay-ms 20 --jitter-ms 10 --state off";
 
-/// A bridge, and the flow through it to a critical subscriber.
+/// A bridge and a flow through it to a critical subscriber.
 struct Scene {
     bed: Bed,
     publisher: RunningPeer,
@@ -34,7 +34,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// Samples at that rate; `at` is the host of the critical subscriber.
+    /// Starts the flow with a given rate; `at` is the host of the critical subscriber.
     fn start(bed: Bed, rate_hz: f64, at: &str) -> Self {
         bed.up.wait_for_log("control is up");
         let critical = bed.subscribe(at, Peer::fast().keep_all(), CRITICAL);
@@ -47,27 +47,27 @@ impl Scene {
         self.bed.host(name)
     }
 
-    /// A responder beside the subscriber on a host.
+    /// Starts a responder on a subscriber's host.
     fn responder(&self, host: &str, id: &str) -> Process {
         let responder = self.bed.bridge.start_on(self.host(host), &format!("responder --id {id}"));
         responder.wait_for_log("responder is up");
         responder
     }
 
-    /// The link from the bridge to a host, well so far.
+    /// Prepares the impairment of the link from the bridge to a host, switched off so far.
     fn link(&self, host: &str, seed: u64) -> Impairment {
         Impairment::start(self.host(host), self.host("bridge"), &format!("{STRONG} --seed {seed}"))
     }
 
-    /// What `status` says now; every sample is accounted for in it.
+    /// The current status, in which every sample must be accounted for.
     fn status(&self) -> Value {
         let status = self.bed.bridge.status();
         assert_whole(&status);
         status
     }
 
-    /// Waits until the status fulfils a condition; yields it, and how long that took. Every sample is
-    /// accounted for all the while.
+    /// Waits until the status fulfils a condition; returns the status and the time that took. Every sample
+    /// must be accounted for in each status until then.
     fn wait(&self, what: &str, mut fulfilled: impl FnMut(&Value) -> bool) -> (Value, Duration) {
         let began = Instant::now();
         let status = self.bed.bridge.wait_status(what, |status| {
@@ -77,7 +77,7 @@ impl Scene {
         (status, began.elapsed())
     }
 
-    /// Waits until a subscriber is in a state and its lane in a mode that control has decided on.
+    /// Waits until a subscriber is in a state and its lane applies a mode that control has decided.
     fn wait_state(&self, id: &str, state: &str, lane: &str, mode: &str) -> (Value, Duration) {
         let (status, took) = self.wait(&format!("{id} {state}, {lane} {mode}"), |status| {
             let lane = lane_of(status, lane);
@@ -91,11 +91,11 @@ impl Scene {
         (status, took)
     }
 
-    /// Checks that a lane forwards at that rate for some seconds, by its own count: 5 % and two samples are
-    /// what the ends of the time and a busy machine may take.
+    /// Asserts by the lane's own counters that it forwards at a rate for some seconds, within 5 % and two
+    /// samples for the ends of the interval and a busy machine.
     fn assert_rate(&self, lane: &str, rate_hz: f64, seconds: u64) {
-        // A machine that is busy for long delays probes as a bad link does, and the mode follows. That time
-        // says nothing about the rate.
+        // A busy machine delays probes as a bad link does, which changes the mode. Such an interval is
+        // measured again.
         for _ in 0..5 {
             let before = self.status();
             std::thread::sleep(Duration::from_secs(seconds));
@@ -104,34 +104,38 @@ impl Scene {
             if lane_of(&after, lane)["policy_epoch"] == *epoch {
                 return assert_rate_between(&before, &after, lane, rate_hz);
             }
-            println!("{lane} was not {mode} all the time: once more");
+            println!("{lane} did not stay {mode}: measured again");
             self.wait("the same mode again", |status| lane_of(status, lane)["applied_mode"] == *mode);
         }
-        panic!("{lane} has no mode for {seconds} s: {}", self.status());
+        panic!("{lane} keeps no mode for {seconds} s: {}", self.status());
     }
 
-    /// Rewrites the configuration and has it read by every process.
+    /// Rewrites the configuration and reloads it in every process.
     fn reload(&self, yaml: &str) {
         self.bed.bridge.write_config(&format!("instance: {{instance}}\n{yaml}"));
         let output = self.bed.bridge.run("reload");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// Lines of the log with a text in them.
-    fn said(&self, text: &str) -> Vec<String> {
+    /// The lines of the log that contain a text.
+    fn log_lines(&self, text: &str) -> Vec<String> {
         self.bed.up.log().lines().filter(|line| line.contains(text)).map(str::to_owned).collect()
     }
 
-    /// Ends the flow: the publisher was never held up, the critical subscriber got each sample once, and
-    /// every sample on every lane is accounted for.
+    /// Ends the flow. Asserts that the publisher was never blocked, that the critical subscriber received
+    /// each sample once, and that every sample is accounted for on every lane.
     fn end_whole(self) {
         let sent: Sent = self.publisher.end();
         self.critical.wait_received(sent.ok);
         let received: Received = self.critical.end();
         received.assert_all_of(&sent);
         assert_eq!(sent.failed, 0, "{sent:?}");
-        println!("{} samples whole; write took {:?} µs", sent.ok, sent.call_us.map(|call| call.max));
-        assert!(is_whole_and_quiet(&self.bed.wait_whole()));
+        println!(
+            "all of {} samples received; write took {:?} µs",
+            sent.ok,
+            sent.call_us.map(|call| call.max)
+        );
+        assert!(is_accounted_and_idle(&self.bed.wait_accounted()));
         self.bed.end();
     }
 }
@@ -144,7 +148,7 @@ fn assert_whole(status: &Value) {
 }
 
 fn assert_rate_between(before: &Value, after: &Value, lane: &str, rate_hz: f64) {
-    // The lane keeps its rate whether or not a subscriber is there.
+    // The lane keeps its rate with and without a subscriber.
     let count = |status: &Value| {
         let output = output(status, lane);
         output["forwarded"].as_u64().unwrap() + output["drops"]["no_reader"].as_u64().unwrap()
@@ -157,12 +161,12 @@ fn assert_rate_between(before: &Value, after: &Value, lane: &str, rate_hz: f64) 
     assert!((forwarded - expected).abs() <= expected * 0.05 + 2.0, "{forwarded} of {expected}: {after}");
 }
 
-fn by<'a>(list: &'a Value, key: &str, value: &str) -> Option<&'a Value> {
+fn find_by<'a>(list: &'a Value, key: &str, value: &str) -> Option<&'a Value> {
     list.as_array().into_iter().flatten().find(|item| item[key] == value)
 }
 
 fn find<'a>(status: &'a Value, id: &str) -> Option<&'a Value> {
-    by(&status["subscribers"], "id", id)
+    find_by(&status["subscribers"], "id", id)
 }
 
 fn subscriber<'a>(status: &'a Value, id: &str) -> &'a Value {
@@ -170,14 +174,14 @@ fn subscriber<'a>(status: &'a Value, id: &str) -> &'a Value {
 }
 
 fn lane_of<'a>(status: &'a Value, name: &str) -> &'a Value {
-    by(&status["lanes"], "name", name).unwrap_or_else(|| panic!("{name} in {status}"))
+    find_by(&status["lanes"], "name", name).unwrap_or_else(|| panic!("{name} in {status}"))
 }
 
 fn output<'a>(status: &'a Value, lane: &str) -> &'a Value {
     outputs(status).find(|output| output["lane"] == lane).unwrap_or_else(|| panic!("{lane} in {status}"))
 }
 
-/// A ROS 2 node on a host.
+/// Opens a ROS 2 node on a host.
 fn node_on(host: &Host, name: &str) -> Participant {
     let options = ParticipantOptions {
         network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
@@ -198,7 +202,7 @@ fn read(node: &mut Participant, topic: &str, dds_type: &str) -> RawReader {
     node.create_reader(topic, dds_type, &qos).unwrap()
 }
 
-/// The next payload of a reader for which `wanted` yields a value.
+/// Waits for a payload for which `wanted` returns a value; returns that value.
 fn wait_payload<T>(reader: &RawReader, what: &str, mut wanted: impl FnMut(&[u8]) -> Option<T>) -> T {
     support::wait_for(what, || {
         let mut found = None;
@@ -212,7 +216,7 @@ fn wait_payload<T>(reader: &RawReader, what: &str, mut wanted: impl FnMut(&[u8])
     })
 }
 
-/// Little-endian CDR of messages of numbers, texts and lists.
+/// A decoder of little-endian CDR messages that consist of numbers, strings and lists.
 struct Cdr<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -236,12 +240,12 @@ impl Cdr<'_> {
     }
 }
 
-/// The JSON of a `std_msgs/String`.
+/// Parses the JSON in a `std_msgs/String`.
 fn json(payload: &[u8]) -> Value {
     serde_json::from_str(&Cdr { bytes: payload, at: 0 }.text()).unwrap()
 }
 
-/// The statuses of a `diagnostic_msgs/DiagnosticArray`: level and values, by name.
+/// Decodes the statuses of a `diagnostic_msgs/DiagnosticArray`: level and values, by name.
 fn statuses(payload: &[u8]) -> BTreeMap<String, (u8, BTreeMap<String, String>)> {
     let mut cdr = Cdr { bytes: payload, at: 0 };
     let (_sec, _nanosec, _frame_id) = (cdr.u32(), cdr.u32(), cdr.text());
@@ -254,9 +258,9 @@ fn statuses(payload: &[u8]) -> BTreeMap<String, (u8, BTreeMap<String, String>)> 
 }
 
 #[test]
-fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
-    let test = "an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well";
-    // The paper's figures: 5 Hz, a window of 10 s, its thresholds, its rates.
+fn an_impaired_subscriber_degrades_its_lane_to_3_hz_until_its_link_recovers() {
+    let test = "an_impaired_subscriber_degrades_its_lane_to_3_hz_until_its_link_recovers";
+    // The paper's values: 5 Hz, a window of 10 s, its thresholds and rates.
     let yaml = format!("{SCAN}subscribers: {{slow: noncritical}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     let scene = Scene::start(bed, 100.0, "critical");
@@ -286,9 +290,9 @@ fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
         promoted.as_secs_f64(),
         counters["loss"]
     );
-    // To CRITICAL, to NONCRITICAL and back; a machine that is busy for long may add pairs.
+    // To CRITICAL, to NONCRITICAL and back; a busy machine may add pairs of transitions.
     assert!(transitions >= 3 && transitions % 2 == 1, "{transitions} transitions");
-    assert!(scene.said("subscriber demoted").len() as u64 >= transitions / 2);
+    assert!(scene.log_lines("subscriber demoted").len() as u64 >= transitions / 2);
     slow.end::<Received>().assert_sound();
     scene.end_whole();
 }
@@ -296,7 +300,7 @@ fn an_impaired_subscriber_slows_its_lane_to_3_hz_until_its_link_is_well() {
 #[test]
 fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
     let test = "only_the_lane_of_the_impaired_subscriber_is_degraded";
-    // The other lane is in a domain of its own, and so is its responder.
+    // The other lane and its responder are in a separate domain.
     let yaml = format!(
         "{SCAN}{QUICK}lanes: {{rviz: {{domain_id: 7, max_rate_hz: 20, degraded_rate_hz: 5}}}}\n\
          subscribers: {{robot_shop: noncritical, desk: {{lane: rviz}}}}\n"
@@ -337,8 +341,8 @@ fn only_the_lane_of_the_impaired_subscriber_is_degraded() {
 }
 
 #[test]
-fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
-    let test = "a_responder_that_is_not_listed_appears_on_the_noncritical_lane";
+fn a_responder_that_is_not_listed_becomes_a_subscriber_of_the_noncritical_lane() {
+    let test = "a_responder_that_is_not_listed_becomes_a_subscriber_of_the_noncritical_lane";
     let config = |listed: &str| format!("{SCAN}{QUICK}lanes: {{rviz: {{}}}}\nsubscribers: {listed}\n");
     let Some(bed) = Bed::start(test, &config("{desk: rviz}")) else { return };
     let scene = Scene::start(bed, 30.0, "critical");
@@ -353,8 +357,8 @@ fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
     let (status, _) = scene.wait_state("laptop", "CRITICAL", "noncritical", "normal");
     let laptop = subscriber(&status, "laptop");
     assert_eq!((&laptop["lane"], &laptop["listed"]), (&"noncritical".into(), &false.into()), "{laptop}");
-    assert_eq!(scene.said("not listed under `subscribers`").len(), 1);
-    // One that is listed and was never heard is no reason to slow its lane.
+    assert_eq!(scene.log_lines("not listed under `subscribers`").len(), 1);
+    // A listed subscriber that never responded does not degrade its lane.
     let desk = subscriber(&status, "desk");
     assert_eq!((&desk["state"], &desk["listed"]), (&"UNKNOWN".into(), &true.into()), "{desk}");
     assert_eq!(lane_of(&status, "rviz")["mode"], "normal");
@@ -367,21 +371,21 @@ fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
         (decision["subscriber_id"] == "laptop" && decision["state"] == "NONCRITICAL").then_some(decision)
     });
     assert_eq!((&decision["lane"], &decision["v"]), (&"noncritical".into(), &1.into()), "{decision}");
-    let report = wait_payload(&diagnostics, "diagnostics of it", |payload| {
+    let report = wait_payload(&diagnostics, "the subscriber in the JSON diagnostics", |payload| {
         let report = json(payload);
         find(&report, "laptop").is_some_and(|laptop| laptop["state"] == "NONCRITICAL").then_some(report)
     });
     assert_eq!(subscriber(&report, "laptop")["lane"], "noncritical");
     assert_eq!(lane_of(&report, "noncritical")["mode"], "degraded", "{report}");
-    let (level, values) = wait_payload(&array, "its status", |payload| {
+    let (level, values) = wait_payload(&array, "the subscriber in the diagnostic array", |payload| {
         let found = statuses(payload).into_iter().find(|(name, _)| name.ends_with("subscriber laptop"));
         found.map(|(_, status)| status).filter(|(_, values)| values["state"] == "NONCRITICAL")
     });
     assert_eq!((values["lane"].as_str(), values["listed"].as_str()), ("noncritical", "no"), "{values:?}");
-    assert_ne!(level, 0, "an impaired subscriber is no OK: {values:?}");
+    assert_ne!(level, 0, "the level of an impaired subscriber is not OK: {values:?}");
 
-    // Whom a reload lists takes his state along to his lane; one that was never heard and is listed no
-    // longer is nobody.
+    // A subscriber that a reload lists keeps its state in its new lane. A subscriber that never responded and
+    // is no longer listed is removed.
     scene.reload(&config("{laptop: rviz}"));
     let (status, _) = scene.wait_state("laptop", "NONCRITICAL", "rviz", "degraded");
     let laptop = subscriber(&status, "laptop");
@@ -393,28 +397,28 @@ fn a_responder_that_is_not_listed_appears_on_the_noncritical_lane() {
 }
 
 #[test]
-fn a_responder_that_falls_silent_is_demoted_by_loss_and_comes_back() {
-    let test = "a_responder_that_falls_silent_is_demoted_by_loss_and_comes_back";
+fn a_subscriber_whose_responder_falls_silent_is_demoted_by_loss_and_promoted_again() {
+    let test = "a_subscriber_whose_responder_falls_silent_is_demoted_by_loss_and_promoted_again";
     let yaml = format!("{SCAN}{QUICK}subscribers: {{slow: noncritical}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     let scene = Scene::start(bed, 100.0, "critical");
     let mut responder = scene.responder("slow", "slow");
     scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
-    let wait_silent = || {
+    let wait_demoted = || {
         let (status, _) = scene.wait_state("slow", "NONCRITICAL", "noncritical", "degraded");
         let slow = subscriber(&status, "slow");
         assert!(slow["reason"].as_str().unwrap().contains("impaired (loss)"), "{slow}");
-        // Silence goes on being loss: nothing of it is forgotten.
+        // Continued silence counts as loss until the window contains nothing else.
         scene.wait("a window of nothing but loss", |status| subscriber(status, "slow")["loss"] == 1.0);
         scene.assert_rate("noncritical", 3.0, 2);
     };
 
     responder.stop();
-    wait_silent();
+    wait_demoted();
     responder.cont();
     scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
     responder.kill9();
-    wait_silent();
+    wait_demoted();
     let _responder = scene.responder("slow", "slow");
     let (status, _) = scene.wait_state("slow", "CRITICAL", "noncritical", "normal");
     assert_eq!(status["subscribers"].as_array().unwrap().len(), 1, "{status}");
@@ -422,8 +426,8 @@ fn a_responder_that_falls_silent_is_demoted_by_loss_and_comes_back() {
 }
 
 #[test]
-fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
-    let test = "overrides_go_before_the_classifier_and_change_by_a_reload_under_flow";
+fn overrides_take_precedence_over_the_classifier_and_change_by_a_reload_while_samples_flow() {
+    let test = "overrides_take_precedence_over_the_classifier_and_change_by_a_reload_while_samples_flow";
     let config = |classifier: &str, overrides: &str| {
         let quick = QUICK.replace("classifier: {", &format!("classifier: {{enabled: {classifier}, "));
         format!("{SCAN}{quick}subscribers: {{slow: noncritical}}\noverrides: {overrides}\n")
@@ -438,13 +442,13 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
             slow["state"] == state && slow["forced"] == forced && reason.starts_with("forced") == forced
         });
     };
-    // At once: nobody has been probed yet.
+    // Immediately, before any probe is sent.
     forced("NONCRITICAL", "degraded", true);
     let _responder = scene.responder("slow", "slow");
     scene.wait("a full window", |status| subscriber(status, "slow")["settled"] == 20);
     forced("NONCRITICAL", "degraded", true);
 
-    // Without it the classifier goes on, and a good link is seen for one.
+    // Without an override the classifier decides again, and the link is good.
     scene.reload(&config("true", "{}"));
     forced("CRITICAL", "normal", false);
     let mut link = scene.link("slow", 5);
@@ -457,27 +461,27 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
     scene.reload(&config("true", "{}"));
     forced("NONCRITICAL", "degraded", false);
 
-    // A bad file changes nothing and is told of.
+    // An invalid file is refused and changes nothing.
     scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{slow: GOOD}")));
     assert_eq!(scene.bed.bridge.run("reload").status.code(), Some(78));
     scene.bed.bridge.write_config(&format!("instance: {{instance}}\n{}", config("true", "{}")));
     scene.assert_rate("noncritical", 3.0, 4);
 
-    // Nobody is classified: the lane has its full rate, and nobody is shown as what he is not.
+    // Without classifier the lane has its full rate and the state is UNKNOWN.
     scene.reload(&config("false", "{}"));
     forced("UNKNOWN", "normal", false);
     scene.assert_rate("noncritical", 10.0, 4);
-    // An override counts all the same, and nothing of it stays.
+    // An override works without the classifier and leaves no trace after it is removed.
     scene.reload(&config("false", "{slow: NONCRITICAL}"));
     forced("NONCRITICAL", "degraded", true);
     scene.reload(&config("false", "{}"));
     forced("UNKNOWN", "normal", false);
-    // Nor does what was found before: the other's override switches the classifier on for nobody else.
+    // An override of another subscriber does not bring back the earlier state of this one.
     scene.reload(&config("false", "{another: NONCRITICAL}"));
     scene.assert_rate("noncritical", 10.0, 4);
     scene.reload(&config("true", "{}"));
     forced("NONCRITICAL", "degraded", false);
-    // One that forces what is so already is told of too, and its end.
+    // The beginning and the end of an override are shown even if the state does not change.
     scene.reload(&config("true", "{slow: NONCRITICAL}"));
     forced("NONCRITICAL", "degraded", true);
     scene.reload(&config("true", "{}"));
@@ -486,10 +490,10 @@ fn overrides_go_before_the_classifier_and_change_by_a_reload_under_flow() {
 }
 
 #[test]
-fn remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once() {
-    let test = "remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once";
+fn remote_readers_of_the_input_and_of_the_critical_output_are_logged_once() {
+    let test = "remote_readers_of_the_input_and_of_the_critical_output_are_logged_once";
     let Some(bed) = Bed::start(test, SCAN) else { return };
-    // The critical subscriber is on the robot, where it should be.
+    // The critical subscriber is on the bridge's host and therefore no intruder.
     let scene = Scene::start(bed, 50.0, "bridge");
     assert_eq!(scene.status()["intruders"], Value::Array(Vec::new()));
     let slow = scene.host("slow").clone();
@@ -515,17 +519,17 @@ fn remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once() {
     assert_eq!(status["intruders_seen"], 3, "{status}");
     assert!(!status["problems"].as_array().unwrap().is_empty(), "{status}");
 
-    // They stay for a while, and announce themselves again and again.
+    // The intruders announce themselves repeatedly in these 5 s, but each is logged once.
     std::thread::sleep(Duration::from_secs(5));
-    for (who, topic) in [
+    for (reader, topic) in [
         ("a reader without a known node", "/scan directly"),
         ("node /fleet/rviz", "/scan directly"),
         ("a reader without a known node", "/adaptive_bridge/critical/scan"),
     ] {
-        let text = format!("{who} on host {address} subscribes to {topic}");
-        let said = scene.said(&text);
-        assert_eq!(said.len(), 1, "{text} in {:?}", scene.said("subscribes to"));
-        assert!(said[0].contains("WARN") && said[0].contains(remedy), "{said:?}");
+        let text = format!("{reader} on host {address} subscribes to {topic}");
+        let lines = scene.log_lines(&text);
+        assert_eq!(lines.len(), 1, "{text} in {:?}", scene.log_lines("subscribes to"));
+        assert!(lines[0].contains("WARN") && lines[0].contains(remedy), "{lines:?}");
     }
 
     drop((by_rviz, rviz));
@@ -533,24 +537,24 @@ fn remote_readers_of_the_input_and_of_the_critical_output_are_warned_of_once() {
     critical.end::<Received>().assert_sound();
     let (status, _) = scene.wait("no intruders", |status| status["intruders"] == Value::Array(Vec::new()));
     assert_eq!(status["intruders_seen"], 3, "{status}");
-    support::wait_until("three ends in the log", || scene.said("gone: ").len() == 3);
+    support::wait_until("three intruders left in the log", || scene.log_lines("intruder left: ").len() == 3);
     scene.end_whole();
 }
 
 #[test]
-fn a_stopped_critical_subscriber_is_named_in_a_warning() {
-    let test = "a_stopped_critical_subscriber_is_named_in_a_warning";
+fn the_log_names_a_stopped_critical_subscriber() {
+    let test = "the_log_names_a_stopped_critical_subscriber";
     let yaml = format!("{SCAN}lanes: {{critical: {{window_samples: 64}}}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     bed.up.wait_for_log("control is up");
-    let laggard = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let stopped = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
     let other = bed.subscribe("slow", Peer::fast().keep_all(), CRITICAL);
     let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(1_000.0), INPUT);
-    laggard.wait_received(20);
-    laggard.stop();
+    stopped.wait_received(20);
+    stopped.stop();
     let before = other.received();
-    other.wait_received(before + 6_000); // 18 MB: more than the laggard's socket holds
-    laggard.cont();
+    other.wait_received(before + 6_000); // 18 MB: more than the stopped subscriber's socket holds
+    stopped.cont();
     bed.up.wait_for_log("a subscriber does not keep up");
     let log = bed.up.log();
     let warning = log.lines().find(|line| line.contains("a subscriber does not keep up")).unwrap();
@@ -558,12 +562,12 @@ fn a_stopped_critical_subscriber_is_named_in_a_warning() {
     assert!(warning.contains("WARN") && warning.contains("critical"), "{warning}");
     let address = bed.host("critical").address().to_string();
     assert!(warning.contains(&address), "{address} in {warning}");
-    let before = laggard.received();
-    laggard.wait_received(before + 100);
+    let before = stopped.received();
+    stopped.wait_received(before + 100);
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher notices nothing: {sent:?}");
-    bed.wait_whole();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    bed.wait_accounted();
     other.end::<Received>().assert_all_of(&sent);
-    laggard.end::<Received>().assert_sound();
+    stopped.end::<Received>().assert_sound();
     bed.end();
 }

@@ -1,5 +1,5 @@
-//! The control plane's policy in virtual time: random links, random overload, the paper's toggle, recorded
-//! probe traces, replays and floods. Pure; nothing sleeps.
+//! Tests of control's policy in virtual time: random links, random overload, the paper's toggled impairment,
+//! recorded probe traces, replays and floods. No I/O and no sleeping.
 
 #[path = "control_policy/classifier.rs"]
 mod classifier;

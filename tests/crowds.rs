@@ -1,5 +1,5 @@
-//! Crowds of bad subscribers of the critical lane: eight ways to be bad, all at once, beside subscribers of
-//! three libraries that keep up. Each test is one rate and size.
+//! Crowds of bad subscribers of the critical lane: eight kinds of bad subscribers at the same time, beside
+//! subscribers of three libraries that keep up. Each test has one rate and sample size.
 
 mod support;
 
@@ -12,32 +12,32 @@ use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
 
 const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
-/// The mean loss of the link to a bad subscriber is 28 %, in bursts.
+/// The impairment of the link to the lossy subscribers: a mean loss of 28 %, in bursts.
 const LOSS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 24";
+/// The impairment of the link to the far subscribers.
 const DELAY: &str = "--level clean --delay-ms 200 --jitter-ms 0 --seed 24 --queue 1";
 
-/// What flows.
+/// The samples of a flow and its subscribers.
 struct Flow {
     rate_hz: f64,
     bytes: usize,
-    /// Bytes that a sample may have in the configuration.
+    /// `max_sample_bytes` in the configuration.
     max_sample_bytes: usize,
     /// The history of a subscriber.
     depth: u32,
-    /// Which libraries a kind of bad subscriber has.
-    bad: Bad,
-    /// Whether the subscribers are on the bridge's host, but for the one behind a lossy link. Each remote
-    /// subscriber of 1 MiB at 30 Hz is 23,000 packets a second; two CPUs carry two such subscribers.
+    bad: BadLibraries,
+    /// Whether the subscribers are on the bridge's host, except the one behind a lossy link. Each remote
+    /// subscriber of 1 MiB at 30 Hz takes 23,000 packets a second; two CPUs can handle two such subscribers.
     on_robot: bool,
 }
 
-/// Which libraries a kind of bad subscriber has.
+/// The libraries of the bad subscribers of one kind.
 #[derive(Clone, Copy)]
-enum Bad {
+enum BadLibraries {
     /// Each of the three.
-    OfEach,
-    /// One: that of the kind's number and this one. 24 subscribers at 200 Hz overload two CPUs by themselves,
-    /// and so would tell nothing of the bridge.
+    All,
+    /// One: the sum of the kind's number and this number selects it. 24 subscribers at 200 Hz alone would
+    /// overload two CPUs, so that the test would not measure the bridge.
     Rotated(usize),
 }
 
@@ -50,11 +50,11 @@ impl Flow {
         peer.keep_last(self.depth).size(self.bytes)
     }
 
-    /// The libraries of the bad subscribers of that kind.
+    /// The libraries of the bad subscribers of a kind.
     fn libraries(&self, kind: usize) -> Vec<Library> {
         match self.bad {
-            Bad::OfEach => LIBRARIES.to_vec(),
-            Bad::Rotated(by) => vec![LIBRARIES[(kind + by) % LIBRARIES.len()]],
+            BadLibraries::All => LIBRARIES.to_vec(),
+            BadLibraries::Rotated(by) => vec![LIBRARIES[(kind + by) % LIBRARIES.len()]],
         }
     }
 
@@ -64,8 +64,8 @@ impl Flow {
     }
 }
 
-/// Waits until so many more samples have come to each.
-fn all_receive(subscribers: &[RunningPeer], more: u64) {
+/// Waits until each subscriber has received so many more samples.
+fn wait_more(subscribers: &[RunningPeer], more: u64) {
     let goals: Vec<u64> = subscribers.iter().map(|subscriber| subscriber.received() + more).collect();
     for (subscriber, goal) in subscribers.iter().zip(goals) {
         subscriber.wait_received(goal);
@@ -76,14 +76,16 @@ fn critical(status: &Value) -> &Value {
     outputs(status).find(|output| output["lane"] == "critical").unwrap_or_else(|| panic!("{status}"))
 }
 
-/// Lets no acknowledgement of the host arrive. The announcements of its participants do: they are multicast.
+/// Drops the acknowledgements of a host. The announcements of its participants still arrive: they are
+/// multicast.
 fn mute(bed: &Bed, host: &str) {
     let bridge = bed.host("bridge").address().to_string();
     bed.host(host).run("iptables", &["-A", "OUTPUT", "-p", "udp", "-d", &bridge, "-j", "DROP"]);
 }
 
-/// The flow past subscribers that are killed, that stop for 1 s, for 10 s and past their lease, that lose
-/// 28 % in bursts, that are 200 ms away, that read nothing, and whose acknowledgements never arrive.
+/// Runs a flow to subscribers that are killed, that stop for 1 s, for 10 s and beyond their lease, that lose
+/// 28 % in bursts, that are 200 ms away, that read nothing, and whose acknowledgements never arrive; and to
+/// subscribers that keep up, which must receive every sample.
 fn crowd(test: &str, flow: &Flow) {
     if let Some(reason) = ros::missing() {
         return support::skip(test, &reason);
@@ -123,7 +125,7 @@ fn crowd(test: &str, flow: &Flow) {
     let publisher = bed.publish(publisher, INPUT);
     let crowd = [&killed, &short, &long, &beyond_lease, &lossy, &far, &muted];
     for subscribers in crowd.into_iter().chain([&healthy]) {
-        all_receive(subscribers, 5);
+        wait_more(subscribers, 5);
     }
     let _loss = Impairment::start(bed.host("lossy"), bridge, LOSS);
     let _delay = Impairment::start(bed.host("far"), bridge, DELAY);
@@ -142,23 +144,23 @@ fn crowd(test: &str, flow: &Flow) {
         }
     }
     for returned in [&short, &long, &beyond_lease, &lossy, &far] {
-        all_receive(returned, 5);
+        wait_more(returned, 5);
     }
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "no call of the publisher waited in vain: {sent:?}");
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
     for subscriber in healthy {
         subscriber.wait_received(sent.ok);
         subscriber.end::<Received>().assert_all_of(&sent);
     }
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     assert_eq!(critical(&status)["forwarded"], sent.ok, "{status}");
     for subscriber in [short, long, beyond_lease, lossy, far, muted].into_iter().flatten() {
         let received: Received = subscriber.end();
         received.assert_sound();
         println!("{} of {} samples", received.received, sent.ok);
     }
-    for mut one in idle {
-        one.kill9();
+    for mut subscriber in idle {
+        subscriber.kill9();
     }
     bed.end();
 }
@@ -171,7 +173,7 @@ fn a_crowd_at_30_hz_costs_the_others_no_sample() {
         max_sample_bytes: 65_536,
         depth: 1_000,
         on_robot: false,
-        bad: Bad::OfEach,
+        bad: BadLibraries::All,
     };
     crowd("a_crowd_at_30_hz_costs_the_others_no_sample", &flow);
 }
@@ -184,7 +186,7 @@ fn a_crowd_at_200_hz_costs_the_others_no_sample() {
         max_sample_bytes: 65_536,
         depth: 1_000,
         on_robot: false,
-        bad: Bad::Rotated(0),
+        bad: BadLibraries::Rotated(0),
     };
     crowd("a_crowd_at_200_hz_costs_the_others_no_sample", &flow);
 }
@@ -197,7 +199,7 @@ fn a_crowd_at_1_khz_costs_the_others_no_sample() {
         max_sample_bytes: 65_536,
         depth: 1_000,
         on_robot: false,
-        bad: Bad::Rotated(1),
+        bad: BadLibraries::Rotated(1),
     };
     crowd("a_crowd_at_1_khz_costs_the_others_no_sample", &flow);
 }
@@ -210,7 +212,7 @@ fn a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample() {
         max_sample_bytes: 2 << 20,
         depth: 60,
         on_robot: true,
-        bad: Bad::Rotated(2),
+        bad: BadLibraries::Rotated(2),
     };
     crowd("a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample", &flow);
 }

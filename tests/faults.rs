@@ -1,6 +1,6 @@
-//! What goes wrong on a robot, while samples flow: processes of the bridge stopped and killed, subscribers
-//! that stall, links that break, memory that is full. Real processes, real signals, real DDS peers on hosts
-//! of their own.
+//! Faults while samples flow: processes of the bridge that are stopped and killed, subscribers that stall,
+//! links that break, shared memory that is full. Uses real processes, signals and DDS peers on separate
+//! hosts.
 
 mod support;
 
@@ -14,7 +14,7 @@ use support::bridge::Bridge;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::{Process, signal};
 
-/// The flow that faults happen to: 200 Hz, a critical subscriber on a host of its own.
+/// A flow of 200 Hz to a critical subscriber on a separate host.
 struct Flow {
     publisher: RunningPeer,
     critical: RunningPeer,
@@ -30,14 +30,15 @@ impl Flow {
         Self { publisher, critical }
     }
 
-    /// Lets samples flow for a while; that they do is part of the test.
-    fn go_on(&self, seconds: u64) {
+    /// Waits for some seconds and asserts that samples flow in that time.
+    fn flow_for(&self, seconds: u64) {
         let before = self.critical.received();
         std::thread::sleep(Duration::from_secs(seconds));
-        assert!(self.critical.received() > before, "nothing flows to the critical subscriber");
+        assert!(self.critical.received() > before, "no sample reached the critical subscriber");
     }
 
-    /// Ends the flow: the publisher was never held up, and the critical subscriber got each sample once.
+    /// Ends the flow. Asserts that the publisher was never blocked and that the critical subscriber received
+    /// each sample once.
     fn end_whole(self) -> (Sent, Received) {
         let sent: Sent = self.publisher.end();
         self.critical.wait_received(sent.ok);
@@ -52,7 +53,7 @@ fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
     outputs(status).find(|output| output["lane"] == name).unwrap_or_else(|| panic!("{name} in {status}"))
 }
 
-/// Files of an instance in the shared-memory file system.
+/// The names of an instance's files in `/dev/shm`.
 fn shared_memory_of(instance: &str) -> Vec<String> {
     let files = std::fs::read_dir("/dev/shm").unwrap();
     let names = files.filter_map(|file| file.ok()?.file_name().into_string().ok());
@@ -60,8 +61,8 @@ fn shared_memory_of(instance: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_disturbs_nobody() {
-    let test = "a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_disturbs_nobody";
+fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample() {
+    let test = "a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let slow = bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL);
@@ -69,7 +70,7 @@ fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_disturbs_n
 
     let stopped = bed.pid("egress-noncritical");
     signal(stopped, Signal::SIGSTOP);
-    flow.go_on(10);
+    flow.flow_for(10);
     signal(stopped, Signal::SIGCONT);
     let before = slow.received();
     slow.wait_received(before + 5);
@@ -77,18 +78,18 @@ fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_disturbs_n
     for restarts in 1..=5 {
         signal(bed.pid("egress-noncritical"), Signal::SIGKILL);
         support::wait_until("a restart", || bed.pids("egress-noncritical").len() == restarts + 1);
-        flow.go_on(1);
+        flow.flow_for(1);
     }
     slow.wait_received(slow.received() + 5);
     flow.end_whole();
-    bed.wait_whole();
+    bed.wait_accounted();
     slow.end::<Received>().assert_sound();
     bed.end();
 }
 
 #[test]
-fn remote_subscribers_that_are_slow_stopped_or_cut_off_disturb_nobody() {
-    let test = "remote_subscribers_that_are_slow_stopped_or_cut_off_disturb_nobody";
+fn remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample() {
+    let test = "remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let reader = || Peer::cyclone().best_effort().keep_all();
@@ -96,24 +97,24 @@ fn remote_subscribers_that_are_slow_stopped_or_cut_off_disturb_nobody() {
     let stopped = bed.subscribe("slow", reader(), NONCRITICAL);
     stopped.wait_received(3);
     stopped.stop();
-    flow.go_on(4);
+    flow.flow_for(4);
     bed.host("slow").lose_incoming(0.5);
-    flow.go_on(3);
+    flow.flow_for(3);
     bed.host("slow").lose_incoming(0.0);
     bed.host("slow").set_link(false);
-    flow.go_on(3);
+    flow.flow_for(3);
     bed.host("slow").set_link(true);
     stopped.cont();
     let before = stalling.received();
     stalling.wait_received(before + 5);
     flow.end_whole();
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }
 
 #[test]
-fn a_link_that_was_down_for_longer_than_the_lease_carries_samples_again() {
-    let test = "a_link_that_was_down_for_longer_than_the_lease_carries_samples_again";
+fn samples_flow_again_after_a_link_was_down_for_longer_than_the_lease() {
+    let test = "samples_flow_again_after_a_link_was_down_for_longer_than_the_lease";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let subscribers = [
         bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL),
@@ -130,17 +131,17 @@ fn a_link_that_was_down_for_longer_than_the_lease_carries_samples_again() {
     };
     all_receive("samples before");
 
-    // First the subscribers' cable, then the publisher's.
+    // First the link of the subscribers, then that of the publisher.
     let readers =
         |status: &Value| outputs(status).map(|output| output["readers"].as_u64()).sum::<Option<u64>>();
     bed.host("slow").set_link(false);
-    bed.bridge.wait_status("the end of the readers", |status| readers(status) == Some(0));
+    bed.bridge.wait_status("no matched readers", |status| readers(status) == Some(0));
     bed.host("slow").set_link(true);
     all_receive("samples after the subscribers are back");
 
     let writers = |status: &Value| status["routes"][0]["writers"].as_u64();
     bed.host("publisher").set_link(false);
-    bed.bridge.wait_status("the end of the publisher", |status| writers(status) == Some(0));
+    bed.bridge.wait_status("no matched publisher", |status| writers(status) == Some(0));
     bed.host("publisher").set_link(true);
     all_receive("samples after the publisher is back");
 
@@ -152,8 +153,8 @@ fn a_link_that_was_down_for_longer_than_the_lease_carries_samples_again() {
 }
 
 #[test]
-fn a_killed_critical_egress_comes_back_and_states_what_was_lost() {
-    let test = "a_killed_critical_egress_comes_back_and_states_what_was_lost";
+fn a_killed_critical_egress_is_restarted_and_counts_the_lost_samples() {
+    let test = "a_killed_critical_egress_is_restarted_and_counts_the_lost_samples";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     for restarts in 1..=3 {
@@ -163,24 +164,24 @@ fn a_killed_critical_egress_comes_back_and_states_what_was_lost() {
         flow.critical.wait_received(before + 100);
     }
     let sent: Sent = flow.publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher is not held up: {sent:?}");
-    let status = bed.wait_whole();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    let status = bed.wait_accounted();
     let critical = lane(&status, "critical");
     let received: Received = flow.critical.end();
     received.assert_sound();
-    // What the lane says it forwarded and what arrived differ only by what was on its way when the process
-    // was killed, and by what was written before the subscriber knew the new writer.
+    // The lane's count of forwarded samples and the subscriber's count differ only by samples that were in
+    // flight when the process was killed and by samples written before the subscriber matched the new writer.
     let forwarded = critical["forwarded"].as_u64().unwrap();
-    let stated: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
-    assert_eq!(forwarded + stated, sent.ok, "every sample is forwarded or named: {critical}");
+    let dropped: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
+    assert_eq!(forwarded + dropped, sent.ok, "every sample is forwarded or has a drop reason: {critical}");
     assert!(received.received <= forwarded, "{received:?} of {critical}");
     assert!(received.missing_count > 0 && received.missing_count < 600, "{received:?}");
     bed.end();
 }
 
 #[test]
-fn a_killed_ingress_comes_back_and_goes_on_counting() {
-    let test = "a_killed_ingress_comes_back_and_goes_on_counting";
+fn a_killed_ingress_is_restarted_and_continues_its_counts() {
+    let test = "a_killed_ingress_is_restarted_and_continues_its_counts";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     for restarts in 1..=3 {
@@ -193,11 +194,10 @@ fn a_killed_ingress_comes_back_and_goes_on_counting() {
     let received: Received = flow.critical.end();
     received.assert_sound();
     assert!(received.missing_count < 600, "{received:?}");
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     let route = &status["routes"][0];
     assert_eq!(route["whole"], true, "{route}");
-    // Numbers go on across restarts, and what no ingress took is the publisher's knowledge and the
-    // subscriber's.
+    // Sequence numbers continue across restarts. Samples that no ingress received are missing in `published`.
     let published = route["published"].as_u64().unwrap();
     let critical = lane(&status, "critical");
     assert!(published <= sent.ok, "{route}");
@@ -210,8 +210,8 @@ fn a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed() {
     let test = "a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    // 200 samples are 6.7 s, less than the lease of the killed one, which is 15 s: a publisher that holds its
-    // samples for it until then has no room for more.
+    // 200 samples are 6.7 s, less than the 15 s lease of the killed ingress: a publisher that retains its
+    // samples for that ingress until the lease ends has no room for more.
     let publisher = bed.publish(Peer::fast().keep_all().max_samples(200).rate_hz(30.0), INPUT);
     critical.wait_received(30);
     signal(bed.pid("ingress"), Signal::SIGKILL);
@@ -225,21 +225,21 @@ fn a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed() {
 }
 
 #[test]
-fn nothing_of_a_bridge_is_left_whose_processes_were_killed() {
-    let test = "nothing_of_a_bridge_is_left_whose_processes_were_killed";
+fn a_bridge_whose_processes_were_killed_leaves_no_shared_memory() {
+    let test = "a_bridge_whose_processes_were_killed_leaves_no_shared_memory";
     let Some(mut bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let children: Vec<i32> =
         ["ingress", "egress-critical", "egress-noncritical"].iter().map(|child| bed.pid(child)).collect();
     assert!(!shared_memory_of(bed.bridge.instance()).is_empty());
-    // The supervisor first: its children have to end by themselves.
+    // Kills the supervisor first: its children must end by themselves.
     bed.up.kill9();
     support::wait_until("no orphans", || {
         children.iter().all(|child| nix::sys::signal::kill(Pid::from_raw(*child), None).is_err())
     });
 
-    // The next bridge of the same name cleans up what the former left, flows, and leaves nothing when it
-    // ends.
+    // The next bridge of the same instance removes the files of the previous one, forwards, and leaves no
+    // files when it ends.
     bed.up = bed.bridge.start_on(bed.net.host("bridge"), "up");
     bed.wait_up();
     let before = flow.critical.received();
@@ -255,28 +255,28 @@ fn nothing_of_a_bridge_is_left_whose_processes_were_killed() {
 }
 
 #[test]
-fn a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counted_for_it() {
-    let test = "a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counted_for_it";
+fn a_stopped_critical_subscriber_costs_the_others_no_sample_and_its_overrun_is_counted() {
+    let test = "a_stopped_critical_subscriber_costs_the_others_no_sample_and_its_overrun_is_counted";
     let yaml = format!("{SCAN}lanes:\n  critical: {{window_samples: 64}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
-    let laggard = bed.subscribe("slow", Peer::cyclone().keep_all(), CRITICAL);
+    let stopped = bed.subscribe("slow", Peer::cyclone().keep_all(), CRITICAL);
     let others = [
         bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL),
         bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL),
     ];
     let publisher = bed.publish(Peer::fast().keep_all().rate_hz(1_000.0), INPUT);
-    laggard.wait_received(50);
-    laggard.stop();
-    // 18 MB: more than the laggard's socket holds.
+    stopped.wait_received(50);
+    stopped.stop();
+    // 18 MB: more than the stopped subscriber's socket holds.
     let before = others[0].received();
     others[0].wait_received(before + 6_000);
-    laggard.cont();
-    let before = laggard.received();
-    laggard.wait_received(before + 100);
+    stopped.cont();
+    let before = stopped.received();
+    stopped.wait_received(before + 100);
     bed.up.wait_for_log("a subscriber does not keep up");
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "no call of the publisher waited in vain: {sent:?}");
-    bed.wait_whole();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    bed.wait_accounted();
     let status = bed.bridge.wait_status("all acknowledged", |status| {
         let readers = lane(status, "critical")["matched_readers"].as_array().unwrap().clone();
         readers.len() == 3 && readers.iter().all(|reader| reader["unacknowledged"] == 0)
@@ -286,8 +286,8 @@ fn a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counte
     for other in others {
         other.end::<Received>().assert_all_of(&sent);
     }
-    let lagged: Received = laggard.end();
-    lagged.assert_sound();
+    let received: Received = stopped.end();
+    received.assert_sound();
     let overruns: Vec<u64> = critical["matched_readers"]
         .as_array()
         .unwrap()
@@ -295,41 +295,41 @@ fn a_stopped_critical_subscriber_costs_the_others_nothing_and_its_loss_is_counte
         .map(|reader| reader["overrun"].as_u64().unwrap())
         .filter(|overrun| *overrun > 0)
         .collect();
-    assert_eq!(overruns, [lagged.missing_count], "{critical}\n{lagged:?}");
-    assert_eq!(critical["reader_overrun"], lagged.missing_count, "{critical}");
+    assert_eq!(overruns, [received.missing_count], "{critical}\n{received:?}");
+    assert_eq!(critical["reader_overrun"], received.missing_count, "{critical}");
     bed.end();
 }
 
 #[test]
-fn killed_critical_subscribers_cost_the_others_nothing() {
-    let test = "killed_critical_subscribers_cost_the_others_nothing";
+fn killed_critical_subscribers_cost_the_others_no_sample() {
+    let test = "killed_critical_subscribers_cost_the_others_no_sample";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let other = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
-    let doomed = [
+    let victims = [
         bed.subscribe("slow", Peer::cyclone().keep_all(), CRITICAL),
         bed.subscribe("slow", Peer::fast().keep_all(), CRITICAL),
         bed.subscribe("critical", Peer::fast(), CRITICAL),
     ];
     let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(500.0), INPUT);
-    for one in &doomed {
-        one.wait_received(100);
+    for victim in &victims {
+        victim.wait_received(100);
     }
-    for mut one in doomed {
-        one.kill9();
+    for mut victim in victims {
+        victim.kill9();
     }
-    // Beyond the 256 samples that the writer retains, within the leases of 10 and 20 s.
+    // More than the 256 samples that the writer retains, sent before the leases of 10 and 20 s end.
     let before = other.received();
     other.wait_received(before + 3_000);
     let sent: Sent = publisher.end();
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     assert_eq!(lane(&status, "critical")["forwarded"], sent.ok, "{status}");
     other.end::<Received>().assert_all_of(&sent);
     bed.end();
 }
 
 #[test]
-fn modes_set_by_hand_take_effect_and_rates_are_held() {
-    let test = "modes_set_by_hand_take_effect_and_rates_are_held";
+fn manual_modes_take_effect_and_rates_are_kept() {
+    let test = "manual_modes_take_effect_and_rates_are_kept";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let slow = bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL);
@@ -342,7 +342,7 @@ fn modes_set_by_hand_take_effect_and_rates_are_held() {
             lanes.iter().any(|lane| lane["name"] == "noncritical" && lane["applied_mode"] == mode)
         });
     };
-    // Over 20 s within 1 % of the target, and two samples for where the window begins and ends.
+    // Over 20 s within 1 % of the target rate, plus two samples for the ends of the interval.
     for (mode, rate_hz) in [("normal", 10.0), ("degraded", 3.0)] {
         set(mode);
         let forwarded = || lane(&bed.bridge.status(), "noncritical")["forwarded"].as_u64().unwrap();
@@ -355,7 +355,7 @@ fn modes_set_by_hand_take_effect_and_rates_are_held() {
     }
     set("suspended");
     let before = slow.received();
-    flow.go_on(2);
+    flow.flow_for(2);
     assert!(slow.received() <= before + 1, "a suspended lane forwards nothing");
     set("normal");
     slow.wait_received(before + 10);
@@ -363,13 +363,13 @@ fn modes_set_by_hand_take_effect_and_rates_are_held() {
     assert_eq!(refused.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("critical, noncritical"));
     flow.end_whole();
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }
 
 #[test]
-fn two_bridges_run_side_by_side_and_one_that_ends_leaves_the_other_alone() {
-    let test = "two_bridges_run_side_by_side_and_one_that_ends_leaves_the_other_alone";
+fn two_bridges_run_side_by_side_and_the_end_of_one_does_not_affect_the_other() {
+    let test = "two_bridges_run_side_by_side_and_the_end_of_one_does_not_affect_the_other";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let other = Bridge::new(&format!(
@@ -386,26 +386,26 @@ fn two_bridges_run_side_by_side_and_one_that_ends_leaves_the_other_alone() {
     second.end::<Received>().assert_sound();
     assert!(other_up.terminate().success(), "{}", other_up.log());
     assert_eq!(shared_memory_of(other.instance()), Vec::<String>::new());
-    flow.go_on(1);
+    flow.flow_for(1);
     flow.end_whole();
     bed.end();
 }
 
-/// Runs a role that is expected to end by itself; its exit code and log.
-fn ends(mut process: Process) -> (Option<i32>, String) {
+/// Waits until a role ends by itself; returns its exit code and log.
+fn wait_ended(mut process: Process) -> (Option<i32>, String) {
     let status = process.wait();
     (status.code(), process.log())
 }
 
 #[test]
-fn a_lane_that_is_served_already_is_refused_by_name() {
+fn a_second_egress_of_a_lane_is_refused_and_names_the_first() {
     let bridge = Bridge::new(&format!("instance: {{instance}}\nros: {{domain_id: 120}}\n{SCAN}"));
     let mut first = bridge.start("egress --lane critical");
     first.wait_for_log("egress is up");
-    let (code, log) = ends(bridge.start("egress --lane critical"));
+    let (code, log) = wait_ended(bridge.start("egress --lane critical"));
     assert_eq!(code, Some(1), "{log}");
     assert!(log.contains("egress-critical") && log.contains(&first.pid().to_string()), "{log}");
-    let (code, log) = ends(bridge.start("egress --lane nosuch"));
+    let (code, log) = wait_ended(bridge.start("egress --lane nosuch"));
     assert_eq!(code, Some(1), "{log}");
     assert!(log.contains("nosuch") && log.contains("critical, noncritical"), "{log}");
     first.kill9();
@@ -415,29 +415,29 @@ fn a_lane_that_is_served_already_is_refused_by_name() {
 }
 
 #[test]
-fn shared_memory_that_does_not_fit_is_an_error_that_says_how_much_is_needed() {
-    // More than any machine's /dev/shm: 64 MiB for each of more than 4,096 slots.
+fn shared_memory_that_does_not_fit_is_an_error_with_the_needed_size() {
+    // Larger than /dev/shm of any machine: 64 MiB for each of more than 4,096 slots.
     let yaml = "instance: {instance}\nros: {domain_id: 121}\ntopics:\n  - {id: scan, input_topic: /scan, \
                 max_sample_bytes: 67108864}\nlanes:\n  critical: {queue_depth: 4096}\n";
     let bridge = Bridge::new(yaml);
-    let (code, log) = ends(bridge.start("ingress"));
+    let (code, log) = wait_ended(bridge.start("ingress"));
     assert_eq!(code, Some(1), "{log}");
     assert!(log.contains("/dev/shm") && log.contains("byte"), "{log}");
     assert_eq!(shared_memory_of(bridge.instance()), Vec::<String>::new());
 }
 
 #[test]
-fn every_role_ends_with_0_when_it_is_asked_to() {
+fn every_role_ends_with_exit_code_0_after_sigterm_and_sigint() {
     let bridge = Bridge::new(&format!("instance: {{instance}}\nros: {{domain_id: 122}}\n{SCAN}"));
     for (role, up) in
         [("ingress", "ingress is up"), ("egress --lane noncritical", "egress is up"), ("up", "ingress is up")]
     {
-        for asked in [Signal::SIGTERM, Signal::SIGINT] {
+        for signal in [Signal::SIGTERM, Signal::SIGINT] {
             let mut process = bridge.start(role);
             process.wait_for_log(up);
-            process.signal(asked);
+            process.signal(signal);
             let status = process.wait();
-            assert!(status.success(), "{role} after {asked}: {status}\n{}", process.log());
+            assert!(status.success(), "{role} after {signal}: {status}\n{}", process.log());
         }
     }
     assert_eq!(shared_memory_of(bridge.instance()), Vec::<String>::new());

@@ -1,5 +1,5 @@
-//! A hostile network: for a minute, datagrams that are no RTPS, nearly RTPS, and cut off in the middle, at
-//! every port of a running bridge, while samples flow. No process dies, none is restarted, no sample is lost.
+//! A hostile network: random, malformed and truncated RTPS datagrams at every port of a running bridge for a
+//! minute, while samples flow. No process crashes or is restarted, and no sample is lost.
 
 mod support;
 
@@ -13,7 +13,7 @@ use support::peer::{Peer, Received, Sent};
 
 const ATTACK: Duration = Duration::from_secs(60);
 
-/// A sequence of numbers that looks random and is the same for a seed (xorshift64*).
+/// A pseudo-random sequence that is reproducible from its seed (xorshift64*).
 struct Random(u64);
 
 impl Random {
@@ -33,7 +33,7 @@ impl Random {
     }
 }
 
-/// The entity ids that a bridge listens to or may be thought to: discovery's, and the first ones of users.
+/// Entity ids of the attack: those of discovery and the first user-defined ones.
 const ENTITIES: [[u8; 4]; 10] = [
     [0, 1, 0, 0xc2],
     [0, 1, 0, 0xc7],
@@ -47,13 +47,13 @@ const ENTITIES: [[u8; 4]; 10] = [
     [0, 0, 0, 0],
 ];
 
-/// The submessages of RTPS 2.5 (clause 9.4.5.1.1), and one that there is not.
+/// The submessage kinds of RTPS 2.5 (clause 9.4.5.1.1), and an undefined one.
 const KINDS: [u8; 14] = [0x01, 0x06, 0x07, 0x08, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x13, 0x15, 0x16, 0x7f];
 
-/// Numbers at the edges of what their fields can hold.
+/// Boundary values of number fields.
 const EDGES: [u32; 8] = [0, 1, 2, 255, 256, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff];
 
-/// One datagram of the attack.
+/// Makes one datagram of the attack.
 fn datagram(random: &mut Random) -> Vec<u8> {
     if random.below(8) == 0 {
         let length = random.below(1500);
@@ -72,7 +72,7 @@ fn datagram(random: &mut Random) -> Vec<u8> {
                 _ => body.extend(random.bytes(4)),
             }
         }
-        // The length is right, wrong, or the zero that means "to the end".
+        // The length is correct, random, or zero, which means "to the end of the message".
         let length = match random.below(4) {
             0 => random.next() as u16,
             1 => 0,
@@ -89,7 +89,7 @@ fn datagram(random: &mut Random) -> Vec<u8> {
     datagram
 }
 
-/// The UDP ports that anybody listens to in the network namespace of a process.
+/// The open UDP ports in the network namespace of a process.
 fn udp_ports(pid: i32) -> Vec<u16> {
     let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
     let mut ports: Vec<u16> = table
@@ -102,7 +102,7 @@ fn udp_ports(pid: i32) -> Vec<u16> {
     ports
 }
 
-/// Sends for a while from inside a network namespace; how many datagrams were sent.
+/// Sends datagrams for [`ATTACK`] from inside a network namespace; returns the number sent.
 fn attack(namespace: &str, address: Ipv4Addr, ports: &[u16], seed: u64) -> u64 {
     setns(File::open(format!("/run/netns/{namespace}")).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
@@ -110,11 +110,11 @@ fn attack(namespace: &str, address: Ipv4Addr, ports: &[u16], seed: u64) -> u64 {
     let until = Instant::now() + ATTACK;
     let mut sent = 0;
     while Instant::now() < until {
-        // Some 20,000 datagrams a second are more than a robot's network carries, and leave the machine,
-        // which is also the robot, the time to forward.
+        // About 20,000 datagrams a second: more than a robot's network carries, but few enough that the
+        // machine, which also runs the bridge, has time to forward.
         for _ in 0..40 {
             let port = ports[random.below(ports.len())];
-            // By unicast also to the ports of multicast: it is the bridge that is attacked, not the peers.
+            // Also sends to the multicast ports by unicast, to attack only the bridge and not the peers.
             if socket.send_to(&datagram(&mut random), (address, port)).is_ok() {
                 sent += 1;
             }
@@ -125,8 +125,8 @@ fn attack(namespace: &str, address: Ipv4Addr, ports: &[u16], seed: u64) -> u64 {
 }
 
 #[test]
-fn a_minute_of_malformed_datagrams_at_every_port_disturbs_nothing() {
-    let test = "a_minute_of_malformed_datagrams_at_every_port_disturbs_nothing";
+fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process() {
+    let test = "a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
     let slow = bed.subscribe("critical", Peer::fast().best_effort(), NONCRITICAL);
@@ -152,6 +152,6 @@ fn a_minute_of_malformed_datagrams_at_every_port_disturbs_nothing() {
     critical.wait_received(sent.ok);
     critical.end::<Received>().assert_all_of(&sent);
     slow.end::<Received>().assert_sound();
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }

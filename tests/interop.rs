@@ -1,5 +1,5 @@
-//! The bridge between DDS libraries: Cyclone DDS, Fast DDS and RustDDS programs as publishers and subscribers
-//! on hosts of their own (network namespaces), the bridge on a third one. Every payload is compared by hash.
+//! The bridge between DDS libraries: publishers and subscribers on Cyclone DDS, Fast DDS and RustDDS run on
+//! separate hosts (network namespaces) from the bridge. Every payload is compared by hash.
 
 mod support;
 
@@ -25,7 +25,7 @@ fn every_library_reaches_every_library_through_both_lanes() {
             let publisher = bed.publish(peer(from).rate_hz(200.0).count(300), INPUT);
             let sent: Sent = publisher.finish();
             assert_eq!((sent.ok, sent.failed), (300, 0), "{from:?} to {to:?}");
-            // By the reader that is there; of those of former publishers nobody may still wait for one.
+            // By ingress's current reader; no writer may still wait for an acknowledgement of an earlier one.
             assert!(sent.acknowledged, "{from:?} to {to:?}");
             critical.wait_received(300);
             noncritical.wait_for("a late sample", |event| event["last"].as_u64() > Some(280));
@@ -39,60 +39,59 @@ fn every_library_reaches_every_library_through_both_lanes() {
             assert_eq!(slow.source_timestamps_changed, 0, "{from:?} to {to:?}");
         }
     }
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }
 
 #[test]
-fn hosts_that_have_nothing_to_say_are_quiet() {
-    let Some(bed) = Bed::start("hosts_that_have_nothing_to_say_are_quiet", SCAN) else { return };
+fn hosts_without_samples_send_few_packets() {
+    let Some(bed) = Bed::start("hosts_without_samples_send_few_packets", SCAN) else { return };
     for library in LIBRARIES {
         let subscriber = bed.subscribe("critical", Peer::on(library), CRITICAL);
         subscriber.wait_matched(1);
-        // Discovery is over.
+        // Waits until discovery is finished.
         std::thread::sleep(Duration::from_secs(3));
         let before = packets(&bed);
         std::thread::sleep(Duration::from_secs(4));
-        let spoken = packets(&bed) - before;
-        // Announcements of a few participants, which are seconds apart. A reader of Fast DDS that is left
-        // without a HEARTBEAT asks for it seven times a second, and each process of the bridge has several
-        // such writers.
-        assert!(spoken < 100, "{library:?}: {spoken} packets in 4 s");
+        let sent = packets(&bed) - before;
+        // Expected are announcements of a few participants, seconds apart. A Fast DDS reader that receives no
+        // HEARTBEAT requests one seven times a second, from each of several writers of each process.
+        assert!(sent < 100, "{library:?}: {sent} packets in 4 s");
         subscriber.end::<Received>();
     }
     bed.end();
 }
 
-/// Packets that the host of the critical subscriber has sent.
+/// The number of packets that the host of the critical subscriber has sent.
 fn packets(bed: &Bed) -> u64 {
     let output = bed.host("critical").command("cat").arg("/proc/net/dev").output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
     let lines = text.lines().filter_map(|line| line.split_once(':'));
     let interfaces = lines.filter(|(name, _)| name.trim() != "lo");
-    // Of what was received there are eight columns, of which packets are the second; those sent follow.
+    // The tenth column has the sent packets: eight columns of received data precede those of sent data.
     interfaces.map(|(_, counts)| counts.split_whitespace().nth(9).unwrap().parse::<u64>().unwrap()).sum()
 }
 
 #[test]
 fn best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably() {
     let test = "best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably";
-    // What waits for a repair comes at once when it is repaired; the lane has room for all of it.
+    // Samples that wait for a repair arrive together when it is done; the lane has room for all of them.
     let yaml = format!("{SCAN}lanes:\n  critical: {{queue_depth: 512}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     for (index, from) in LIBRARIES.into_iter().enumerate() {
-        // Another subscriber for each publisher, so that every library reads.
+        // A different subscriber for each publisher, so that every library subscribes.
         let to = |offset| Peer::on(LIBRARIES[(index + offset) % LIBRARIES.len()]).keep_all();
         let critical = bed.subscribe("critical", to(1), CRITICAL);
-        let weak = bed.publish(Peer::on(from).best_effort().rate_hz(200.0).count(200), INPUT);
-        let sent: Sent = weak.finish();
+        let best_effort = bed.publish(Peer::on(from).best_effort().rate_hz(200.0).count(200), INPUT);
+        let sent: Sent = best_effort.finish();
         critical.wait_received(200);
         critical.end::<Received>().assert_all_of(&sent);
 
-        // One that comes later and offers more is matched by the reader that is there; once the former is
-        // gone, one that asks for repair of what is lost is read reliably again.
+        // A RELIABLE publisher that joins after the BEST_EFFORT one has left is read reliably: ingress
+        // requests repairs of its lost samples.
         let critical = bed.subscribe("critical", to(2), CRITICAL);
         bed.host("bridge").lose_incoming(0.05);
-        let strong = bed.publish(
+        let reliable = bed.publish(
             Peer::on(from)
                 .keep_all()
                 .option("--max-blocking-ms", 5000)
@@ -104,72 +103,72 @@ fn best_effort_publishers_are_read_best_effort_and_reliable_ones_reliably() {
         );
         critical.wait_received(400);
         bed.host("bridge").lose_incoming(0.0);
-        critical.end::<Received>().assert_all_of(&strong.end());
+        critical.end::<Received>().assert_all_of(&reliable.end());
     }
     bed.end();
 }
 
 #[test]
-fn a_reliable_publisher_stays_repaired_beside_best_effort_ones_that_come_and_go() {
-    let test = "a_reliable_publisher_stays_repaired_beside_best_effort_ones_that_come_and_go";
-    // What waits for a repair comes at once when it is repaired; the lane has room for all of it.
+fn a_reliable_publisher_is_repaired_beside_best_effort_ones_that_join_and_leave() {
+    let test = "a_reliable_publisher_is_repaired_beside_best_effort_ones_that_join_and_leave";
+    // Samples that wait for a repair arrive together when it is done; the lane has room for all of them.
     let yaml = format!("{SCAN}lanes:\n  critical: {{queue_depth: 1024}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     for (index, from) in LIBRARIES.into_iter().enumerate() {
         let beside = LIBRARIES[(index + 1) % LIBRARIES.len()];
-        // One subscriber for each publisher: it leaves out the numbers of the other.
+        // One subscriber receives the samples of all publishers, which use different ranges of numbers.
         let critical =
             bed.subscribe("critical", Peer::on(Library::Cyclone).keep_all().each_sample(), CRITICAL);
-        let repaired = Peer::on(from).keep_all().option("--max-blocking-ms", 5000).heartbeat_ms(200);
-        let weak = Peer::on(beside).best_effort().rate_hz(100.0);
+        let reliable_peer = Peer::on(from).keep_all().option("--max-blocking-ms", 5000).heartbeat_ms(200);
+        let best_effort_peer = Peer::on(beside).best_effort().rate_hz(100.0);
 
-        // The RELIABLE one joins BEST_EFFORT ones.
-        let first_weak = bed.publish(weak.clone().first_seq(1_000_000), INPUT);
+        // The RELIABLE publisher joins a BEST_EFFORT one.
+        let first_best_effort = bed.publish(best_effort_peer.clone().first_seq(1_000_000), INPUT);
         critical.wait_received(20);
-        let strong = bed.publish(repaired.rate_hz(200.0).count(1_500).linger_s(20.0), INPUT);
-        let strong_numbers = || sequences_below(&critical, 1_000_000);
-        support::wait_until("samples of the RELIABLE publisher", || strong_numbers().len() > 50);
+        let reliable = bed.publish(reliable_peer.rate_hz(200.0).count(1_500).linger_s(20.0), INPUT);
+        let reliable_numbers = || sequences_below(&critical, 1_000_000);
+        support::wait_until("samples of the RELIABLE publisher", || reliable_numbers().len() > 50);
         bed.host("bridge").lose_incoming(0.05);
-        support::wait_until("repaired samples", || strong_numbers().len() > 450);
-        // And BEST_EFFORT ones come and go beside it.
-        let _: Sent = first_weak.end();
-        let before = strong_numbers().len();
-        let second_weak = bed.publish(weak.first_seq(2_000_000), INPUT);
+        support::wait_until("repaired samples", || reliable_numbers().len() > 450);
+        // BEST_EFFORT publishers leave and join beside it.
+        let _: Sent = first_best_effort.end();
+        let before = reliable_numbers().len();
+        let second_best_effort = bed.publish(best_effort_peer.first_seq(2_000_000), INPUT);
         support::wait_until("samples of both", || {
             let both = sequences(&critical);
-            strong_numbers().len() > before + 200 && both.iter().any(|number| *number >= 2_000_000)
+            reliable_numbers().len() > before + 200 && both.iter().any(|number| *number >= 2_000_000)
         });
         bed.bridge.wait_status("a problem that names the BEST_EFFORT publisher", |status| {
             let problems = status["problems"].as_array().unwrap();
-            let is_meant = |problem: &&Value| {
+            let is_expected = |problem: &&Value| {
                 problem.as_str().unwrap().contains("BEST_EFFORT publishers beside RELIABLE ones")
             };
-            problems.iter().filter(is_meant).count() == 1
+            problems.iter().filter(is_expected).count() == 1
         });
         bed.host("bridge").lose_incoming(0.0);
-        let _: Sent = second_weak.end();
+        let _: Sent = second_best_effort.end();
         let status = bed.bridge.status();
         let accounts = status["routes"][0]["publishers"].as_array().unwrap();
         let account = accounts.iter().find(|account| account["reliability"] == "RELIABLE");
         assert_eq!(account.unwrap()["lost_upstream"], 0, "{status}");
-        strong.wait_sent();
-        let sent: Sent = strong.end();
+        reliable.wait_sent();
+        let sent: Sent = reliable.end();
         support::wait_until(format!("the last sample of the RELIABLE publisher, {sent:?}"), || {
-            strong_numbers().last() == Some(&sent.last)
+            reliable_numbers().last() == Some(&sent.last)
         });
-        // What it wrote before its first sample was read came before the RELIABLE reader was there.
-        let numbers = strong_numbers();
+        // Samples before the first received one were written before ingress's RELIABLE reader matched.
+        let numbers = reliable_numbers();
         let first = numbers[0];
         assert!(numbers.iter().copied().eq(first..=sent.last), "in order, each once: {numbers:?}");
         println!("{from:?} beside {beside:?}: from sample {first} on");
         assert_eq!(sent.failed, 0, "{sent:?}");
         let _: Received = critical.end();
     }
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }
 
-/// The sequence numbers that a subscriber has received, in that order.
+/// The sequence numbers that a subscriber has received, in order of arrival.
 fn sequences(subscriber: &RunningPeer) -> Vec<u64> {
     let events = subscriber.events();
     events
@@ -183,7 +182,7 @@ fn sequences_below(subscriber: &RunningPeer, bound: u64) -> Vec<u64> {
     sequences(subscriber).into_iter().filter(|number| *number < bound).collect()
 }
 
-/// A route of any size up to 4 MiB whose samples are all wanted on both lanes.
+/// A route for samples of up to 4 MiB, all of which both lanes forward.
 const LARGE: &str = "topics:\n  - {id: cloud, input_topic: /cloud, message_type: sensor_msgs/msg/PointCloud2, \
                      max_sample_bytes: 4194304, retained_samples: 1}\n\
                      lanes:\n  critical: {queue_depth: 8}\n  \
@@ -191,8 +190,8 @@ const LARGE: &str = "topics:\n  - {id: cloud, input_topic: /cloud, message_type:
                      history: KEEP_LAST, depth: 10}, queue_samples: 8, drop_policy: drop_latest, queue_depth: 8}\n";
 
 #[test]
-fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
-    let test = "every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes";
+fn every_size_from_0_bytes_to_4_mib_arrives_unchanged_on_both_lanes() {
+    let test = "every_size_from_0_bytes_to_4_mib_arrives_unchanged_on_both_lanes";
     let Some(bed) = Bed::start(test, LARGE) else { return };
     let cloud =
         |library| Peer::on(library).keep_all().seed(12).type_name("sensor_msgs::msg::dds_::PointCloud2_");
@@ -201,8 +200,8 @@ fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
     for from in LIBRARIES {
         for to in LIBRARIES {
             let mut first = 0;
-            // Nothing; one LaserScan of 360 beams; one PointCloud2 of 2 MB; the largest allowed, header
-            // included.
+            // An empty sample; a LaserScan of 360 beams, a PointCloud2 of 2 MB, and the largest allowed
+            // sample, whose size includes the header.
             for (sizes, count, rate_hz) in [(&[0][..], 10, 50.0), (&[2948, 2_000_000, (4 << 20) - 4], 9, 3.0)]
             {
                 let subscribe = |host, topic| bed.subscribe(host, cloud(to).sizes(sizes), topic);
@@ -219,29 +218,32 @@ fn every_size_from_nothing_to_4_mib_arrives_bit_for_bit_on_both_lanes() {
             }
         }
     }
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     if status.is_null() {
         return;
     }
     let critical = support::bed::outputs(&status).next().unwrap();
-    assert!(critical["by_reference"].as_u64() > Some(0), "large samples go by reference: {critical}");
-    // Six of the nine samples with contents are of several datagrams, whatever the library.
+    assert!(
+        critical["by_reference"].as_u64() > Some(0),
+        "no large sample was forwarded by reference: {critical}"
+    );
+    // With every library, six of the nine samples of several sizes take several datagrams.
     let in_place = status["routes"][0]["in_place"].as_u64();
     let large = (LIBRARIES.len() * LIBRARIES.len() * 6) as u64;
-    assert!(in_place >= Some(large), "{in_place:?} of {large} large samples were put together in the pool");
+    assert!(in_place >= Some(large), "{in_place:?} of {large} large samples were assembled in the pool");
     bed.end();
 }
 
 #[test]
-fn large_samples_of_which_packets_are_lost_arrive_whole() {
-    let Some(bed) = Bed::start("large_samples_of_which_packets_are_lost_arrive_whole", LARGE) else { return };
+fn large_samples_arrive_complete_when_packets_are_lost() {
+    let Some(bed) = Bed::start("large_samples_arrive_complete_when_packets_are_lost", LARGE) else { return };
     for (from, to) in [(Library::Cyclone, Library::Fast), (Library::Fast, Library::Cyclone)] {
         let cloud = |library| {
             let kind = "sensor_msgs::msg::dds_::PointCloud2_";
             Peer::on(library).keep_all().seed(13).type_name(kind).size(1_000_000)
         };
         let critical = bed.subscribe("critical", cloud(to), "rt/adaptive_bridge/critical/cloud");
-        // Of each sample, some ten packets on the way in and as many on the way out.
+        // Loses about ten packets of each sample on the way to the bridge and as many on the way from it.
         for host in ["bridge", "critical"] {
             bed.host(host).lose_incoming(0.01);
         }
@@ -265,7 +267,8 @@ fn large_samples_of_which_packets_are_lost_arrive_whole() {
 fn encapsulation_kind_and_padding_bits_arrive_as_they_were_sent() {
     let test = "encapsulation_kind_and_padding_bits_arrive_as_they_were_sent";
     let Some(bed) = Bed::start(test, SCAN) else { return };
-    // CDR_BE with two bytes of padding announced, PL_CDR_LE, CDR2_LE with one (XTypes 1.3, table 60).
+    // CDR_BE with two announced padding bytes, PL_CDR_LE, CDR2_LE with one padding byte (XTypes 1.3, table
+    // 60).
     for (header, from, to) in [
         ("00000002", Library::Fast, Library::Fast),
         ("00030000", Library::Fast, Library::Rust),
@@ -288,24 +291,24 @@ fn encapsulation_kind_and_padding_bits_arrive_as_they_were_sent() {
 }
 
 #[test]
-fn a_type_is_found_by_discovery_and_two_types_on_one_topic_are_an_error_that_names_both() {
-    let test = "a_type_is_found_by_discovery_and_two_types_on_one_topic_are_an_error_that_names_both";
+fn a_type_is_discovered_and_an_error_names_both_of_two_types_on_one_topic() {
+    let test = "a_type_is_discovered_and_an_error_names_both_of_two_types_on_one_topic";
     let yaml = "topics:\n  - {id: any, input_topic: /any, max_sample_bytes: 65536}\n";
     let Some(bed) = Bed::start(test, yaml) else { return };
     bed.up.wait_for_log("waiting for a publisher");
-    let peer = || Peer::cyclone().keep_all().type_name("robot_msgs::msg::dds_::Strange_");
+    let peer = || Peer::cyclone().keep_all().type_name("robot_msgs::msg::dds_::Custom_");
     let critical =
         peer().subscriber().topic("rt/adaptive_bridge/critical/any").start_on(bed.host("critical"));
     let publisher = bed.publish(peer().rate_hz(100.0), "rt/any");
     critical.wait_received(50);
 
-    let other = Peer::fast().type_name("other_msgs::msg::dds_::Stranger_").topic("rt/any").publisher();
+    let other = Peer::fast().type_name("other_msgs::msg::dds_::Different_").topic("rt/any").publisher();
     let other = other.start_on(bed.host("slow"));
     bed.up.wait_for_log("two types claim the topic");
     let log = bed.up.log();
     let line = log.lines().find(|line| line.contains("two types claim")).unwrap();
-    assert!(line.contains("robot_msgs::msg::dds_::Strange_"), "{line}");
-    assert!(line.contains("other_msgs::msg::dds_::Stranger_"), "{line}");
+    assert!(line.contains("robot_msgs::msg::dds_::Custom_"), "{line}");
+    assert!(line.contains("other_msgs::msg::dds_::Different_"), "{line}");
     let before = critical.received();
     critical.wait_received(before + 50);
     let _: Sent = other.end();
@@ -321,8 +324,8 @@ const MAP: &str = "topics:\n  - id: map\n    input_topic: /map\n    message_type
                    noncritical: {durability: TRANSIENT_LOCAL, depth: 1}\n";
 
 #[test]
-fn a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_restarted() {
-    let test = "a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_restarted";
+fn a_latched_sample_reaches_late_joiners_of_both_lanes_even_after_a_restart_of_egress() {
+    let test = "a_latched_sample_reaches_late_joiners_of_both_lanes_even_after_a_restart_of_egress";
     let Some(bed) = Bed::start(test, MAP) else { return };
     let map = |library| {
         Peer::on(library)
@@ -331,7 +334,7 @@ fn a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_
             .type_name("nav_msgs::msg::dds_::OccupancyGrid_")
             .size(4000)
     };
-    // Published once, long ago: its age does not matter.
+    // Published once with an old source timestamp: a latched sample is forwarded at any age.
     let publisher = map(Library::Cyclone).count(1).linger_s(600.0).source_age_ms(60_000);
     let publisher = bed.publish(publisher, "rt/map");
     publisher.wait_sent();
@@ -360,8 +363,8 @@ fn a_latched_sample_reaches_late_joiners_of_both_lanes_also_after_an_egress_was_
 }
 
 #[test]
-fn several_routes_and_a_lane_of_the_users_own_in_another_domain() {
-    let test = "several_routes_and_a_lane_of_the_users_own_in_another_domain";
+fn several_routes_and_a_user_defined_lane_in_another_domain_forward_samples() {
+    let test = "several_routes_and_a_user_defined_lane_in_another_domain_forward_samples";
     let yaml = "topics:\n  \
                 - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, max_sample_bytes: 8192}\n  \
                 - {id: odom, input_topic: /odom, message_type: nav_msgs/msg/Odometry, max_sample_bytes: 8192, \
@@ -385,11 +388,11 @@ fn several_routes_and_a_lane_of_the_users_own_in_another_domain() {
     for subscriber in [rviz_scan, rviz_odom] {
         let received: Received = subscriber.end();
         received.assert_sound();
-        // 20 Hz for 3 s, with the burst of a bucket at each end.
+        // 20 Hz for 3 s, plus a burst of the token bucket at each end.
         assert!((50..=66).contains(&received.received), "{received:?}");
         assert!(missing_from(&received, 0).len() > 10);
     }
-    bed.wait_whole();
+    bed.wait_accounted();
     bed.end();
 }
 

@@ -1,8 +1,8 @@
-//! Networks that come, go and change while samples flow: a link that is down for shorter and longer than the
-//! leases of discovery, another address, an address that comes after the bridge, an interface that vanishes,
-//! a second one. With subscribers of both lanes, publishers and a responder on the far side, on ROS 2 nodes
-//! (rclpy), Fast DDS and Cyclone DDS, and by their own counts. Each event happens to flows without the bridge
-//! as well.
+//! Changes of the network while samples flow: a link that is down for shorter and longer than the leases of
+//! discovery, a changed address, an address that is assigned after the bridge has started, a deleted
+//! interface, a second interface. Subscribers of both lanes, publishers and a responder are on another host,
+//! on rclpy, Fast DDS and Cyclone DDS; their own counts are checked. Each event is applied to flows without
+//! the bridge as well.
 
 mod support;
 
@@ -19,19 +19,20 @@ use support::process::Process;
 use support::ros;
 
 const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
-/// Those that offer a bridge on their host the loopback interface. Cyclone DDS uses the one interface that it
-/// chose when it was started, and when that has lost its address it sends nothing, with or without a bridge.
+/// The libraries that also use the loopback interface, and so reach a bridge on the same host through it.
+/// Cyclone DDS uses the one interface that it selected at its start; when that has lost its address, it sends
+/// nothing, with or without a bridge.
 const LOOPBACK: [Library; 2] = [Library::Rclpy, Library::Fast];
 /// A topic that the bridge does not know.
 const PLAIN: &str = "rt/plain";
-/// The responder's id.
+/// The id of the responder.
 const RESPONDER: &str = "laptop";
-/// Samples that show that a subscriber is served again: of RELIABLE ones the first few may be repairs of what
-/// was sent before the event.
-const AGAIN: u64 = 5;
+/// Samples after which a subscriber counts as receiving again: for a RELIABLE one the first few may be
+/// repairs of samples sent before the event.
+const RECOVERY_SAMPLES: u64 = 5;
 
-/// Routes for `rt/scan`, which the bridge's host publishes, and for `rt/from_LIBRARY`, which come from the
-/// host whose link goes.
+/// The configuration: a route for `rt/scan`, which is published on the bridge's host, and routes for
+/// `rt/from_LIBRARY`, which are published on the host whose link fails.
 fn routes() -> String {
     let route = |name: &str| {
         format!(
@@ -55,12 +56,12 @@ fn peer(library: Library, node: &str) -> Peer {
     }
 }
 
-/// Why the tests can't run here.
+/// Returns why the tests cannot run here.
 fn missing() -> Option<String> {
     ros::missing().or_else(support::testbed_missing)
 }
 
-/// One subscriber, and what it is.
+/// One subscriber and its description.
 struct Flow {
     name: String,
     subscriber: RunningPeer,
@@ -74,11 +75,11 @@ impl Flow {
     }
 }
 
-/// Flows between the bridge's host and another one.
+/// Flows between the bridge's host and another host.
 struct Scene {
-    /// Subscribers on the other host, and those that read what it publishes.
+    /// Subscribers on the other host, and subscribers of the topics that it publishes.
     flows: Vec<Flow>,
-    /// Critical subscribers beside the bridge, which no event is to disturb.
+    /// Critical subscribers on the bridge's host, which must receive every sample.
     local: Vec<RunningPeer>,
     scanner: RunningPeer,
     /// The other publishers.
@@ -87,18 +88,18 @@ struct Scene {
 }
 
 impl Scene {
-    /// Starts the flows, some with the bridge and some without. `far` is the other host; `local` are the
-    /// libraries of the subscribers beside the bridge.
+    /// Starts flows with and without the bridge. `far` is the other host; `local` has the libraries of the
+    /// subscribers on the bridge's host.
     fn start(bed: &Bed, far: &str, local: &[Library]) -> Self {
         let scene = Self::start_unmatched(bed, far, local);
         for subscriber in scene.local.iter().chain(scene.flows.iter().map(|flow| &flow.subscriber)) {
-            subscriber.wait_received(AGAIN);
+            subscriber.wait_received(RECOVERY_SAMPLES);
         }
         scene.wait_answered(bed);
         scene
     }
 
-    /// As [`start`](Self::start), and waits only for what is on the bridge's host.
+    /// Like [`start`](Self::start), but waits only for subscribers on the bridge's host.
     fn start_unmatched(bed: &Bed, far: &str, local: &[Library]) -> Self {
         let robot = bed.host("bridge");
         let subscribers = local
@@ -112,7 +113,7 @@ impl Scene {
             publishers: Vec::new(),
             responder: None,
         };
-        // Without the bridge, each library publishes to itself, from where the bridge is.
+        // Without the bridge, each library publishes to itself, from the bridge's host.
         for &library in local {
             let plain = peer(library, "plain_scanner").publisher().topic(&plain_topic(library)).rate_hz(30.0);
             scene.publishers.push(plain.start_on(robot));
@@ -121,8 +122,8 @@ impl Scene {
         scene
     }
 
-    /// Subscribers of both lanes, publishers and a responder on a host; and, of the libraries in `plain`,
-    /// subscribers and publishers without the bridge.
+    /// Adds subscribers of both lanes, publishers and a responder on a host, and for the libraries in `plain`
+    /// also subscribers and publishers without the bridge.
     fn add_far_side(&mut self, bed: &Bed, far: &str, libraries: &[Library], plain: &[Library]) {
         let far = bed.host(far);
         let robot = bed.host("bridge");
@@ -151,39 +152,39 @@ impl Scene {
         self.flows.iter().map(|flow| flow.subscriber.received()).collect()
     }
 
-    /// Waits until the responder's answers arrive.
+    /// Waits until control receives the responder's responses.
     fn wait_answered(&self, bed: &Bed) {
-        bed.bridge.wait_status("answers of the responder", is_answered);
+        bed.bridge.wait_status("responses of the responder", is_answered);
     }
 
     /// Waits until the local subscribers have received so many more samples.
-    fn local_go_on(&self, samples: u64) {
+    fn wait_more_local(&self, samples: u64) {
         for subscriber in &self.local {
             subscriber.wait_received(subscriber.received() + samples);
         }
     }
 
-    /// Calls what ends an event, waits until every subscriber of the bridge is served again and the responder
-    /// answers; prints for each how long that took. What works without the bridge works with it: its
-    /// subscribers have to be served whether the others are or not.
-    fn served_again(&self, bed: &Bed, what: &str, end_event: impl FnOnce()) {
+    /// Calls `end_event`, waits until every subscriber of the bridge receives samples again and the responder
+    /// responds, and prints the time that each took. Subscribers without the bridge are not waited for: the
+    /// bridge must recover even if they do not.
+    fn wait_recovered(&self, bed: &Bed, what: &str, end_event: impl FnOnce()) {
         let before = self.counts();
         end_event();
         let began = Instant::now();
-        let mut served = vec![false; self.flows.len()];
+        let mut recovered = vec![false; self.flows.len()];
         let mut answered = false;
         let print = |name: &str| {
             println!("after {what}: {name}: {:.2} s", began.elapsed().as_secs_f64());
             true
         };
-        support::wait_until(format_args!("all served again after {what}"), || {
+        support::wait_until(format_args!("all subscribers receiving again after {what}"), || {
             let mut is_over = true;
-            for ((flow, before), served) in self.flows.iter().zip(&before).zip(&mut served) {
+            for ((flow, before), recovered) in self.flows.iter().zip(&before).zip(&mut recovered) {
                 let received = flow.subscriber.received() - before;
-                if !*served && received > 0 {
-                    *served = print(&flow.name);
+                if !*recovered && received > 0 {
+                    *recovered = print(&flow.name);
                 }
-                is_over &= received >= AGAIN || !flow.through_bridge;
+                is_over &= received >= RECOVERY_SAMPLES || !flow.through_bridge;
             }
             if !answered && bed.bridge.try_status().as_ref().is_ok_and(is_answered) {
                 answered = print("responder");
@@ -192,21 +193,22 @@ impl Scene {
         });
     }
 
-    /// Ends the flows. Every sample has come to each local subscriber, and to the others in order and once.
+    /// Ends the flows. Asserts that each local subscriber received every sample, and that the others received
+    /// samples in order and without duplicates.
     fn end(self, bed: &Bed) {
         self.end_with(bed, 0);
     }
 
-    /// As [`end`](Self::end), but so many samples may have come twice to a subscriber on the other host.
+    /// Like [`end`](Self::end), but a subscriber on the other host may have received so many duplicates.
     fn end_with(self, bed: &Bed, max_duplicates: u64) {
         let sent: Sent = self.scanner.end();
         for subscriber in self.local {
             subscriber.wait_received(sent.ok);
             subscriber.end::<Received>().assert_all_of(&sent);
         }
-        // Killed: without its interface, Cyclone DDS does not end.
+        // Kills the publishers: without its interface, Cyclone DDS does not end by itself.
         drop(self.publishers);
-        bed.wait_whole();
+        bed.wait_accounted();
         for flow in self.flows {
             let received: Received = flow.subscriber.end();
             if flow.through_bridge {
@@ -236,7 +238,7 @@ fn bed(test: &str) -> Option<Bed> {
     bed_with(test, "", &[])
 }
 
-/// With more configuration and more hosts.
+/// Like [`bed`], with additional configuration and hosts.
 fn bed_with(test: &str, yaml: &str, more: &[&str]) -> Option<Bed> {
     if let Some(reason) = missing() {
         support::skip(test, &reason);
@@ -245,150 +247,153 @@ fn bed_with(test: &str, yaml: &str, more: &[&str]) -> Option<Bed> {
     Bed::start_with(test, &format!("{}{yaml}", routes()), more)
 }
 
-/// A link that is down for so long, first that of the other host, then that of the bridge.
+/// Tests a link that is down for so many seconds: first that of the other host, then that of the bridge.
 fn outage(test: &str, seconds: u64) {
     let Some(bed) = bed(test) else { return };
     let scene = Scene::start(&bed, "slow", &LIBRARIES);
     for host in ["slow", "bridge"] {
         bed.host(host).set_link(false);
         let began = Instant::now();
-        scene.local_go_on(15);
+        scene.wait_more_local(15);
         std::thread::sleep(Duration::from_secs(seconds).saturating_sub(began.elapsed()));
-        let said = problems(&bed);
-        let about_interface = said.iter().any(|problem| problem.starts_with("network interface eth0"));
+        let problems = problems(&bed);
+        let about_interface = problems.iter().any(|problem| problem.starts_with("network interface eth0"));
         let far = bed.host("slow").address().to_string();
-        let about_peer = |what| said.iter().any(|problem| problem.contains(&far) && problem.contains(what));
+        let about_peer =
+            |what| problems.iter().any(|problem| problem.contains(&far) && problem.contains(what));
         if seconds >= 5 {
-            assert_eq!(about_interface, host == "bridge", "{said:#?}");
+            assert_eq!(about_interface, host == "bridge", "{problems:#?}");
             let peer = ["acknowledges no samples", "missed", "has been silent"].into_iter().any(about_peer);
-            assert!(peer, "{said:#?}");
+            assert!(peer, "{problems:#?}");
         }
         if seconds >= 17 {
-            assert!(about_peer("has been silent"), "{said:#?}");
-            assert!(said.iter().any(|problem| problem.contains(RESPONDER)), "{said:#?}");
+            assert!(about_peer("has been silent"), "{problems:#?}");
+            assert!(problems.iter().any(|problem| problem.contains(RESPONDER)), "{problems:#?}");
         }
         let what = format!("{seconds} s without the link of {host}");
-        scene.served_again(&bed, &what, || bed.host(host).set_link(true));
-        wait_nothing_away(&bed);
+        scene.wait_recovered(&bed, &what, || bed.host(host).set_link(true));
+        wait_absences_ended(&bed);
     }
-    // One that comes afterwards is found, so built-in endpoints are served, too.
+    // A subscriber that joins afterwards is discovered, so that built-in endpoints have recovered too.
     let late = bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL);
     late.wait_received(5);
     scene.end(&bed);
     bed.end();
 }
 
-/// What `status` says is wrong, over a second.
+/// The problems in `status` over an interval of one second, without those about intruders.
 fn problems(bed: &Bed) -> Vec<String> {
     let output = bed.bridge.run("status --json --interval-ms 1000");
     let status: Value = serde_json::from_slice(&output.stdout).unwrap();
     let problems = status["problems"].as_array().into_iter().flatten().filter_map(Value::as_str);
-    // Subscribers that bypass the bridge have nothing to do with networks.
+    // Problems about subscribers that bypass the bridge are unrelated to networks.
     let problems = problems.filter(|problem| !problem.contains("bypass"));
     let problems: Vec<String> = problems.map(str::to_owned).collect();
     println!("{problems:#?}");
     problems
 }
 
-/// Waits until `status` says of everything that was away that it is back.
-fn wait_nothing_away(bed: &Bed) {
-    let status = bed.bridge.wait_status("nothing away", |status| {
+/// Waits until `status` shows every absence as ended.
+fn wait_absences_ended(bed: &Bed) {
+    let status = bed.bridge.wait_status("the end of all absences", |status| {
         status["absences"].as_array().unwrap().iter().all(|absence| absence["back_s"].is_number())
     });
-    println!("back: {}", status["absences"]);
+    println!("absences: {}", status["absences"]);
 }
 
-/// Waits until `status` names this interface as away.
-fn wait_away(bed: &Bed, interface: &str) {
-    let is_it = |problem: &Value| {
+/// Waits until `status` has a problem about an absent interface.
+fn wait_absence(bed: &Bed, interface: &str) {
+    let is_absence = |problem: &Value| {
         problem.as_str().is_some_and(|text| text.starts_with(&format!("network interface {interface} ")))
     };
-    bed.bridge
-        .wait_status("an interface away", |status| status["problems"].as_array().unwrap().iter().any(is_it));
+    bed.bridge.wait_status("an absent interface", |status| {
+        status["problems"].as_array().unwrap().iter().any(is_absence)
+    });
 }
 
 #[test]
-fn an_outage_of_1_s_ends_with_the_link() {
-    outage("an_outage_of_1_s_ends_with_the_link", 1);
+fn all_flows_recover_from_an_outage_of_1_s() {
+    outage("all_flows_recover_from_an_outage_of_1_s", 1);
 }
 
 #[test]
-fn an_outage_of_5_s_ends_with_the_link() {
-    outage("an_outage_of_5_s_ends_with_the_link", 5);
+fn all_flows_recover_from_an_outage_of_5_s() {
+    outage("all_flows_recover_from_an_outage_of_5_s", 5);
 }
 
-/// The peers' lease for the bridge ends, that of the bridge for Fast DDS (20 s) does not.
+/// The lease of the bridge's participants expires at the peers; that of Fast DDS (20 s) does not expire at
+/// the bridge.
 #[test]
-fn an_outage_of_17_s_ends_with_the_link() {
-    outage("an_outage_of_17_s_ends_with_the_link", 17);
+fn all_flows_recover_from_an_outage_of_17_s() {
+    outage("all_flows_recover_from_an_outage_of_17_s", 17);
 }
 
-/// 60 s, or as many as `ADAPTIVE_BRIDGE_TEST_OUTAGE_S` says.
+/// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`.
 #[test]
-fn a_long_outage_ends_with_the_link() {
+fn all_flows_recover_from_a_long_outage() {
     let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());
-    outage("a_long_outage_ends_with_the_link", seconds.unwrap_or(60));
+    outage("all_flows_recover_from_a_long_outage", seconds.unwrap_or(60));
 }
 
 /// A laptop that sleeps for longer than every lease: its programs stop, and its link is down. The programs run
 /// again before the link is up.
 #[test]
-fn a_suspended_laptop_is_served_again() {
-    let Some(bed) = bed("a_suspended_laptop_is_served_again") else { return };
+fn all_flows_recover_from_a_suspended_laptop() {
+    let Some(bed) = bed("all_flows_recover_from_a_suspended_laptop") else { return };
     let laptop = bed.host("slow").clone();
     let scene = Scene::start(&bed, "slow", &LIBRARIES);
     laptop.signal_all(Signal::SIGSTOP);
     laptop.set_link(false);
     std::thread::sleep(Duration::from_secs(25));
-    scene.local_go_on(15);
+    scene.wait_more_local(15);
     laptop.signal_all(Signal::SIGCONT);
     std::thread::sleep(Duration::from_secs(1));
-    scene.served_again(&bed, "25 s of suspend", || laptop.set_link(true));
-    wait_nothing_away(&bed);
+    scene.wait_recovered(&bed, "25 s of suspend", || laptop.set_link(true));
+    wait_absences_ended(&bed);
     scene.end(&bed);
     bed.end();
 }
 
 #[test]
-fn another_address_of_the_robot_disturbs_no_local_subscriber_and_is_announced() {
-    let test = "another_address_of_the_robot_disturbs_no_local_subscriber_and_is_announced";
+fn a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_sample() {
+    let test = "a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_sample";
     let Some(bed) = bed(test) else { return };
     let robot = bed.host("bridge").clone();
     let scene = Scene::start(&bed, "slow", &LOOPBACK);
 
     robot.set_address(None);
-    scene.local_go_on(60);
-    wait_away(&bed, "eth0");
+    scene.wait_more_local(60);
+    wait_absence(&bed, "eth0");
     let [a, b, c, d] = robot.address().octets();
     let another = Ipv4Addr::new(a, b, c, d + 100);
-    scene.served_again(&bed, "another address", || robot.set_address(Some(another)));
-    wait_nothing_away(&bed);
-    // What joins now has to find the built-in endpoints at the new address.
+    scene.wait_recovered(&bed, "another address", || robot.set_address(Some(another)));
+    wait_absences_ended(&bed);
+    // A subscriber that joins now must find the built-in endpoints at the new address.
     let late = bed.subscribe("slow", Peer::fast(), CRITICAL);
     late.wait_received(30);
-    // A subscriber that discovers the bridge anew receives again what it had received and whose
-    // acknowledgement was lost with the address.
+    // A subscriber that discovers the bridge again receives a second time the samples whose acknowledgements
+    // were lost with the address.
     scene.end_with(&bed, 3);
     bed.end();
 }
 
 #[test]
-fn an_interface_that_is_deleted_and_made_again_is_used_again() {
-    let test = "an_interface_that_is_deleted_and_made_again_is_used_again";
+fn an_interface_that_is_deleted_and_recreated_is_used_again() {
+    let test = "an_interface_that_is_deleted_and_recreated_is_used_again";
     let Some(bed) = bed(test) else { return };
     let robot = bed.host("bridge").clone();
     let scene = Scene::start(&bed, "slow", &LOOPBACK);
     robot.unplug();
-    scene.local_go_on(60);
-    wait_away(&bed, "eth0");
-    scene.served_again(&bed, "an interface that was deleted", || robot.plug_in());
-    wait_nothing_away(&bed);
+    scene.wait_more_local(60);
+    wait_absence(&bed, "eth0");
+    scene.wait_recovered(&bed, "an interface that was deleted", || robot.plug_in());
+    wait_absences_ended(&bed);
     scene.end(&bed);
     bed.end();
 }
 
-/// Cyclone DDS sends acknowledgements to one of the addresses that a participant announces, the lowest. A
-/// subscriber on it that is behind the second interface needs a lane that uses only that one.
+/// Cyclone DDS sends acknowledgements only to the lowest address that a participant announces. A subscriber
+/// on it behind the second interface therefore needs a lane that uses only that interface.
 #[test]
 fn a_second_interface_reaches_subscribers_behind_it() {
     let test = "a_second_interface_reaches_subscribers_behind_it";
@@ -398,21 +403,21 @@ fn a_second_interface_reaches_subscribers_behind_it() {
     far.unplug();
     bed.up.wait_for_log("network interface wlan0 is not on this host or has no IPv4 address");
     let mut scene = Scene::start(&bed, "slow", &LOOPBACK);
-    wait_away(&bed, "wlan0");
+    wait_absence(&bed, "wlan0");
     bed.host("bridge").connect("wlan0", "192.168.77.1/24", far, "192.168.77.2/24");
     scene.flows.clear();
     scene.publishers.clear();
     scene.add_far_side(&bed, "far", &LOOPBACK, &[]);
     let field = Peer::cyclone().best_effort().subscriber().topic("rt/adaptive_bridge/field/scan");
     scene.flows.push(Flow::new("field", Library::Cyclone, field.start_on(far)));
-    scene.served_again(&bed, "a second interface", || {});
+    scene.wait_recovered(&bed, "a second interface", || {});
     scene.end(&bed);
     bed.end();
 }
 
 #[test]
-fn an_address_that_comes_after_the_bridge_is_used() {
-    let test = "an_address_that_comes_after_the_bridge_is_used";
+fn an_address_that_is_assigned_after_the_start_is_used() {
+    let test = "an_address_that_is_assigned_after_the_start_is_used";
     if let Some(reason) = missing() {
         support::skip(test, &reason);
         return;
@@ -420,7 +425,7 @@ fn an_address_that_comes_after_the_bridge_is_used() {
     let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
     let robot = net.host("bridge").clone();
     robot.set_address(None);
-    // The interface by its name, although it has no address yet.
+    // The interface is configured by name and has no address yet.
     let yaml = format!("instance: {{instance}}\nros: {{networks: [eth0]}}\n{}", routes());
     let bridge = Bridge::new(&yaml);
     let up = bridge.start_on(&robot, "up");
@@ -428,10 +433,10 @@ fn an_address_that_comes_after_the_bridge_is_used() {
     bed.wait_up();
     bed.up.wait_for_log("network interface eth0 is not on this host or has no IPv4 address");
     let scene = Scene::start_unmatched(&bed, "slow", &LOOPBACK);
-    scene.local_go_on(30);
-    wait_away(&bed, "eth0");
-    scene.served_again(&bed, "an address that came late", || robot.set_address(Some(robot.address())));
-    wait_nothing_away(&bed);
+    scene.wait_more_local(30);
+    wait_absence(&bed, "eth0");
+    scene.wait_recovered(&bed, "a late address", || robot.set_address(Some(robot.address())));
+    wait_absences_ended(&bed);
     scene.end(&bed);
     bed.end();
 }

@@ -1,5 +1,5 @@
-//! Subscribers of the critical lane that crash, stop, join and leave, beside subscribers that keep up: ROS 2
-//! nodes (rclpy), Fast DDS and Cyclone DDS. Each event happens to subscribers without the bridge as well.
+//! Subscribers of the critical lane that crash, stop, join and leave, beside subscribers that keep up, on
+//! rclpy, Fast DDS and Cyclone DDS. Each event is applied to a second flow without the bridge as well.
 
 mod support;
 
@@ -17,7 +17,7 @@ const PLAIN: &str = "rt/plain";
 const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
 const RATE_HZ: f64 = 200.0;
 
-/// A bridge on a host of its own, or `None` where the machine lacks what `test` needs.
+/// Starts a bridge on a separate host; `None` if the machine lacks the requirements of `test`.
 fn bed(test: &str) -> Option<Bed> {
     if let Some(reason) = ros::missing() {
         support::skip(test, &reason);
@@ -33,7 +33,7 @@ fn peer(library: Library, node: &str) -> Peer {
     }
 }
 
-/// The same publisher and the same subscribers twice: one flow passes through the bridge, the other does not.
+/// Two flows with the same publisher and subscribers: one through the bridge, one without it.
 struct Scene<'b> {
     bed: &'b Bed,
     flows: [Flow; 2],
@@ -46,8 +46,8 @@ struct Flow {
 }
 
 impl<'b> Scene<'b> {
-    /// Starts both flows, and waits until samples have come to every subscriber. The publishers are rclpy
-    /// nodes with a depth of 1,000 samples, which are 5 s.
+    /// Starts both flows and waits until every subscriber receives samples. The publishers are rclpy nodes
+    /// with a depth of 1,000 samples, which are 5 s.
     fn start(bed: &'b Bed) -> Self {
         let healthy = |topic| -> Vec<RunningPeer> {
             LIBRARIES.map(|library| subscribe(bed, "critical", library, "planner", topic)).into()
@@ -56,8 +56,9 @@ impl<'b> Scene<'b> {
         let bridged = healthy(CRITICAL);
         let plain = healthy(PLAIN);
         let host = bed.host("publisher");
-        // A subscriber on Cyclone DDS counts what precedes a writer's first heartbeat as history. The one of
-        // the bridge matched a writer that has no samples yet.
+        // A VOLATILE subscriber on Cyclone DDS discards samples before a writer's first heartbeat as history,
+        // so that the publisher without the bridge sends a priming sample. The bridge's writer was matched
+        // before it had samples.
         let publishers = [
             publisher("scanner").topic(INPUT).wait_match(1).start_on(host),
             publisher("plain_scanner").topic(PLAIN).wait_match(LIBRARIES.len()).prime().hold().start_on(host),
@@ -70,28 +71,29 @@ impl<'b> Scene<'b> {
         let flows =
             [Flow { publisher, healthy: bridged }, Flow { publisher: plain_publisher, healthy: plain }];
         let scene = Self { bed, flows };
-        scene.go_on(100);
+        scene.wait_more(100);
         scene
     }
 
-    /// Waits until so many more samples have come to every subscriber that keeps up.
-    fn go_on(&self, samples: u64) {
+    /// Waits until every subscriber that keeps up has received so many more samples.
+    fn wait_more(&self, samples: u64) {
         wait_more(self.flows.iter().flat_map(|flow| &flow.healthy), samples);
     }
 
-    /// Starts one more subscriber of each library on another host: those of the bridge, then the others.
+    /// Starts one more subscriber of each library on another host; returns those of the bridge, then the
+    /// others.
     fn join(&self, node: &str) -> [Vec<RunningPeer>; 2] {
         let join = |topic| LIBRARIES.map(|library| subscribe(self.bed, "slow", library, node, topic)).into();
         [CRITICAL, PLAIN].map(join)
     }
 
-    /// Ends both flows: every sample has come to each subscriber that keeps up, through the bridge as without
-    /// it, and the bridge accounts for it.
+    /// Ends both flows. Asserts that each subscriber that keeps up received every sample, with and without
+    /// the bridge, and that the critical lane forwarded every sample.
     fn end(self) {
         let [bridged, plain] = self.flows;
         plain.end();
         let sent = bridged.end();
-        let status = self.bed.wait_whole();
+        let status = self.bed.wait_accounted();
         let critical = critical(&status);
         assert_eq!(critical["received"], sent.ok, "{critical}");
         assert_eq!(critical["forwarded"], sent.ok, "{critical}");
@@ -99,7 +101,7 @@ impl<'b> Scene<'b> {
 }
 
 impl Flow {
-    /// Ends it; every sample has come to each subscriber that keeps up.
+    /// Ends the flow. Asserts that each subscriber that keeps up received every sample.
     fn end(self) -> Sent {
         let sent: Sent = self.publisher.end();
         assert_eq!(sent.failed, 0, "{sent:?}");
@@ -111,7 +113,7 @@ impl Flow {
     }
 }
 
-/// Waits until so many more samples have come to each subscriber.
+/// Waits until each subscriber has received so many more samples.
 fn wait_more<'a>(subscribers: impl IntoIterator<Item = &'a RunningPeer>, samples: u64) {
     let goals = subscribers.into_iter().map(|subscriber| (subscriber, subscriber.received() + samples));
     for (subscriber, goal) in goals.collect::<Vec<_>>() {
@@ -119,7 +121,7 @@ fn wait_more<'a>(subscribers: impl IntoIterator<Item = &'a RunningPeer>, samples
     }
 }
 
-/// A RELIABLE subscriber with room for 1,000 samples; through the bridge it is matched on both sides.
+/// Starts a RELIABLE subscriber with a depth of 1,000 samples; one of the bridge is matched on both sides.
 fn subscribe(bed: &Bed, host: &str, library: Library, node: &str, topic: &str) -> RunningPeer {
     let peer = peer(library, node).keep_last(1000);
     if topic == PLAIN {
@@ -141,15 +143,16 @@ fn killed_critical_subscribers_cost_the_others_no_sample() {
         victim.wait_received(10);
         victim.kill9();
     }
-    // Four times what a writer retains for a subscriber that does not acknowledge, long before a lease ends.
-    scene.go_on(1024);
+    // Four times the samples that a writer retains for a subscriber that does not acknowledge, sent long
+    // before a lease ends.
+    scene.wait_more(1024);
     scene.end();
     bed.end();
 }
 
 #[test]
-fn critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_are_served_again() {
-    let test = "critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_are_served_again";
+fn critical_subscribers_stopped_beyond_their_lease_cost_the_others_no_sample_and_receive_again() {
+    let test = "critical_subscribers_stopped_beyond_their_lease_cost_the_others_no_sample_and_receive_again";
     let Some(bed) = bed(test) else { return };
     let scene = Scene::start(&bed);
     let stopped = scene.join("debugged");
@@ -159,7 +162,7 @@ fn critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_a
     }
     // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
     std::thread::sleep(Duration::from_secs(22));
-    scene.go_on(100);
+    scene.wait_more(100);
     for victim in stopped.iter().flatten() {
         victim.cont();
     }
@@ -174,8 +177,9 @@ fn critical_subscribers_stopped_past_their_lease_cost_the_others_no_sample_and_a
 }
 
 #[test]
-fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_begin_with_the_present() {
-    let test = "twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_begin_with_the_present";
+fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_receive_no_history() {
+    let test =
+        "twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_receive_no_history";
     let Some(bed) = bed(test) else { return };
     let scene = Scene::start(&bed);
     for visit in 0..20 {
@@ -196,14 +200,14 @@ fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and
             }
         }
     }
-    scene.go_on(512);
+    scene.wait_more(512);
     scene.end();
     bed.end();
 }
 
 #[test]
-fn what_a_critical_egress_killed_five_times_forwarded_reached_every_subscriber() {
-    let test = "what_a_critical_egress_killed_five_times_forwarded_reached_every_subscriber";
+fn all_samples_forwarded_by_a_critical_egress_killed_five_times_reach_every_subscriber() {
+    let test = "all_samples_forwarded_by_a_critical_egress_killed_five_times_reach_every_subscriber";
     let Some(bed) = bed(test) else { return };
     let subscribers = LIBRARIES.map(|library| subscribe(&bed, "critical", library, "planner", CRITICAL));
     let publisher = Peer::rclpy("scanner").keep_last(1000).rate_hz(RATE_HZ);
@@ -215,17 +219,18 @@ fn what_a_critical_egress_killed_five_times_forwarded_reached_every_subscriber()
         wait_more(&subscribers, 100);
     }
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher is not held up: {sent:?}");
-    let status = bed.wait_whole();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    let status = bed.wait_accounted();
     let critical = critical(&status);
     let forwarded = critical["forwarded"].as_u64().unwrap();
-    let named: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
-    assert_eq!(forwarded + named, sent.ok, "every sample is forwarded or named: {critical}");
+    let dropped: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
+    assert_eq!(forwarded + dropped, sent.ok, "every sample is forwarded or has a drop reason: {critical}");
     for subscriber in subscribers {
         subscriber.wait_for("the last sample", |event| event["last"] == sent.last);
         let received: Received = subscriber.end();
         received.assert_sound();
-        // What was written before all three were matched again is `no_reader`; some of them have it.
+        // Samples written before all three were matched again count as `no_reader`; some subscribers received
+        // them.
         let no_reader = critical["drops"]["no_reader"].as_u64().unwrap();
         let possible = forwarded..=forwarded + no_reader;
         assert!(possible.contains(&received.received), "{received:?} of {critical}");

@@ -1,5 +1,5 @@
-//! The inputs that fuzzing began with and those that it found, through the functions that are fuzzed. They
-//! are checked here without a fuzzer; `scripts/fuzz.sh` looks for more.
+//! Runs the fuzz targets on their seed inputs and on the failing inputs that fuzzing has found, without a
+//! fuzzer. `scripts/fuzz.sh` searches for more.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[path = "../fuzz/src/lib.rs"]
 mod fuzz;
 
-/// The files of a folder of `fuzz/`; none if there is no such folder.
+/// The input files of a target in a folder of `fuzz/`; empty if the folder does not exist.
 fn inputs(folder: &str, target: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz").join(folder).join(target);
     let mut files: Vec<PathBuf> =
@@ -17,12 +17,12 @@ fn inputs(folder: &str, target: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn no_kept_input_breaks_a_promise() {
+fn no_stored_input_fails() {
     for (name, target) in fuzz::TARGETS {
         let seeds = inputs("seeds", name);
-        assert!(!seeds.is_empty(), "{name} begins with nothing");
+        assert!(!seeds.is_empty(), "{name} has no seeds");
         for path in seeds.into_iter().chain(inputs("regressions", name)) {
-            // Of a failure, it is the last one printed that was at fault.
+            // If the target fails, the last printed path is the failing input.
             println!("{}", path.display());
             target(&fs::read(path).unwrap());
         }
@@ -30,7 +30,7 @@ fn no_kept_input_breaks_a_promise() {
 }
 
 #[test]
-fn every_target_of_the_fuzzer_is_run_here() {
+fn every_fuzz_target_is_tested_here() {
     let manifest = include_str!("../fuzz/Cargo.toml");
     let built: Vec<&str> =
         manifest.split("[[bin]]").skip(1).map(|bin| bin.split('"').nth(1).unwrap()).collect();
@@ -39,7 +39,7 @@ fn every_target_of_the_fuzzer_is_run_here() {
     for folder in ["seeds", "regressions"] {
         for path in inputs(folder, "") {
             let name = path.file_name().unwrap().to_str().unwrap();
-            assert!(run.contains(&name), "{} is of no target", path.display());
+            assert!(run.contains(&name), "{} belongs to no target", path.display());
         }
     }
 }

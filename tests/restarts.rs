@@ -1,5 +1,5 @@
-//! Ingress killed and started again while samples flow: no sample is published twice or after a younger one,
-//! and the account of each publisher names what was lost. Real processes, real signals, real DDS peers.
+//! Restarts of a killed ingress while samples flow: no sample is published twice or out of order, and each
+//! publisher's account counts the lost samples. Uses real processes, signals and DDS peers.
 
 mod support;
 
@@ -12,11 +12,11 @@ use support::ros;
 
 const RATE_HZ: f64 = 200.0;
 const KILLS: usize = 5;
-/// Samples to the subscriber between two kills.
+/// Samples that the subscriber receives between two kills.
 const SAMPLES_BETWEEN: u64 = 300;
 
-/// Kills ingress five times while `publisher` writes at 200 Hz, and checks the accounts. Yields what was
-/// sent, and the route in the status.
+/// Kills ingress five times while `publisher` writes at 200 Hz, and checks the accounts. Returns the
+/// publisher's summary and the route in the status.
 fn kill_ingress_five_times(bed: &Bed, publisher: Peer) -> (Sent, Value) {
     let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(1000), CRITICAL);
     let publisher = bed.publish(publisher.rate_hz(RATE_HZ), INPUT);
@@ -27,19 +27,19 @@ fn kill_ingress_five_times(bed: &Bed, publisher: Peer) -> (Sent, Value) {
         subscriber.wait_received(subscriber.received() + SAMPLES_BETWEEN);
     }
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher is not held up: {sent:?}");
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
     let number = |value: &Value| value.as_u64().unwrap_or_else(|| panic!("{value}"));
-    bed.bridge.wait_status("the last sample, taken", |status| {
+    bed.bridge.wait_status("the last sample received by ingress", |status| {
         let publishers = &status["routes"][0]["publishers"];
         publishers[0]["last_sequence"].as_u64() == Some(sent.ok)
     });
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     let route = status["routes"][0].clone();
     assert_eq!(route["whole"], true, "{route}");
     let [account] = route["publishers"].as_array().unwrap().as_slice() else { panic!("{route}") };
     let before_first = number(&account["first_sequence"]) - 1;
-    let taken = number(&account["received"]);
-    assert_eq!(before_first + taken + number(&account["lost_upstream"]), sent.ok, "{sent:?} {route}");
+    let received = number(&account["received"]);
+    assert_eq!(before_first + received + number(&account["lost_upstream"]), sent.ok, "{sent:?} {route}");
     assert_eq!(account["received"], route["received"], "{route}");
     assert_eq!(account["lost_upstream"], route["lost_upstream"], "{route}");
     assert_eq!(account["repeated"], route["repeated"], "{route}");
@@ -47,7 +47,7 @@ fn kill_ingress_five_times(bed: &Bed, publisher: Peer) -> (Sent, Value) {
     let lane = outputs(&status).find(|output| output["lane"] == "critical").unwrap();
     let forwarded = number(&lane["forwarded"]);
     let dropped: u64 = lane["drops"].as_object().unwrap().values().map(number).sum();
-    assert_eq!(forwarded + dropped, taken, "{lane}");
+    assert_eq!(forwarded + dropped, received, "{lane}");
     subscriber.wait_received(forwarded);
     let received: Received = subscriber.end();
     received.assert_sound();
@@ -69,14 +69,14 @@ fn a_reliable_publisher_is_forwarded_once_and_in_order_when_ingress_is_killed() 
 }
 
 #[test]
-fn what_a_publishers_history_was_too_short_for_is_counted_as_lost_upstream() {
-    let test = "what_a_publishers_history_was_too_short_for_is_counted_as_lost_upstream";
+fn samples_beyond_the_history_of_a_publisher_are_counted_as_lost_upstream() {
+    let test = "samples_beyond_the_history_of_a_publisher_are_counted_as_lost_upstream";
     if let Some(reason) = ros::missing() {
         support::skip(test, &reason);
         return;
     }
     let Some(bed) = Bed::start(test, SCAN) else { return };
-    // Ten samples are 50 ms; ingress is away for longer.
+    // Ten samples are 50 ms; ingress is down for longer.
     let (_, route) = kill_ingress_five_times(&bed, Peer::rclpy("scanner").keep_last(10));
     assert!(route["lost_upstream"].as_u64() > Some(0), "{route}");
     bed.end();

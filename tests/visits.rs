@@ -1,6 +1,6 @@
-//! Subscribers of the critical lane that join and leave at 1 kHz, a hundred of them, on this network and
-//! behind 100 ms of delay: no other subscriber misses or repeats a sample, a VOLATILE visitor begins with the
-//! present, a TRANSIENT_LOCAL one with its history and without a gap behind it.
+//! A hundred subscribers of the critical lane that join and leave (visitors) while samples flow at 1 kHz,
+//! with and without 100 ms of delay. No other subscriber misses or repeats a sample. A VOLATILE visitor
+//! receives no history; a TRANSIENT_LOCAL one receives the history and no gap after it.
 
 mod support;
 
@@ -11,12 +11,13 @@ use support::ros;
 
 const RATE_HZ: f64 = 1_000.0;
 const VISITS: usize = 100;
-/// Visitors that are there at the same time.
+/// Visitors at the same time.
 const AT_ONCE: usize = 4;
-/// Of the history that a lane keeps for late joiners.
+/// Depth of the history that a lane keeps for late joiners.
 const DEPTH: u64 = 50;
 const DELAY: &str = "--level clean --delay-ms 100 --jitter-ms 0 --seed 24";
-/// rclpy takes half a second to start, and Cyclone DDS a fifth of it: most visitors are C++ programs.
+/// The libraries of the visitors. rclpy takes half a second to start, and Cyclone DDS a fifth of that, so
+/// that most visitors are C++ programs.
 const VISITORS: [Library; 8] = [
     Library::Cyclone,
     Library::Fast,
@@ -47,29 +48,33 @@ fn visitor(bed: &Bed, library: Library, durability: Durability) -> RunningPeer {
     bed.subscribe("slow", peer, CRITICAL)
 }
 
-/// Starts [`AT_ONCE`] visitors; half of them leave in due form, the others are killed. Of a lane that keeps
-/// its history two of three visitors want it.
+/// Starts [`AT_ONCE`] visitors; half of them leave normally, the others are killed. On a TRANSIENT_LOCAL lane
+/// two of three visitors are TRANSIENT_LOCAL.
 fn visit(bed: &Bed, lane: Durability, batch: usize, published: &RunningPeer) {
     let before = published.received();
     let visitors: Vec<_> = (0..AT_ONCE)
         .map(|place| {
             let number = batch * AT_ONCE + place;
-            let wants = if number.is_multiple_of(3) { Durability::Volatile } else { lane };
-            (number, wants, visitor(bed, VISITORS[number % VISITORS.len()], wants))
+            let requested = if number.is_multiple_of(3) { Durability::Volatile } else { lane };
+            (number, requested, visitor(bed, VISITORS[number % VISITORS.len()], requested))
         })
         .collect();
-    for (number, wants, mut visitor) in visitors {
+    for (number, requested, mut visitor) in visitors {
         visitor.wait_received(DEPTH + 10);
-        // Neighbours in the list are not of the same library.
+        // Both killed and leaving visitors are of all libraries.
         if (number / 2).is_multiple_of(2) {
             visitor.kill9();
             continue;
         }
         let received: Received = visitor.end();
         received.assert_sound();
-        assert_eq!(received.missing_count, 0, "a gap, {wants:?} visitor {number}: {received:?}");
-        let oldest = if wants == Durability::TransientLocal { before.saturating_sub(DEPTH) } else { before };
-        assert!(received.first >= Some(oldest), "{wants:?} visitor {number} after {before}: {received:?}");
+        assert_eq!(received.missing_count, 0, "a gap, {requested:?} visitor {number}: {received:?}");
+        let oldest =
+            if requested == Durability::TransientLocal { before.saturating_sub(DEPTH) } else { before };
+        assert!(
+            received.first >= Some(oldest),
+            "{requested:?} visitor {number} after {before}: {received:?}"
+        );
     }
 }
 
@@ -84,8 +89,8 @@ fn visits(test: &str, lane: Durability, delay: Option<&str>) {
          lanes:\n  critical: {{queue_depth: 1024, window_samples: 4096}}\n"
     );
     let Some(bed) = Bed::start(test, &yaml) else { return };
-    // What is tested is not whether the machine has time for a hundred programs to start: the lane and the
-    // subscribers have room for four seconds.
+    // Starting a hundred programs delays the others on the machine, so that the lane and the subscribers have
+    // room for four seconds.
     let healthy = [Library::Rclpy, Library::Fast, Library::Cyclone]
         .map(|library| bed.subscribe("critical", peer(library, "planner").keep_last(4_000), CRITICAL));
     let publisher = Peer::cyclone().keep_last(4_000).rate_hz(RATE_HZ);
@@ -98,17 +103,17 @@ fn visits(test: &str, lane: Durability, delay: Option<&str>) {
     drop(link);
 
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "no call of the publisher waited in vain: {sent:?}");
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
     for subscriber in healthy {
         subscriber.wait_received(sent.ok);
         subscriber.end::<Received>().assert_all_of(&sent);
     }
-    let status = bed.wait_whole();
+    let status = bed.wait_accounted();
     let critical = outputs(&status).find(|output| output["lane"] == "critical").unwrap();
     assert_eq!(critical["forwarded"], sent.ok, "{critical}");
     println!("{} samples, reader_overrun {}", sent.ok, critical["reader_overrun"]);
 
-    // Now that nothing is written a late joiner gets the history alone, and all of it.
+    // After the last sample a late joiner receives exactly the history.
     if lane == Durability::TransientLocal {
         for library in [Library::Rclpy, Library::Fast, Library::Cyclone] {
             let late = visitor(&bed, library, lane);
@@ -132,19 +137,19 @@ fn a_hundred_visits_at_1_khz_cost_the_others_no_sample() {
 }
 
 #[test]
-fn a_hundred_visits_behind_100_ms_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_behind_100_ms_cost_the_others_no_sample";
+fn a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample() {
+    let test = "a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample";
     visits(test, Durability::Volatile, Some(DELAY));
 }
 
 #[test]
-fn a_hundred_visits_to_a_history_at_1_khz_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_to_a_history_at_1_khz_cost_the_others_no_sample";
+fn a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample() {
+    let test = "a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample";
     visits(test, Durability::TransientLocal, None);
 }
 
 #[test]
-fn a_hundred_visits_to_a_history_behind_100_ms_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_to_a_history_behind_100_ms_cost_the_others_no_sample";
+fn a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample() {
+    let test = "a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample";
     visits(test, Durability::TransientLocal, Some(DELAY));
 }

@@ -1,4 +1,4 @@
-//! A bridge on a host of its own, between a host with the publisher and hosts with the subscribers.
+//! A test bed: a bridge on a separate host, between a host with the publisher and hosts with the subscribers.
 
 use serde_json::Value;
 
@@ -7,18 +7,20 @@ use super::netns::{Host, Net};
 use super::peer::{Peer, Received, RunningPeer};
 use super::process::Process;
 
-/// The configuration of one LaserScan route, whose type is given, so that every writer is there from the
+/// The configuration of one LaserScan route. The type is configured, so that all writers exist from the
 /// start.
 pub const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
                         max_sample_bytes: 65536}\n";
-/// The DDS type of it.
+/// The DDS type of the route.
 pub const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
-/// Its DDS topics.
+/// The DDS topic of the route's input.
 pub const INPUT: &str = "rt/scan";
+/// The DDS topic of the route's critical output.
 pub const CRITICAL: &str = "rt/adaptive_bridge/critical/scan";
+/// The DDS topic of the route's noncritical output.
 pub const NONCRITICAL: &str = "rt/adaptive_bridge/noncritical/scan";
 
-/// A running bridge and the hosts around it. Fields are dropped in this order: processes before their hosts.
+/// A running bridge and the hosts around it. The order of the fields drops processes before their hosts.
 pub struct Bed {
     pub up: Process,
     pub bridge: Bridge,
@@ -26,13 +28,13 @@ pub struct Bed {
 }
 
 impl Bed {
-    /// Starts a bridge with this configuration, but for its instance name; records that `test` is skipped
-    /// where the machine can't.
+    /// Starts a bridge with the configuration `yaml`, to which the instance name is added. Returns `None` and
+    /// records that `test` is skipped if the machine lacks the requirements.
     pub fn start(test: &str, yaml: &str) -> Option<Self> {
         Self::start_with(test, yaml, &[])
     }
 
-    /// As [`start`](Self::start), with more hosts beside the four.
+    /// Like [`start`](Self::start), with more hosts than the default four.
     pub fn start_with(test: &str, yaml: &str, more: &[&str]) -> Option<Self> {
         if let Some(reason) = super::testbed_missing() {
             super::skip(test, &reason);
@@ -46,7 +48,7 @@ impl Bed {
         Some(bed)
     }
 
-    /// Waits until ingress and the two fixed lanes are up.
+    /// Waits until ingress and the two default lanes are up.
     pub fn wait_up(&self) {
         for role in ["ingress is up", "egress is up lane=\"critical\"", "egress is up lane=\"noncritical\""] {
             self.up.wait_for_log(role);
@@ -57,11 +59,12 @@ impl Bed {
         self.net.host(name)
     }
 
-    /// A subscriber on a host, matched on both sides: each end learns of the other by itself, and what is
-    /// written before the writer knows of a reader is not for that reader.
+    /// Starts a subscriber on a host and waits until reader and writer have matched each other. Each side
+    /// discovers the other independently, and a VOLATILE reader does not receive samples written before the
+    /// writer matched it.
     pub fn subscribe(&self, host: &str, peer: Peer, topic: &str) -> RunningPeer {
         let (route, lane) = self.output(topic);
-        // Not by the number of readers: one that has just ended may still be counted.
+        // Counts log messages instead of readers: a reader that has just ended may still be counted.
         let joined = || {
             let log = self.up.log();
             let of_output = format!("readers changed route={route} lane={lane} ");
@@ -74,7 +77,7 @@ impl Bed {
         subscriber
     }
 
-    /// Route and lane of a DDS topic of the bridge, in quotes.
+    /// The route and the lane of an output's DDS topic, as JSON strings.
     fn output(&self, topic: &str) -> (Value, Value) {
         let status = self.bridge.status();
         for route in status["routes"].as_array().into_iter().flatten() {
@@ -84,37 +87,37 @@ impl Bed {
                 }
             }
         }
-        panic!("{topic} in {status}")
+        panic!("no output {topic} in {status}")
     }
 
-    /// A publisher that begins when ingress reads it.
+    /// Starts a publisher that publishes its first sample when ingress has matched it.
     pub fn publish(&self, peer: Peer, topic: &str) -> RunningPeer {
         peer.publisher().topic(topic).wait_match(1).start_on(self.host("publisher"))
     }
 
-    /// Waits until each lane accounts for each sample, and none waits; yields the status.
-    pub fn wait_whole(&self) -> Value {
+    /// Waits until every lane accounts for every sample and none waits; returns the status.
+    pub fn wait_accounted(&self) -> Value {
         if self.bridge.try_status().is_err() {
             return Value::Null;
         }
-        self.bridge.wait_status("every lane whole and quiet", is_whole_and_quiet)
+        self.bridge.wait_status("all samples accounted for, none waiting", is_accounted_and_idle)
     }
 
-    /// The process ids of a child of `up`, oldest first: `ingress`, `egress-critical`, …
+    /// The process ids that a child of `up` (`ingress`, `egress-critical`, …) has had, oldest first.
     pub fn pids(&self, child: &str) -> Vec<i32> {
-        let mark = format!("started child=\"{child}\" pid=");
+        let marker = format!("started child=\"{child}\" pid=");
         let log = self.up.log();
         log.lines()
-            .filter_map(|line| line.split(&mark).nth(1)?.split_whitespace().next()?.parse().ok())
+            .filter_map(|line| line.split(&marker).nth(1)?.split_whitespace().next()?.parse().ok())
             .collect()
     }
 
-    /// The process id of the present child of that name.
+    /// The current process id of a child of `up`.
     pub fn pid(&self, child: &str) -> i32 {
         *self.pids(child).last().unwrap_or_else(|| panic!("{child} was never started\n{}", self.up.log()))
     }
 
-    /// Asks the bridge to end, and checks that it does so as it should.
+    /// Terminates the bridge and asserts that it ends successfully.
     pub fn end(mut self) {
         let status = self.up.terminate();
         assert!(status.success(), "up ended with {status}\n{}", self.up.log());
@@ -125,26 +128,26 @@ impl Drop for Bed {
     fn drop(&mut self) {
         if std::thread::panicking() {
             match self.bridge.try_status() {
-                Ok(status) => eprintln!("--- what the bridge counted: {}\n---", status["routes"]),
+                Ok(status) => eprintln!("--- counters of the bridge: {}\n---", status["routes"]),
                 Err(error) => eprintln!("--- no status of the bridge: {error}"),
             }
         }
     }
 }
 
-/// Whether every lane accounts for every sample of every route, and none waits.
-pub fn is_whole_and_quiet(status: &Value) -> bool {
+/// Whether every lane accounts for every sample of every route and none waits.
+pub fn is_accounted_and_idle(status: &Value) -> bool {
     let mut outputs = outputs(status).peekable();
     outputs.peek().is_some() && outputs.all(|output| output["whole"] == true && output["waiting"] == 0)
 }
 
-/// Each lane of each route in a status.
+/// Iterates over the outputs (lanes of all routes) in a status.
 pub fn outputs(status: &Value) -> impl Iterator<Item = &Value> {
     let routes = status["routes"].as_array().into_iter().flatten();
     routes.flat_map(|route| route["lanes"].as_array().into_iter().flatten())
 }
 
-/// What a subscriber missed from sample `first` on.
+/// The gaps of a subscriber from sample `first` on.
 pub fn missing_from(received: &Received, first: u64) -> Vec<(u64, u64)> {
     received.missing.iter().copied().filter(|(_, last)| *last >= first).collect()
 }

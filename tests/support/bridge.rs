@@ -1,4 +1,4 @@
-//! The program under test, run as a user runs it: its binary, a configuration file, its command line.
+//! Runs the program under test as a user does: the binary with a configuration file and arguments.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -12,23 +12,23 @@ use tempfile::TempDir;
 use super::netns::Host;
 use super::process::Process;
 
-/// The binary.
+/// The path of the `adaptive-bridge` binary.
 pub fn program() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_adaptive-bridge"))
 }
 
-/// One bridge: an instance name, and a folder with its configuration file.
+/// One bridge: an instance name and a folder with its configuration file.
 ///
-/// Declare it before its processes: they are killed when they are dropped and leave their shared memory
-/// behind, which is removed with the bridge.
+/// Declare it before its processes: dropping a process kills it and leaves its shared memory behind, which
+/// dropping the bridge removes.
 pub struct Bridge {
     instance: String,
     folder: TempDir,
 }
 
 impl Bridge {
-    /// A bridge of its own, not started yet. In `yaml`, `{instance}` becomes a name that no other bridge has,
-    /// and `{folder}` the folder of the file, which is removed with the bridge.
+    /// Creates a bridge without starting it. In `yaml`, `{instance}` is replaced by a unique instance name,
+    /// and `{folder}` by the folder of the configuration file, which is removed with the bridge.
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -38,24 +38,24 @@ impl Bridge {
         bridge
     }
 
-    /// Writes the configuration file anew, as [`Bridge::new`] does.
+    /// Rewrites the configuration file, with the same replacements as [`Bridge::new`].
     pub fn write_config(&self, yaml: &str) {
         let folder = self.folder().display().to_string();
         let yaml = yaml.replace("{instance}", &self.instance).replace("{folder}", &folder);
         std::fs::write(self.config(), yaml).unwrap();
     }
 
-    /// Its instance name.
+    /// The instance name.
     pub fn instance(&self) -> &str {
         &self.instance
     }
 
-    /// Its folder.
+    /// The folder of the configuration file.
     pub fn folder(&self) -> &Path {
         self.folder.path()
     }
 
-    /// Its configuration file.
+    /// The path of the configuration file.
     pub fn config(&self) -> PathBuf {
         self.folder().join("bridge.yaml")
     }
@@ -67,7 +67,7 @@ impl Bridge {
         command
     }
 
-    /// Starts a role on a host; `arguments` such as `up`, `ingress`, `egress --lane critical`.
+    /// Starts a role on a host, with arguments such as `up`, `ingress`, `egress --lane critical`.
     pub fn start_on(&self, host: &Host, arguments: &str) -> Process {
         let command = self.complete(host.command(program()), arguments);
         Process::spawn(&format!("adaptive-bridge {arguments} on {}", host.name()), command)
@@ -79,28 +79,28 @@ impl Bridge {
         Process::spawn(&format!("adaptive-bridge {arguments}"), command)
     }
 
-    /// Runs a subcommand to its end, such as `check` or `mode rviz suspended`.
+    /// Runs a subcommand such as `check` or `mode rviz suspended` and waits for its end.
     pub fn run(&self, arguments: &str) -> Output {
         self.complete(Command::new(program()), arguments).output().unwrap()
     }
 
-    /// What `status --json` says; an error is what it wrote instead. It reads shared memory, so it needs no
-    /// host.
+    /// The output of `status --json`, or an error with its stderr. It reads shared memory and therefore runs
+    /// outside the bridge's host.
     pub fn try_status(&self) -> Result<Value, String> {
         let output = self.run("status --json --interval-ms 50");
-        let said = || String::from_utf8_lossy(&output.stderr).into_owned();
+        let stderr = || String::from_utf8_lossy(&output.stderr).into_owned();
         if !output.status.success() {
-            return Err(format!("{}: {}", output.status, said()));
+            return Err(format!("{}: {}", output.status, stderr()));
         }
-        serde_json::from_slice(&output.stdout).map_err(|error| format!("{error}: {}", said()))
+        serde_json::from_slice(&output.stdout).map_err(|error| format!("{error}: {}", stderr()))
     }
 
-    /// What `status --json` says.
+    /// The output of `status --json`; panics if it fails.
     pub fn status(&self) -> Value {
         self.try_status().unwrap_or_else(|error| panic!("status of {}: {error}", self.instance))
     }
 
-    /// Waits until the status fulfils a condition; yields it.
+    /// Waits until the status fulfils a condition; returns that status.
     pub fn wait_status(&self, what: &str, mut fulfilled: impl FnMut(&Value) -> bool) -> Value {
         let deadline = Instant::now() + super::patience();
         loop {
@@ -110,7 +110,7 @@ impl Bridge {
             {
                 return status.clone();
             }
-            assert!(Instant::now() < deadline, "waited in vain for: {what}; the last status: {status:?}");
+            assert!(Instant::now() < deadline, "timed out waiting for: {what}; the last status: {status:?}");
             std::thread::sleep(Duration::from_millis(50));
         }
     }
@@ -124,7 +124,7 @@ impl Drop for Bridge {
                 let _ = std::fs::remove_file(entry.path());
             }
         }
-        // Where the configuration names no root below the bridge's own folder.
+        // For a configuration whose root path is not inside the bridge's folder.
         let root = default_root(None, |name| std::env::var_os(name));
         let _ = std::fs::remove_dir_all(root.join(&self.instance));
     }

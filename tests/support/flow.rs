@@ -1,5 +1,5 @@
-//! A flow of 200 numbered samples per second through a bridge of one route, `/scan`, from a publisher to a
-//! subscriber of each lane, all of this process.
+//! A flow of 200 numbered samples per second through a bridge with one route, `/scan`, from a publisher to
+//! one subscriber of each lane, all in the test's own process.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,7 +17,7 @@ use super::wait_until;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
-/// A subscriber of each lane, and a publisher that has begun when the bridge has matched all three.
+/// A subscriber of each lane and a publisher, which publishes from when the bridge has matched all three.
 pub struct Flow {
     reader: RawReader,
     _noncritical: RawReader,
@@ -28,12 +28,12 @@ pub struct Flow {
 }
 
 impl Flow {
-    /// Starts it. `join` opens a participant of that name in the bridge's network.
+    /// Starts the flow. `join` opens a participant of a given name in the bridge's network.
     pub fn start(bridge: &Bridge, join: impl Fn(&str) -> Participant) -> Self {
         let mut publisher = join("publisher");
         let writer: RawWriter =
             publisher.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
-        wait_until("ingress to match the publisher", || {
+        wait_until("ingress matched by the publisher", || {
             matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
         });
         let mut subscriber = join("subscriber");
@@ -51,17 +51,17 @@ impl Flow {
             ["critical", "noncritical"].iter().all(|name| lane(status, name)["readers"] == 1)
         });
         let stop = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&stop);
+        let is_stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             let mut number = 0_u32;
-            while !asked.load(Ordering::Relaxed) {
+            while !is_stopped.load(Ordering::Relaxed) {
                 let payload = [number.to_le_bytes(), [0; 4]].concat();
                 let stamp = SourceTimestamp::from_wall(clock::wall());
                 writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
                 number += 1;
                 std::thread::sleep(Duration::from_millis(5));
             }
-            // Until the last one has been acknowledged, the writer must stay.
+            // Keeps the writer until the last sample is acknowledged.
             writer.wait_acknowledged(super::patience());
             number
         });
@@ -76,38 +76,38 @@ impl Flow {
         }
     }
 
-    /// Takes what has come; how many samples it is so far.
+    /// Takes the samples that have arrived; returns the number of samples received so far.
     pub fn received(&mut self) -> usize {
         let received = &mut self.received;
-        let mut lend = |payload: &[u8], _| {
+        let mut on_sample = |payload: &[u8], _| {
             received.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
         };
-        while self.reader.take(&mut lend) != Take::Empty {}
+        while self.reader.take(&mut on_sample) != Take::Empty {}
         self.received.len()
     }
 
-    /// Waits until that many more samples have come.
+    /// Waits until so many more samples have arrived.
     pub fn wait_more(&mut self, samples: usize) {
         let before = self.received();
         wait_until("samples at the critical subscriber", || self.received() >= before + samples);
     }
 
-    /// Ends the flow: every sample has reached the critical subscriber, in order, and the bridge can account
-    /// for each on both lanes.
+    /// Ends the flow. Asserts that the critical subscriber received every sample in order, and that the
+    /// bridge accounts for each sample on both lanes.
     pub fn end_whole(mut self, bridge: &Bridge) -> Value {
         let sent = self.stop();
         wait_until("every sample at the critical subscriber", || self.received() >= sent as usize);
         assert_eq!(self.received, (0..sent).collect::<Vec<_>>());
-        let status = accounted(bridge, sent);
+        let status = wait_accounted(bridge, sent);
         assert_eq!(lane(&status, "critical")["forwarded"], sent, "{status}");
         status
     }
 
-    /// Ends a flow of which the bridge was to stop a part: what reached the critical subscriber is in order,
-    /// and the bridge can account for each sample on both lanes.
+    /// Ends a flow that the bridge stopped for a part of the time. Asserts that the samples at the critical
+    /// subscriber are in order, and that the bridge accounts for each sample on both lanes.
     pub fn end_accounted(mut self, bridge: &Bridge) -> Value {
         let sent = self.stop();
-        let status = accounted(bridge, sent);
+        let status = wait_accounted(bridge, sent);
         let forwarded = lane(&status, "critical")["forwarded"].as_u64().unwrap();
         wait_until("every forwarded sample", || self.received() as u64 >= forwarded);
         assert!(self.received.is_sorted_by(|one, next| one < next), "{:?}", self.received);
@@ -127,7 +127,9 @@ impl Drop for Flow {
     }
 }
 
-fn accounted(bridge: &Bridge, sent: u32) -> Value {
+/// Waits until both lanes have settled all samples and asserts that they account for each; returns the
+/// status.
+fn wait_accounted(bridge: &Bridge, sent: u32) -> Value {
     let status = bridge.wait_status("every sample accounted for", |status| {
         let settled = |name| {
             let lane = lane(status, name);
@@ -142,7 +144,7 @@ fn accounted(bridge: &Bridge, sent: u32) -> Value {
     status
 }
 
-/// What a status says of a lane of the first route.
+/// The output of a lane of the first route in a status.
 pub fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
     let lanes = status["routes"][0]["lanes"].as_array().unwrap();
     lanes.iter().find(|lane| lane["lane"] == name).unwrap()

@@ -1,5 +1,5 @@
-//! A machine with a systemd of its own, in a container of systemd-nspawn: this machine's files, below a layer
-//! that is gone with it; its own processes, `/dev/shm` and users; the network of a [`Host`].
+//! A test machine with its own systemd, in a systemd-nspawn container: this machine's files below a temporary
+//! overlay; its own processes, `/dev/shm` and users; the network of a [`Host`].
 
 use std::fmt::Write as _;
 use std::fs;
@@ -18,18 +18,19 @@ use super::netns::Host;
 use super::process::Process;
 use super::{bridge, netns, wait_for, wait_until};
 
-/// The hierarchies in which a container of systemd needs a control group of its own.
+/// The hierarchies in which a container with systemd needs its own control group.
 const CGROUPS: [&str; 2] = ["/sys/fs/cgroup/systemd", "/sys/fs/cgroup/unified"];
 
-/// Those of version 1 in which it limits what services take. Without them it may have real-time processes:
-/// with `RT_GROUP_SCHED` a control group for the CPU has no time for those.
+/// The version 1 hierarchies with which systemd limits the resources of services. They are only used on
+/// request: with `RT_GROUP_SCHED` a CPU control group has no real-time budget, so that real-time processes
+/// fail in it.
 const LIMITING: [&str; 3] = ["/sys/fs/cgroup/cpu", "/sys/fs/cgroup/cpuacct", "/sys/fs/cgroup/memory"];
 
-/// systemd shuts down in order (systemd(1): SIGRTMIN+4).
+/// The signal that makes systemd shut down in order (systemd(1): SIGRTMIN+4).
 const POWER_OFF: &str = "RTMIN+4";
 
-/// What runs between the start and systemd-nspawn: in a mount namespace of its own, so that its mounts go
-/// with it.
+/// The shell script that prepares the root directory and starts systemd-nspawn. It runs in its own mount
+/// namespace, which removes its mounts when it ends.
 const PREPARE: &str = "\
 set -e
 mount -t tmpfs -o mode=755 tmpfs $1
@@ -42,22 +43,23 @@ for group in $3; do mkdir -p $group; echo $$ >$group/cgroup.procs; done
 exec systemd-nspawn --quiet --machine=$5 --directory=$1/root --network-namespace-path=$4 --register=no --keep-unit \
     --resolv-conf=off --timezone=off --link-journal=no --console=pipe --boot -- --unit=basic.target";
 
-/// Why no such machine can be had here.
+/// Returns why a test machine cannot be started here.
 fn missing() -> Option<String> {
     netns::requires_root().or_else(|| {
-        let runs =
+        let is_installed =
             |program: &str| Command::new(program).arg("--version").stdout(Stdio::null()).status().is_ok();
-        let lacking = ["systemd-nspawn", "systemd-analyze"].into_iter().find(|program| !runs(program));
+        let lacking =
+            ["systemd-nspawn", "systemd-analyze"].into_iter().find(|program| !is_installed(program));
         lacking.map(|program| format!("{program} is not installed (make setup)"))
     })
 }
 
-/// Why tests with machines can't run here.
+/// Returns why tests with test machines cannot run here.
 pub fn machine_missing() -> Option<String> {
     super::testbed_missing().or_else(missing)
 }
 
-/// A running machine. Dropping it switches it off.
+/// A running test machine. Dropping it powers it off.
 pub struct Machine {
     nspawn: Process,
     leader: i32,
@@ -66,15 +68,15 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// Boots a machine on a host. `stage` puts files into a folder that becomes part of its root.
+    /// Boots a machine on a host. `stage` adds files to a folder that becomes part of its root directory.
     pub fn boot(host: &Host, stage: &dyn Fn(&Path)) -> Machine {
         Self::boot_in(host, &CGROUPS, stage)
     }
 
-    /// As [`boot`](Self::boot), with limits on CPU and memory that bite.
+    /// Like [`boot`](Self::boot), with working limits on CPU and memory.
     pub fn boot_with_limits(host: &Host, stage: &dyn Fn(&Path)) -> Machine {
         let machine = Self::boot_in(host, &[CGROUPS.as_slice(), &LIMITING].concat(), stage);
-        // nspawn leaves these to be looked at only.
+        // systemd-nspawn mounts these read-only.
         for hierarchy in LIMITING.iter().filter(|path| Path::new(path).is_dir()) {
             machine.run(&["mount", "-o", "remount,bind,rw", hierarchy]);
         }
@@ -85,8 +87,8 @@ impl Machine {
     fn boot_in(host: &Host, hierarchies: &[&str], stage: &dyn Fn(&Path)) -> Machine {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let folder = tempfile::tempdir().unwrap();
-        let [disk, staged] = ["disk", "staged"].map(|name| folder.path().join(name));
-        fs::create_dir(&disk).unwrap();
+        let [overlay, staged] = ["overlay", "staged"].map(|name| folder.path().join(name));
+        fs::create_dir(&overlay).unwrap();
         fs::create_dir(&staged).unwrap();
         stage(&staged);
         let name = format!("ab-{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
@@ -98,18 +100,23 @@ impl Machine {
         });
         let mut command = Command::new("unshare");
         command.args(["--mount", "--propagation", "private", "sh", "-c", PREPARE, "sh"]);
-        command.arg(&disk).arg(&staged).arg(groups).arg(format!("/run/netns/{}", host.namespace())).arg(name);
+        command
+            .arg(&overlay)
+            .arg(&staged)
+            .arg(groups)
+            .arg(format!("/run/netns/{}", host.namespace()))
+            .arg(name);
         let nspawn = Process::spawn("systemd-nspawn", command);
         let leader = wait_for("the first process of the machine", || child_of(nspawn.pid().as_raw()));
         let machine = Machine { nspawn, leader, cgroups, _folder: folder };
-        wait_until("a machine that has booted", || {
+        wait_until("the machine to boot", || {
             let state = machine.try_run(&["systemctl", "is-system-running"]);
             matches!(String::from_utf8_lossy(&state.stdout).trim(), "running" | "degraded")
         });
         machine
     }
 
-    /// A command that will run in the machine.
+    /// Makes a command that will run in the machine.
     pub fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new("nsenter");
         command
@@ -119,41 +126,42 @@ impl Machine {
         command
     }
 
-    /// Runs a program to its end, whatever its exit code.
+    /// Runs a program and waits for its end, without checking its exit code.
     pub fn try_run(&self, arguments: &[&str]) -> Output {
         self.command(arguments).output().unwrap()
     }
 
-    /// Runs a program to its end, which must be a good one; yields what it prints.
+    /// Runs a program, asserts that it succeeds, and returns its stdout.
     pub fn run(&self, arguments: &[&str]) -> String {
         let output = self.try_run(arguments);
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success(), "{arguments:?}: {}\n{said}", output.status);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{arguments:?}: {}\n{stderr}", output.status);
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Writes a file.
+    /// Writes a file in the machine.
     pub fn write(&self, path: &str, text: &str) {
         let mut command = self.command(&["tee", path]);
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
         child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
-        assert!(child.wait().unwrap().success(), "{path} can't be written");
+        assert!(child.wait().unwrap().success(), "{path} cannot be written");
     }
 
-    /// A property of a unit, as `systemctl show` has it.
+    /// A property of a unit, from `systemctl show`.
     pub fn property(&self, unit: &str, property: &str) -> String {
         self.run(&["systemctl", "show", "--property", property, "--value", unit]).trim().to_owned()
     }
 
-    /// Waits until a property of a unit has a value; shows the unit and its log when it does not get it.
+    /// Waits until a property of a unit has a value; panics with the unit's status and log after
+    /// [`patience`](super::patience).
     pub fn wait_property(&self, unit: &str, property: &str, value: &str) {
         let deadline = std::time::Instant::now() + super::patience();
         while self.property(unit, property) != value {
             if std::time::Instant::now() > deadline {
                 let status = self.try_run(&["systemctl", "status", "--lines=40", unit]);
-                let is = self.property(unit, property);
+                let actual = self.property(unit, property);
                 panic!(
-                    "{property} of {unit} is {is}, not {value}\n{}",
+                    "{property} of {unit} is {actual}, not {value}\n{}",
                     String::from_utf8_lossy(&status.stdout)
                 );
             }
@@ -161,25 +169,26 @@ impl Machine {
         }
     }
 
-    /// The main process of a unit, by its number in the machine.
+    /// The process id of a unit's main process, inside the machine.
     pub fn main_pid(&self, unit: &str) -> String {
         self.property(unit, "MainPID")
     }
 
-    /// Stops one thread of the main process of a unit, by the beginning of its name, while the others go on.
-    /// Until the calling thread ends, which traces it.
+    /// Stops one thread of a unit's main process, found by the beginning of its name, while the others go on.
+    /// The calling thread traces it: it stays stopped until the calling thread ends.
     pub fn freeze_thread(&self, unit: &str, name: &str) {
         let pid = self.main_pid(unit);
-        let own = fs::read_link(format!("/proc/{}/ns/pid", self.leader)).unwrap();
-        // Its number outside the machine, which is the first of those that it has.
+        let own_namespace = fs::read_link(format!("/proc/{}/ns/pid", self.leader)).unwrap();
+        // Searches /proc outside the machine; the last entry of `NSpid` is the process id inside.
         let processes = fs::read_dir("/proc").unwrap().flatten().map(|entry| entry.path());
-        let is_it = |process: &PathBuf| {
+        let is_main_process = |process: &PathBuf| {
             let status = fs::read_to_string(process.join("status")).unwrap_or_default();
             let numbers = status.lines().find_map(|line| line.strip_prefix("NSpid:")).unwrap_or_default();
             numbers.split_whitespace().last() == Some(&pid)
-                && fs::read_link(process.join("ns/pid")).is_ok_and(|namespace| namespace == own)
+                && fs::read_link(process.join("ns/pid")).is_ok_and(|namespace| namespace == own_namespace)
         };
-        let process = processes.into_iter().find(is_it).unwrap_or_else(|| panic!("{unit} has no process"));
+        let process =
+            processes.into_iter().find(is_main_process).unwrap_or_else(|| panic!("{unit} has no process"));
         let threads = fs::read_dir(process.join("task")).unwrap().flatten().map(|entry| entry.path());
         let is_named = |thread: &PathBuf| {
             fs::read_to_string(thread.join("comm")).is_ok_and(|thread_name| thread_name.starts_with(name))
@@ -187,18 +196,18 @@ impl Machine {
         let thread =
             threads.into_iter().find(is_named).unwrap_or_else(|| panic!("{unit} has no thread {name}"));
         let thread: i32 = thread.file_name().unwrap().to_str().unwrap().parse().unwrap();
-        let nothing = std::ptr::null_mut::<nix::libc::c_void>();
-        // SAFETY: attaching passes no memory to the kernel; nix has the call only with a feature of its own.
-        let attached = unsafe { nix::libc::ptrace(nix::libc::PTRACE_ATTACH, thread, nothing, nothing) };
+        let null = std::ptr::null_mut::<nix::libc::c_void>();
+        // SAFETY: attaching passes no memory to the kernel. nix has this call only behind a separate feature.
+        let attached = unsafe { nix::libc::ptrace(nix::libc::PTRACE_ATTACH, thread, null, null) };
         assert_eq!(attached, 0, "{}", std::io::Error::last_os_error());
-        // A traced thread that has died is its tracer's to bury, and the process is not gone before.
+        // The tracer has to reap a dead traced thread; until then the process does not end.
         std::thread::spawn(move || {
             let wait = || waitpid(Pid::from_raw(thread), Some(WaitPidFlag::__WALL));
             while !matches!(wait(), Ok(WaitStatus::Exited(..) | WaitStatus::Signaled(..)) | Err(_)) {}
         });
     }
 
-    /// What `adaptive-bridge status --json` says there, if the bridge runs.
+    /// The output of `adaptive-bridge status --json` in the machine; `None` if the bridge does not run.
     pub fn try_status(&self) -> Option<Value> {
         let user = ["runuser", "-u", "adaptive-bridge", "--"];
         let status = ["adaptive-bridge", "status", "--json", "--interval-ms", "50"];
@@ -206,7 +215,7 @@ impl Machine {
         serde_json::from_slice(&output.stdout).ok()
     }
 
-    /// The log of a unit, an entry with all its fields on each line.
+    /// The log entries of a unit, with all their fields.
     pub fn journal(&self, unit: &str) -> Vec<Value> {
         let lines = self.run(&["journalctl", "--output=json", "--all", "--unit", unit]);
         lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
@@ -229,16 +238,16 @@ impl Drop for Machine {
     }
 }
 
-/// The only child of a process.
+/// The child of a process once it is systemd.
 fn child_of(pid: i32) -> Option<i32> {
     let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).ok()?;
     let child: i32 = children.trim().parse().ok()?;
-    // Until it is systemd it is a child of the shell, or nspawn on its way.
+    // Before that it is a child of the shell, or of nspawn while it starts.
     let name = fs::read_to_string(format!("/proc/{child}/comm")).ok()?;
     (name.trim() == "systemd").then_some(child)
 }
 
-/// Removes a control group with all below it. Files there go by themselves.
+/// Removes a control group and its descendants. The kernel removes the files in them.
 fn remove_groups(group: &Path) {
     for entry in fs::read_dir(group).into_iter().flatten().flatten() {
         if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
@@ -248,7 +257,7 @@ fn remove_groups(group: &Path) {
     let _ = fs::remove_dir(group);
 }
 
-/// Puts the program and its units where a package would.
+/// Copies the program and its units to where a package would install them.
 pub fn install(root: &Path) {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd");
     let units = root.join("usr/lib/systemd/system");

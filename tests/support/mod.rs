@@ -1,9 +1,11 @@
-//! What the integration tests share: hosts, DDS peers of other makes, and the bridge, all of them real.
+//! Shared support of the integration tests: hosts, peers on several DDS libraries, and the bridge. Nothing is
+//! mocked.
 //!
-//! A test waits for a condition with [`patience`] and then asserts; it never asserts a maximum time.
-//! A test that needs what a machine lacks calls [`skip`], and nothing else, so that `make test` can list it.
+//! A test waits for a condition with the timeout [`patience`] and then asserts; it never asserts a maximum
+//! time. A test whose requirements the machine does not meet calls [`skip`] and returns, so that `make test`
+//! lists it.
 
-// Every test binary compiles this module and uses a part of it.
+// Every test binary compiles this module and uses only a part of it.
 #![allow(dead_code)]
 
 pub mod bed;
@@ -27,45 +29,46 @@ use std::time::{Duration, Instant};
 
 use nix::fcntl::{Flock, FlockArg};
 
-/// How long a test waits for something that should happen: 30 s, or `ADAPTIVE_BRIDGE_TEST_PATIENCE_S`.
+/// The timeout of a test for an expected condition: 30 s, or `ADAPTIVE_BRIDGE_TEST_PATIENCE_S`.
 pub fn patience() -> Duration {
     let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_PATIENCE_S").ok().and_then(|text| text.parse().ok());
     Duration::from_secs(seconds.unwrap_or(30))
 }
 
-/// Polls until `probe` yields a value; after [`patience`] panics and says `what` did not happen.
+/// Polls until `probe` returns a value; panics with `what` after [`patience`].
 pub fn wait_for<T>(what: impl Display, mut probe: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + patience();
     loop {
         if let Some(value) = probe() {
             return value;
         }
-        assert!(Instant::now() < deadline, "waited {:?} in vain for: {what}", patience());
+        assert!(Instant::now() < deadline, "timed out after {:?} waiting for: {what}", patience());
         std::thread::sleep(Duration::from_millis(10));
     }
 }
 
-/// As [`wait_for`], for a condition.
+/// Like [`wait_for`], for a condition.
 pub fn wait_until(what: impl Display, mut condition: impl FnMut() -> bool) {
     wait_for(what, || condition().then_some(()));
 }
 
-/// The build folder of this source tree.
+/// The build directory of this source tree.
 fn target_dir() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("target")
 }
 
-/// Records that `test` is not run on this machine, and why. The caller returns at once after it.
+/// Records that `test` is skipped on this machine, and why. The caller then returns.
 ///
-/// `make test` prints the list at its end. Panics where `CI` is set: there nothing may be skipped.
+/// `make test` prints the list of skipped tests at its end. Panics if `CI` is set, where no test may be
+/// skipped.
 pub fn skip(test: &str, reason: &str) {
     let ci = std::env::var_os("CI").is_some_and(|value| !value.is_empty());
     skip_into(&target_dir().join("skipped.txt"), ci, test, reason);
 }
 
-/// [`skip`] with its surroundings as arguments.
+/// Like [`skip`], with the list file and whether `CI` is set as arguments.
 pub fn skip_into(list: &Path, ci: bool, test: &str, reason: &str) {
-    assert!(!ci, "{test} can't run here ({reason}), and nothing may be skipped where CI is set");
+    assert!(!ci, "{test} cannot run here ({reason}), and no test may be skipped if CI is set");
     eprintln!("SKIPPED {test}: {reason}");
     if let Some(folder) = list.parent() {
         fs::create_dir_all(folder).unwrap();
@@ -74,19 +77,18 @@ pub fn skip_into(list: &Path, ci: bool, test: &str, reason: &str) {
     writeln!(file, "{test}: {reason}").unwrap();
 }
 
-/// Why tests between hosts can't run on this machine: no right to make network namespaces, or a peer not
-/// built.
+/// Returns why tests with several hosts cannot run on this machine: no permission to create network
+/// namespaces, or a peer that is not built.
 pub fn testbed_missing() -> Option<String> {
     netns::requires_root().or_else(peer::missing)
 }
 
-/// Held by one test at a time over all test programs of this source tree.
+/// A lock that one test at a time holds, among all test programs of this source tree.
 pub struct Exclusive(#[allow(dead_code)] Flock<File>);
 
-/// Waits until no other test holds it. [`netns::Net`] has it built in; a test takes it once, else it waits
-/// for itself for ever.
+/// Waits for the lock and takes it. [`netns::Net`] takes it as well; a test that takes it twice deadlocks.
 ///
-/// It makes tests that load the machine run one after another under any runner, whatever its number of
+/// With it, tests that load the machine run one after another under any test runner, with any number of
 /// threads.
 pub fn exclusive() -> Exclusive {
     fs::create_dir_all(target_dir()).unwrap();

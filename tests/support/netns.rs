@@ -1,4 +1,4 @@
-//! Hosts on one Ethernet switch, as network namespaces: each has its own addresses, ports and multicast.
+//! Hosts on one Ethernet switch, as network namespaces with their own addresses, ports and multicast.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;
@@ -15,11 +15,11 @@ use nix::unistd::Pid;
 
 use super::{Exclusive, exclusive};
 
-/// Namespaces are called `ab-PID-NUMBER-HOST`: PID is the test program's.
+/// The prefix of the namespaces' names, `ab-PID-NUMBER-HOST`. PID is the test program's process id.
 const PREFIX: &str = "ab-";
 const NAMESPACES: &str = "/run/netns";
 
-/// Why network namespaces can't be made on this machine; `None` when they can.
+/// Returns why network namespaces cannot be created on this machine; `None` if they can.
 pub fn requires_root() -> Option<String> {
     static REASON: OnceLock<Option<String>> = OnceLock::new();
     REASON
@@ -28,22 +28,22 @@ pub fn requires_root() -> Option<String> {
                 return Some("network namespaces need root".to_owned());
             }
             let name = format!("{PREFIX}{}-probe", std::process::id());
-            let made = try_run("ip", &["netns", "add", &name]);
+            let created = try_run("ip", &["netns", "add", &name]);
             let _ = try_run("ip", &["netns", "del", &name]);
-            made.err().map(|error| format!("network namespaces can't be made: {error}"))
+            created.err().map(|error| format!("network namespaces cannot be created: {error}"))
         })
         .clone()
 }
 
-/// Runs a program to its end; an error is what it said.
+/// Runs a program and returns its stdout; an error contains its stderr.
 fn try_run(program: &str, arguments: &[&str]) -> Result<String, String> {
     let output =
         Command::new(program).args(arguments).output().map_err(|error| format!("{program}: {error}"))?;
     if output.status.success() {
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     } else {
-        let said = String::from_utf8_lossy(&output.stderr);
-        Err(format!("{program} {}: {} {}", arguments.join(" "), output.status, said.trim()))
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        Err(format!("{program} {}: {} {}", arguments.join(" "), output.status, stderr.trim()))
     }
 }
 
@@ -51,12 +51,12 @@ fn run(program: &str, arguments: &[&str]) {
     try_run(program, arguments).unwrap_or_else(|error| panic!("{error}"));
 }
 
-/// Runs `ip` with arguments that have no blanks in them.
+/// Runs `ip` with arguments that are separated by spaces.
 fn ip(arguments: &str) {
     run("ip", &arguments.split_whitespace().collect::<Vec<_>>());
 }
 
-/// Kills what runs in a namespace and removes it. What has gone meanwhile is as good as removed.
+/// Kills all processes in a namespace and removes it. Ignores processes and namespaces that no longer exist.
 fn remove(namespace: &str) {
     let pids = try_run("ip", &["netns", "pids", namespace]).unwrap_or_default();
     for pid in pids.split_whitespace().filter_map(|pid| pid.parse().ok()) {
@@ -65,7 +65,7 @@ fn remove(namespace: &str) {
     let _ = try_run("ip", &["netns", "del", namespace]);
 }
 
-/// Removes the namespaces that test programs which are gone have left.
+/// Removes the namespaces of test programs that no longer run.
 fn remove_stale() {
     let Ok(entries) = fs::read_dir(NAMESPACES) else { return };
     for name in entries.flatten().filter_map(|entry| entry.file_name().into_string().ok()) {
@@ -76,9 +76,8 @@ fn remove_stale() {
     }
 }
 
-/// Removes the shared memory that Fast DDS peers and ROS 2 nodes which were killed have left: hosts share
-/// `/dev/shm`, and another version of Fast DDS aborts at what it finds there. What a process has mapped
-/// stays.
+/// Removes the shared memory of killed Fast DDS peers and ROS 2 nodes, except segments that a process has
+/// mapped. The hosts share `/dev/shm`, and another version of Fast DDS aborts when it finds such a segment.
 fn remove_stale_shared_memory() {
     let is_of_fast_dds = |name: &str| name.starts_with("fastrtps_") || name.starts_with("sem.fastrtps_");
     let mut mapped = BTreeSet::new();
@@ -89,7 +88,7 @@ fn remove_stale_shared_memory() {
     }
     for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
         let Ok(name) = entry.file_name().into_string() else { continue };
-        // Beside each segment there is a file that is only locked.
+        // The lock file of a segment is never mapped; it is kept as long as its segment is.
         let segment = name.strip_suffix("_el").unwrap_or(&name);
         if is_of_fast_dds(&name) && !mapped.contains(segment) {
             let _ = fs::remove_file(entry.path());
@@ -98,12 +97,12 @@ fn remove_stale_shared_memory() {
 }
 
 thread_local! {
-    /// A second [`Net`] in one test would wait for the first for ever.
+    /// Whether the test has a [`Net`]: a second one would wait forever for the first.
     static HAS_NET: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Hosts on one switch. Only one exists at a time on a machine's source tree (see [`exclusive`]); dropping it
-/// kills whatever still runs in its hosts and removes them.
+/// Hosts on one switch. Only one exists at a time for a source tree (see [`exclusive`]). Dropping it kills
+/// all processes on its hosts and removes them.
 pub struct Net {
     id: String,
     hosts: Vec<Host>,
@@ -111,10 +110,10 @@ pub struct Net {
 }
 
 impl Net {
-    /// Makes the hosts, each connected to the switch at once. Panics where [`requires_root`] has a reason.
+    /// Creates the hosts and connects each to the switch. Panics if [`requires_root`] returns a reason.
     pub fn new(hosts: &[&str]) -> Net {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
-        assert!(!HAS_NET.replace(true), "a test has one Net: drop the first before making another");
+        assert!(!HAS_NET.replace(true), "a test can have one Net: drop it before creating another");
         let exclusive = exclusive();
         remove_stale();
         remove_stale_shared_memory();
@@ -127,14 +126,14 @@ impl Net {
         ip(&format!("netns add {switch}"));
         ip(&format!("-n {switch} link add br0 type bridge mcast_snooping 0"));
         ip(&format!("-n {switch} link set br0 up"));
-        // Else the machine's firewall sees, and reassembles, what passes the switch.
+        // Otherwise the machine's firewall filters and reassembles the packets that pass the switch.
         let no_netfilter = "f=/proc/sys/net/bridge/bridge-nf-call-iptables; test ! -e $f || echo 0 > $f";
         run("nsenter", &[&format!("--net={NAMESPACES}/{switch}"), "sh", "-c", no_netfilter]);
 
         for (index, name) in hosts.iter().enumerate() {
             let namespace = format!("{}-{name}", net.id);
             let port = format!("p{index}");
-            // Another subnet for each Net, so that no peer takes an address for one it knew before.
+            // Uses a different subnet for each Net, so that no peer knows an address from an earlier one.
             let address = Ipv4Addr::new(10, 64 + (pid % 128) as u8, (number % 256) as u8, index as u8 + 1);
             ip(&format!("netns add {namespace}"));
             let host = Host { name: (*name).to_owned(), namespace, address, switch: switch.clone(), port };
@@ -149,7 +148,7 @@ impl Net {
         format!("{}-switch", self.id)
     }
 
-    /// The host of that name.
+    /// The host with a given name.
     pub fn host(&self, name: &str) -> &Host {
         self.hosts.iter().find(|host| host.name == name).unwrap_or_else(|| panic!("no host '{name}'"))
     }
@@ -157,7 +156,7 @@ impl Net {
 
 impl Drop for Net {
     fn drop(&mut self) {
-        // By name and not by `hosts`, so that a Net that could not be made whole is removed too.
+        // By name instead of by `hosts`, so that a partly created Net is removed too.
         let prefix = format!("{}-", self.id);
         for entry in fs::read_dir(NAMESPACES).into_iter().flatten().flatten() {
             if let Some(name) = entry.file_name().to_str().filter(|name| name.starts_with(&prefix)) {
@@ -194,15 +193,15 @@ impl Host {
         &self.namespace
     }
 
-    /// A command that will run on this host. It is the program itself that runs under the child's pid, and it
-    /// shares all but the network with the test: files, `/dev/shm`, process ids.
+    /// Makes a command that will run on this host. The child's pid is that of the program itself. It shares
+    /// everything but the network with the test: files, `/dev/shm`, process ids.
     pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
         let mut command = Command::new("nsenter");
         command.arg(format!("--net={NAMESPACES}/{}", self.namespace)).arg(program);
         command
     }
 
-    /// Runs a program on this host to its end; yields its output.
+    /// Runs a program on this host and returns its stdout; panics if it fails.
     pub fn run(&self, program: &str, arguments: &[&str]) -> String {
         let network = format!("--net={NAMESPACES}/{}", self.namespace);
         let mut all = vec![network.as_str(), program];
@@ -210,12 +209,13 @@ impl Host {
         try_run("nsenter", &all).unwrap_or_else(|error| panic!("{error}"))
     }
 
-    /// A UDP socket of this host, bound to a port of its `eth0`, which this process uses from where it is.
+    /// Opens a UDP socket on this host, bound to its address on `eth0`. The test uses it from outside the
+    /// host.
     pub fn udp_socket(&self) -> UdpSocket {
         self.within(|| UdpSocket::bind((self.address, 0)).unwrap())
     }
 
-    /// Calls a function of this test on this host. Threads and sockets that it makes stay there.
+    /// Calls a function of the test on this host. Threads and sockets that it creates stay on the host.
     pub fn within<T: Send>(&self, call: impl FnOnce() -> T + Send) -> T {
         let enter = || {
             let namespace = File::open(Path::new(NAMESPACES).join(&self.namespace)).unwrap();
@@ -226,24 +226,25 @@ impl Host {
         joined.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     }
 
-    /// A cable of its own to another host, beside the switch: an interface of this name and these addresses
-    /// (with the length of the prefix, such as `192.168.7.1/24`) on each.
-    pub fn connect(&self, interface: &str, own: &str, other: &Host, others: &str) {
+    /// Connects this host to another one directly, in addition to the switch: each gets an interface of the
+    /// given name with its address and prefix length (such as `192.168.7.1/24`).
+    pub fn connect(&self, interface: &str, own_address: &str, other: &Host, other_address: &str) {
         let (here, there) = (&self.namespace, &other.namespace);
         ip(&format!("link add {interface} netns {here} type veth peer name {interface} netns {there}"));
-        for (namespace, address) in [(here, own), (there, others)] {
+        for (namespace, address) in [(here, own_address), (there, other_address)] {
             ip(&format!("-n {namespace} addr add {address} dev {interface}"));
             ip(&format!("-n {namespace} link set {interface} up"));
         }
-        // The kernel says up to a second later that there is a carrier; a program that starts before does not
-        // use the interface.
+        // The kernel reports the carrier up to a second later; a program that starts before that does not use
+        // the interface.
         for host in [self, other] {
             let operstate = || host.run("ip", &["-br", "link", "show", "dev", interface]);
             super::wait_until("a carrier", || operstate().split_whitespace().nth(1) == Some("UP"));
         }
     }
 
-    /// An interface of this host that leads nowhere, as the bridge of a container engine without containers.
+    /// Adds an interface that is connected to nothing, like the network bridge of a container engine without
+    /// containers.
     pub fn add_interface(&self, name: &str, address: &str) {
         let namespace = &self.namespace;
         ip(&format!("-n {namespace} link add {name} type veth peer name {name}-end"));
@@ -252,7 +253,7 @@ impl Host {
         ip(&format!("-n {namespace} link set {name} up"));
     }
 
-    /// Takes the address from `eth0`, and gives it this one instead, if any, as DHCP does.
+    /// Replaces the address of `eth0`, or removes it, as DHCP does.
     pub fn set_address(&self, address: Option<Ipv4Addr>) {
         let namespace = &self.namespace;
         ip(&format!("-n {namespace} addr flush dev eth0"));
@@ -262,7 +263,7 @@ impl Host {
         }
     }
 
-    /// Makes `eth0`, with the host's address, and connects it to the switch.
+    /// Creates `eth0` with the host's address and connects it to the switch.
     pub fn plug_in(&self) {
         let Host { namespace, address, switch, port, .. } = self;
         ip(&format!("link add {port} netns {switch} type veth peer name eth0 netns {namespace}"));
@@ -272,12 +273,12 @@ impl Host {
         ip(&format!("-n {namespace} route add 239.0.0.0/8 dev eth0"));
     }
 
-    /// Deletes `eth0`, as a USB adapter that is unplugged.
+    /// Deletes `eth0`, as unplugging a USB adapter does.
     pub fn unplug(&self) {
         ip(&format!("-n {} link del eth0", self.namespace));
     }
 
-    /// Connects the host to the switch, or pulls its cable at the switch's end.
+    /// Sets the switch's port of this host up or down.
     pub fn set_link(&self, up: bool) {
         let state = if up { "up" } else { "down" };
         ip(&format!("-n {} link set {} {state}", self.switch, self.port));
@@ -292,8 +293,8 @@ impl Host {
         }
     }
 
-    /// From now on loses datagrams that arrive, each with that probability (0 to 1; 0 ends it). The kernel's
-    /// random numbers are not seeded.
+    /// Drops each arriving packet with a probability of 0 to 1; 0 ends it. The kernel's random numbers cannot
+    /// be seeded.
     pub fn lose_incoming(&self, probability: f64) {
         self.run("iptables", &["-F", "INPUT"]);
         if probability > 0.0 {

@@ -1,4 +1,4 @@
-//! A child process whose output is kept, which can be stopped and killed, and which never outlives its test.
+//! A child process of a test: keeps its output, can be stopped and killed, and never outlives its test.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
@@ -11,10 +11,10 @@ use nix::unistd::Pid;
 
 use super::patience;
 
-/// How much of an output is shown when a test fails.
+/// The number of output lines that are printed when a test fails.
 const TAIL_LINES: usize = 20;
 
-/// The lines of one output stream, so far.
+/// The lines of one output stream that have been read so far.
 #[derive(Default)]
 struct Lines {
     state: Mutex<LinesState>,
@@ -32,7 +32,7 @@ impl Lines {
         let lines = Arc::new(Lines::default());
         let sink = Arc::clone(&lines);
         std::thread::spawn(move || {
-            // Bytes that are no UTF-8 are shown as such: a log is never the reason for a test to fail.
+            // Invalid UTF-8 is replaced, so that a log never makes a test fail.
             let mut stream = BufReader::new(stream);
             let mut line = Vec::new();
             while matches!(stream.read_until(b'\n', &mut line), Ok(count) if count > 0) {
@@ -48,10 +48,10 @@ impl Lines {
     }
 }
 
-/// A running child, the leader of a process group of its own.
+/// A child process, the leader of its own process group.
 ///
-/// Dropping it kills the whole group; so does the death of the test's thread or process. When the test is
-/// failing, its log and the end of its output are printed.
+/// Dropping it kills the whole group. The kernel kills the child when the test's thread or process ends. If
+/// the test fails, the child's log and the end of its output are printed.
 pub struct Process {
     name: String,
     child: Child,
@@ -60,18 +60,18 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it, with nothing to read. Call it on the test's own thread: the kernel kills the child when the
-    /// thread that started it ends.
+    /// Starts a process with an empty stdin. Must be called on the test's own thread: the kernel kills the
+    /// child when the thread that started it ends.
     pub fn spawn(name: &str, command: Command) -> Process {
-        Self::spawn_with(name, command, Stdio::null())
+        Self::spawn_piped(name, command, Stdio::null())
     }
 
-    /// As [`Process::spawn`], but it reads what [`Process::feed`] gives it, until [`Process::wait`].
-    pub fn spawn_fed(name: &str, command: Command) -> Process {
-        Self::spawn_with(name, command, Stdio::piped())
+    /// Like [`Process::spawn`], with a stdin for [`Process::write_stdin`], which [`Process::wait`] closes.
+    pub fn spawn_with_stdin(name: &str, command: Command) -> Process {
+        Self::spawn_piped(name, command, Stdio::piped())
     }
 
-    fn spawn_with(name: &str, mut command: Command, stdin: Stdio) -> Process {
+    fn spawn_piped(name: &str, mut command: Command, stdin: Stdio) -> Process {
         command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
         // SAFETY: between fork and exec the closure makes one system call (prctl), which is
         // async-signal-safe; it neither allocates nor takes a lock.
@@ -80,16 +80,16 @@ impl Process {
                 .pre_exec(|| nix::sys::prctl::set_pdeathsig(Signal::SIGKILL).map_err(std::io::Error::from));
         }
         let mut child =
-            command.spawn().unwrap_or_else(|error| panic!("{name}: {command:?} can't be started: {error}"));
+            command.spawn().unwrap_or_else(|error| panic!("{name}: {command:?} cannot be started: {error}"));
         let stdout = Lines::read_from(child.stdout.take().unwrap());
         let stderr = Lines::read_from(child.stderr.take().unwrap());
         Process { name: name.to_owned(), child, stdout, stderr }
     }
 
     /// Writes to its stdin.
-    pub fn feed(&mut self, bytes: &[u8]) {
-        let stdin = self.child.stdin.as_mut().unwrap_or_else(|| panic!("{} reads nothing", self.name));
-        stdin.write_all(bytes).unwrap_or_else(|error| panic!("{} does not read: {error}", self.name));
+    pub fn write_stdin(&mut self, bytes: &[u8]) {
+        let stdin = self.child.stdin.as_mut().unwrap_or_else(|| panic!("{} has no stdin", self.name));
+        stdin.write_all(bytes).unwrap_or_else(|error| panic!("cannot write to {}: {error}", self.name));
     }
 
     /// The process id.
@@ -97,33 +97,33 @@ impl Process {
         Pid::from_raw(self.child.id() as i32)
     }
 
-    /// Sends a signal to the process itself, not to its children.
+    /// Sends a signal to the process, not to its children.
     pub fn signal(&self, signal: Signal) {
         kill(self.pid(), signal).unwrap_or_else(|error| panic!("{signal} to {}: {error}", self.name));
     }
 
-    /// Sends a signal to the process and to those of its children that have stayed in its group.
+    /// Sends a signal to the process and to its children in the same group.
     pub fn signal_group(&self, signal: Signal) {
         killpg(self.pid(), signal).unwrap_or_else(|error| panic!("{signal} to {}: {error}", self.name));
     }
 
-    /// Freezes it (SIGSTOP).
+    /// Stops it (SIGSTOP).
     pub fn stop(&self) {
         self.signal(Signal::SIGSTOP);
     }
 
-    /// Lets it go on (SIGCONT).
+    /// Continues it (SIGCONT).
     pub fn cont(&self) {
         self.signal(Signal::SIGCONT);
     }
 
-    /// Kills it (SIGKILL) and takes its exit status, so that its pid is free.
+    /// Kills it (SIGKILL) and reaps it; returns its exit status.
     pub fn kill9(&mut self) -> ExitStatus {
         self.signal(Signal::SIGKILL);
         self.wait()
     }
 
-    /// Asks it to end (SIGTERM) and waits until it has.
+    /// Terminates it (SIGTERM) and waits for its end.
     pub fn terminate(&mut self) -> ExitStatus {
         if self.is_running() {
             self.signal(Signal::SIGTERM);
@@ -131,17 +131,17 @@ impl Process {
         self.wait()
     }
 
-    /// Whether it has not ended yet; a stopped process is running.
+    /// Whether it has not ended yet; a stopped process counts as running.
     pub fn is_running(&mut self) -> bool {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// Ends its stdin, waits until it has ended, and until all that it wrote has been read.
+    /// Closes its stdin and waits until it has ended and its output has been read.
     pub fn wait(&mut self) -> ExitStatus {
         self.child.stdin = None;
         let what = format!("the end of {}", self.name);
         let status = super::wait_for(&what, || self.child.try_wait().unwrap());
-        // A grandchild may hold the pipe open; then what has come so far is all there is to wait for.
+        // A grandchild may keep the pipe open, so that waiting for the end of the output has a limit of 1 s.
         let deadline = Instant::now() + std::time::Duration::from_secs(1);
         for lines in [&self.stdout, &self.stderr] {
             let mut state = lines.state.lock().unwrap();
@@ -153,18 +153,18 @@ impl Process {
         status
     }
 
-    /// What it wrote to stdout so far.
+    /// The lines of its stdout so far.
     pub fn stdout_lines(&self) -> Vec<String> {
         self.stdout.state.lock().unwrap().lines.clone()
     }
 
-    /// What it wrote to stderr so far.
+    /// Its output on stderr so far.
     pub fn log(&self) -> String {
         self.stderr.state.lock().unwrap().lines.join("\n")
     }
 
-    /// Waits until `find` yields a value for a line of stdout, from line `from` on; yields it and the number
-    /// of the line after it. Panics with the last lines when patience or the output ends.
+    /// Waits until `find` returns a value for a line of stdout, from line `from` on; returns the value and
+    /// the number of the next line. Panics with the last lines if the output ends or after [`patience`].
     pub fn wait_for_line<T>(
         &self,
         what: &str,
@@ -183,7 +183,7 @@ impl Process {
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if state.ended || left.is_zero() {
-                let why = if state.ended { "its output ended" } else { "patience ended" };
+                let why = if state.ended { "its output ended" } else { "timed out" };
                 let tail = state.lines[state.lines.len().saturating_sub(TAIL_LINES)..].join("\n");
                 drop(state);
                 panic!("{}: {why} while waiting for: {what}; its last lines:\n{tail}", self.name);
@@ -200,7 +200,7 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // The group may be gone already; a group that is not can be killed by the one who started it.
+        // The only expected error is that the group no longer exists.
         let _ = killpg(self.pid(), Signal::SIGKILL);
         let _ = self.child.wait();
         if std::thread::panicking() {
@@ -211,7 +211,7 @@ impl Drop for Process {
     }
 }
 
-/// Sends a signal to a process that is not a child of the test, such as a child of `up`.
+/// Sends a signal to a process that the test did not start itself, such as a child of `up`.
 pub fn signal(pid: i32, signal: Signal) {
     nix::sys::signal::kill(Pid::from_raw(pid), signal)
         .unwrap_or_else(|error| panic!("{signal} to {pid}: {error}"));

@@ -1,11 +1,12 @@
-//! The parser of Prometheus' own Python client.
+//! Parsing of metrics pages with the official Python client of Prometheus.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
 
 use serde_json::Value;
 
-/// Reads a page from standard input and prints each family: name, type, samples as [name, labels, value].
+/// A Python program that reads a page from stdin and prints each family as JSON: name, type, and samples as
+/// [name, labels, value].
 const PARSER: &str = "
 import json, sys
 from prometheus_client.parser import text_string_to_metric_families
@@ -14,7 +15,8 @@ families = text_string_to_metric_families(text)
 print(json.dumps([[f.name, f.type, [[s.name, s.labels, str(s.value)] for s in f.samples]] for f in families]))
 ";
 
-/// A Python that has the parser. That of the system is not always the first in the path.
+/// Returns a Python interpreter that has the parser. The first one in the path may lack the system's
+/// packages.
 pub fn python() -> Option<&'static str> {
     let has_parser = |python: &&str| {
         let import = Command::new(python).args(["-c", "import prometheus_client.parser"]).output();
@@ -23,7 +25,7 @@ pub fn python() -> Option<&'static str> {
     ["python3", "/usr/bin/python3"].into_iter().find(has_parser)
 }
 
-/// The families of a page: name, type, and samples as [name, labels, value].
+/// Parses a page into families: name, type, and samples as [name, labels, value].
 pub fn parse(python: &str, page: &str) -> Vec<(String, String, Vec<Value>)> {
     let mut parser = Command::new(python)
         .args(["-c", PARSER])

@@ -1,9 +1,9 @@
-//! The ROS 2 nodes of `tests/ros`: rclpy of Jazzy in the virtual environment that `scripts/setup.sh` makes.
-//! [`Peer::rclpy`](super::peer::Peer::rclpy) starts one.
+//! Paths of the ROS 2 nodes in `tests/ros`, which run on rclpy of Jazzy in the virtual environment that
+//! `scripts/setup.sh` creates. [`Peer::rclpy`](super::peer::Peer::rclpy) starts a node.
 
 use std::path::{Path, PathBuf};
 
-/// The list of the packages; the environment has a copy of it when it is complete.
+/// The list of required packages; a complete environment contains a copy of it.
 const REQUIREMENTS: &str = "requirements.txt";
 
 fn environment() -> PathBuf {
@@ -14,17 +14,17 @@ fn sources() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros")
 }
 
-/// The Python that has rclpy.
+/// The Python interpreter that has rclpy.
 pub fn python() -> PathBuf {
     environment().join("bin/python")
 }
 
-/// The program of a node.
+/// The Python program of a node.
 pub fn node_program() -> PathBuf {
     sources().join("node.py")
 }
 
-/// Why a node can't be started: rclpy is not installed, or not in the versions of the list.
+/// Returns why a node cannot be started: rclpy is not installed, or not in the required versions.
 pub fn missing() -> Option<String> {
     let wanted = std::fs::read(sources().join(REQUIREMENTS)).unwrap();
     let installed = std::fs::read(environment().join(REQUIREMENTS)).ok();
@@ -32,7 +32,7 @@ pub fn missing() -> Option<String> {
         return None;
     }
     Some(format!(
-        "rclpy is not installed in {}: run `make setup`, and see what it says",
+        "rclpy is not installed in {}: run `make setup` and read its output",
         environment().display()
     ))
 }

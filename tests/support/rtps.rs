@@ -1,5 +1,5 @@
-//! Forged RTPS (version 2.5 of the specification): participants that announce themselves and one RELIABLE
-//! reader as a DDS library does, and whose acknowledgements say whatever a test wants.
+//! Forged RTPS participants (version 2.5 of the specification): each announces itself and one RELIABLE reader
+//! as a DDS library does, and sends any acknowledgement that a test makes.
 //!
 //! Each has one UDP socket, whose address it announces for discovery and for samples.
 
@@ -8,9 +8,9 @@ use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 
 use super::netns::Host;
 
-/// Of a GUID: the participant.
+/// The part of a GUID that identifies the participant.
 pub type Prefix = [u8; 12];
-/// Of a GUID: the reader or writer.
+/// The part of a GUID that identifies the reader or writer.
 pub type EntityId = [u8; 4];
 
 const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
@@ -18,19 +18,20 @@ const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
 const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
 const SEDP_SUBSCRIPTIONS_WRITER: EntityId = [0, 0, 4, 0xc2];
 const SEDP_SUBSCRIPTIONS_READER: EntityId = [0, 0, 4, 0xc7];
-/// A reader of an application, of a topic without a key.
+/// The entity id of the forged reader: a user-defined reader of a topic without a key.
 const READER: EntityId = [0, 0, 1, 0x04];
-/// The kind of a writer of an application, of a topic without a key: the last byte of its entity id.
+/// The entity kind (last byte of the entity id) of a user-defined writer of a topic without a key.
 const WRITER_KIND: u8 = 0x03;
 
-/// Where the participants of domain 0 find each other.
+/// The multicast address of participant discovery in domain 0.
 const SPDP_MULTICAST: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
-/// Announcers and detectors of participants, publications and subscriptions.
+/// The announced built-in endpoints: announcers and detectors of participants, publications and
+/// subscriptions.
 const BUILTIN_ENDPOINTS: u32 = 0x3f;
-/// No test takes longer.
+/// The announced lease, longer than any test.
 const LEASE_S: u32 = 600;
 
-/// Submessages (clause 9.4.5.1.1).
+/// Kinds of submessages (clause 9.4.5.1.1).
 mod kind {
     pub const ACKNACK: u8 = 0x06;
     pub const HEARTBEAT: u8 = 0x07;
@@ -40,7 +41,7 @@ mod kind {
     pub const DATA_FRAG: u8 = 0x16;
 }
 
-/// Parameters of discovery (clause 9.6.4).
+/// Ids of discovery parameters (clause 9.6.4).
 mod pid {
     pub const SENTINEL: u16 = 0x0001;
     pub const PARTICIPANT_LEASE_DURATION: u16 = 0x0002;
@@ -58,8 +59,8 @@ mod pid {
     pub const ENDPOINT_GUID: u16 = 0x005a;
 }
 
-/// A set of numbers as ACKNACK and NACK_FRAG carry it (clause 9.4.2.6): `bits` numbers from `base` on, of
-/// which `words` marks some. Nothing makes the three agree.
+/// A number set of ACKNACK and NACK_FRAG (clause 9.4.2.6): `bits` numbers from `base` on, of which `words`
+/// marks some. The three values need not be consistent.
 #[derive(Clone, Debug)]
 pub struct NumberSet {
     pub base: i64,
@@ -68,36 +69,36 @@ pub struct NumberSet {
 }
 
 impl NumberSet {
-    /// No number: everything before `base` is acknowledged.
+    /// An empty set, which acknowledges every number before `base`.
     pub fn none(base: i64) -> Self {
         Self { base, bits: 0, words: Vec::new() }
     }
 
-    /// All that one set can hold: 256 numbers.
+    /// The largest set: 256 numbers, all marked.
     pub fn all(base: i64) -> Self {
         Self { base, bits: 256, words: vec![u32::MAX; 8] }
     }
 }
 
-/// A datagram.
+/// An RTPS message, sent as one datagram.
 #[derive(Clone, Debug)]
 #[must_use]
 pub struct Message(Vec<u8>);
 
 impl Message {
-    /// Of that participant.
+    /// An empty message from a given participant.
     pub fn of(source: Prefix) -> Self {
         let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
         bytes.extend(source);
         Self(bytes)
     }
 
-    /// What follows is for that participant.
+    /// Adds INFO_DST: the following submessages are for a given participant.
     pub fn to(self, destination: Prefix) -> Self {
         self.submessage(kind::INFO_DST, 0x01, &destination)
     }
 
-    /// ACKNACK: the reader has everything before the base, and requests what the set marks.
+    /// Adds ACKNACK: the reader acknowledges all samples before the base and requests the marked ones.
     pub fn ack_nack(self, reader: EntityId, writer: EntityId, set: &NumberSet, count: i32) -> Self {
         let mut body = [reader, writer].concat();
         body.extend(number(set.base));
@@ -107,7 +108,7 @@ impl Message {
         self.submessage(kind::ACKNACK, 0x01, &body)
     }
 
-    /// NACK_FRAG: the reader requests the fragments of a sample that the set marks.
+    /// Adds NACK_FRAG: the reader requests the marked fragments of a sample.
     pub fn nack_frag(
         self,
         reader: EntityId,
@@ -125,9 +126,9 @@ impl Message {
         self.submessage(kind::NACK_FRAG, 0x01, &body)
     }
 
-    /// DATA with a list of parameters, little endian.
+    /// Adds DATA with a parameter list in little endian.
     fn data(self, reader: EntityId, writer: EntityId, sequence: i64, parameters: &Parameters) -> Self {
-        // No flags beyond; 16 bytes from here to what would be the inline QoS.
+        // No extra flags; 16 bytes from here to the offset of the inline QoS, which is absent.
         let mut body = vec![0, 0, 16, 0];
         body.extend([reader, writer].concat());
         body.extend(number(sequence));
@@ -138,6 +139,7 @@ impl Message {
         self.submessage(kind::DATA, 0x05, &body)
     }
 
+    /// Adds HEARTBEAT.
     fn heartbeat(self, reader: EntityId, writer: EntityId, first: i64, last: i64, count: i32) -> Self {
         let mut body = [reader, writer].concat();
         body.extend(number(first));
@@ -154,13 +156,13 @@ impl Message {
     }
 }
 
-/// A sequence number: the high half comes first.
+/// Encodes a sequence number: the high half first, each half in little endian.
 fn number(value: i64) -> [u8; 8] {
     let [high, low] = [(value >> 32) as u32, value as u32].map(u32::to_le_bytes);
     [high, low].concat().try_into().unwrap()
 }
 
-/// Parameters of discovery.
+/// A list of discovery parameters.
 #[derive(Default)]
 struct Parameters(Vec<u8>);
 
@@ -190,23 +192,23 @@ impl Parameters {
     }
 }
 
-/// A participant of which an announcement has come.
+/// The addresses of a participant that has announced itself.
 #[derive(Clone, Copy, Debug)]
 pub struct Announced {
-    /// Where it hears of endpoints.
+    /// The address for endpoint discovery.
     pub discovery: SocketAddrV4,
-    /// Where its readers and writers are reached.
+    /// The address of its readers and writers.
     pub traffic: SocketAddrV4,
 }
 
-/// A writer from which something has come.
+/// A writer that has sent a sample or a heartbeat.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Writer {
     pub participant: Prefix,
     pub entity: EntityId,
-    /// The first sample that came of it or that it announced.
+    /// The first sequence number that it sent or announced.
     pub first: i64,
-    /// The last one.
+    /// The last sequence number that it sent or announced.
     pub last: i64,
 }
 
@@ -220,7 +222,7 @@ pub struct ForgedReader {
 }
 
 impl ForgedReader {
-    /// One on a host; `identity` tells it from others.
+    /// Creates a forged reader on a host; `identity` distinguishes it from others.
     pub fn new(host: &Host, identity: u8) -> Self {
         let socket = host.udp_socket();
         socket.set_nonblocking(true).unwrap();
@@ -230,7 +232,7 @@ impl ForgedReader {
         Self { prefix, socket, address, announced: BTreeMap::new(), writer: None }
     }
 
-    /// Its GUID as the bridge shows it.
+    /// Its GUID as text, formatted as by the bridge.
     pub fn guid(&self) -> String {
         let hexadecimal =
             |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };
@@ -245,7 +247,8 @@ impl ForgedReader {
         READER
     }
 
-    /// Announces the participant to all (SPDP), and to those who have answered the reader (SEDP) of a topic.
+    /// Announces the participant by multicast (SPDP), and its reader of a topic to all participants that have
+    /// announced themselves (SEDP).
     pub fn announce(&self, topic: &str, type_name: &str) {
         let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
         let participant = Parameters::default()
@@ -277,26 +280,26 @@ impl ForgedReader {
         }
     }
 
-    /// Takes what has come.
-    pub fn listen(&mut self) {
+    /// Handles the datagrams that have arrived.
+    pub fn receive(&mut self) {
         let mut buffer = [0; 1 << 16];
         while let Ok(length) = self.socket.recv(&mut buffer) {
-            self.take(&buffer[..length]);
+            self.handle(&buffer[..length]);
         }
     }
 
-    /// The writer of the topic, and where it is reached, as soon as something has come from it.
+    /// The writer of the topic and its address; `None` until the writer has sent something.
     pub fn writer(&self) -> Option<(Writer, SocketAddrV4)> {
         let writer = self.writer?;
         Some((writer, self.announced.get(&writer.participant)?.traffic))
     }
 
-    /// Sends a datagram; what can't be sent is lost, as datagrams are.
+    /// Sends a datagram; one that cannot be sent is lost, as datagrams can be.
     pub fn send(&self, message: &Message, to: SocketAddrV4) {
         let _ = self.socket.send_to(&message.0, to);
     }
 
-    fn take(&mut self, datagram: &[u8]) -> Option<()> {
+    fn handle(&mut self, datagram: &[u8]) -> Option<()> {
         let source: Prefix = datagram.get(8..20)?.try_into().ok()?;
         let mut rest = &datagram[20..];
         while let [kind, flags, low, high, following @ ..] = rest {
@@ -311,10 +314,10 @@ impl ForgedReader {
                     }
                 }
                 kind::DATA | kind::DATA_FRAG if *body.get(11)? == WRITER_KIND => {
-                    self.heard(source, body.get(8..12)?, body.get(12..20)?)?;
+                    self.note_writer(source, body.get(8..12)?, body.get(12..20)?)?;
                 }
                 kind::HEARTBEAT if *body.get(7)? == WRITER_KIND => {
-                    self.heard(source, body.get(4..8)?, body.get(16..24)?)?;
+                    self.note_writer(source, body.get(4..8)?, body.get(16..24)?)?;
                 }
                 _ => {}
             }
@@ -322,7 +325,8 @@ impl ForgedReader {
         Some(())
     }
 
-    fn heard(&mut self, participant: Prefix, entity: &[u8], number: &[u8]) -> Option<()> {
+    /// Records a sequence number that a writer sent or announced.
+    fn note_writer(&mut self, participant: Prefix, entity: &[u8], number: &[u8]) -> Option<()> {
         let half = |at: usize| Some(u32::from_le_bytes(number.get(at..at + 4)?.try_into().ok()?));
         let number = i64::from(half(0)?) << 32 | i64::from(half(4)?);
         let first = self.writer.map_or(number, |writer| writer.first);
@@ -332,7 +336,7 @@ impl ForgedReader {
     }
 }
 
-/// The addresses in the announcement of a participant that has IPv4 and writes little endian, as the bridge
+/// Parses the addresses in the announcement of a participant that uses IPv4 and little endian, as the bridge
 /// does.
 fn announcement(flags: u8, data: &[u8]) -> Option<Announced> {
     let mut rest = data.get(20..)?;
@@ -353,7 +357,7 @@ fn announcement(flags: u8, data: &[u8]) -> Option<Announced> {
     Some(Announced { discovery: discovery?, traffic: traffic? })
 }
 
-/// Calls `each` for every parameter of a list; yields what follows the list.
+/// Calls `each` for every parameter of a list; returns the bytes after the list.
 fn parameters(mut list: &[u8], mut each: impl FnMut(u16, &[u8])) -> Option<&[u8]> {
     loop {
         let [id_low, id_high, low, high, following @ ..] = list else { return None };
