@@ -1,5 +1,5 @@
 use std::{
-  collections::BTreeMap,
+  collections::{BTreeMap, VecDeque},
   sync::{Arc, RwLock, RwLockReadGuard, RwLockWriteGuard},
   time::Instant,
 };
@@ -45,8 +45,8 @@ const DEFAULT_PARTICIPANT_LEASE_DURATION: Duration = Duration::from_secs(60);
 // How much longer to wait than lease duration before pronouncing lost.
 const PARTICIPANT_LEASE_DURATION_TOLERANCE: Duration = Duration::from_secs(0);
 
-// How many participants whose lease has expired are remembered, with their
-// readers and writers. They may come back.
+// How many participants that are gone are remembered, with their readers and writers.
+// They may come back.
 const MAX_PARTICIPANTS_IN_ATTIC: usize = 256;
 
 // TODO: Let DiscoveryDB itself become thread-safe and support smaller-scope
@@ -74,6 +74,8 @@ pub(crate) struct DiscoveryDB {
   external_topic_readers_attic: BTreeMap<GUID, DiscoveredReaderData>,
   external_topic_writers_attic: BTreeMap<GUID, DiscoveredWriterData>,
   participant_attic: BTreeMap<GuidPrefix, SpdpDiscoveredParticipantData>,
+  // Whose endpoints are in the attics, the one that has been gone for longest first.
+  attic_order: VecDeque<GuidPrefix>,
 
   // Database of topic updates:
   // Outer level key is topic name
@@ -143,6 +145,7 @@ impl DiscoveryDB {
       external_topic_readers_attic: BTreeMap::new(),
       external_topic_writers_attic: BTreeMap::new(),
       participant_attic: BTreeMap::new(),
+      attic_order: VecDeque::new(),
       topics: BTreeMap::new(),
       topic_updated_sender,
       participant_status_sender,
@@ -179,6 +182,7 @@ impl DiscoveryDB {
     // }
 
     self.participant_attic.remove(&guid.prefix);
+    self.attic_order.retain(|prefix| *prefix != guid.prefix);
 
     let mut new_participant = false;
     if !self.participant_proxies.contains_key(&guid.prefix) {
@@ -241,37 +245,50 @@ impl DiscoveryDB {
   // active_disposal means that we received a discovery message announcing the
   // disposal of the participant. active_disposal=false means that the
   // participant timed out.
+  //
+  // Its readers and writers are remembered in both cases: a participant that
+  // reintroduces itself disposes itself first, and our readers drop the endpoints that
+  // it announces afterwards, because they have received them before.
   pub fn remove_participant(&mut self, guid_prefix: GuidPrefix, active_disposal: bool) {
     info!("removing participant {guid_prefix:?}");
     let participant_data = self.participant_proxies.remove(&guid_prefix);
     self.participant_last_life_signs.remove(&guid_prefix);
-    self.remove_from_attic(guid_prefix);
     #[cfg(feature = "security")]
     self.authentication_statuses.remove(&guid_prefix);
 
+    if let Some(participant_data) = participant_data {
+      self.remember_in_attic(guid_prefix);
+      self.participant_attic.insert(guid_prefix, participant_data);
+    }
     if active_disposal {
+      // A datagram that it sent before is no sign of life.
+      self.participant_attic.remove(&guid_prefix);
+    }
+    if !self.attic_order.contains(&guid_prefix) {
+      // Endpoints of a participant that was never discovered.
       self.remove_topic_reader_with_prefix(guid_prefix);
       self.remove_topic_writer_with_prefix(guid_prefix);
-    } else {
-      // move to attic
-      if let Some(participant_data) = participant_data {
-        if self.participant_attic.len() == MAX_PARTICIPANTS_IN_ATTIC {
-          if let Some((forgotten, _)) = self.participant_attic.pop_first() {
-            self.remove_from_attic(forgotten);
-          }
-        }
-        self.participant_attic.insert(guid_prefix, participant_data);
+      return;
+    }
+    move_by_guid_prefix(
+      guid_prefix,
+      &mut self.external_topic_readers,
+      &mut self.external_topic_readers_attic,
+    );
+    move_by_guid_prefix(
+      guid_prefix,
+      &mut self.external_topic_writers,
+      &mut self.external_topic_writers_attic,
+    );
+  }
+
+  fn remember_in_attic(&mut self, guid_prefix: GuidPrefix) {
+    self.attic_order.retain(|prefix| *prefix != guid_prefix);
+    self.attic_order.push_back(guid_prefix);
+    if self.attic_order.len() > MAX_PARTICIPANTS_IN_ATTIC {
+      if let Some(forgotten) = self.attic_order.pop_front() {
+        self.remove_from_attic(forgotten);
       }
-      move_by_guid_prefix(
-        guid_prefix,
-        &mut self.external_topic_readers,
-        &mut self.external_topic_readers_attic,
-      );
-      move_by_guid_prefix(
-        guid_prefix,
-        &mut self.external_topic_writers,
-        &mut self.external_topic_writers_attic,
-      );
     }
   }
 
@@ -945,6 +962,48 @@ mod tests {
     assert!(discoverydb.participant_proxies.is_empty());
 
     // TODO: more operations tests
+  }
+
+  #[test]
+  fn endpoints_of_a_disposed_participant_are_restored_with_its_next_announcement() {
+    let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
+    let (status_sender, _status_receiver) = sync_status_channel(16).unwrap();
+    let mut db = DiscoveryDB::new(GUID::new_participant_guid(), updated_sender, status_sender);
+    let announce = |db: &mut DiscoveryDB| {
+      let mut participant = spdp_participant_data().unwrap();
+      participant.participant_guid = GUID::new_participant_guid();
+      db.update_participant(&participant);
+      let mut reader =
+        DiscoveredReaderData::default("some_topic".to_string(), "RandomData".to_string());
+      reader.reader_proxy.remote_reader_guid = GUID::new(
+        participant.participant_guid.prefix,
+        EntityId::create_custom_entity_id([0, 0, 1], EntityKind::READER_NO_KEY_USER_DEFINED),
+      );
+      db.update_subscription(&reader);
+      participant
+    };
+    let participant = announce(&mut db);
+    let prefix = participant.participant_guid.prefix;
+    for was_silent in [false, true] {
+      if was_silent {
+        db.remove_participant(prefix, false);
+      }
+      db.remove_participant(prefix, true);
+      assert_eq!(db.endpoints_of(prefix).0.len(), 0);
+      assert!(db.participant_is_alive(prefix).is_none(), "a late datagram does not restore it");
+      assert!(db.update_participant(&participant), "it is new");
+      assert_eq!(db.endpoints_of(prefix).0.len(), 1);
+    }
+
+    // The memory for those that are gone is bounded, and the first to go is the first forgotten.
+    db.remove_participant(prefix, true);
+    for _ in 0..MAX_PARTICIPANTS_IN_ATTIC {
+      let other = announce(&mut db).participant_guid.prefix;
+      db.remove_participant(other, true);
+    }
+    assert_eq!(db.external_topic_readers_attic.len(), MAX_PARTICIPANTS_IN_ATTIC);
+    db.update_participant(&participant);
+    assert_eq!(db.endpoints_of(prefix).0.len(), 0);
   }
 
   #[test]

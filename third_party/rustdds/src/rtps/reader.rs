@@ -2354,7 +2354,7 @@ mod tests {
       ..Default::default()
     };
     reader.matched_writer_add(writer_guid, EntityId::UNKNOWN, vec![], vec![], &qos_policy);
-    let mut receive = |reader: &mut Reader, sn, number| {
+    let receive = |reader: &mut Reader, sn, number| {
       let fragment = DataFrag {
         writer_id: writer_guid.entity_id,
         writer_sn: SequenceNumber::new(sn),
