@@ -223,10 +223,7 @@ impl Child {
         assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
         println!("@ ready");
         while !self.stopping() {
-            match sleeper.sleep(PATIENCE * 2) {
-                Woken::Announced => continue,
-                woken => assert_eq!(woken, Woken::Woken),
-            }
+            assert_eq!(sleeper.sleep(PATIENCE * 2), Woken::Woken);
             waker.wake();
         }
     }
