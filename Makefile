@@ -1,5 +1,5 @@
 # The commands of this project. `make test` must pass before a change is merged.
-FUZZ_SECONDS ?= 20
+FUZZ_SECONDS ?= 10
 # Test programs that run no bridge and open no network: files of the project, and policy in virtual time.
 PURE_TESTS = config control_policy performance policy regressions report tidy
 
@@ -45,8 +45,15 @@ bench:
 fuzz:
 	scripts/fuzz.sh $(FUZZ_SECONDS)
 
+# What takes hours: each fuzz target for SOAK_FUZZ_SECONDS, and memory over time under load for SOAK_TIME.
+SOAK_FUZZ_SECONDS ?= 600
+SOAK_TIME ?= 1h
+soak:
+	scripts/fuzz.sh $(SOAK_FUZZ_SECONDS)
+	cargo bench --locked -- --soak $(SOAK_TIME)
+
 clean:
 	cargo clean
 	$(MAKE) --no-print-directory -C tests/peers clean
 
-.PHONY: build setup peers test quick lint demo package bench fuzz clean
+.PHONY: build setup peers test quick lint demo package bench fuzz soak clean

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs all checks that must pass before a change is merged: set-up, lints, tests, fuzzing.
 #
-# FUZZ_SECONDS: how long each fuzz target runs (default 20). With CI set, skipped tests are failures.
+# FUZZ_SECONDS: how long each fuzz target runs (default 10). With CI set, skipped tests are failures.
 set -eu
 cd "$(dirname "$0")/.."
 PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
@@ -36,4 +36,4 @@ step make --no-print-directory lint
 step cargo test --locked --all-features --no-fail-fast
 # The tests of the patched DDS library, a separate package with its own development dependencies.
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds
-step scripts/fuzz.sh "${FUZZ_SECONDS:-20}"
+step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"
