@@ -28,6 +28,9 @@ lint:
 	cargo fmt --check
 	cargo clippy --locked --all-targets --all-features -- -D warnings
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --no-deps --all-features
+	@if cargo deny --version >/dev/null 2>&1; then cargo deny --locked check bans licenses sources; \
+	else echo '*** NOT CHECKED: licences and versions of dependencies: cargo-deny is not installed (make setup)'; \
+	test -z "$$CI"; fi
 
 # Runs a publisher, a critical and a slow subscriber, first without and then with the bridge. Needs no ROS 2 and no root.
 demo: build

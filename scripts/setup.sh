@@ -178,4 +178,8 @@ if ! cargo deb --version >/dev/null 2>&1; then
     say "cargo install cargo-deb --locked"
     cargo install cargo-deb --locked
 fi
+if ! cargo deny --version >/dev/null 2>&1; then
+    say "cargo install cargo-deny --locked (three minutes on two cores)"
+    cargo install cargo-deny --locked || say "******** not installed: make lint does not check dependencies"
+fi
 say "done"
