@@ -1,9 +1,11 @@
-//! Rules of this source tree that nobody has to remember: layers, purity, words, sizes, links. Pure: reads
-//! files.
+//! Rules of this source tree that nobody has to remember: layers, purity, words, sizes, links, dependencies.
+//! Pure: reads files, and asks cargo about the dependencies.
 //!
 //! Each rule is a function of a file's path and text that lists what breaks it, so that the tests can also
 //! show that it finds what it is for.
 
+#[path = "tidy/dependencies.rs"]
+mod dependencies;
 #[path = "tidy/docs.rs"]
 mod docs;
 #[path = "tidy/layers.rs"]
