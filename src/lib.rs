@@ -15,8 +15,12 @@
 //! - [`cli`]: the subcommands.
 //! - [`eval`]: the evaluation harness (feature `eval`).
 
-#![warn(missing_docs)]
-#![cfg_attr(not(feature = "eval"), allow(rustdoc::broken_intra_doc_links))]
+// Of the library and not of its tests, hence not in Cargo.toml.
+#![cfg_attr(not(test), warn(clippy::disallowed_methods, clippy::expect_used, clippy::unwrap_used))]
+#![cfg_attr(
+    not(feature = "eval"),
+    allow(rustdoc::broken_intra_doc_links, reason = "the module `eval` is left out")
+)]
 
 pub mod cli;
 pub mod clock;

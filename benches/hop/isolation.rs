@@ -220,7 +220,7 @@ enum Disturbance {
     Spinning(Program),
     Killed { stop: Arc<AtomicBool>, killer: JoinHandle<Result<(Process, u64), String>> },
     Flooding,
-    Reader(#[allow(dead_code)] Program),
+    Reader(#[allow(dead_code, reason = "ends when it is dropped")] Program),
 }
 
 impl Disturbance {

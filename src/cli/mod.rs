@@ -226,6 +226,7 @@ fn pause(ms: u64, stop: &Stop) -> bool {
         if left_ns == 0 || stop.is_requested() {
             return !stop.is_requested();
         }
+        #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
         std::thread::sleep(Duration::from_nanos(left_ns.min(POLL_MS * 1_000_000)));
     }
 }

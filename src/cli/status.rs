@@ -54,6 +54,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     if arguments.watch {
         return watch(arguments, root, settings, first);
     }
+    #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
     std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
     match read_bridge(&root, &settings) {
         Ok(Some(second)) => match show(&second.since(&first), arguments.json) {

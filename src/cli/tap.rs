@@ -175,6 +175,7 @@ impl Tap {
                 }
                 check_at = now.plus_ms(BRIDGE_CHECK_MS);
             }
+            #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
             std::thread::sleep(interval.after(taken));
         }
         self.finish()?;

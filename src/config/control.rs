@@ -138,8 +138,7 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
 
 fn topic(field: &Field<'_>, default: &str) -> TopicName {
     let given = field.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
-    // The defaults are topic names, as the tests of this module show.
-    #[allow(clippy::expect_used)]
+    #[allow(clippy::expect_used, reason = "the defaults are topic names, as the tests of this module show")]
     given.unwrap_or_else(|| TopicName::try_from(default).expect("a default topic name"))
 }
 

@@ -157,8 +157,7 @@ fn inline_secret(document: Option<&yaml::Node>) -> Option<InlineSecret> {
 fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let instance =
         root.get("instance").parsed(InstanceName::ALLOWED, |text| InstanceName::try_from(text).ok());
-    // `default` is a valid instance name.
-    #[allow(clippy::expect_used)]
+    #[allow(clippy::expect_used, reason = "`default` is a valid instance name")]
     let instance =
         instance.unwrap_or_else(|| InstanceName::try_from("default").expect("a valid instance name"));
 

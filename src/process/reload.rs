@@ -415,6 +415,7 @@ pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnsw
         if answers.iter().all(|answer| answer.result.is_some()) || clock::monotonic() >= give_up_at {
             return Ok(answers);
         }
+        #[allow(clippy::disallowed_methods, reason = "a reload is asked for outside the data path")]
         std::thread::sleep(Duration::from_millis(10));
     }
 }

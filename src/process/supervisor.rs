@@ -127,6 +127,7 @@ pub fn up(
     }
     let mut report = ManagerReport::new(settings);
     while outcome.is_ok() && !stop.is_requested() {
+        #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
         std::thread::sleep(Duration::from_millis(POLL_MS));
         match hang_up.take() {
             Some(HangUpMeaning::Reload) => {
@@ -229,6 +230,7 @@ fn stop_all(children: &mut [Supervised]) {
             }
             return;
         }
+        #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
         std::thread::sleep(Duration::from_millis(5));
     }
 }

@@ -183,6 +183,7 @@ impl RouteChannel {
             if attempt < OPEN_ATTEMPTS && is_transient(error) {
                 // Its creator may have died during the creation, or its last user is removing it.
                 shared.clean_up(start);
+                #[allow(clippy::disallowed_methods, reason = "a process that starts waits for a clean-up")]
                 thread::sleep(OPEN_PAUSE);
                 continue;
             }

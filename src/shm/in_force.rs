@@ -142,6 +142,7 @@ impl InForceShare {
                     read_pid(&path)
                 )));
             }
+            #[allow(clippy::disallowed_methods, reason = "waits for a lock file at the start of a process")]
             thread::sleep(Duration::from_millis(2));
         }
     }

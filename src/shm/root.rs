@@ -248,6 +248,7 @@ impl FileLock {
             if clock::monotonic() > start.plus_ms(START_TIMEOUT_MS) {
                 return Err(ShmError::Busy { path: path.to_owned(), pid: read_pid(path) });
             }
+            #[allow(clippy::disallowed_methods, reason = "waits for a lock file at the start of a process")]
             thread::sleep(Duration::from_millis(2));
         }
     }

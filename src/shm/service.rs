@@ -71,6 +71,7 @@ fn fits_block(layout: Layout) -> bool {
 /// Returns memory for `layout`: a kept block if it fits, else newly allocated memory.
 fn take_memory(layout: Layout) -> NonNull<u8> {
     let layout = if fits_block(layout) {
+        #[allow(clippy::disallowed_methods, reason = "held for the push or pop of one pointer")]
         let mut blocks = BLOCKS.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(block) = blocks.0.pop() {
             return block;
@@ -93,6 +94,7 @@ fn take_memory(layout: Layout) -> NonNull<u8> {
 /// `memory` comes from `take_memory` with the same layout, and is not used any more.
 unsafe fn return_memory(memory: NonNull<u8>, layout: Layout) {
     let layout = if fits_block(layout) {
+        #[allow(clippy::disallowed_methods, reason = "held for the push or pop of one pointer")]
         let mut blocks = BLOCKS.lock().unwrap_or_else(PoisonError::into_inner);
         if blocks.0.len() < KEPT_BLOCKS {
             blocks.0.push(memory);

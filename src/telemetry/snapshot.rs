@@ -379,6 +379,7 @@ fn read_lane(boards: &Boards, lane: usize, route: usize) -> Result<LaneCounters,
         if counters.is_whole() {
             break;
         }
+        #[allow(clippy::disallowed_methods, reason = "readers of the boards handle no samples")]
         thread::sleep(WHOLE_PAUSE);
         counters = consistent(boards.lane(lane, route))?;
     }

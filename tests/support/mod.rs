@@ -5,8 +5,7 @@
 //! time. A test whose requirements the machine does not meet calls [`skip`] and returns, so that `make test`
 //! lists it.
 
-// Every test binary compiles this module and uses only a part of it.
-#![allow(dead_code)]
+#![allow(dead_code, reason = "every test binary compiles this module and uses a part of it")]
 
 pub mod bed;
 pub mod bridge;
@@ -84,7 +83,7 @@ pub fn testbed_missing() -> Option<String> {
 }
 
 /// A lock that one test at a time holds, among all test programs of this source tree.
-pub struct Exclusive(#[allow(dead_code)] Flock<File>);
+pub struct Exclusive(#[allow(dead_code, reason = "holds the lock")] Flock<File>);
 
 /// Waits for the lock and takes it. [`netns::Net`] takes it as well; a test that takes it twice deadlocks.
 ///

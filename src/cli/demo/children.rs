@@ -145,6 +145,7 @@ impl Drop for Children<'_> {
                 && matches!(child.try_wait(), Ok(None))
                 && clock::monotonic() < deadline
             {
+                #[allow(clippy::disallowed_methods, reason = "waits for a child to end")]
                 thread::sleep(Duration::from_millis(5));
             }
             if matches!(child.try_wait(), Ok(None)) {

@@ -124,6 +124,7 @@ fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, P
     report(Report::Began { at: began_at })?;
     let mut number = 0;
     loop {
+        #[allow(clippy::disallowed_methods, reason = "the demo's publisher keeps its rate")]
         thread::sleep(Duration::from_nanos(due_at(began_at, number).since(clock::monotonic())));
         let taken_at = clock::monotonic();
         let payload = Bytes::from(Scan { number, taken_at }.encode());

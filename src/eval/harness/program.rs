@@ -93,6 +93,7 @@ impl Program {
             if let Some(line) = self.latest(event) {
                 return Some(line.clone());
             }
+            #[allow(clippy::disallowed_methods, reason = "the harness handles no samples")]
             thread::sleep(Duration::from_millis(10));
         }
         None
@@ -130,6 +131,7 @@ impl Program {
                 self.kill();
                 return false;
             }
+            #[allow(clippy::disallowed_methods, reason = "the harness handles no samples")]
             thread::sleep(Duration::from_millis(5));
         }
         self.ended.is_some_and(|status| status.success())

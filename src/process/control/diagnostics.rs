@@ -55,6 +55,7 @@ struct Shared {
 }
 
 impl Shared {
+    #[allow(clippy::disallowed_methods, reason = "held for a copy of the settings, by control only")]
     fn settings(&self) -> Settings {
         self.settings.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -95,6 +96,7 @@ impl Diagnostics {
     }
 
     /// Applies a reloaded configuration.
+    #[allow(clippy::disallowed_methods, reason = "held for a copy of the settings, by control only")]
     pub fn apply(&mut self, settings: &Settings) {
         self.enabled = settings.diagnostics.enabled;
         *self.shared.settings.lock().unwrap_or_else(PoisonError::into_inner) = settings.clone();

@@ -191,6 +191,7 @@ impl Egress {
         if woken {
             self.sleeper.sleep(Duration::from_nanos(wait_ns));
         } else {
+            #[allow(clippy::disallowed_methods, reason = "no sample may end this wait")]
             std::thread::sleep(Duration::from_nanos(wait_ns));
         }
     }
@@ -255,6 +256,7 @@ impl Egress {
             }
         }
         while self.count_sent() && clock::monotonic() < give_up_at {
+            #[allow(clippy::disallowed_methods, reason = "the lane shuts down")]
             std::thread::sleep(Duration::from_nanos(UNSENT_POLL_NS));
         }
         for output in &mut self.outputs {

@@ -143,6 +143,7 @@ impl Ingress {
     /// Sleeps until housekeeping is due.
     fn sleep(&self) {
         let wait_ns = self.housekeeping_at.since(clock::monotonic());
+        #[allow(clippy::disallowed_methods, reason = "other threads receive the samples")]
         std::thread::sleep(Duration::from_nanos(wait_ns));
     }
 

@@ -41,6 +41,7 @@ impl PoolOwner {
     /// Connects new lanes, and frees the slots that the DDS library has dropped and those of lanes that have
     /// ended; on the main thread.
     pub fn housekeeping(&self) {
+        #[allow(clippy::disallowed_methods, reason = "housekeeping; receiving threads only try this lock")]
         let _connecting = self.pool.connecting.lock().unwrap_or_else(PoisonError::into_inner);
         while let Ok(slot) = self.abandoned.try_recv() {
             drop(slot);

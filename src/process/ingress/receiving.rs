@@ -115,6 +115,7 @@ impl Receiving {
 }
 
 impl SharedRoute {
+    #[allow(clippy::disallowed_methods, reason = "one input is used by one thread at a time")]
     fn lock(&self) -> MutexGuard<'_, Input> {
         self.input.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -100,6 +100,7 @@ impl MetricsServer {
 
     /// Serves this report from now on. It waits at most for another thread to copy a pointer.
     pub fn show(&self, report: Arc<Report>) {
+        #[allow(clippy::disallowed_methods, reason = "held for the copy of a pointer")]
         let former = self.latest.lock().unwrap_or_else(PoisonError::into_inner).replace(report);
         // The former report is freed after the lock is released.
         drop(former);
@@ -244,6 +245,7 @@ impl AsFd for Stream {
 
 /// Serves until the other end of `stopped` is closed.
 fn serve(listener: &Listener, stopped: &UnixStream, reports: &Mutex<Option<Arc<Report>>>) {
+    #[allow(clippy::disallowed_methods, reason = "held for the copy of a pointer")]
     let latest = || reports.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let mut clients: Vec<Client> = Vec::with_capacity(MAX_CLIENTS);
     loop {
@@ -281,6 +283,7 @@ fn wait(
         Ok(_) | Err(nix::errno::Errno::EINTR) => None,
         Err(error) => {
             tracing::error!(%error, "the metrics page cannot poll its clients; it retries in 100 ms");
+            #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
             thread::sleep(RETRY_PAUSE);
             None
         }
@@ -302,6 +305,7 @@ fn accept(listener: &Listener, clients: &mut Vec<Client>) {
             Err(error) => {
                 // For example, no file descriptor is free.
                 tracing::warn!(%error, "the metrics page cannot accept a client; it retries in 100 ms");
+                #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
                 thread::sleep(RETRY_PAUSE);
                 return;
             }
