@@ -2,6 +2,8 @@
 
 use std::fmt::{self, Write};
 
+use comfy_table::{CellAlignment, ColumnConstraint, Table, Width, presets};
+
 use super::liveness::ProcessState;
 use super::report::{
     AbsenceReport, Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
@@ -43,10 +45,8 @@ impl fmt::Display for Report {
         if let Some(ingress) = process("ingress") {
             write!(f, "\n{}", process_line("ingress", ingress))?;
         }
-        f.write_str(&row(["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST UPSTREAM"]))?;
-        for route in &self.routes {
-            f.write_str(&route_text(route))?;
-        }
+        let heads = ["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST UPSTREAM"];
+        f.write_str(&table(TOPIC_TABLE, heads, self.routes.iter().map(route_row)))?;
         for lane in &self.lanes {
             let process = process(&format!("egress-{}", lane.name));
             let title = format!("lane {}: {};", lane.name, mode_text(lane));
@@ -55,35 +55,71 @@ impl fmt::Display for Report {
             if matches!(lane.mode_reason, "control" | "safety" | "held") {
                 f.write_str(&wrapped("  why: ", "    ", lane.mode_detail.split(' '), " "))?;
             }
-            f.write_str(&row(["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"]))?;
+            let heads = ["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"];
             let outputs = self.routes.iter().flat_map(|route| &route.lanes);
-            for output in outputs.filter(|output| output.lane == lane.name) {
-                f.write_str(&output_text(output))?;
-            }
+            let rows = outputs.filter(|output| output.lane == lane.name).map(output_row);
+            f.write_str(&table(TOPIC_TABLE, heads, rows))?;
         }
         Ok(())
     }
 }
 
-fn row([topic, peers, rate_in, rate_out, one, two, three]: [&str; 7]) -> String {
-    let line = format!(
-        "  {topic:<TOPIC_COLUMNS$} {peers:>5} {rate_in:>7} {rate_out:>7} {one:>13} {two:>13} {three:>13}"
-    );
-    format!("{}\n", line.trim_end())
+/// The alignment and the minimum width of each column.
+type Columns = [(CellAlignment, u16); 7];
+/// The cells of a row, and the lines that follow it.
+type Row = ([String; 7], String);
+
+/// The columns of the tables of ingress and the lanes, which line up with each other.
+const TOPIC_TABLE: Columns = [
+    (CellAlignment::Left, TOPIC_COLUMNS as u16),
+    (CellAlignment::Right, 5),
+    (CellAlignment::Right, 7),
+    (CellAlignment::Right, 7),
+    (CellAlignment::Right, 13),
+    (CellAlignment::Right, 13),
+    (CellAlignment::Right, 13),
+];
+const SUBSCRIBER_TABLE: Columns = [
+    (CellAlignment::Left, 24),
+    (CellAlignment::Left, 13),
+    (CellAlignment::Left, 12),
+    (CellAlignment::Right, 13),
+    (CellAlignment::Right, 7),
+    (CellAlignment::Right, 7),
+    (CellAlignment::Right, 15),
+];
+
+/// A table without borders, indented by two columns.
+fn table(columns: Columns, heads: [&str; 7], rows: impl Iterator<Item = Row>) -> String {
+    let (cells, notes): (Vec<_>, Vec<_>) = rows.unzip();
+    let mut table = Table::new();
+    table.load_preset(presets::NOTHING).set_header(heads).add_rows(cells);
+    for (index, (column, (alignment, width))) in table.column_iter_mut().zip(columns).enumerate() {
+        let padding = if index == 0 { 2 } else { 1 };
+        column.set_padding((padding, 0)).set_cell_alignment(alignment);
+        column.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(padding + width)));
+    }
+    let mut text = String::new();
+    // A cell has no line breaks, so each row is one line; the first is that of the heads.
+    for (line, notes) in table.lines().zip([String::new()].iter().chain(&notes)) {
+        let _ = writeln!(text, "{}", line.trim_end());
+        text.push_str(notes);
+    }
+    text
 }
 
-fn route_text(route: &RouteReport) -> String {
+fn route_row(route: &RouteReport) -> Row {
     let bytes = route.bytes_per_s.map_or("-".to_owned(), |rate| format!("{}/s", bytes_text(rate)));
-    let mut text = row([
-        &topic_text(&route.input_topic),
-        &route.writers.to_string(),
-        &rate_text(route.rate_hz),
-        "",
-        &bytes,
-        &latencies_text(&route.dds_in),
-        &route.lost_upstream.to_string(),
-    ]);
-    text.push_str(&drops_text(&route.drops, &route.drops_in_window));
+    let cells = [
+        topic_text(&route.input_topic),
+        route.writers.to_string(),
+        rate_text(route.rate_hz),
+        String::new(),
+        bytes,
+        latencies_text(&route.dds_in),
+        route.lost_upstream.to_string(),
+    ];
+    let mut notes = drops_text(&route.drops, &route.drops_in_window);
     for publisher in route.publishers.iter().filter(|of| of.lost_upstream > 0 || of.repeated > 0) {
         let PublisherReport { writer, received, lost_upstream, repeated, .. } = publisher;
         let counts = [
@@ -92,23 +128,22 @@ fn route_text(route: &RouteReport) -> String {
             format!("{repeated} repeated"),
         ];
         let first = format!("    publisher {writer}: ");
-        text.push_str(&wrapped(&first, "      ", counts.iter().map(String::as_str), ""));
+        notes.push_str(&wrapped(&first, "      ", counts.iter().map(String::as_str), ""));
     }
-    text
+    (cells, notes)
 }
 
-fn output_text(output: &OutputReport) -> String {
-    let mut text = row([
-        &topic_text(&output.topic),
-        &output.readers.to_string(),
-        &rate_text(output.received_hz),
-        &rate_text(output.rate_hz),
-        &latencies_text(&output.shm),
-        &latencies_text(&output.dds_out),
-        &latencies_text(&output.age),
-    ]);
-    text.push_str(&drops_text(&output.drops, &output.drops_in_window));
-    text
+fn output_row(output: &OutputReport) -> Row {
+    let cells = [
+        topic_text(&output.topic),
+        output.readers.to_string(),
+        rate_text(output.received_hz),
+        rate_text(output.rate_hz),
+        latencies_text(&output.shm),
+        latencies_text(&output.dds_out),
+        latencies_text(&output.age),
+    ];
+    (cells, drops_text(&output.drops, &output.drops_in_window))
 }
 
 fn safety_text(safety: &SafetyReport) -> String {
@@ -128,43 +163,37 @@ fn probes_text(probes: &ProbesReport) -> String {
 }
 
 fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
-    let mut text = String::new();
-    let row = |[id, lane, state, rtt, jitter, loss, response_age]: [&str; 7]| {
-        let line =
-            format!("  {id:<24} {lane:<13} {state:<12} {rtt:>13} {jitter:>7} {loss:>7} {response_age:>15}");
-        format!("{}\n", line.trim_end())
-    };
-    if !subscribers.is_empty() {
-        text += &row(["SUBSCRIBER", "LANE", "STATE", "RTT MEAN/P95", "JITTER", "LOSS", "LAST RESPONSE"]);
+    if subscribers.is_empty() {
+        return String::new();
     }
-    for subscriber in subscribers {
-        let ms = |ms: Option<f64>| ms.map_or("-".to_owned(), |ms| latency_text(ms * 1e3));
-        let response_age_ms = subscriber.last_response_age_ms;
-        text += &row([
-            &end_of(&subscriber.id, 24),
-            &end_of(subscriber.lane.as_deref().unwrap_or("-"), 13),
-            subscriber.state,
-            &format!("{}/{}", ms(subscriber.rtt_mean_ms), ms(subscriber.rtt_p95_ms)),
-            &ms(subscriber.jitter_ms),
-            &subscriber.loss.map_or("-".to_owned(), |loss| format!("{:.1} %", loss * 100.0)),
-            &response_age_ms
-                .map_or("never".to_owned(), |age_ms| format!("{} ago", latency_text(age_ms * 1e3))),
-        ]);
-        let since = subscriber
-            .state_since_s
-            .map_or(String::new(), |since_s| format!("for {}, ", duration_text(since_s)));
-        let mut reason = format!("{since}{}", counted(subscriber.transitions, "change"));
-        if subscriber.forced {
-            reason += ", forced by the configuration";
-        } else if !subscriber.reason.is_empty() {
-            let _ = write!(reason, ": {}", subscriber.reason);
-        }
-        if !subscriber.listed {
-            reason += "; not listed under subscribers";
-        }
-        text += &wrapped("    ", "      ", reason.split(' '), " ");
+    let heads = ["SUBSCRIBER", "LANE", "STATE", "RTT MEAN/P95", "JITTER", "LOSS", "LAST RESPONSE"];
+    table(SUBSCRIBER_TABLE, heads, subscribers.iter().map(subscriber_row))
+}
+
+fn subscriber_row(subscriber: &SubscriberReport) -> Row {
+    let ms = |ms: Option<f64>| ms.map_or("-".to_owned(), |ms| latency_text(ms * 1e3));
+    let response_age_ms = subscriber.last_response_age_ms;
+    let cells = [
+        end_of(&subscriber.id, 24),
+        end_of(subscriber.lane.as_deref().unwrap_or("-"), 13),
+        subscriber.state.to_owned(),
+        format!("{}/{}", ms(subscriber.rtt_mean_ms), ms(subscriber.rtt_p95_ms)),
+        ms(subscriber.jitter_ms),
+        subscriber.loss.map_or("-".to_owned(), |loss| format!("{:.1} %", loss * 100.0)),
+        response_age_ms.map_or("never".to_owned(), |age_ms| format!("{} ago", latency_text(age_ms * 1e3))),
+    ];
+    let since =
+        subscriber.state_since_s.map_or(String::new(), |since_s| format!("for {}, ", duration_text(since_s)));
+    let mut reason = format!("{since}{}", counted(subscriber.transitions, "change"));
+    if subscriber.forced {
+        reason += ", forced by the configuration";
+    } else if !subscriber.reason.is_empty() {
+        let _ = write!(reason, ": {}", subscriber.reason);
     }
-    text
+    if !subscriber.listed {
+        reason += "; not listed under subscribers";
+    }
+    (cells, wrapped("    ", "      ", reason.split(' '), " "))
 }
 
 fn absences_text(absences: &[AbsenceReport]) -> String {

@@ -1,57 +1,50 @@
 //! Markdown tables whose columns are also aligned as plain text.
 
-use std::fmt::Write as _;
+use comfy_table::{CellAlignment, ColumnConstraint, Width, presets};
 
 /// The longest cell of a column of figures; columns with a longer cell hold text.
-const MAX_FIGURE_CHARS: usize = 24;
+const MAX_FIGURE_CHARS: u16 = 24;
 
 /// A table. The first column and columns of text are flush left, columns of figures flush right.
-pub struct Table {
-    rows: Vec<Vec<String>>,
-}
+pub struct Table(comfy_table::Table);
 
 impl Table {
     pub fn new(heads: &[&str]) -> Self {
-        Self { rows: vec![heads.iter().map(|head| (*head).to_owned()).collect()] }
+        let mut table = comfy_table::Table::new();
+        table.load_preset(presets::ASCII_MARKDOWN).set_header(heads);
+        // Three characters and a space on each side; Markdown needs three for the separator.
+        table.set_constraints(heads.iter().map(|_| ColumnConstraint::LowerBoundary(Width::Fixed(5))));
+        Self(table)
     }
 
     /// Adds a row; missing cells stay empty.
     pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
-        let columns = self.rows[0].len();
-        let mut cells: Vec<String> = cells.into_iter().map(|cell| cell.replace('|', "/")).collect();
-        cells.resize(columns, String::new());
-        self.rows.push(cells);
+        self.0.add_row(cells.into_iter().map(|cell| cell.replace('|', "/")));
     }
 
     pub fn is_empty(&self) -> bool {
-        self.rows.len() == 1
+        self.0.is_empty()
     }
 
     pub fn text(&self) -> String {
-        let width = |column: usize| {
-            self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or_default().max(3)
-        };
-        let widths: Vec<usize> = (0..self.rows[0].len()).map(width).collect();
+        let mut table = self.0.clone();
+        let widths = table.column_max_content_widths();
         let left: Vec<bool> = widths
             .iter()
             .enumerate()
             .map(|(column, width)| column == 0 || *width > MAX_FIGURE_CHARS)
             .collect();
-        let mut text = String::new();
-        for (index, row) in self.rows.iter().enumerate() {
-            for ((cell, width), left) in row.iter().zip(&widths).zip(&left) {
-                let _ =
-                    if *left { write!(text, "| {cell:<width$} ") } else { write!(text, "| {cell:>width$} ") };
-            }
-            text.push_str("|\n");
-            if index == 0 {
-                for (width, left) in widths.iter().zip(&left) {
-                    let dashes = "-".repeat(width - usize::from(!left));
-                    let _ = write!(text, "| {dashes}{} ", if *left { "" } else { ":" });
-                }
-                text.push_str("|\n");
-            }
+        for (column, left) in table.column_iter_mut().zip(&left) {
+            column.set_cell_alignment(if *left { CellAlignment::Left } else { CellAlignment::Right });
         }
-        text
+        let mut lines: Vec<String> = table.lines().collect();
+        // comfy-table writes a separator without the alignment of the columns.
+        let dashes = lines[1].split('|').filter(|dashes| !dashes.is_empty());
+        let separators = dashes.zip(&left).map(|(dashes, left)| match left {
+            true => format!(" {} |", &dashes[2..]),
+            false => format!(" {}: |", &dashes[3..]),
+        });
+        lines[1] = format!("|{}", separators.collect::<String>());
+        lines.join("\n") + "\n"
     }
 }
