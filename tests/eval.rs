@@ -84,15 +84,8 @@ impl Run {
 
     /// The rows of a file, by the names of the columns.
     fn rows(&self, file: &str) -> Vec<BTreeMap<String, String>> {
-        let text = fs::read_to_string(self.folder.join(file)).unwrap();
-        let mut lines = text.lines();
-        let names: Vec<&str> = lines.next().unwrap().split(',').collect();
-        let row = |line: &str| {
-            let values: Vec<String> = line.split(',').map(str::to_owned).collect();
-            assert_eq!(values.len(), names.len(), "{file}: {line}");
-            names.iter().map(|name| (*name).to_owned()).zip(values).collect()
-        };
-        lines.map(row).collect()
+        let mut reader = csv::Reader::from_path(self.folder.join(file)).unwrap();
+        reader.deserialize().map(|row| row.unwrap_or_else(|error| panic!("{file}: {error}"))).collect()
     }
 
     /// A column of numbers.
@@ -127,9 +120,8 @@ impl Run {
         for file in fs::read_dir(&self.folder).unwrap() {
             let path = file.unwrap().path();
             if path.extension().is_some_and(|extension| extension == "csv") {
-                let text = fs::read_to_string(&path).unwrap();
-                let header = text.lines().find(|line| !line.starts_with('#')).unwrap();
-                for column in header.split(',') {
+                let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_path(&path).unwrap();
+                for column in reader.headers().unwrap() {
                     assert!(documented(column), "{column} of {}", path.display());
                 }
             }

@@ -98,9 +98,9 @@ fn measure(options: &Options) -> Result<(), String> {
     let line =
         format!("steal: the hypervisor gave {stolen_percent:.0} % of the CPUs' time to other machines");
     output.summary.parameters.push(line);
+    let failures = report::soak_failures(&output.summary);
     let folder = output.finish(&options)?;
     println!("raw data: {}", folder.display());
-    let failures = report::soak_failures(&output.summary);
     if failures.is_empty() { Ok(()) } else { Err(failures.join("; ")) }
 }
 

@@ -2,7 +2,6 @@
 //! to.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -15,9 +14,9 @@ use super::report::{Quantiles, Summary, figures, readme};
 /// The results of a run so far.
 pub struct Output {
     pub summary: Summary,
-    raw: String,
-    /// A line for each sample. Too large for the repository, so it is written only to the target directory.
-    samples: String,
+    raw: csv::Writer<Vec<u8>>,
+    /// A row for each sample. Too large for the repository, so it is written only to the target directory.
+    samples: csv::Writer<Vec<u8>>,
     /// Names and contents of files that other tools wrote, such as strace.
     files: Vec<(String, String)>,
 }
@@ -32,27 +31,36 @@ pub struct RowKey<'a> {
     pub repetition: usize,
 }
 
+impl RowKey<'_> {
+    /// The values of the columns [`KEY`]. Cases lose their commas, as in the runs that are saved already.
+    fn fields(self) -> [String; 5] {
+        let Self { section, scheduling, case, program, repetition } = self;
+        let case = case.replace(',', "");
+        [section.to_owned(), scheduling.to_owned(), case, program.to_owned(), repetition.to_string()]
+    }
+}
+
+/// The names of the key columns.
+const KEY: [&str; 5] = ["section", "scheduling", "case", "program", "repetition"];
+
 impl Output {
     pub fn new(summary: Summary) -> Self {
+        let with_columns = |columns: &[&str]| {
+            let mut writer = csv::Writer::from_writer(Vec::new());
+            add(&mut writer, KEY.iter().chain(columns));
+            writer
+        };
         Self {
             summary,
-            raw: "section,scheduling,case,program,repetition,figure,value\n".to_owned(),
-            samples: "section,scheduling,case,program,repetition,written_at_ns,late_us,latency_us,dds_in_us,\
-                      dds_out_us\n"
-                .to_owned(),
+            raw: with_columns(&["figure", "value"]),
+            samples: with_columns(&["written_at_ns", "late_us", "latency_us", "dds_in_us", "dds_out_us"]),
             files: Vec::new(),
         }
     }
 
     /// Adds one figure of one repetition to the raw data.
     pub fn raw(&mut self, key: RowKey, figure: &str, value: f64) {
-        let RowKey { section, scheduling, case, program, repetition } = key;
-        let case = case.replace(',', "");
-        let _ = writeln!(
-            self.raw,
-            "{section},{scheduling},{case},{program},{repetition},{figure},{}",
-            short(value)
-        );
+        add(&mut self.raw, key.fields().into_iter().chain([figure.to_owned(), short(value)]));
     }
 
     /// Adds the quantiles of one repetition to the raw data.
@@ -82,12 +90,8 @@ impl Output {
     pub fn sample(&mut self, key: RowKey, record: &Record) {
         let [late, latency, dds_in, dds_out] =
             [record.late_us(), record.latency_us(), record.dds_in_us(), record.dds_out_us()].map(short);
-        let RowKey { section, scheduling, case, program, repetition } = key;
-        let (case, written_at) = (case.replace(',', ""), record.written_at);
-        let _ = writeln!(
-            self.samples,
-            "{section},{scheduling},{case},{program},{repetition},{written_at},{late},{latency},{dds_in},{dds_out}"
-        );
+        let values = [record.written_at.to_string(), late, latency, dds_in, dds_out];
+        add(&mut self.samples, key.fields().into_iter().chain(values));
     }
 
     /// Adds a file that another tool wrote.
@@ -96,33 +100,41 @@ impl Output {
     }
 
     /// Prints the tables, writes the files of the run and returns its folder.
-    pub fn finish(&self, options: &Options) -> Result<PathBuf, String> {
+    pub fn finish(self, options: &Options) -> Result<PathBuf, String> {
         println!("{}", readme(&self.summary));
         let manifest = Path::new(env!("CARGO_MANIFEST_DIR"));
         let target =
             std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| manifest.join("target"), PathBuf::from);
         let folder = target.join("bench").join(&self.summary.date);
-        self.write_to(&folder)?;
-        write(&folder.join("samples.csv"), &self.samples)?;
+        let [raw, samples] = [self.raw, self.samples]
+            .map(|rows| rows.into_inner().map_err(|error| format!("the rows of a CSV file: {error}")));
+        let raw = raw?;
+        write_to(&folder, &self.summary, &raw, &self.files)?;
+        write(&folder.join("samples.csv"), &samples?)?;
         if options.save {
             let saved = manifest.join("benches").join("runs").join(&self.summary.date);
-            self.write_to(&saved)?;
+            write_to(&saved, &self.summary, &raw, &self.files)?;
             println!("saved in {}", saved.display());
         }
         Ok(folder)
     }
+}
 
-    fn write_to(&self, folder: &Path) -> Result<(), String> {
-        fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        let summary = serde_json::to_string_pretty(&self.summary).map_err(|error| error.to_string())?;
-        write(&folder.join("summary.json"), &(summary + "\n"))?;
-        write(&folder.join("raw.csv"), &self.raw)?;
-        write(&folder.join("README.md"), &readme(&self.summary))?;
-        for (name, text) in figures(&self.summary).iter().chain(&self.files) {
-            write(&folder.join(name), text)?;
-        }
-        Ok(())
+fn write_to(folder: &Path, summary: &Summary, raw: &[u8], files: &[(String, String)]) -> Result<(), String> {
+    fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let json = serde_json::to_string_pretty(summary).map_err(|error| error.to_string())?;
+    write(&folder.join("summary.json"), (json + "\n").as_bytes())?;
+    write(&folder.join("raw.csv"), raw)?;
+    write(&folder.join("README.md"), readme(summary).as_bytes())?;
+    for (name, text) in figures(summary).iter().chain(files) {
+        write(&folder.join(name), text.as_bytes())?;
     }
+    Ok(())
+}
+
+/// Adds a row to a file that is kept in memory, which does not fail.
+fn add(writer: &mut csv::Writer<Vec<u8>>, fields: impl Iterator<Item: AsRef<[u8]>>) {
+    let _ = writer.write_record(fields);
 }
 
 /// A value with two decimals; a hundredth of a µs is below the resolution of the clocks.
@@ -130,8 +142,8 @@ fn short(value: f64) -> String {
     if value.is_finite() { format!("{value:.2}") } else { String::new() }
 }
 
-fn write(path: &Path, text: &str) -> Result<(), String> {
-    fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))
+fn write(path: &Path, bytes: &[u8]) -> Result<(), String> {
+    fs::write(path, bytes).map_err(|error| format!("{}: {error}", path.display()))
 }
 
 /// An instant such as `2025-11-20T14-05-00Z`, formatted by the `date` command.

@@ -1,14 +1,14 @@
 //! The bridge of a run: starts its programs as a user does, and records its status.
 
 use std::fmt::Write as _;
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use super::csv::Csv;
 use super::pinned;
 use super::plan::Plan;
 use super::program::Program;
@@ -30,7 +30,9 @@ pub(super) struct Bridge {
     program: PathBuf,
     config: PathBuf,
     latest: Value,
-    record: Csv,
+    /// The status of each second, as a line of JSON.
+    record: BufWriter<File>,
+    record_path: PathBuf,
 }
 
 impl Bridge {
@@ -50,9 +52,11 @@ impl Bridge {
             command.args(["responder", "--id", &remote.name]);
             responders.push(Program::start(&format!("responder-{}", remote.name), command, &logs)?);
         }
-        let record = Csv::create_without_header(folder, "status.jsonl")?;
+        let record_path = folder.join("status.jsonl");
+        let record = File::create(&record_path).map_err(|error| EvalError::file(&record_path, &error))?;
+        let record = BufWriter::new(record);
         let program = settings.bridge.clone();
-        Ok(Self { up, responders, watch: None, program, config, latest: Value::Null, record })
+        Ok(Self { up, responders, watch: None, program, config, latest: Value::Null, record, record_path })
     }
 
     fn status(&self, host: &Host, arguments: &[&str]) -> Command {
@@ -82,7 +86,8 @@ impl Bridge {
     /// Records the status lines since the last call.
     pub fn sample(&mut self) -> Result<(), EvalError> {
         for (time, status) in self.watch.as_mut().map(Program::read_lines).unwrap_or_default() {
-            self.record.line(&json!({ "time_ns": time.0, "status": status }).to_string())?;
+            writeln!(self.record, "{}", json!({ "time_ns": time.0, "status": status }))
+                .map_err(|error| EvalError::file(&self.record_path, &error))?;
             self.latest = status;
         }
         Ok(())
@@ -123,7 +128,7 @@ impl Bridge {
     /// Stops all programs; returns the problems.
     pub fn end(mut self) -> Result<Vec<String>, EvalError> {
         self.sample()?;
-        self.record.flush()?;
+        self.record.flush().map_err(|error| EvalError::file(&self.record_path, &error))?;
         let mut problems = Vec::new();
         let watch = self.watch.as_mut();
         for program in watch.into_iter().chain(&mut self.responders).chain(std::iter::once(&mut self.up)) {

@@ -44,14 +44,24 @@ impl Tally {
                                user_heartbeat,user_acknack";
 
     /// The values of a row.
-    pub fn row(&self) -> String {
+    pub fn row(&self) -> [u64; 12] {
         let Self { packets, bytes, fragments, data, data_frag, heartbeat, acknack, nack_frag, gap, .. } =
-            self;
-        let Self { user_data, user_heartbeat, user_acknack, .. } = self;
-        format!(
-            "{packets},{bytes},{fragments},{data},{data_frag},{heartbeat},{acknack},{nack_frag},{gap},\
-             {user_data},{user_heartbeat},{user_acknack}"
-        )
+            *self;
+        let Self { user_data, user_heartbeat, user_acknack, .. } = *self;
+        [
+            packets,
+            bytes,
+            fragments,
+            data,
+            data_frag,
+            heartbeat,
+            acknack,
+            nack_frag,
+            gap,
+            user_data,
+            user_heartbeat,
+            user_acknack,
+        ]
     }
 
     /// Counts an IP packet of `length` bytes that starts with `packet`; ignores packets other than UDP over
@@ -214,7 +224,7 @@ mod tests {
             fragments: 0,
         };
         assert_eq!(tally, expected);
-        assert_eq!(tally.row().split(',').count(), Tally::COLUMNS.split(',').count());
+        assert_eq!(tally.row().len(), Tally::COLUMNS.split(',').count());
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Samples kernel counters once a second during a run: ports of the switch, fragments and sockets of hosts,
 //! CPU time and memory of processes.
 
+use std::fmt::Display;
 use std::fs;
 use std::path::Path;
 
@@ -113,7 +114,10 @@ impl Sampler {
         }
         for capture in &self.captures {
             for (direction, tally) in capture.tallies() {
-                self.rtps.row(&[&now.0, &capture.port, &direction, &tally.row()])?;
+                let counts = tally.row();
+                let mut row: Vec<&dyn Display> = vec![&now.0, &capture.port, &direction];
+                row.extend(counts.iter().map(|count| count as &dyn Display));
+                self.rtps.row(&row)?;
             }
         }
         for (name, pid) in processes {

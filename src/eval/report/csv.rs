@@ -9,7 +9,7 @@ pub fn runs(results: &Results) -> String {
     let mut columns =
         vec!["run", "scenario", "library", "reading", "bed", "switch", "repetition", "quick", "synthetic"];
     columns.extend(METRICS.iter().map(|metric| metric.key));
-    let mut text = line(columns.iter().map(|column| (*column).to_owned()));
+    let mut rows = vec![columns.iter().map(|column| (*column).to_owned()).collect()];
     for cell in results.cells() {
         for (index, measures) in cell.runs.iter().zip(&cell.measures) {
             let Some(run) = results.runs.get(*index) else { continue };
@@ -26,10 +26,10 @@ pub fn runs(results: &Results) -> String {
                 manifest.synthetic.to_string(),
             ];
             fields.extend(METRICS.iter().map(|metric| optional((metric.of)(measures))));
-            text += &line(fields);
+            rows.push(fields);
         }
     }
-    text
+    text(&rows)
 }
 
 /// Writes `figures.csv`: a line for each figure of each scenario in each setting, over its repetitions.
@@ -50,7 +50,7 @@ pub fn figures(results: &Results) -> String {
         "repetitions",
         "paper",
     ];
-    let mut text = line(COLUMNS.map(str::to_owned));
+    let mut rows = vec![COLUMNS.map(str::to_owned).to_vec()];
     for cell in results.cells() {
         for metric in &METRICS {
             let Some(estimate) = cell.estimate(metric.of) else { continue };
@@ -73,20 +73,20 @@ pub fn figures(results: &Results) -> String {
             fields.extend(numbers.map(|number| optional(Some(number))));
             fields.push(estimate.count.to_string());
             fields.push(optional(paper_value(&cell.scenario, &cell.place.library, metric.key)));
-            text += &line(fields);
+            rows.push(fields);
         }
     }
-    text
+    text(&rows)
 }
 
 /// Writes `verdicts.csv`: a line for each criterion of each verdict.
 pub fn verdicts(findings: &[Finding]) -> String {
     const COLUMNS: [&str; 7] = ["hypothesis", "title", "verdict", "rule", "where", "found", "holds"];
-    let mut text = line(COLUMNS.map(str::to_owned));
+    let mut rows = vec![COLUMNS.map(str::to_owned).to_vec()];
     for finding in findings {
         let verdict = [finding.id.to_owned(), finding.title.clone(), finding.verdict.name().to_owned()];
         if finding.criteria.is_empty() {
-            text += &line(verdict.iter().cloned().chain(std::iter::repeat_n(String::new(), 4)));
+            rows.push(verdict.iter().cloned().chain(std::iter::repeat_n(String::new(), 4)).collect());
         }
         for criterion in &finding.criteria {
             let of = [
@@ -95,10 +95,10 @@ pub fn verdicts(findings: &[Finding]) -> String {
                 criterion.found.clone(),
                 criterion.holds.to_string(),
             ];
-            text += &line(verdict.iter().cloned().chain(of));
+            rows.push(verdict.iter().cloned().chain(of).collect());
         }
     }
-    text
+    text(&rows)
 }
 
 fn optional(value: Option<f64>) -> String {
@@ -108,19 +108,13 @@ fn optional(value: Option<f64>) -> String {
         .unwrap_or_default()
 }
 
-/// Writes a line; quotes fields where RFC 4180 requires it.
-fn line(fields: impl IntoIterator<Item = String>) -> String {
-    let quoted: Vec<String> = fields
-        .into_iter()
-        .map(|field| {
-            if field.contains([',', '"', '\n', '\r']) {
-                format!("\"{}\"", field.replace('"', "\"\""))
-            } else {
-                field
-            }
-        })
-        .collect();
-    quoted.join(",") + "\n"
+/// The text of a file. Writing to memory does not fail, and fields are valid UTF-8.
+fn text(rows: &[Vec<String>]) -> String {
+    let mut writer = csv::WriterBuilder::new().flexible(true).from_writer(Vec::new());
+    for row in rows {
+        let _ = writer.write_record(row);
+    }
+    String::from_utf8(writer.into_inner().unwrap_or_default()).unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -129,7 +123,8 @@ mod tests {
 
     #[test]
     fn fields_are_quoted_where_required() {
-        assert_eq!(line(["a".into(), "b, c".into(), "say \"d\"".into()]), "a,\"b, c\",\"say \"\"d\"\"\"\n");
+        let rows = [vec!["a".into(), "b, c".into(), "say \"d\"".into()], vec!["e".into(), String::new()]];
+        assert_eq!(text(&rows), "a,\"b, c\",\"say \"\"d\"\"\"\ne,\n");
         let numbers = [Some(1.5), Some(30.0), Some(1e-9), Some(1_200.0), None].map(optional);
         assert_eq!(numbers, ["1.5", "30", "0", "1200", ""]);
     }

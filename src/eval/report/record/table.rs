@@ -1,34 +1,41 @@
-//! Reads the CSV files of a run: a header line, commas, no quotes.
+//! Reads the CSV files of a run by the names of their columns.
 
-use std::fs;
+use std::fs::File;
 use std::io::ErrorKind;
 use std::path::Path;
 use std::str::FromStr;
 
+use csv::{Position, StringRecord};
+
 use super::super::error::ReportError;
 
-/// The requested columns of a line of a CSV file.
+/// The requested columns of a row of a CSV file.
 pub struct Row<'a, const N: usize> {
     path: &'a Path,
-    line: usize,
     columns: [&'a str; N],
-    fields: [&'a str; N],
+    /// Where the columns are in the file.
+    places: [usize; N],
+    record: &'a StringRecord,
 }
 
 impl<'a, const N: usize> Row<'a, N> {
     /// The text of a column, by its index in the requested columns.
     pub fn text(&self, column: usize) -> &'a str {
-        self.fields[column]
+        &self.record[self.places[column]]
     }
 
     /// Parses the number in a column.
     pub fn number<T: FromStr>(&self, column: usize) -> Result<T, ReportError> {
-        self.fields[column].parse().map_err(|_| {
-            let (column, text) = (self.columns[column], self.fields[column]);
-            let problem = format!("{column} is '{text}', but must be a number");
-            ReportError::content(self.path, self.line, problem)
+        self.text(column).parse().map_err(|_| {
+            let problem =
+                format!("{} is '{}', but must be a number", self.columns[column], self.text(column));
+            ReportError::content(self.path, line(self.record.position()), problem)
         })
     }
+}
+
+fn line(position: Option<&Position>) -> usize {
+    position.map_or(0, |position| position.line() as usize)
 }
 
 /// Reads a file and converts each row with `read`. The file may have further columns.
@@ -37,25 +44,25 @@ pub fn read<T, const N: usize>(
     columns: [&str; N],
     mut read: impl FnMut(Row<N>) -> Result<T, ReportError>,
 ) -> Result<Vec<T>, ReportError> {
-    let text = fs::read_to_string(path).map_err(ReportError::file(path))?;
-    let mut lines = text.lines();
-    let header: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
+    let file = File::open(path).map_err(ReportError::file(path))?;
+    let refused = |error: csv::Error| ReportError::content(path, line(error.position()), error.to_string());
+    // Rows of other lengths are refused below, with a message that names the header.
+    let mut reader = csv::ReaderBuilder::new().flexible(true).from_reader(file);
+    let header = reader.headers().map_err(refused)?.clone();
     let mut places = [0; N];
     for (place, column) in places.iter_mut().zip(columns) {
-        let found = header.iter().position(|name| *name == column);
+        let found = header.iter().position(|name| name == column);
         *place =
             found.ok_or_else(|| ReportError::content(path, 1, format!("there is no column {column}")))?;
     }
     let mut rows = Vec::new();
-    let mut fields: Vec<&str> = Vec::with_capacity(header.len());
-    for (index, line) in lines.enumerate() {
-        fields.clear();
-        fields.extend(line.split(','));
-        if fields.len() != header.len() {
-            let problem = format!("{} fields, but the header has {}", fields.len(), header.len());
-            return Err(ReportError::content(path, index + 2, problem));
+    let mut record = StringRecord::new();
+    while reader.read_record(&mut record).map_err(refused)? {
+        if record.len() != header.len() {
+            let problem = format!("{} fields, but the header has {}", record.len(), header.len());
+            return Err(ReportError::content(path, line(record.position()), problem));
         }
-        rows.push(read(Row { path, line: index + 2, columns, fields: places.map(|place| fields[place]) })?);
+        rows.push(read(Row { path, columns, places, record: &record })?);
     }
     Ok(rows)
 }
@@ -74,6 +81,8 @@ pub fn read_if_exists<T, const N: usize>(
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn rows(text: &str) -> Result<Vec<(u64, String)>, String> {
