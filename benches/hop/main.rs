@@ -10,7 +10,8 @@
 //! Publishers are open loop: sample k is due at `start + k / rate`, no matter how the sample before it went.
 //! The bench records the latency both from the write and from the due time.
 //!
-//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. [`Options`] lists the other arguments.
+//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. `cargo bench -- --help` lists the other
+//! arguments.
 
 mod beds;
 mod cpu_delay;
@@ -33,6 +34,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use adaptive_bridge::telemetry::CpuTime;
+use clap::Parser;
 use options::Options;
 use out::Output;
 use report::Summary;
@@ -43,10 +45,11 @@ fn main() -> ExitCode {
     if let Some(role) = arguments.first().filter(|role| role.starts_with("__")) {
         return link::run(role, &arguments[1..]);
     }
-    let done = Options::parse(&arguments).and_then(|options| match &options.page {
+    let options = Options::parse();
+    let done = match &options.page {
         Some(runs) => fill_page(runs),
         None => measure(&options),
-    });
+    };
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -3,6 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::Parser;
+use clap::builder::ArgPredicate;
+
 use super::report::payload;
 use super::system::{Placement, Scheduling};
 
@@ -54,83 +57,50 @@ const TARGET_REPETITIONS: usize = 20;
 const MAX_BYTES_PER_S: u64 = 1_100_000_000;
 
 /// The command line.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Parser)]
+#[command(bin_name = "cargo bench --", about = "Measures the latency and the CPU time that the bridge adds")]
 pub struct Options {
-    /// `--quick`: a few cases of each section, in less than three minutes.
+    /// Measure a few cases of each section, in less than three minutes
+    #[arg(long)]
     pub quick: bool,
-    /// `--save`: save the result in `benches/runs/<date>` too.
+    /// Save the result in `benches/runs/<date>` too
+    #[arg(long)]
     pub save: bool,
-    /// `--repetitions N`: 3 by default; at least 20 for cases with a target.
+    /// Repetitions of each case; at least 20 for cases with a target
+    #[arg(long, value_name = "N", value_parser = count, default_value = "3")]
+    #[arg(default_value_if("quick", ArgPredicate::IsPresent, "1"))]
     pub repetitions: usize,
-    /// `--longer FACTOR`: multiplies every duration.
+    /// Multiply every duration
+    #[arg(long, value_name = "FACTOR", value_parser = factor, default_value = "1")]
     pub longer: f64,
-    /// `--placement alternating|split|free`.
+    /// How the programs are placed on CPUs
+    #[arg(long, value_enum, default_value_t = Placement::Alternating)]
     pub placement: Placement,
-    /// `--awake`: keep idle CPUs from sleeping.
+    /// Keep idle CPUs from sleeping
+    #[arg(long)]
     pub awake: bool,
-    /// `--scheduling other|fifo`: measure only with this scheduling.
+    /// Measure only with this scheduling
+    #[arg(long, value_enum)]
     pub scheduling: Option<Scheduling>,
-    /// `--only TEXT`, repeatable: only cases whose name, `SECTION CASE`, contains one of the texts.
+    /// Measure only cases whose name, `SECTION CASE`, contains one of the texts
+    #[arg(long, value_name = "TEXT")]
     pub only: Vec<String>,
-    /// `--soak DURATION`: measure only memory over time.
+    /// Measure only memory over time
+    #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
     pub soak: Option<Duration>,
-    /// `--page RUN…`: measure nothing; fill docs/performance.md with the figures of the runs, by default of
-    /// those that it already names.
+    /// Measure nothing; fill docs/performance.md with the figures of the runs, by default of those that it
+    /// already names
+    #[arg(long, value_name = "RUN", num_args = 0..)]
     pub page: Option<Vec<PathBuf>>,
-    /// `--bridge FILE`: measure another build of the bridge.
+    /// Measure another build of the bridge
+    #[arg(long, value_name = "FILE", default_value = env!("CARGO_BIN_EXE_adaptive-bridge"))]
     pub bridge: PathBuf,
+    /// Added by cargo.
+    #[arg(long = "bench", hide = true)]
+    _bench: bool,
 }
 
 impl Options {
-    pub fn parse(arguments: &[String]) -> Result<Self, String> {
-        let mut options = Self {
-            quick: false,
-            save: false,
-            repetitions: 0,
-            longer: 1.0,
-            placement: Placement::Alternating,
-            awake: false,
-            scheduling: None,
-            only: Vec::new(),
-            soak: None,
-            page: None,
-            bridge: PathBuf::from(env!("CARGO_BIN_EXE_adaptive-bridge")),
-        };
-        let mut rest = arguments.iter();
-        while let Some(argument) = rest.next() {
-            let mut value = || rest.next().ok_or_else(|| format!("{argument} needs a value"));
-            match argument.as_str() {
-                // Added by cargo.
-                "--bench" => {}
-                "--quick" => options.quick = true,
-                "--save" => options.save = true,
-                "--awake" => options.awake = true,
-                "--bridge" => options.bridge = PathBuf::from(value()?),
-                "--only" => options.only.push(value()?.clone()),
-                "--repetitions" => options.repetitions = number(value()?)? as usize,
-                "--longer" => options.longer = number(value()?)?,
-                "--placement" => options.placement = Placement::parse(value()?)?,
-                "--scheduling" => options.scheduling = Some(Scheduling::parse(value()?)?),
-                "--soak" => {
-                    let text = value()?;
-                    let duration = humantime::parse_duration(text);
-                    options.soak = Some(duration.map_err(|error| format!("{text}: {error}"))?);
-                }
-                "--page" => {
-                    let runs = rest.by_ref().filter(|argument| *argument != "--bench");
-                    options.page = Some(runs.map(PathBuf::from).collect());
-                }
-                other => {
-                    return Err(format!("unknown argument {other}; benches/README.md lists the arguments"));
-                }
-            }
-        }
-        if options.repetitions == 0 {
-            options.repetitions = if options.quick { 1 } else { 3 };
-        }
-        Ok(options)
-    }
-
     /// Whether `--only` selects a case of a section; `case` may be empty.
     pub fn wants(&self, section: &str, case: &str) -> bool {
         let name = format!("{section} {case}");
@@ -216,7 +186,11 @@ fn exceeds_limit(rate_hz: u64, bytes: usize) -> bool {
     rate_hz * bytes as u64 > MAX_BYTES_PER_S
 }
 
-fn number(text: &str) -> Result<f64, String> {
-    let number: f64 = text.parse().map_err(|_| format!("{text} is not a number"))?;
-    if number > 0.0 { Ok(number) } else { Err(format!("{text} must be greater than 0")) }
+fn count(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "must be a whole number above 0".to_owned())
+}
+
+fn factor(text: &str) -> Result<f64, String> {
+    let factor = text.parse().ok().filter(|factor: &f64| factor.is_finite() && *factor > 0.0);
+    factor.ok_or_else(|| "must be a number above 0".to_owned())
 }

@@ -6,6 +6,7 @@ use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::process::Command;
 
+use clap::ValueEnum;
 use nix::errno::Errno;
 use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
@@ -17,7 +18,7 @@ use super::options::Options;
 use super::report::Machine;
 
 /// The placement of the programs on CPUs. Stages are the processes that a sample passes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Placement {
     /// Each stage on a different CPU than the one before, so that every hand-over crosses CPUs, as that of
     /// the eventfd does: publisher 0, then relay 1 or ingress 1 and egress 0, then the subscriber.
@@ -29,15 +30,6 @@ pub enum Placement {
 }
 
 impl Placement {
-    pub fn parse(text: &str) -> Result<Self, String> {
-        match text {
-            "alternating" => Ok(Self::Alternating),
-            "split" => Ok(Self::Split),
-            "free" => Ok(Self::Free),
-            other => Err(format!("{other} is not a placement; allowed: alternating, split, free")),
-        }
-    }
-
     pub const fn label(self) -> &'static str {
         match self {
             Self::Alternating => "alternating",
@@ -57,22 +49,15 @@ impl Placement {
 }
 
 /// The scheduling policy of all programs on the path of a sample.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Scheduling {
+    /// SCHED_OTHER, the default of Linux.
     Other,
     /// SCHED_FIFO with priority 50, so that other programs on the machine do not affect the result.
     Fifo,
 }
 
 impl Scheduling {
-    pub fn parse(text: &str) -> Result<Self, String> {
-        match text {
-            "other" => Ok(Self::Other),
-            "fifo" => Ok(Self::Fifo),
-            other => Err(format!("{other} is not a scheduling; allowed: other, fifo")),
-        }
-    }
-
     pub const fn label(self) -> &'static str {
         match self {
             Self::Other => "other",
@@ -104,7 +89,7 @@ impl Place {
 
     pub fn parse(text: &str) -> Result<Self, String> {
         let (cpu, scheduling) = text.split_once(':').ok_or("a place must be CPU:SCHEDULING")?;
-        Ok(Self { cpu: cpu.parse().ok(), scheduling: Scheduling::parse(scheduling)? })
+        Ok(Self { cpu: cpu.parse().ok(), scheduling: Scheduling::from_str(scheduling, false)? })
     }
 
     /// Applies CPU and scheduling to this thread and those that it starts. Prints what the kernel refuses,
