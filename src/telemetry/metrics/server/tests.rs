@@ -1,5 +1,10 @@
 //! Tests of the server with real sockets and misbehaving clients.
 
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::os::unix::net::UnixListener;
+
+use super::page::CONTENT_TYPE;
 use super::*;
 use crate::telemetry::test_report::wide_report;
 
@@ -40,10 +45,13 @@ fn the_page_is_that_of_the_latest_report() {
     let (head, body) = response.split_once("\r\n\r\n").unwrap();
     assert_eq!(body, metrics_page(&report));
     assert_eq!(status(head), "HTTP/1.1 200 OK");
-    assert!(head.contains(&format!("\r\nContent-Type: {CONTENT_TYPE}\r\n")), "{head}");
-    assert!(head.contains(&format!("\r\nContent-Length: {}\r\n", body.len())), "{head}");
-    let head_only = request(&path, "HEAD /metrics?x=1 HTTP/1.0\r\n\r\n");
+    for field in [format!("Content-Type: {CONTENT_TYPE}"), format!("Content-Length: {}", body.len())] {
+        assert!(head.split("\r\n").any(|line| line == field), "{head}");
+    }
+    let head_only = request(&path, "HEAD /metrics?x=1 HTTP/1.1\r\n\r\n");
     assert_eq!(head_only, format!("{head}\r\n\r\n"));
+    let old = request(&path, "GET /metrics HTTP/1.0\r\n\r\n");
+    assert_eq!((status(&old), old.ends_with(body)), ("HTTP/1.0 200 OK", true));
 }
 
 #[test]
@@ -77,7 +85,8 @@ fn bad_requests_are_refused() {
         ("GET /metrics HTTP/2\r\n\r\n", "400 Bad Request"),
         ("GET  /metrics HTTP/1.1\r\n\r\n", "400 Bad Request"),
         ("\u{1}\u{2}é\r\n\r\n", "400 Bad Request"),
-        ("\r\n\r\n", "400 Bad Request"),
+        // Empty lines before the request are ignored, as RFC 9112 asks for.
+        ("\r\n\r\nGET\r\n\r\n", "400 Bad Request"),
         (&"x".repeat(MAX_REQUEST_BYTES + 1), "431 Request Header Fields Too Large"),
         (&format!("GET /metrics HTTP/1.1\r\n{}\r\n\r\n", "x".repeat(100_000)), "431 Request"),
     ] {
