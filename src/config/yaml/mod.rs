@@ -1,17 +1,17 @@
-//! Parses YAML into a tree of nodes with their lines. Only this module depends on the YAML library.
+//! Parses YAML into a tree of nodes with their lines. Only this module depends on YAML libraries.
 //!
 //! The size, the depth and the number of nodes are limited, with aliases counted as if they were written out,
 //! so that no file can make the loader hang or exhaust the memory.
 //!
-//! The library reads through serde, which supports neither lines nor the original text of numbers. The file
-//! is therefore read twice: a first pass finds the line and kind of each value ([`Survey`]), and a second
-//! pass uses these to read the text of each scalar ([`NodeSeed`]). Both depend on behaviour of this version
-//! of the library that serde does not guarantee, so `Cargo.toml` requires that exact version: a seed that
-//! fails before it has read a value leaves the value to the next seed.
+//! A file is read twice. A parser that reports positions finds the line and kind of each value
+//! ([`outline`]); then serde_yaml, which supports neither lines nor the original text of numbers unless it is
+//! asked for text, reads the content ([`NodeSeed`]). The second pass depends on behaviour of this version of
+//! the library that serde does not guarantee, so `Cargo.toml` requires that exact version: a seed that fails
+//! before it has read a key leaves the key to the next seed.
 
-mod survey;
+mod outline;
 
-use std::cell::{Cell, RefCell};
+use std::cell::Cell;
 use std::collections::HashSet;
 use std::fmt;
 use std::rc::Rc;
@@ -19,9 +19,8 @@ use std::rc::Rc;
 use serde::Deserializer;
 use serde::de::{DeserializeSeed, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_yaml::DeserializerOptions;
-use serde_yaml::budget::Budget;
 
-use survey::{Kind, Outline, Position, SECOND_DOCUMENT, Shape, Survey};
+use outline::{Kind, Shape, line_after, not_yaml, outline};
 
 /// The largest configuration file, in bytes. The default one has 6 KiB.
 pub(super) const MAX_BYTES: usize = 1 << 20;
@@ -119,94 +118,56 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Rc<Node>>, SyntaxError> {
     })?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
 
-    let outline = RefCell::new(Outline::new(text));
-    let surveyed =
-        Survey { outline: &outline, line: 1, latest_line: 1, is_key: false }.deserialize(deserializer(text));
-    let outline = outline.into_inner();
-    surveyed.map_err(|error| outline.stop.clone().unwrap_or_else(|| outline.explain(&error)))?;
-    if let Some(line) = line_after_end(text) {
-        // The library does not read it.
-        return Err(SyntaxError::at(line, SECOND_DOCUMENT));
-    }
-    if outline.shapes.is_empty() {
+    let shapes = outline(text)?;
+    if shapes.is_empty() {
         return Ok(None);
     }
-
-    let (next, text_bytes) = (Cell::new(0), Cell::new(0));
-    let seed = NodeSeed { source: text, shapes: &outline.shapes, next: &next, text_bytes: &text_bytes };
-    let mut root = seed.deserialize(deserializer(text)).map_err(|error| {
-        if text_bytes.get() <= MAX_TEXT_BYTES {
-            return outline.explain(&error);
-        }
-        let line = outline.shapes.get(next.get().saturating_sub(1)).map(|shape| shape.line);
-        let message = format!("must have at most {MAX_TEXT_BYTES} bytes of text, including that of aliases");
-        SyntaxError { line, message }
-    })?;
-    if !matches!(root.content, Content::Map(_)) {
-        // The caller reports it, and only the root's line is not known yet.
-        let found =
-            Position::default().deserialize(deserializer(text)).err().and_then(|error| error.location());
-        root.line = found.map_or(1, |location| outline.line_in_editor(location.line()));
-    }
+    let seed = NodeSeed { shapes: &shapes, next: &Cell::new(0) };
+    let root = seed.deserialize(deserializer(text)).map_err(|error| explain(&error, text))?;
     Ok(Some(Rc::new(root)))
 }
 
+/// A deserializer without limits of its own except that of recursion; [`outline`] has checked the others.
 fn deserializer(text: &str) -> serde_yaml::Deserializer<'_> {
     let options = DeserializerOptions {
         recursion_limit: MAX_DEPTH as u8 + 1,
-        alias_limit: max_aliases(text),
-        budget: Some(budget()),
+        alias_limit: usize::MAX,
+        budget: None,
         ..DeserializerOptions::default()
     };
     serde_yaml::Deserializer::from_str_with_options(text, &options)
-}
-
-/// The line of the first content after the end marker of the document.
-fn line_after_end(text: &str) -> Option<usize> {
-    let is_end = |line: &str| {
-        line.strip_prefix("...").is_some_and(|rest| rest.is_empty() || rest.starts_with(char::is_whitespace))
-    };
-    let is_content =
-        |line: &str| !is_end(line) && !matches!(line.trim_start().chars().next(), None | Some('#'));
-    let mut lines = text.lines().zip(1..).skip_while(|(line, _)| !is_end(line));
-    lines.find(|(line, _)| is_content(line)).map(|(_, number)| number)
 }
 
 fn max_aliases(text: &str) -> usize {
     MAX_ALIASED_BYTES / text.len().max(1)
 }
 
-/// The limits that the library checks before it parses: its parser takes quadratic time for deep nesting.
-fn budget() -> Budget {
-    Budget {
-        max_events: usize::MAX,
-        max_aliases: MAX_NODES,
-        max_anchors: MAX_NODES,
-        max_depth: MAX_DEPTH,
-        max_documents: 1,
-        max_nodes: MAX_NODES,
-        max_total_scalar_bytes: MAX_TEXT_BYTES,
-        enforce_alias_anchor_ratio: false,
-        ..Budget::default()
-    }
-}
-
-fn too_many() -> String {
-    format!("must have at most {MAX_NODES} keys and values, including those of aliases")
-}
-
-fn too_deep() -> String {
-    format!("must be nested at most {MAX_DEPTH} deep")
+/// Converts an error of the library about a text that the first parser accepts: the library reads YAML 1.1,
+/// the first parser YAML 1.2.
+fn explain(error: &serde_yaml::Error, text: &str) -> SyntaxError {
+    let line = error.location().map(|location| line_after(text, location.index()));
+    let message = match error.is_message() {
+        true => {
+            not_yaml("YAML 1.1 and YAML 1.2 read this differently; put text in quotes, and indent by spaces")
+        }
+        false => {
+            let error = error.to_string();
+            if error.contains("more than one document") {
+                return SyntaxError::of_file("must be one YAML document");
+            }
+            let end = [" at line ", " at position "].iter().filter_map(|at| error.find(at)).min();
+            not_yaml(&error[..end.unwrap_or(error.len())])
+        }
+    };
+    SyntaxError { line, message }
 }
 
 /// The second pass: reads one value, whose kind is known, into a [`Node`].
 #[derive(Clone, Copy)]
 struct NodeSeed<'r> {
-    source: &'r str,
     shapes: &'r [Shape],
     /// The index of the next value in `shapes`.
     next: &'r Cell<usize>,
-    text_bytes: &'r Cell<usize>,
 }
 
 impl<'de> DeserializeSeed<'de> for NodeSeed<'_> {
@@ -214,19 +175,12 @@ impl<'de> DeserializeSeed<'de> for NodeSeed<'_> {
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Node, D::Error> {
         let Some(&Shape { line, kind }) = self.shapes.get(self.next.get()) else {
-            return Err(D::Error::custom("more values than before"));
+            return Err(D::Error::custom("more values than in the first pass"));
         };
         self.next.set(self.next.get() + 1);
         let content = match kind {
-            Kind::Scalar { typed } => {
-                let Scalar { text, may_be_plain } =
-                    deserializer.deserialize_str(ScalarVisitor(self.source))?;
-                self.text_bytes.set(self.text_bytes.get() + text.len());
-                if self.text_bytes.get() > MAX_TEXT_BYTES {
-                    return Err(D::Error::custom("too much text"));
-                }
-                let plain = typed || may_be_plain && !has_type(&text);
-                Content::Scalar { text, plain }
+            Kind::Scalar { plain } => {
+                Content::Scalar { text: deserializer.deserialize_str(TextVisitor)?, plain }
             }
             Kind::List => deserializer.deserialize_seq(self)?,
             Kind::Map => deserializer.deserialize_map(self)?,
@@ -239,7 +193,7 @@ impl<'de> Visitor<'de> for NodeSeed<'_> {
     type Value = Content;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("the same value as before")
+        f.write_str("the value of the first pass")
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Content, A::Error> {
@@ -252,10 +206,11 @@ impl<'de> Visitor<'de> for NodeSeed<'_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut pairs: A) -> Result<Content, A::Error> {
         let mut entries = Vec::new();
-        while !matches!(pairs.next_key_seed(Position::default()), Ok(None)) {
+        // Read as a key, a repeated key would be an error of the library, which would hide later problems.
+        while !matches!(pairs.next_key_seed(Unread), Ok(None)) {
             let key = pairs.next_value_seed(self)?;
             let Content::Scalar { text, .. } = key.content else {
-                return Err(A::Error::custom("another key than before"));
+                return Err(A::Error::custom("another key than in the first pass"));
             };
             let value = Rc::new(pairs.next_value_seed(self)?);
             entries.push(Entry { key: text, line: key.line, value });
@@ -264,43 +219,30 @@ impl<'de> Visitor<'de> for NodeSeed<'_> {
     }
 }
 
-struct Scalar {
-    text: String,
-    may_be_plain: bool,
+/// Fails without reading: whether there is a key, while the next seed reads it.
+struct Unread;
+
+impl<'de> DeserializeSeed<'de> for Unread {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, _: D) -> Result<(), D::Error> {
+        Err(D::Error::custom("left to the next seed"))
+    }
 }
 
-/// Reads a scalar of the source as text.
-struct ScalarVisitor<'s>(&'s str);
+/// Reads a scalar as text.
+struct TextVisitor;
 
-impl<'de> Visitor<'de> for ScalarVisitor<'_> {
-    type Value = Scalar;
+impl Visitor<'_> for TextVisitor {
+    type Value = String;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("text")
     }
 
-    /// A slice of the source; in quotes if a quote precedes it.
-    fn visit_borrowed_str<E: serde::de::Error>(self, text: &'de str) -> Result<Scalar, E> {
-        let offset = text.as_ptr().addr().wrapping_sub(self.0.as_ptr().addr());
-        let before = self.0.as_bytes().get(offset.wrapping_sub(1));
-        let may_be_plain = !matches!(before, Some(b'\'' | b'"'));
-        Ok(Scalar { text: text.to_owned(), may_be_plain })
+    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<String, E> {
+        Ok(text.to_owned())
     }
-
-    /// No slice of the source: a block, or text with escapes or line breaks.
-    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<Scalar, E> {
-        Ok(Scalar { text: text.to_owned(), may_be_plain: false })
-    }
-}
-
-/// Whether plain text is a number, boolean or null. If the library did not treat it as such, it has a `!!str`
-/// tag.
-fn has_type(text: &str) -> bool {
-    let is_number = || serde_yaml::parse_f64(text).is_some() && !serde_yaml::digits_but_not_number(text);
-    matches!(text, "" | "~" | "null" | "Null" | "NULL")
-        || text.eq_ignore_ascii_case("true")
-        || text.eq_ignore_ascii_case("false")
-        || is_number()
 }
 
 /// Replaces each merge key (`<<: *alias`) by the entries of the mapping that it names, except keys that the
