@@ -6,8 +6,8 @@ use std::fs;
 use std::path::Path;
 
 use adaptive_bridge::config::{
-    self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, KEYS, LaneRates, Place,
-    Probes, RatePolicy, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
+    self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, KEYS, Kind, LaneRates,
+    Place, Probes, RatePolicy, Row, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
 };
 use adaptive_bridge::model::{QosProfile, TopicName, TypeName};
 use proptest::prelude::*;
@@ -246,6 +246,52 @@ fn every_key_is_documented_and_every_documented_key_exists() {
     let known: BTreeSet<&str> = KEYS.iter().copied().collect();
     assert_eq!(known.len(), KEYS.len(), "a key is listed twice");
     assert_eq!(documented_keys(), known);
+}
+
+#[test]
+fn the_tables_of_the_documentation_are_made_of_the_rows() {
+    let environment = README.find("\n## Environment").unwrap();
+    let tables: Vec<&str> = README[..environment].lines().filter(|line| line.starts_with("| `")).collect();
+    let rows: Vec<String> = config::rows().map(Row::documented).collect();
+    let missing: Vec<&str> = rows.iter().map(String::as_str).filter(|row| !tables.contains(row)).collect();
+    assert!(missing.is_empty(), "config/README.md must have these rows:\n{}", missing.join("\n"));
+    assert_eq!(tables.len(), rows.len(), "a row of config/README.md has no declaration");
+}
+
+#[test]
+fn the_default_file_has_the_defaults_of_the_rows() {
+    let text = block_default();
+    let lines: Vec<&str> = text.lines().collect();
+    let mut checked = 0;
+    for key in default_keys(&text) {
+        let Some(row) = config::rows().find(|row| row.paths.contains(&key.pattern.as_str())) else {
+            continue;
+        };
+        let value = lines[key.line][key.column..].split('#').next().unwrap().trim();
+        let default = row.default.trim_matches('`');
+        let equal = match row.kind {
+            Kind::Flag => default == value,
+            Kind::Choice(names) if names().contains(&default) => default == value,
+            Kind::Whole(..) | Kind::Decimal(..) => match default.parse::<f64>() {
+                Ok(default) => value.parse::<f64>() == Ok(default),
+                // The default depends on other keys.
+                Err(_) => continue,
+            },
+            _ => continue,
+        };
+        // A lane or mode may have another default than most.
+        let is_exception = key.path.starts_with("routing_policy.modes.");
+        assert!(equal || value == "null" || is_exception, "{} is {value}, not {default}", key.path);
+        checked += 1;
+    }
+    assert!(checked > 50, "{checked} keys");
+}
+
+#[test]
+fn the_defaults_of_the_rows_are_those_of_the_policies() {
+    let settings = settings(MINIMAL);
+    assert_eq!(settings.classifier.thresholds, ClassifierThresholds::default());
+    assert_eq!(settings.safety.rules, SafetyRules::default());
 }
 
 /// A key of `default.yaml`.

@@ -6,32 +6,11 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::field::Field;
-use super::qos::DAY_MS;
-use super::rates::MAX_QUEUE;
 use super::settings::{
     Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
     SecretSource, Security, TrustMode, Verbosity,
 };
 use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
-
-/// The allowed rates of periodic work in the control process.
-const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
-
-/// The largest threshold for round trips: an hour.
-const MAX_RTT_MS: f64 = 3_600_000.0;
-
-/// The allowed rates of the safety supervisor. At intervals below 50 ms a few errors would count as many
-/// errors per second.
-const SAFETY_RATES_HZ: std::ops::RangeInclusive<f64> = 0.1..=20.0;
-
-/// The largest threshold for silence: an hour.
-const HOUR_MS: u64 = 3_600_000;
-
-/// The smallest threshold for silence: an idle process makes a turn about every 100 ms.
-const MIN_SILENT_MS: u64 = 500;
-
-/// The largest threshold for errors: more than any process can count.
-const MAX_ERRORS_PER_S: f64 = 1_000_000.0;
 
 pub(super) const TRUST_MODES: &[(&str, TrustMode)] = &[
     ("default_deny", TrustMode::DefaultDeny),
@@ -47,7 +26,7 @@ pub(super) const VERBOSITIES: &[(&str, Verbosity)] = &[
     ("trace", Verbosity::Trace),
 ];
 
-const STATES: &[(&str, SubscriberState)] = &[
+pub(super) const STATES: &[(&str, SubscriberState)] = &[
     ("UNKNOWN", SubscriberState::Unknown),
     ("CRITICAL", SubscriberState::Critical),
     ("NONCRITICAL", SubscriberState::Noncritical),
@@ -61,21 +40,17 @@ pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     let promote_loss = section.get("promote_loss_threshold");
     let demote_rtt = section.get("demote_rtt_ms");
     let promote_rtt = section.get("promote_rtt_ms");
-    let default = ClassifierThresholds::default();
     let classifier = Classifier {
-        enabled: section.get("enabled").flag().unwrap_or(true),
+        enabled: section.get("enabled").flag_or_default(),
         subscriber_id: subscriber.map(str::to_owned),
-        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(RATES_HZ).unwrap_or(2.0),
+        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal_or_default(),
         thresholds: ClassifierThresholds {
-            demote_loss: demote_loss.decimal(0.0..=1.0).unwrap_or(default.demote_loss),
-            promote_loss: promote_loss.decimal(0.0..=1.0).unwrap_or(default.promote_loss),
-            demote_rtt_ms: demote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(default.demote_rtt_ms),
-            promote_rtt_ms: promote_rtt.decimal(0.0..=MAX_RTT_MS).unwrap_or(default.promote_rtt_ms),
-            hysteresis_count: readings(&section.get("hysteresis_count"), default.hysteresis_count),
-            allow_unknown_state: section
-                .get("allow_unknown_state")
-                .flag()
-                .unwrap_or(default.allow_unknown_state),
+            demote_loss: demote_loss.decimal_or_default(),
+            promote_loss: promote_loss.decimal_or_default(),
+            demote_rtt_ms: demote_rtt.decimal_or_default(),
+            promote_rtt_ms: promote_rtt.decimal_or_default(),
+            hysteresis_count: section.get("hysteresis_count").count_or_default(),
+            allow_unknown_state: section.get("allow_unknown_state").flag_or_default(),
         },
     };
     let thresholds = &classifier.thresholds;
@@ -98,12 +73,6 @@ fn check_below((lower, low): (&Field<'_>, f64), (upper, high): (&Field<'_>, f64)
     }
 }
 
-/// Reads a number of consecutive readings.
-fn readings(field: &Field<'_>, default: u32) -> u32 {
-    let count = field.whole(1..=1_000);
-    count.and_then(|count| u32::try_from(count).ok()).unwrap_or(default)
-}
-
 /// Reads `probes`. `max_probe_rate_hz` is the rate that a responder accepts.
 pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
     let section = root.section("probes");
@@ -111,16 +80,16 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
     let request = section.get("request_topic");
     let response = section.get("response_topic");
     let probes = Probes {
-        enabled: section.get("enabled").flag().unwrap_or(true),
-        rate_hz: rate.decimal(RATES_HZ).unwrap_or(5.0),
-        rtt_threshold_ms: section.get("rtt_threshold_ms").decimal(0.0..=MAX_RTT_MS).unwrap_or(100.0),
-        loss_threshold: section.get("loss_threshold").decimal(0.0..=1.0).unwrap_or(0.05),
-        jitter_threshold_ms: section.get("jitter_threshold_ms").decimal(0.0..=MAX_RTT_MS).unwrap_or(25.0),
-        window_size: section.get("window_size").count(1..=10_000).unwrap_or(50),
-        hysteresis_count: readings(&section.get("hysteresis_count"), 3),
-        timeout_ms: section.get("timeout_ms").whole(1..=60_000).unwrap_or(500),
-        request_topic: topic(&request, "/adaptive_bridge/probe_req"),
-        response_topic: topic(&response, "/adaptive_bridge/probe_resp"),
+        enabled: section.get("enabled").flag_or_default(),
+        rate_hz: rate.decimal_or_default(),
+        rtt_threshold_ms: section.get("rtt_threshold_ms").decimal_or_default(),
+        loss_threshold: section.get("loss_threshold").decimal_or_default(),
+        jitter_threshold_ms: section.get("jitter_threshold_ms").decimal_or_default(),
+        window_size: section.get("window_size").count_or_default(),
+        hysteresis_count: section.get("hysteresis_count").count_or_default(),
+        timeout_ms: section.get("timeout_ms").whole_or_default(),
+        request_topic: topic(&request),
+        response_topic: topic(&response),
     };
     if probes.rate_hz > f64::from(max_probe_rate_hz) && !rate.was_reported() {
         // Probes above the limit are not answered, and would count as lost.
@@ -136,50 +105,35 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
     probes
 }
 
-fn topic(field: &Field<'_>, default: &str) -> TopicName {
-    let given = field.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
-    #[allow(clippy::expect_used, reason = "the defaults are topic names, as the tests of this module show")]
-    given.unwrap_or_else(|| TopicName::try_from(default).expect("a default topic name"))
+fn topic(field: &Field<'_>) -> TopicName {
+    field.parsed_or_default(TopicName::ALLOWED, |text| TopicName::try_from(text).ok())
 }
 
 /// Reads `safety`.
 pub(super) fn safety(root: &Field<'_>) -> Safety {
     let section = root.section("safety");
-    let flag = |name: &str| section.get(name).flag().unwrap_or(true);
-    let default = SafetyRules::default();
-    let queue = section.get("max_noncritical_queue").count(1..=MAX_QUEUE);
+    let flag = |name: &str| section.get(name).flag_or_default();
     let silent = section.get("silent_ms");
     let emergency_silent = section.get("emergency_silent_ms");
-    let pair = |what: &str, range: std::ops::RangeInclusive<f64>, defaults: (f64, f64)| {
+    let pair = |what: &str| {
         let degraded = section.get(&format!("degraded_{what}"));
         let emergency = section.get(&format!("emergency_{what}"));
-        let low = degraded.decimal(range.clone()).unwrap_or(defaults.0);
-        let high = emergency.decimal(range).unwrap_or(defaults.1);
+        let (low, high) = (degraded.decimal_or_default(), emergency.decimal_or_default());
         check_below((&degraded, low), (&emergency, high));
         (low, high)
     };
-    let lag_ms = pair("lag_ms", 1.0..=MAX_RTT_MS, (default.degraded_lag_ms, default.emergency_lag_ms));
-    let occupancy = pair(
-        "queue_occupancy",
-        0.01..=1.0,
-        (default.degraded_queue_occupancy, default.emergency_queue_occupancy),
-    );
-    let errors_per_s = pair(
-        "errors_per_s",
-        0.1..=MAX_ERRORS_PER_S,
-        (default.degraded_errors_per_s, default.emergency_errors_per_s),
-    );
-    let silent_ms = silent.whole(MIN_SILENT_MS..=HOUR_MS).unwrap_or(default.silent_ms);
-    let emergency_silent_ms = emergency_silent.whole(0..=HOUR_MS).unwrap_or(default.emergency_silent_ms);
+    let (lag_ms, occupancy, errors_per_s) = (pair("lag_ms"), pair("queue_occupancy"), pair("errors_per_s"));
+    let silent_ms = silent.whole_or_default();
+    let emergency_silent_ms = emergency_silent.whole_or_default();
     if emergency_silent_ms != 0 {
         check_below((&silent, silent_ms as f64), (&emergency_silent, emergency_silent_ms as f64));
     }
     Safety {
-        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal(SAFETY_RATES_HZ).unwrap_or(2.0),
+        evaluate_rate_hz: section.get("evaluate_rate_hz").decimal_or_default(),
         rules: SafetyRules {
             preserve_critical_path: flag("preserve_critical_path"),
             allow_noncritical_degrade: flag("allow_noncritical_degrade"),
-            max_noncritical_queue: queue.unwrap_or(default.max_noncritical_queue),
+            max_noncritical_queue: section.get("max_noncritical_queue").count_or_default(),
             overload_drop_noncritical_first: flag("overload_drop_noncritical_first"),
             degraded_lag_ms: lag_ms.0,
             emergency_lag_ms: lag_ms.1,
@@ -189,8 +143,8 @@ pub(super) fn safety(root: &Field<'_>) -> Safety {
             emergency_errors_per_s: errors_per_s.1,
             silent_ms,
             emergency_silent_ms,
-            hysteresis_count: readings(&section.get("hysteresis_count"), default.hysteresis_count),
-            recovery_count: readings(&section.get("recovery_count"), default.recovery_count),
+            hysteresis_count: section.get("hysteresis_count").count_or_default(),
+            recovery_count: section.get("recovery_count").count_or_default(),
         },
     }
 }
@@ -219,29 +173,25 @@ pub(super) fn security(root: &Field<'_>) -> Security {
             field.report_key(&format!("must not be given together with {}: use one of them", first.path));
         }
     }
-    let rate = section.get("max_probe_rate_hz").whole(1..=10_000);
     Security {
-        trust_mode: section.get("trust_mode").choice(TRUST_MODES).unwrap_or(TrustMode::DefaultDeny),
-        enable_probe_hmac: section.get("enable_probe_hmac").flag().unwrap_or(false),
+        trust_mode: section.get("trust_mode").choice_or_default(TRUST_MODES),
+        enable_probe_hmac: section.get("enable_probe_hmac").flag_or_default(),
         secret: sources.into_iter().next().map(|(_, source)| source),
-        replay_window_ms: section.get("replay_window_ms").whole(1..=DAY_MS).unwrap_or(30_000),
-        max_probe_rate_hz: rate.and_then(|rate| u32::try_from(rate).ok()).unwrap_or(20),
-        allow_legacy_node_name_overrides: section
-            .get("allow_legacy_node_name_overrides")
-            .flag()
-            .unwrap_or(true),
+        replay_window_ms: section.get("replay_window_ms").whole_or_default(),
+        max_probe_rate_hz: section.get("max_probe_rate_hz").count_or_default(),
+        allow_legacy_node_name_overrides: section.get("allow_legacy_node_name_overrides").flag_or_default(),
     }
 }
 
 /// Reads `diagnostics`.
 pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
     let section = root.section("diagnostics");
-    let interval_s = section.get("publish_interval_s").decimal(0.01..=3_600.0).unwrap_or(1.0);
+    let interval_s = section.get("publish_interval_s").decimal_or_default();
     Diagnostics {
-        enabled: section.get("enabled").flag().unwrap_or(true),
+        enabled: section.get("enabled").flag_or_default(),
         publish_interval_ms: (interval_s * 1_000.0).round() as u64,
-        topic: topic(&section.get("topic"), "/adaptive_bridge/diagnostics"),
-        verbosity: section.get("verbosity").choice(VERBOSITIES).unwrap_or(Verbosity::Info),
+        topic: topic(&section.get("topic")),
+        verbosity: section.get("verbosity").choice_or_default(VERBOSITIES),
         metrics: section.get("metrics").parsed(
             "a loopback address and port such as 127.0.0.1:9464, or unix: and an absolute path",
             metrics_listener,

@@ -3,7 +3,7 @@
 
 use std::ops::RangeInclusive;
 
-use super::keys::joined;
+use super::keys::{Key, Kind, joined};
 use super::problem::{Place, Problem, Problems, did_you_mean, shown};
 use super::yaml::{Content, Node};
 
@@ -15,13 +15,15 @@ pub(super) struct Field<'a> {
     /// The line of its key; for a missing key that of the closest existing parent.
     pub line: usize,
     node: Option<&'a Node>,
+    /// Its declaration; `None` for an unknown key.
+    key: Option<&'static Key>,
     problems: &'a Problems,
 }
 
 impl<'a> Field<'a> {
     /// The field of the whole file.
     pub fn root(node: Option<&'a Node>, problems: &'a Problems) -> Self {
-        Self { path: String::new(), line: 1, node, problems }
+        Self { path: String::new(), line: 1, node, key: Some(Key::root()), problems }
     }
 
     /// Whether there is a value other than null.
@@ -48,6 +50,7 @@ impl<'a> Field<'a> {
             path: joined(&self.path, name),
             line: entry.map_or(self.line, |entry| entry.line),
             node: entry.map(|entry| &*entry.value),
+            key: self.key.and_then(|key| key.get(name)),
             problems: self.problems,
         }
     }
@@ -76,7 +79,9 @@ impl<'a> Field<'a> {
         let once = entries.iter().filter(|entry| seen.insert(entry.key.as_str()));
         once.map(|entry| {
             let path = joined(&self.path, &shown(&entry.key));
-            let field = Self { path, line: entry.line, node: Some(&entry.value), problems: self.problems };
+            let key = self.key.and_then(|key| key.get(&entry.key));
+            let field =
+                Self { path, line: entry.line, node: Some(&entry.value), key, problems: self.problems };
             (entry.key.as_str(), field)
         })
         .collect()
@@ -91,6 +96,7 @@ impl<'a> Field<'a> {
             path: format!("{}[{index}]", self.path),
             line: item.line,
             node: Some(item),
+            key: self.key.and_then(Key::item),
             problems: self.problems,
         });
         Some(items.collect())
@@ -121,8 +127,73 @@ impl<'a> Field<'a> {
         }
     }
 
+    /// The type and range that the row of the key declares; `None` for an unknown key, which is reported as
+    /// such.
+    fn kind(&self) -> Option<Kind> {
+        self.key.and_then(|key| key.row).map(|row| row.kind)
+    }
+
+    /// For a key that is read as another type than its row declares, or that has no row.
+    fn no_value<T>(&self, kind: Option<Kind>) -> Option<T> {
+        debug_assert!(kind.is_none(), "{} is declared as {kind:?}", self.path);
+        None
+    }
+
+    /// The default that the row of the key declares.
+    fn default<T>(&self, parse: impl Fn(&str) -> Option<T>) -> T {
+        let text = self.key.and_then(|key| key.row).map_or("", |row| row.default);
+        // A file without any key reads all of them, as the tests do.
+        #[allow(clippy::expect_used)]
+        parse(text.trim_matches('`')).expect("the default of a key is one of its values")
+    }
+
+    /// A boolean, or its default.
+    pub fn flag_or_default(&self) -> bool {
+        self.flag().unwrap_or_else(|| self.default(|text| text.parse().ok()))
+    }
+
+    /// A whole number in the key's range.
+    pub fn whole(&self) -> Option<u64> {
+        match self.kind() {
+            Some(Kind::Whole(least, most)) => self.whole_in(least..=most),
+            other => self.no_value(other),
+        }
+    }
+
+    /// A whole number in the key's range, or its default.
+    pub fn whole_or_default(&self) -> u64 {
+        self.whole().unwrap_or_else(|| self.default(parse_whole))
+    }
+
+    /// A whole number in the key's range, as another type.
+    pub fn count<T: TryFrom<u64>>(&self) -> Option<T> {
+        self.whole().and_then(|number| T::try_from(number).ok())
+    }
+
+    /// A whole number in the key's range or its default, as another type.
+    pub fn count_or_default<T: TryFrom<u64>>(&self) -> T {
+        let default = || self.default(|text| T::try_from(parse_whole(text)?).ok());
+        self.count().unwrap_or_else(default)
+    }
+
+    /// A finite number in the key's range.
+    pub fn decimal(&self) -> Option<f64> {
+        let (least, most) = match self.kind() {
+            Some(Kind::Decimal(least, most)) => (least, most),
+            other => return self.no_value(other),
+        };
+        self.value()?;
+        let allowed = format!("must be a number from {least} to {most}");
+        self.number(&allowed, |text| parse_decimal(text).filter(|number| (least..=most).contains(number)))
+    }
+
+    /// A finite number in the key's range, or its default.
+    pub fn decimal_or_default(&self) -> f64 {
+        self.decimal().unwrap_or_else(|| self.default(parse_decimal))
+    }
+
     /// A whole number in a range; `10.0` is one too.
-    pub fn whole(&self, range: RangeInclusive<u64>) -> Option<u64> {
+    pub fn whole_in(&self, range: RangeInclusive<u64>) -> Option<u64> {
         let allowed = format!("must be a whole number from {} to {}", range.start(), range.end());
         self.whole_where(&allowed, |number| range.contains(&number))
     }
@@ -131,18 +202,6 @@ impl<'a> Field<'a> {
     pub fn whole_where(&self, allowed: &str, accept: impl Fn(u64) -> bool) -> Option<u64> {
         self.value()?;
         self.number(allowed, |text| parse_whole(text).filter(|&number| accept(number)))
-    }
-
-    /// A whole number in a range, as `usize`.
-    pub fn count(&self, range: RangeInclusive<u64>) -> Option<usize> {
-        self.whole(range).and_then(|number| usize::try_from(number).ok())
-    }
-
-    /// A finite number in a range.
-    pub fn decimal(&self, range: RangeInclusive<f64>) -> Option<f64> {
-        self.value()?;
-        let allowed = format!("must be a number from {} to {}", range.start(), range.end());
-        self.number(&allowed, |text| parse_decimal(text).filter(|number| range.contains(number)))
     }
 
     fn number<T>(&self, allowed: &str, parse: impl Fn(&str) -> Option<T>) -> Option<T> {
@@ -183,6 +242,17 @@ impl<'a> Field<'a> {
             let hint = self.problems.hint(word, &names);
             self.report_with(&format!("must be one of {}", names.join(", ")), hint)
         })
+    }
+
+    /// One of a few words in any case, or the default.
+    pub fn choice_or_default<T: Copy>(&self, choices: &[(&str, T)]) -> T {
+        let find = |text: &str| choices.iter().find(|(name, _)| *name == text).map(|&(_, choice)| choice);
+        self.choice(choices).unwrap_or_else(|| self.default(find))
+    }
+
+    /// A text that `parse` accepts, or the default.
+    pub fn parsed_or_default<T>(&self, allowed: &str, parse: impl Fn(&str) -> Option<T>) -> T {
+        self.parsed(allowed, &parse).unwrap_or_else(|| self.default(parse))
     }
 
     /// A reference by name to something that the file defines elsewhere; `find` looks it up.

@@ -3,16 +3,13 @@
 use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
-use super::rates::{self, MAX_QUEUE, RoutingPolicy};
+use super::rates::{self, RoutingPolicy};
 use super::settings::{DdsNetwork, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
 use crate::model::{LaneName, TrafficClass};
 
 /// The most lanes. Each is a process with its own DDS participant, and a domain allows 120 participants on a
 /// host (RTPS 2.5 clause 9.6.2.3).
 const MAX_LANES: usize = 32;
-
-/// The largest sample, in bytes.
-pub(super) const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// The nice value of noncritical lanes: when a sample wakes several lanes and one CPU is free, the critical
 /// lane gets it. The scheduler gives a noncritical lane a ninth of the critical lane's weight.
@@ -117,13 +114,10 @@ impl LaneReader<'_> {
             class,
             network: network(field, self.input, self.environment),
             outputs: Vec::new(),
-            queue_depth: field.get("queue_depth").count(1..=MAX_QUEUE).unwrap_or(queue_depth),
-            max_borrowed: field.get("max_borrowed").count(1..=MAX_QUEUE).unwrap_or(8),
-            by_reference_min_bytes: field
-                .get("by_reference_min_bytes")
-                .count(0..=MAX_SAMPLE_BYTES)
-                .unwrap_or(65_536),
-            window_samples: field.get("window_samples").count(1..=100_000).unwrap_or(256),
+            queue_depth: field.get("queue_depth").count().unwrap_or(queue_depth),
+            max_borrowed: field.get("max_borrowed").count_or_default(),
+            by_reference_min_bytes: field.get("by_reference_min_bytes").count_or_default(),
+            window_samples: field.get("window_samples").count_or_default(),
             rates: match class {
                 TrafficClass::Critical => rates::critical_rates(field),
                 TrafficClass::Noncritical => self.policy.lane_rates(field),
@@ -141,7 +135,7 @@ impl LaneReader<'_> {
 
 /// Reads `domain_id` and `networks` of a section; missing values are those of `base`.
 pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {
-    let domain = section.get("domain_id").whole(0..=232).and_then(|id| u16::try_from(id).ok());
+    let domain = section.get("domain_id").count();
     let interfaces = section.get("networks").items().map(|items| {
         let selectors =
             items.iter().filter_map(|item| item.parsed(NetworkSelector::ALLOWED, NetworkSelector::parse));
@@ -158,8 +152,8 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
 pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling {
     let policy = section.get("policy");
     let priority = section.get("priority");
-    let kind = policy.choice(SCHEDULING_POLICIES);
-    let priority = match kind.unwrap_or_default() {
+    let kind = policy.choice_or_default(SCHEDULING_POLICIES);
+    let priority = match kind {
         // If the policy itself is wrong, the allowed priority is unknown.
         SchedulingPolicy::Other if policy.was_reported() => 0,
         SchedulingPolicy::Other => priority
@@ -169,18 +163,18 @@ pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling
             if !priority.is_given() {
                 priority.report::<()>("must be a whole number from 1 to 99, because policy is fifo or rr");
             }
-            priority.whole(1..=99).unwrap_or(1)
+            priority.whole().unwrap_or(1)
         }
     };
-    let given_nice = section.get("nice").whole(0..=19).and_then(|nice| u8::try_from(nice).ok());
-    let slice_ms = section.get("slice_ms").decimal(0.1..=100.0);
+    let given_nice = section.get("nice").count();
+    let slice_ms = section.get("slice_ms").decimal();
     let cpus = section.get("cpus").items().unwrap_or_default();
     Scheduling {
-        policy: kind.unwrap_or_default(),
+        policy: kind,
         priority: u8::try_from(priority).unwrap_or(0),
         nice: given_nice.unwrap_or(default.nice),
         slice_us: slice_ms.map(|ms| (ms * 1_000.0).round() as u32).or(default.slice_us),
-        cpus: cpus.iter().filter_map(|cpu| cpu.count(0..=1023)).collect(),
-        lock_memory: section.get("lock_memory").flag().unwrap_or(false),
+        cpus: cpus.iter().filter_map(|cpu| usize::try_from(cpu.whole_in(0..=1023)?).ok()).collect(),
+        lock_memory: section.get("lock_memory").flag_or_default(),
     }
 }

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use super::environment::Environment;
 use super::field::Field;
 use super::in_force::{Configuration, InlineSecret};
-use super::lanes::MAX_SAMPLE_BYTES;
 use super::problem::{ConfigError, Place, Problem, Problems};
 use super::qos::Profiles;
 use super::settings::{SecretSource, Settings, SharedMemory};
@@ -155,11 +154,9 @@ fn inline_secret(document: Option<&yaml::Node>) -> Option<InlineSecret> {
 
 /// Builds the settings, which are valid only if no problems are reported.
 fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
-    let instance =
-        root.get("instance").parsed(InstanceName::ALLOWED, |text| InstanceName::try_from(text).ok());
-    #[allow(clippy::expect_used, reason = "`default` is a valid instance name")]
-    let instance =
-        instance.unwrap_or_else(|| InstanceName::try_from("default").expect("a valid instance name"));
+    let instance = root
+        .get("instance")
+        .parsed_or_default(InstanceName::ALLOWED, |text| InstanceName::try_from(text).ok());
 
     let profiles = Profiles::read(root);
     let input = routes::input_network(root, environment);
@@ -167,10 +164,10 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let drafts = lanes::read(root, &profiles, &input, environment, safety.rules.max_noncritical_queue as u64);
 
     let memory = root.section("shared_memory");
-    let max_sample_bytes = memory.get("max_sample_bytes").count(1..=MAX_SAMPLE_BYTES).unwrap_or(1 << 20);
+    let max_sample_bytes = memory.get("max_sample_bytes").count_or_default();
     let shared_memory = SharedMemory {
         root_path: memory.get("root_path").parsed("an absolute path", control::absolute_path),
-        max_taps: memory.get("max_taps").count(0..=64).unwrap_or(2),
+        max_taps: memory.get("max_taps").count_or_default(),
     };
     let (routes, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
@@ -180,7 +177,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         lanes::scheduling(&section, lanes::default_scheduling(class))
     };
     let security = control::security(root);
-    let policy_hold_s = root.get("policy_hold_s").decimal(0.0..=3_600.0).unwrap_or(5.0);
+    let policy_hold_s = root.get("policy_hold_s").decimal_or_default();
     Settings {
         instance,
         input,

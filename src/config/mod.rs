@@ -1,8 +1,8 @@
 //! The configuration: reads YAML into validated [`Settings`], or reports every problem of the file at once.
 //!
-//! `yaml` parses text into a tree of values with their lines; `keys` lists all keys and finds unknown ones;
-//! `field` reads and checks one value and reports its problems; the other modules build the settings, with
-//! one file for each part.
+//! `yaml` parses text into a tree of values with their lines; `keys` declares each key in one row and finds
+//! unknown ones; `field` reads and checks one value as its row declares; the other modules build the
+//! settings, with one file for each part.
 
 mod control;
 mod environment;
@@ -23,7 +23,7 @@ mod tests;
 mod yaml;
 
 pub use in_force::{Configuration, DecodeError, InlineSecret};
-pub use keys::KEYS;
+pub use keys::{KEYS, Kind, Row, rows};
 pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, parse};
 pub use problem::{ConfigError, Place, Problem};
 pub use reload::{Change, Reload};

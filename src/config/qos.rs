@@ -6,13 +6,6 @@ use super::field::Field;
 use super::settings::InputQos;
 use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 
-/// The largest depth of HISTORY and the most retained samples. DDS allows 2^31; with 10,000 a route of 1 KiB
-/// samples takes 10 MiB on each lane.
-pub(super) const MAX_DEPTH: u64 = 10_000;
-
-/// The longest LIFESPAN, DEADLINE, stale threshold or replay window: a day.
-pub(super) const DAY_MS: u64 = 86_400_000;
-
 /// The depth of KEEP_LAST without a depth in the file: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
 
@@ -20,11 +13,11 @@ pub(super) const RELIABILITIES: &[(&str, Reliability)] =
     &[("RELIABLE", Reliability::Reliable), ("BEST_EFFORT", Reliability::BestEffort)];
 pub(super) const DURABILITIES: &[(&str, Durability)] =
     &[("VOLATILE", Durability::Volatile), ("TRANSIENT_LOCAL", Durability::TransientLocal)];
-const HISTORIES: &[(&str, HistoryKind)] =
+pub(super) const HISTORIES: &[(&str, HistoryKind)] =
     &[("KEEP_LAST", HistoryKind::KeepLast), ("KEEP_ALL", HistoryKind::KeepAll)];
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum HistoryKind {
+pub(super) enum HistoryKind {
     KeepLast,
     KeepAll,
 }
@@ -47,10 +40,10 @@ impl PartialQos {
         Self {
             reliability: field.get("reliability").choice(RELIABILITIES),
             history: field.get("history").choice(HISTORIES),
-            depth: field.get("depth").whole(1..=MAX_DEPTH).and_then(|depth| u32::try_from(depth).ok()),
+            depth: field.get("depth").count(),
             durability: field.get("durability").choice(DURABILITIES),
-            lifespan_ms: field.get("lifespan_ms").whole(1..=DAY_MS),
-            deadline_ms: field.get("deadline_ms").whole(1..=DAY_MS),
+            lifespan_ms: field.get("lifespan_ms").whole(),
+            deadline_ms: field.get("deadline_ms").whole(),
         }
     }
 

@@ -2,22 +2,10 @@
 //! lane.
 
 use super::field::Field;
-use super::qos::DAY_MS;
 use super::settings::{DropPolicy, LaneRates, RatePolicy};
 
-/// The most samples in a queue or borrowed at once; each of them occupies `max_sample_bytes`.
-pub(super) const MAX_QUEUE: u64 = 4_096;
-
-/// The highest rate, in samples per second.
-const MAX_RATE_HZ: f64 = 100_000.0;
-
-/// The most bytes per second: 1 TB/s, more than the bandwidth of any memory.
-const MAX_BYTES_PER_S: u64 = 1_000_000_000_000;
-
-/// The paper's rates and stale threshold (section III-D).
-const NORMAL_RATE_HZ: f64 = 10.0;
+/// The paper's rate in DEGRADED (section III-D).
 const DEGRADED_RATE_HZ: f64 = 3.0;
-const STALE_THRESHOLD_MS: u64 = 200;
 
 /// The default queue of a noncritical lane: the depth of the paper's writer, and fewer samples in DEGRADED.
 const NORMAL_DEPTH: u64 = 5;
@@ -87,10 +75,9 @@ impl RoutingPolicy {
         if forward.flag() == Some(false) {
             forward.report::<()>("must be true: a critical lane forwards in every mode but emergency");
         }
-        let rate_hz = section.get("noncritical_max_rate_hz").decimal(0.0..=MAX_RATE_HZ);
-        let stale_ms = section.get("stale_threshold_ms").whole(0..=DAY_MS);
-        let drop_policy = section.get("noncritical_drop_policy").choice(DROP_POLICIES);
-        let drop_policy = drop_policy.unwrap_or(DropPolicy::DropOldest);
+        let rate_hz = section.get("noncritical_max_rate_hz").decimal_or_default();
+        let stale_ms = section.get("stale_threshold_ms").whole_or_default();
+        let drop_policy = section.get("noncritical_drop_policy").choice_or_default(DROP_POLICIES);
 
         let modes = section.section("modes");
         for (name, mode) in modes.entries() {
@@ -101,8 +88,8 @@ impl RoutingPolicy {
             }
         }
         let queue = |mode: &Field<'_>, default: u64| {
-            let cap = mode.get("max_noncritical_queue").whole(0..=MAX_QUEUE).unwrap_or(max_noncritical_queue);
-            let depth = mode.get("noncritical_depth").whole(0..=MAX_QUEUE).unwrap_or(default);
+            let cap = mode.get("max_noncritical_queue").whole().unwrap_or(max_noncritical_queue);
+            let depth = mode.get("noncritical_depth").whole().unwrap_or(default);
             Queue {
                 drop_policy: mode.get("noncritical_drop_policy").choice(DROP_POLICIES).unwrap_or(drop_policy),
                 // At least one sample waits: the one that the next token sends.
@@ -110,13 +97,13 @@ impl RoutingPolicy {
             }
         };
         let (normal, degraded) = (modes.section("normal"), modes.section("degraded"));
-        let mode_rate_hz = |mode: &Field<'_>| mode.get("noncritical_max_rate_hz").decimal(0.0..=MAX_RATE_HZ);
-        let mode_stale_ms = |mode: &Field<'_>| mode.get("stale_threshold_ms").whole(0..=DAY_MS);
+        let mode_rate_hz = |mode: &Field<'_>| mode.get("noncritical_max_rate_hz").decimal();
+        let mode_stale_ms = |mode: &Field<'_>| mode.get("stale_threshold_ms").whole();
         Self {
-            enabled: section.get("noncritical_enabled").flag().unwrap_or(true),
-            normal_rate_hz: mode_rate_hz(&normal).or(rate_hz).unwrap_or(NORMAL_RATE_HZ),
+            enabled: section.get("noncritical_enabled").flag_or_default(),
+            normal_rate_hz: mode_rate_hz(&normal).unwrap_or(rate_hz),
             degraded_rate_hz: mode_rate_hz(&degraded),
-            normal_stale_ms: mode_stale_ms(&normal).or(stale_ms).unwrap_or(STALE_THRESHOLD_MS),
+            normal_stale_ms: mode_stale_ms(&normal).unwrap_or(stale_ms),
             degraded_stale_ms: mode_stale_ms(&degraded),
             normal_queue: queue(&normal, NORMAL_DEPTH),
             degraded_queue: queue(&degraded, DEGRADED_DEPTH),
@@ -125,9 +112,9 @@ impl RoutingPolicy {
 
     /// The rates of one noncritical lane: its own, else the defaults of the mode.
     pub fn lane_rates(&self, lane: &Field<'_>) -> LaneRates {
-        let rate_hz = |key: &str| lane.get(key).decimal(0.0..=MAX_RATE_HZ);
-        let bytes_per_s = |key: &str| lane.get(key).whole(1..=MAX_BYTES_PER_S);
-        let stale_ms = |key: &str| lane.get(key).whole(0..=DAY_MS);
+        let rate_hz = |key: &str| lane.get(key).decimal();
+        let bytes_per_s = |key: &str| lane.get(key).whole();
+        let stale_ms = |key: &str| lane.get(key).whole();
 
         let normal_rate_hz = rate_hz("max_rate_hz").unwrap_or(self.normal_rate_hz);
         // A lane with a normal rate below 3 Hz does not become faster in DEGRADED.
@@ -141,7 +128,7 @@ impl RoutingPolicy {
         let degraded_bytes_per_s = bytes_per_s("degraded_max_bytes_per_s").or(normal_bytes_per_s);
 
         let drop_policy = lane.get("drop_policy").choice(DROP_POLICIES);
-        let queue_samples = lane.get("queue_samples").count(1..=MAX_QUEUE);
+        let queue_samples = lane.get("queue_samples").count::<usize>();
         let policy = |queue: &Queue, max_rate_hz, max_bytes_per_s, stale_threshold_ms| RatePolicy {
             max_rate_hz: if self.enabled { max_rate_hz } else { 0.0 },
             max_bytes_per_s,
@@ -161,8 +148,8 @@ fn check_closed_mode(mode: &Field<'_>) {
     mode.entries();
     let rate = mode.get("noncritical_max_rate_hz");
     rate.whole_where("must be 0: noncritical lanes forward nothing in this mode", |rate| rate == 0);
-    mode.get("noncritical_depth").whole(0..=MAX_QUEUE);
+    mode.get("noncritical_depth").whole();
     mode.get("noncritical_drop_policy").choice(DROP_POLICIES);
-    mode.get("stale_threshold_ms").whole(0..=DAY_MS);
-    mode.get("max_noncritical_queue").whole(0..=MAX_QUEUE);
+    mode.get("stale_threshold_ms").whole();
+    mode.get("max_noncritical_queue").whole();
 }

@@ -1,14 +1,16 @@
 //! Reload: which changes of a file a running bridge applies, and which wait for a restart of the whole
 //! bridge.
 //!
-//! Each structure of the settings is built or destructured here field by field, so that code with a new field
-//! compiles only when this module decides which of the two applies to it.
+//! The row of a key ([`super::keys`]) decides which of the two applies to it. Each structure of the settings
+//! is built or destructured here field by field, so that code with a new field compiles only when this module
+//! compares it.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::keys::Key;
 use super::settings::{
     Classifier, DdsNetwork, Diagnostics, InputQos, Lane, LaneRates, Output, Probes, RatePolicy, Route,
     Safety, Scheduling, Security, Settings, SharedMemory,
@@ -56,14 +58,13 @@ impl Settings {
         let d = &mut differ;
         routes(d, self, &new);
         let lanes = lanes(d, &self.lanes, &new.lanes);
-        d.take("policy_hold_s", &seconds(self.policy_hold_ms), seconds(new.policy_hold_ms));
         let settings = Self {
-            instance: d.keep("instance", &self.instance, &new.instance),
+            instance: d.apply("instance", &self.instance, &new.instance),
             input: network(d, "ros", &self.input, &new.input),
-            graph_gid_bytes: d.keep("ros.graph_gid_bytes", &self.graph_gid_bytes, &new.graph_gid_bytes),
+            graph_gid_bytes: d.apply("ros.graph_gid_bytes", &self.graph_gid_bytes, &new.graph_gid_bytes),
             routes: self.routes.clone(),
             shared_memory: shared_memory(d, &self.shared_memory, &new.shared_memory),
-            policy_hold_ms: new.policy_hold_ms,
+            policy_hold_ms: in_seconds(d, "policy_hold_s", self.policy_hold_ms, new.policy_hold_ms),
             ingress_scheduling: scheduling(
                 d,
                 "processes.ingress",
@@ -76,11 +77,11 @@ impl Settings {
                 &self.control_scheduling,
                 &new.control_scheduling,
             ),
-            classifier: classifier(d, &self.classifier, new.classifier),
-            probes: probes(d, &self.probes, new.probes),
-            safety: safety(d, &self.safety, new.safety),
-            security: security(d, &self.security, new.security),
-            diagnostics: diagnostics(d, &self.diagnostics, new.diagnostics),
+            classifier: classifier(d, &self.classifier, &new.classifier),
+            probes: probes(d, &self.probes, &new.probes),
+            safety: safety(d, &self.safety, &new.safety),
+            security: security(d, &self.security, &new.security),
+            diagnostics: diagnostics(d, &self.diagnostics, &new.diagnostics),
             overrides: overrides(d, &self.overrides, new.overrides),
             subscribers: subscribers(d, &lanes, &self.subscribers, new.subscribers),
             lanes,
@@ -94,6 +95,15 @@ impl Settings {
 struct Differ(Reload);
 
 impl Differ {
+    /// Applies the new value of a setting if the row of its key says so, else keeps the old one.
+    fn apply<T: Clone + PartialEq + Shown>(&mut self, key: &str, old: &T, new: &T) -> T {
+        let path = key.trim_end_matches(" in DEGRADED");
+        match Key::row_of(path).is_some_and(|row| row.reloads) {
+            true => self.take(key, old, new.clone()),
+            false => self.keep(key, old, new),
+        }
+    }
+
     /// Applies the new value of a setting.
     fn take<T: PartialEq + Shown>(&mut self, key: &str, old: &T, new: T) -> T {
         if *old != new {
@@ -111,36 +121,41 @@ impl Differ {
     }
 }
 
-fn seconds(ms: u64) -> f64 {
-    ms as f64 / 1_000.0
+/// Reloads a setting in milliseconds whose key is in seconds.
+fn in_seconds(d: &mut Differ, key: &str, old_ms: u64, new_ms: u64) -> u64 {
+    let [old, new] = [old_ms, new_ms].map(|ms| ms as f64 / 1_000.0);
+    if d.apply(key, &old, &new) == new { new_ms } else { old_ms }
+}
+
+/// Compares the fields of a structure; each has the last part of its key, which is its name if there is none.
+macro_rules! apply_each {
+    ($d:ident, $of:expr, $old:expr, $new:expr, $type:ident {
+        $($field:ident $(: $key:literal)?),+ $(,)?; $($own:ident: $value:expr),* $(,)?
+    }) => {
+        $type {
+            $($field: {
+                let name = [$($key,)? stringify!($field)][0];
+                $d.apply(&format!("{}.{name}", $of), &$old.$field, &$new.$field)
+            },)+
+            $($own: $value,)*
+        }
+    };
 }
 
 fn network(d: &mut Differ, of: &str, old: &DdsNetwork, new: &DdsNetwork) -> DdsNetwork {
-    DdsNetwork {
-        domain_id: d.keep(&format!("{of}.domain_id"), &old.domain_id, &new.domain_id),
-        interfaces: d.keep(&format!("{of}.networks"), &old.interfaces, &new.interfaces),
-    }
+    apply_each!(d, of, old, new, DdsNetwork { domain_id, interfaces: "networks"; })
 }
 
 fn shared_memory(d: &mut Differ, old: &SharedMemory, new: &SharedMemory) -> SharedMemory {
-    SharedMemory {
-        root_path: d.keep("shared_memory.root_path", &old.root_path, &new.root_path),
-        max_taps: d.keep("shared_memory.max_taps", &old.max_taps, &new.max_taps),
-    }
+    apply_each!(d, "shared_memory", old, new, SharedMemory { root_path, max_taps; })
 }
 
 fn scheduling(d: &mut Differ, of: &str, old: &Scheduling, new: &Scheduling) -> Scheduling {
-    let key = |name: &str| format!("{of}.scheduling.{name}");
+    let of = format!("{of}.scheduling");
     let slice_ms = |of: &Scheduling| of.slice_us.map(|us| f64::from(us) / 1_000.0);
-    d.keep(&key("slice_ms"), &slice_ms(old), &slice_ms(new));
-    Scheduling {
-        policy: d.keep(&key("policy"), &old.policy, &new.policy),
-        priority: d.keep(&key("priority"), &old.priority, &new.priority),
-        nice: d.keep(&key("nice"), &old.nice, &new.nice),
-        slice_us: old.slice_us,
-        cpus: d.keep(&key("cpus"), &old.cpus, &new.cpus),
-        lock_memory: d.keep(&key("lock_memory"), &old.lock_memory, &new.lock_memory),
-    }
+    let applied = d.apply(&format!("{of}.slice_ms"), &slice_ms(old), &slice_ms(new));
+    let slice = if applied == slice_ms(new) { new.slice_us } else { old.slice_us };
+    apply_each!(d, of, old, new, Scheduling { policy, priority, nice, cpus, lock_memory; slice_us: slice })
 }
 
 /// Compares the routes, which stay as they are.
@@ -213,25 +228,21 @@ fn lanes(d: &mut Differ, old: &[Lane], new: &[Lane]) -> Vec<Lane> {
 
 fn reload_lane(d: &mut Differ, old: &Lane, new: &Lane) -> Lane {
     let of = format!("lanes.{}", old.name);
-    let key = |name: &str| format!("{of}.{name}");
-    let depth = d.keep(&key("queue_depth"), &old.queue_depth, &new.queue_depth);
-    let borrowed = d.keep(&key("max_borrowed"), &old.max_borrowed, &new.max_borrowed);
-    Lane {
-        name: old.name.clone(),
-        class: old.class,
-        network: network(d, &of, &old.network, &new.network),
-        outputs: old.outputs.clone(),
-        queue_depth: depth,
-        max_borrowed: borrowed,
-        by_reference_min_bytes: d.keep(
-            &key("by_reference_min_bytes"),
-            &old.by_reference_min_bytes,
-            &new.by_reference_min_bytes,
-        ),
-        window_samples: d.keep(&key("window_samples"), &old.window_samples, &new.window_samples),
-        rates: lane_rates(d, old, new),
-        scheduling: scheduling(d, &of, &old.scheduling, &new.scheduling),
-    }
+    apply_each!(
+        d,
+        of,
+        old,
+        new,
+        Lane {
+            queue_depth, max_borrowed, by_reference_min_bytes, window_samples;
+            name: old.name.clone(),
+            class: old.class,
+            network: network(d, &of, &old.network, &new.network),
+            outputs: old.outputs.clone(),
+            rates: lane_rates(d, old, new),
+            scheduling: scheduling(d, &of, &old.scheduling, &new.scheduling),
+        }
+    )
 }
 
 fn lane_rates(d: &mut Differ, old: &Lane, new: &Lane) -> LaneRates {
@@ -267,126 +278,120 @@ fn rate_policy(
     let common_key = |name: &str| format!("lanes.{lane}.{name}{suffix}");
     let rate_key = if prefix.is_empty() { key("max_rate_hz") } else { key("rate_hz") };
     RatePolicy {
-        max_rate_hz: d.take(&rate_key, &old.max_rate_hz, new.max_rate_hz),
-        max_bytes_per_s: d.take(&key("max_bytes_per_s"), &old.max_bytes_per_s, new.max_bytes_per_s),
-        stale_threshold_ms: d.take(
+        max_rate_hz: d.apply(&rate_key, &old.max_rate_hz, &new.max_rate_hz),
+        max_bytes_per_s: d.apply(&key("max_bytes_per_s"), &old.max_bytes_per_s, &new.max_bytes_per_s),
+        stale_threshold_ms: d.apply(
             &key("stale_threshold_ms"),
             &old.stale_threshold_ms,
-            new.stale_threshold_ms,
+            &new.stale_threshold_ms,
         ),
-        drop_policy: d.take(&common_key("drop_policy"), &old.drop_policy, new.drop_policy),
+        drop_policy: d.apply(&common_key("drop_policy"), &old.drop_policy, &new.drop_policy),
         queue_samples: if has_room {
-            d.take(&common_key("queue_samples"), &old.queue_samples, new.queue_samples)
+            d.apply(&common_key("queue_samples"), &old.queue_samples, &new.queue_samples)
         } else {
             d.keep(&common_key("queue_samples"), &old.queue_samples, &new.queue_samples)
         },
     }
 }
 
-/// Applies the new values of all fields of a structure; each field has the last part of its key.
-macro_rules! take_each {
-    ($d:ident, $of:literal, $old:expr, $new:expr, $type:ident { $($field:ident: $key:literal),+ $(,)? }) => {
-        $type { $($field: $d.take(concat!($of, ".", $key), &$old.$field, $new.$field)),+ }
-    };
+fn classifier(d: &mut Differ, old: &Classifier, new: &Classifier) -> Classifier {
+    let reloaded = apply_each!(
+        d,
+        "classifier",
+        old.thresholds,
+        new.thresholds,
+        ClassifierThresholds {
+            demote_loss: "demote_loss_threshold",
+            promote_loss: "promote_loss_threshold",
+            demote_rtt_ms,
+            promote_rtt_ms,
+            hysteresis_count,
+            allow_unknown_state;
+        }
+    );
+    apply_each!(
+        d,
+        "classifier",
+        old,
+        new,
+        Classifier { enabled, subscriber_id, evaluate_rate_hz; thresholds: reloaded }
+    )
 }
 
-fn classifier(d: &mut Differ, old: &Classifier, new: Classifier) -> Classifier {
-    Classifier {
-        enabled: d.take("classifier.enabled", &old.enabled, new.enabled),
-        subscriber_id: d.take("classifier.subscriber_id", &old.subscriber_id, new.subscriber_id),
-        evaluate_rate_hz: d.take("classifier.evaluate_rate_hz", &old.evaluate_rate_hz, new.evaluate_rate_hz),
-        thresholds: take_each!(
-            d,
-            "classifier",
-            old.thresholds,
-            new.thresholds,
-            ClassifierThresholds {
-                demote_loss: "demote_loss_threshold",
-                promote_loss: "promote_loss_threshold",
-                demote_rtt_ms: "demote_rtt_ms",
-                promote_rtt_ms: "promote_rtt_ms",
-                hysteresis_count: "hysteresis_count",
-                allow_unknown_state: "allow_unknown_state",
-            }
-        ),
-    }
+fn probes(d: &mut Differ, old: &Probes, new: &Probes) -> Probes {
+    apply_each!(
+        d,
+        "probes",
+        old,
+        new,
+        Probes {
+            enabled,
+            rate_hz,
+            rtt_threshold_ms,
+            loss_threshold,
+            jitter_threshold_ms,
+            window_size,
+            hysteresis_count,
+            timeout_ms,
+            request_topic,
+            response_topic;
+        }
+    )
 }
 
-fn probes(d: &mut Differ, old: &Probes, new: Probes) -> Probes {
-    let key = |name: &str| format!("probes.{name}");
-    Probes {
-        enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
-        rate_hz: d.take(&key("rate_hz"), &old.rate_hz, new.rate_hz),
-        rtt_threshold_ms: d.take(&key("rtt_threshold_ms"), &old.rtt_threshold_ms, new.rtt_threshold_ms),
-        loss_threshold: d.take(&key("loss_threshold"), &old.loss_threshold, new.loss_threshold),
-        jitter_threshold_ms: d.take(
-            &key("jitter_threshold_ms"),
-            &old.jitter_threshold_ms,
-            new.jitter_threshold_ms,
-        ),
-        window_size: d.take(&key("window_size"), &old.window_size, new.window_size),
-        hysteresis_count: d.take(&key("hysteresis_count"), &old.hysteresis_count, new.hysteresis_count),
-        timeout_ms: d.take(&key("timeout_ms"), &old.timeout_ms, new.timeout_ms),
-        request_topic: d.keep(&key("request_topic"), &old.request_topic, &new.request_topic),
-        response_topic: d.keep(&key("response_topic"), &old.response_topic, &new.response_topic),
-    }
+fn safety(d: &mut Differ, old: &Safety, new: &Safety) -> Safety {
+    let reloaded = apply_each!(
+        d,
+        "safety",
+        old.rules,
+        new.rules,
+        SafetyRules {
+            preserve_critical_path,
+            allow_noncritical_degrade,
+            max_noncritical_queue,
+            overload_drop_noncritical_first,
+            degraded_lag_ms,
+            emergency_lag_ms,
+            degraded_queue_occupancy,
+            emergency_queue_occupancy,
+            degraded_errors_per_s,
+            emergency_errors_per_s,
+            silent_ms,
+            emergency_silent_ms,
+            hysteresis_count,
+            recovery_count;
+        }
+    );
+    apply_each!(d, "safety", old, new, Safety { evaluate_rate_hz; rules: reloaded })
 }
 
-fn safety(d: &mut Differ, old: &Safety, new: Safety) -> Safety {
-    Safety {
-        evaluate_rate_hz: d.take("safety.evaluate_rate_hz", &old.evaluate_rate_hz, new.evaluate_rate_hz),
-        rules: take_each!(
-            d,
-            "safety",
-            old.rules,
-            new.rules,
-            SafetyRules {
-                preserve_critical_path: "preserve_critical_path",
-                allow_noncritical_degrade: "allow_noncritical_degrade",
-                max_noncritical_queue: "max_noncritical_queue",
-                overload_drop_noncritical_first: "overload_drop_noncritical_first",
-                degraded_lag_ms: "degraded_lag_ms",
-                emergency_lag_ms: "emergency_lag_ms",
-                degraded_queue_occupancy: "degraded_queue_occupancy",
-                emergency_queue_occupancy: "emergency_queue_occupancy",
-                degraded_errors_per_s: "degraded_errors_per_s",
-                emergency_errors_per_s: "emergency_errors_per_s",
-                silent_ms: "silent_ms",
-                emergency_silent_ms: "emergency_silent_ms",
-                hysteresis_count: "hysteresis_count",
-                recovery_count: "recovery_count",
-            }
-        ),
-    }
+fn security(d: &mut Differ, old: &Security, new: &Security) -> Security {
+    apply_each!(
+        d,
+        "security",
+        old,
+        new,
+        Security {
+            trust_mode,
+            enable_probe_hmac,
+            secret: "hmac_secret",
+            replay_window_ms,
+            max_probe_rate_hz,
+            allow_legacy_node_name_overrides;
+        }
+    )
 }
 
-fn security(d: &mut Differ, old: &Security, new: Security) -> Security {
-    let key = |name: &str| format!("security.{name}");
-    Security {
-        trust_mode: d.take(&key("trust_mode"), &old.trust_mode, new.trust_mode),
-        enable_probe_hmac: d.take(&key("enable_probe_hmac"), &old.enable_probe_hmac, new.enable_probe_hmac),
-        secret: d.take(&key("hmac_secret"), &old.secret, new.secret),
-        replay_window_ms: d.take(&key("replay_window_ms"), &old.replay_window_ms, new.replay_window_ms),
-        max_probe_rate_hz: d.take(&key("max_probe_rate_hz"), &old.max_probe_rate_hz, new.max_probe_rate_hz),
-        allow_legacy_node_name_overrides: d.take(
-            &key("allow_legacy_node_name_overrides"),
-            &old.allow_legacy_node_name_overrides,
-            new.allow_legacy_node_name_overrides,
-        ),
-    }
-}
-
-fn diagnostics(d: &mut Differ, old: &Diagnostics, new: Diagnostics) -> Diagnostics {
-    let key = |name: &str| format!("diagnostics.{name}");
-    let interval_s = [old.publish_interval_ms, new.publish_interval_ms].map(seconds);
-    d.take(&key("publish_interval_s"), &interval_s[0], interval_s[1]);
-    Diagnostics {
-        enabled: d.take(&key("enabled"), &old.enabled, new.enabled),
-        publish_interval_ms: new.publish_interval_ms,
-        topic: d.keep(&key("topic"), &old.topic, &new.topic),
-        verbosity: d.take(&key("verbosity"), &old.verbosity, new.verbosity),
-        metrics: d.keep(&key("metrics"), &old.metrics, &new.metrics),
-    }
+fn diagnostics(d: &mut Differ, old: &Diagnostics, new: &Diagnostics) -> Diagnostics {
+    let interval = [old.publish_interval_ms, new.publish_interval_ms];
+    let interval_ms = in_seconds(d, "diagnostics.publish_interval_s", interval[0], interval[1]);
+    apply_each!(
+        d,
+        "diagnostics",
+        old,
+        new,
+        Diagnostics { enabled, topic, verbosity, metrics; publish_interval_ms: interval_ms }
+    )
 }
 
 type BySubscriber<T> = BTreeMap<String, T>;

@@ -4,8 +4,8 @@ use std::collections::{HashMap, HashSet};
 
 use super::environment::Environment;
 use super::field::Field;
-use super::lanes::{self, LaneDraft, MAX_SAMPLE_BYTES};
-use super::qos::{MAX_DEPTH, PartialQos, Profiles};
+use super::lanes::{self, LaneDraft};
+use super::qos::{PartialQos, Profiles};
 use super::settings::{DdsNetwork, Lane, Output, Route};
 use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
 
@@ -102,8 +102,8 @@ impl<'f> RouteReader<'_, 'f> {
         let input_topic = required(&input, TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
         let message_type =
             field.get("message_type").parsed(TypeName::ALLOWED, |text| TypeName::try_from(text).ok());
-        let max_sample_bytes = field.get("max_sample_bytes").count(1..=MAX_SAMPLE_BYTES);
-        let retained_samples = field.get("retained_samples").count(1..=MAX_DEPTH);
+        let max_sample_bytes = field.get("max_sample_bytes").count();
+        let retained_samples = field.get("retained_samples").count();
 
         let overrides = field.section("qos_overrides");
         self.check_lane_keys(&overrides, &["input"]);

@@ -1,0 +1,153 @@
+//! The configuration keys: one [`Row`] declares each, and everything else about the keys comes from these
+//! rows. This module finds the row of a path, and unknown and repeated keys.
+
+mod control;
+mod routes;
+mod row;
+
+use std::collections::HashMap;
+use std::sync::LazyLock;
+
+pub use row::{Kind, Row};
+
+use super::problem::{Place, Problem, Problems, did_you_mean, shown};
+use super::yaml::{Content, Entry, Node};
+
+/// The rows of all keys, in the order of `config/README.md`.
+pub fn rows() -> impl Iterator<Item = &'static Row> {
+    routes::ROWS.iter().chain(control::ROWS)
+}
+
+/// The path of every key. `[]` is an item of a list; a name in angle brackets is a name that the user
+/// chooses.
+pub static KEYS: LazyLock<Vec<&str>> =
+    LazyLock::new(|| rows().flat_map(|row| row.paths.iter().copied()).collect());
+
+static TREE: LazyLock<Key> = LazyLock::new(|| {
+    let mut root = Key::default();
+    for row in rows() {
+        for path in row.paths {
+            let mut key = &mut root;
+            for name in path.split('.') {
+                let list = name.strip_suffix("[]");
+                key = key.insert(list.unwrap_or(name));
+                if list.is_some() {
+                    key = key.insert("[]");
+                }
+            }
+            key.row = Some(row);
+        }
+    }
+    root
+});
+
+/// A known key, or the beginning of one.
+#[derive(Debug, Default)]
+pub(super) struct Key {
+    /// `None` for a section or a list of sections.
+    pub row: Option<&'static Row>,
+    below: Vec<(&'static str, Key)>,
+}
+
+impl Key {
+    /// The file as a whole.
+    pub fn root() -> &'static Self {
+        &TREE
+    }
+
+    /// The key of this name below this one: one of that name, else one that stands for names of the user.
+    pub fn get(&self, name: &str) -> Option<&Self> {
+        let named = |own: &&(&str, Self)| own.0 == name;
+        let placeholder = |own: &&(&str, Self)| own.0.starts_with('<');
+        self.below.iter().find(named).or_else(|| self.below.iter().find(placeholder)).map(|(_, key)| key)
+    }
+
+    /// The items of a list.
+    pub fn item(&self) -> Option<&Self> {
+        self.below.iter().find(|(name, _)| *name == "[]").map(|(_, key)| key)
+    }
+
+    /// The row of a key path without lists, such as `lanes.rviz.queue_depth`.
+    pub fn row_of(path: &str) -> Option<&'static Row> {
+        path.split('.').try_fold(Self::root(), |key, name| key.get(name))?.row
+    }
+
+    fn names(&self) -> Vec<&'static str> {
+        self.below.iter().map(|(name, _)| *name).filter(|name| *name != "[]").collect()
+    }
+
+    fn insert(&mut self, name: &'static str) -> &mut Self {
+        let index = self.below.iter().position(|(own, _)| *own == name).unwrap_or_else(|| {
+            self.below.push((name, Self::default()));
+            self.below.len() - 1
+        });
+        &mut self.below[index].1
+    }
+}
+
+/// Reports every unknown key and every repeated key of the file.
+pub(super) fn check(root: &Node, problems: &Problems) {
+    walk(root, Some(Key::root()), "", problems);
+}
+
+/// Checks a value and all below it. `key` is `None` below an unknown key.
+fn walk(node: &Node, key: Option<&Key>, path: &str, problems: &Problems) {
+    match &node.content {
+        Content::Scalar { .. } => {}
+        Content::List(items) => {
+            let key = key.and_then(Key::item);
+            for (index, item) in items.iter().enumerate() {
+                walk(item, key, &format!("{path}[{index}]"), problems);
+            }
+        }
+        Content::Map(entries) => {
+            let known = key.map(Key::names).unwrap_or_default();
+            let mut first_lines: HashMap<&str, usize> = HashMap::new();
+            for entry in entries {
+                let path = joined(path, &shown_key(path, &entry.key));
+                if let Some(first_line) = first_lines.get(entry.key.as_str()) {
+                    problems.report(Problem {
+                        place: Place::Line(entry.line),
+                        key: path.clone(),
+                        value: None,
+                        allowed: format!("must be given only once; line {first_line} already has it"),
+                        hint: None,
+                    });
+                }
+                first_lines.entry(&entry.key).or_insert(entry.line);
+                let below = key.and_then(|key| key.get(&entry.key));
+                // A mapping at a key that has no keys below it is a value of the wrong type, which its reader
+                // reports.
+                if below.is_none() && !known.is_empty() {
+                    problems.report(unknown(entry, &path, &known, problems));
+                }
+                walk(&entry.value, below, &path, problems);
+            }
+        }
+    }
+}
+
+fn unknown(entry: &Entry, path: &str, known: &[&str], problems: &Problems) -> Problem {
+    // Without a similar key here, a key that exists elsewhere is probably misplaced.
+    let hint = problems.hint(&entry.key, known).or_else(|| {
+        let elsewhere = KEYS.iter().find(|key| key.rsplit('.').next() == Some(&entry.key));
+        elsewhere.map(|key| did_you_mean(key))
+    });
+    let allowed = match hint {
+        Some(_) => "must be a known key".to_owned(),
+        None => format!("must be a known key: {}", known.join(", ")),
+    };
+    Problem { place: Place::Line(entry.line), key: path.to_owned(), value: None, allowed, hint }
+}
+
+/// A key for a message. `{hmac_secret:abc}`, without a space, is a key that contains the secret, so that a
+/// key below `security` is cut at the first separator.
+fn shown_key(path: &str, key: &str) -> String {
+    let end = if path == "security" { key.find([':', '=', ' ']) } else { None };
+    shown(&key[..end.unwrap_or(key.len())])
+}
+
+/// The path of `name` below `path`.
+pub(super) fn joined(path: &str, name: &str) -> String {
+    if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
+}
