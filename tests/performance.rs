@@ -1,5 +1,6 @@
-//! What the bench makes of its figures, with made-up ones: quantiles, growth, targets, tables, plots, and the
-//! page docs/performance.md. Pure: reads files of the project, measures nothing.
+//! What the bench makes of its figures, with invented ones: quantiles, growth, targets, tables, plots; and the
+//! pages docs/performance-runs.md and docs/performance.md. Pure: reads files of the project, measures
+//! nothing.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -433,7 +434,7 @@ fn a_run_is_read_as_it_was_written() {
 
 #[test]
 fn the_figures_of_the_page_are_those_of_its_runs() {
-    let page = fs::read_to_string(root().join("docs/performance.md")).unwrap();
+    let page = fs::read_to_string(root().join("docs/performance-runs.md")).unwrap();
     let runs: Vec<(String, Summary)> = runs_named(&page)
         .into_iter()
         .map(|name| {
@@ -444,8 +445,35 @@ fn the_figures_of_the_page_are_those_of_its_runs() {
         })
         .collect();
     let filled = fill(&page, &runs).unwrap();
-    assert!(filled == page, "docs/performance.md: run `cargo bench -- --page` with its runs");
+    assert!(filled == page, "docs/performance-runs.md: run `cargo bench -- --page` with its runs");
     for section in ["runs", "targets", "latency-other", "throughput", "resources", "isolation", "soak"] {
         assert!(page.contains(&format!("<!-- figures:{section} -->")), "the page has no {section}");
+    }
+}
+
+/// All medians with their intervals, such as `0.68 (0.59 to 0.76)`.
+fn estimates(text: &str) -> Vec<String> {
+    let is_of_number = |c: char| c.is_ascii_digit() || ".,".contains(c);
+    let is_number = |word: &str| !word.is_empty() && word.chars().all(is_of_number);
+    let estimate = |(at, _): (usize, &str)| {
+        let median = text[..at].rsplit(|c| !is_of_number(c)).next()?;
+        let interval = text[at + 2..].split(')').next()?;
+        let (low, high) = interval.split_once(" to ")?;
+        let is_one = [median, low, high].into_iter().all(is_number);
+        is_one.then(|| format!("{median} ({interval})"))
+    };
+    text.match_indices(" (").filter_map(estimate).collect()
+}
+
+#[test]
+fn the_summary_has_only_intervals_of_the_page_of_the_runs() {
+    let text = "a 1.0 (0.9 to 1.1), b (c to d), µ (1 to 2) and 2,000 (1,000 to 3,000).";
+    assert_eq!(estimates(text), ["1.0 (0.9 to 1.1)", "2,000 (1,000 to 3,000)"]);
+    let read = |name: &str| fs::read_to_string(root().join(name)).unwrap();
+    let runs = read("docs/performance-runs.md");
+    let summary = estimates(&read("docs/performance.md"));
+    assert!(summary.len() > 20, "{summary:?}");
+    for estimate in summary.into_iter().chain(estimates(&read("README.md"))) {
+        assert!(runs.contains(&estimate), "{estimate}");
     }
 }

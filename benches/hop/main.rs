@@ -107,9 +107,9 @@ fn measure(options: &Options) -> Result<(), String> {
     if failures.is_empty() { Ok(()) } else { Err(failures.join("; ")) }
 }
 
-/// Fills docs/performance.md with the figures of saved runs.
+/// Fills docs/performance-runs.md with the figures of saved runs.
 fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
-    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/performance.md");
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/performance-runs.md");
     let with_path = |path: &Path| {
         let path = path.display().to_string();
         move |error: &dyn std::fmt::Display| format!("{path}: {error}")

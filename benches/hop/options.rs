@@ -88,7 +88,7 @@ pub struct Options {
     /// Measure only memory over time
     #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
     pub soak: Option<Duration>,
-    /// Measure nothing; fill docs/performance.md with the figures of the runs, by default of those that it
+    /// Measure nothing; fill docs/performance-runs.md with the figures of the runs, by default of those that it
     /// already names
     #[arg(long, value_name = "RUN", num_args = 0..)]
     pub page: Option<Vec<PathBuf>>,

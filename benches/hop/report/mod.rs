@@ -1,5 +1,5 @@
 //! The summary of a bench run and the reports made from it: tables, plots, targets, and the page
-//! docs/performance.md. Pure, so that tests can pass invented runs.
+//! docs/performance-runs.md. Pure, so that tests can pass invented runs.
 
 mod figures;
 mod format;

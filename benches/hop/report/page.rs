@@ -1,5 +1,5 @@
-//! Fills the tables of docs/performance.md, and makes the README of a run. The text of the page is written by
-//! hand; everything between `<!-- figures:SECTION -->` and `<!-- end -->` is generated from runs.
+//! Fills the tables of docs/performance-runs.md, and makes the README of a run. The text of the page is
+//! written by hand; everything between `<!-- figures:SECTION -->` and `<!-- end -->` is generated from runs.
 
 use std::fmt::Write as _;
 
