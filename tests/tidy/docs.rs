@@ -92,6 +92,52 @@ fn every_page_that_the_source_names_is_there() {
     assert!(named > 0, "no page is named anywhere");
 }
 
+/// The files that a line of a guide names in back quotes, and its functions: those of a table's row with the
+/// cells number, file, function and remark.
+fn files_and_functions(line: &str) -> (Vec<String>, Vec<String>) {
+    const FOLDERS: [&str; 8] =
+        ["src/", "tests/", "benches/", "config/", "docs/", "fuzz/", "scripts/", "rustdds/"];
+    let quoted =
+        |text: &str| -> Vec<String> { text.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
+    let is_file = |word: &String| {
+        FOLDERS.iter().any(|folder| word.starts_with(folder)) && !word.contains(['<', '*', ' ', 'N'])
+    };
+    let files: Vec<String> = quoted(line).into_iter().filter(is_file).collect();
+    let cells: Vec<&str> = line.split('|').collect();
+    let functions = match cells[..] {
+        [_, _, file, functions, _, _] if quoted(file).iter().any(is_file) => quoted(functions),
+        _ => Vec::new(),
+    };
+    (files, functions)
+}
+
+#[test]
+fn every_file_and_function_that_the_guides_name_is_there() {
+    let mut named = 0;
+    for page in ["docs/ARCHITECTURE.md", "CONTRIBUTING.md"] {
+        for line in std::fs::read_to_string(root().join(page)).unwrap().lines() {
+            let (files, functions) = files_and_functions(line);
+            let paths: Vec<PathBuf> = files
+                .iter()
+                .map(|file| match file.strip_prefix("rustdds/") {
+                    Some(inside) => root().join("third_party/rustdds/src").join(inside),
+                    None => root().join(file),
+                })
+                .collect();
+            for path in &paths {
+                assert!(path.exists(), "{page}: {}", path.display());
+            }
+            for function in functions {
+                let source = std::fs::read_to_string(&paths[0]).unwrap();
+                let is_there = ["(", "<"].iter().any(|end| source.contains(&format!("fn {function}{end}")));
+                assert!(is_there, "{page}: no function {function} in {}", paths[0].display());
+                named += 1;
+            }
+        }
+    }
+    assert!(named > 10, "{named} functions are named");
+}
+
 #[test]
 fn every_decision_record_has_a_number_of_its_own() {
     let records: Vec<String> = files("docs/decisions", "md").into_iter().map(|page| page.path).collect();
