@@ -1,5 +1,5 @@
-//! What the bench makes of its figures, with invented ones: quantiles, growth, targets, tables, plots; and the
-//! pages docs/performance-runs.md and docs/performance.md. Pure: reads files of the project, measures
+//! What the bench makes of its figures, with invented ones: quantiles, growth, targets, tables and plots; and
+//! the pages docs/performance-runs.md and docs/performance.md. Pure: reads files of the project, measures
 //! nothing.
 
 use std::collections::BTreeMap;
