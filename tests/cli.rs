@@ -571,7 +571,7 @@ fn commands_read_the_configuration_in_force_and_not_another_file_of_the_instance
     assert_eq!(code, Some(0), "{said}");
     let (code, said) = run(&["tap", "/other"]);
     assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the configuration has: /scan (front_laser)"), "{said}");
+    assert!(said.contains("the routes are: /scan (front_laser)"), "{said}");
     let (code, said) = run(&["check"]);
     assert_eq!(code, Some(0), "{said}");
     assert!(said.contains("restart of the whole bridge: topics: [front_laser] -> [rear_laser]"), "{said}");

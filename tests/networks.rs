@@ -335,8 +335,8 @@ fn all_flows_recover_from_a_long_outage() {
     outage("all_flows_recover_from_a_long_outage", seconds.unwrap_or(60));
 }
 
-/// A laptop that sleeps for longer than every lease: its programs stop, and its link is down. The programs run
-/// again before the link is up.
+/// A laptop is suspended for longer than every lease: its programs stop, and its link is down. The programs
+/// run again before the link is up.
 #[test]
 fn all_flows_recover_from_a_suspended_laptop() {
     let Some(bed) = bed("all_flows_recover_from_a_suspended_laptop") else { return };

@@ -88,9 +88,9 @@ impl RawWriter {
         self.guid
     }
 
-    /// Writes a sample. Returns at once; a blocking writer returns within its blocking time. The DDS library keeps
-    /// `payload` until every matched RELIABLE reader has acknowledged it, or until newer samples evict it from the
-    /// history. [`sent_through`](Self::sent_through) tells when it was sent.
+    /// Writes a sample. Returns at once; a blocking writer returns within its blocking time. The DDS library
+    /// keeps `payload` until every matched RELIABLE reader has acknowledged it, or until newer samples evict it
+    /// from the history. [`sent_through`](Self::sent_through) tells when it was sent.
     ///
     /// # Errors
     /// The library did not accept the sample, and `payload` is dropped.
@@ -118,8 +118,8 @@ impl RawWriter {
         self.write_with(payload, encapsulation, timestamp, Some(reader)).map(|_| ())
     }
 
-    /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. A sample
-    /// that the thread that writes it can't send waits for the library's own thread.
+    /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. A
+    /// sample that the writing thread can't send waits for the library's own thread.
     pub fn sent_through(&self) -> i64 {
         self.inner.sent_through().into()
     }

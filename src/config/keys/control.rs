@@ -10,14 +10,14 @@ pub(super) const ROWS: &[Row] = &[
         &["routing_policy.critical_always_forward"],
         Other("`true`"),
         "`true`",
-        "Critical lanes forward in every mode but EMERGENCY. They always do: the key is there for files \
-         that have it.",
+        "Critical lanes forward in every mode but EMERGENCY. They always do; the key exists for files of \
+         the original package.",
     ),
     Row::new(
         &["routing_policy.noncritical_enabled"],
         Flag,
         "`true`",
-        "`false`: noncritical lanes forward nothing, whatever their rates.",
+        "`false`: noncritical lanes forward nothing, at any configured rate.",
     )
     .reloads(),
     Row::new(&["routing_policy.noncritical_max_rate_hz"], Decimal(0.0, 100000.0), "10", "Rate in NORMAL.")
@@ -34,7 +34,7 @@ pub(super) const ROWS: &[Row] = &[
         &["routing_policy.stale_threshold_ms"],
         Whole(0, 86_400_000),
         "200",
-        "Age in all modes. 0: never stale.",
+        "Age limit in all modes. 0: never stale.",
     )
     .unit("ms")
     .reloads(),
@@ -67,7 +67,7 @@ pub(super) const ROWS: &[Row] = &[
         &["routing_policy.modes.<mode>.stale_threshold_ms"],
         Whole(0, 86_400_000),
         "`routing_policy.stale_threshold_ms`",
-        "Age in this mode.",
+        "Age limit in this mode.",
     )
     .unit("ms")
     .reloads(),
@@ -75,7 +75,7 @@ pub(super) const ROWS: &[Row] = &[
         &["routing_policy.modes.<mode>.max_noncritical_queue"],
         Whole(0, 4_096),
         "`safety.max_noncritical_queue`",
-        "`noncritical_depth` counts up to this.",
+        "Upper limit of `noncritical_depth`.",
     )
     .unit("samples")
     .reloads(),
@@ -83,14 +83,14 @@ pub(super) const ROWS: &[Row] = &[
         &["classifier.enabled"],
         Flag,
         "`true`",
-        "Whether subscribers are classified. Where not, each is UNKNOWN unless it is forced.",
+        "Whether control classifies subscribers. If not, each is UNKNOWN unless it is forced.",
     )
     .reloads(),
     Row::new(
         &["classifier.subscriber_id"],
         Other("text"),
         "empty",
-        "The one responder that counts; empty for any.",
+        "The only responder that counts; empty for any.",
     )
     .reloads(),
     Row::new(&["classifier.evaluate_rate_hz"], Decimal(0.01, 1000.0), "2", "Evaluations per second.")
@@ -100,21 +100,21 @@ pub(super) const ROWS: &[Row] = &[
         &["classifier.demote_loss_threshold"],
         Decimal(0.0, 1.0),
         "0.015",
-        "Loss above which a reading speaks for demotion.",
+        "Loss above which a reading counts for demotion.",
     )
     .reloads(),
     Row::new(
         &["classifier.promote_loss_threshold"],
         Decimal(0.0, 1.0),
         "0.005",
-        "Loss below which a reading speaks for promotion.",
+        "Loss below which a reading counts for promotion.",
     )
     .reloads(),
     Row::new(
         &["classifier.demote_rtt_ms"],
         Decimal(0.0, 3600000.0),
         "50",
-        "Mean RTT above which a reading speaks for demotion.",
+        "Mean RTT above which a reading counts for demotion.",
     )
     .unit("ms")
     .reloads(),
@@ -122,7 +122,7 @@ pub(super) const ROWS: &[Row] = &[
         &["classifier.promote_rtt_ms"],
         Decimal(0.0, 3600000.0),
         "35",
-        "Mean RTT below which a reading speaks for promotion.",
+        "Mean RTT below which a reading counts for promotion.",
     )
     .unit("ms")
     .reloads(),
@@ -130,14 +130,14 @@ pub(super) const ROWS: &[Row] = &[
         &["classifier.hysteresis_count"],
         Whole(1, 1_000),
         "3",
-        "Consecutive readings that a change of state takes.",
+        "Consecutive readings required for a change of state.",
     )
     .reloads(),
     Row::new(
         &["classifier.allow_unknown_state"],
         Flag,
         "`true`",
-        "Whether UNKNOWN is a state of its own; otherwise it is treated as CRITICAL.",
+        "Whether UNKNOWN is a separate state; otherwise it is treated as CRITICAL.",
     )
     .reloads(),
     Row::new(&["probes.enabled"], Flag, "`true`", "Whether probes are sent.").reloads(),
@@ -153,7 +153,7 @@ pub(super) const ROWS: &[Row] = &[
         &["probes.rtt_threshold_ms"],
         Decimal(0.0, 3600000.0),
         "100",
-        "A warning is shown above it. Decides nothing.",
+        "`status` shows a warning above it. It has no other effect.",
     )
     .unit("ms")
     .reloads(),
@@ -161,14 +161,14 @@ pub(super) const ROWS: &[Row] = &[
         &["probes.loss_threshold"],
         Decimal(0.0, 1.0),
         "0.05",
-        "A warning is shown above it. Decides nothing.",
+        "`status` shows a warning above it. It has no other effect.",
     )
     .reloads(),
     Row::new(
         &["probes.jitter_threshold_ms"],
         Decimal(0.0, 3600000.0),
         "25",
-        "A warning is shown above it. Decides nothing.",
+        "`status` shows a warning above it. It has no other effect.",
     )
     .unit("ms")
     .reloads(),
@@ -177,7 +177,7 @@ pub(super) const ROWS: &[Row] = &[
         &["probes.hysteresis_count"],
         Whole(1, 1_000),
         "3",
-        "Consecutive readings before a warning is shown or withdrawn.",
+        "Consecutive readings before a warning appears or disappears.",
     )
     .reloads(),
     Row::new(&["probes.timeout_ms"], Whole(1, 60_000), "500", "A later response counts as lost.")
@@ -193,7 +193,7 @@ pub(super) const ROWS: &[Row] = &[
         &["probes.response_topic"],
         Other("absolute topic name"),
         "`/adaptive_bridge/probe_resp`",
-        "Topic of the responses; another one.",
+        "Topic of the responses, different from the former.",
     ),
     Row::new(
         &["subscribers.<subscriber>"],
@@ -209,29 +209,28 @@ pub(super) const ROWS: &[Row] = &[
         "The same, in the second form.",
     )
     .reloads(),
-    Row::new(&["overrides.<subscriber>"], Choice(|| names(STATES)), "none", "A state forced by hand.")
-        .reloads(),
+    Row::new(&["overrides.<subscriber>"], Choice(|| names(STATES)), "none", "A forced state.").reloads(),
     Row::new(
         &["safety.preserve_critical_path"],
         Flag,
         "`true`",
-        "Whether the critical path is preserved in DEGRADED. `false` stops it there too, but never for \
-         trouble of noncritical lanes alone.",
+        "Whether critical lanes continue in DEGRADED. `false` stops them there, too, but never for faults \
+         of noncritical lanes alone.",
     )
     .reloads(),
     Row::new(
         &["safety.allow_noncritical_degrade"],
         Flag,
         "`true`",
-        "Whether noncritical lanes may be degraded at all, by the classifier or the supervisor. EMERGENCY \
-         stops them all the same.",
+        "Whether the classifier and the supervisor may degrade noncritical lanes. EMERGENCY stops them in \
+         any case.",
     )
     .reloads(),
     Row::new(
         &["safety.max_noncritical_queue"],
         Whole(1, 4_096),
         "50",
-        "More samples of a route waiting in a noncritical lane count as an overflowing queue.",
+        "If more samples of a route wait in a noncritical lane, its queue counts as overflowing.",
     )
     .unit("samples")
     .reloads(),
@@ -239,8 +238,8 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.overload_drop_noncritical_first"],
         Flag,
         "`true`",
-        "Whether overload takes the noncritical lanes first: EMERGENCY then comes only when DEGRADED has \
-         not helped.",
+        "Whether overload suspends the noncritical lanes first: EMERGENCY then follows only if DEGRADED \
+         has not helped.",
     )
     .reloads(),
     // At intervals below 50 ms a few errors would count as many errors per second.
@@ -251,7 +250,7 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.degraded_lag_ms"],
         Decimal(1.0, 3600000.0),
         "500",
-        "p99 of the processing lag from which on a reading speaks for DEGRADED.",
+        "A reading with at least this p99 of the processing lag counts for DEGRADED.",
     )
     .unit("ms")
     .reloads(),
@@ -259,8 +258,8 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.emergency_lag_ms"],
         Decimal(1.0, 3600000.0),
         "2000",
-        "p99 of a critical lane's lag from shared memory to its writer from which on a reading speaks for \
-         EMERGENCY.",
+        "A reading with at least this p99 of a critical lane's lag, from shared memory to its writer, \
+         counts for EMERGENCY.",
     )
     .unit("ms")
     .reloads(),
@@ -268,7 +267,7 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.degraded_queue_occupancy"],
         Decimal(0.01, 1.0),
         "0.75",
-        "Share of a critical lane's queue in use from which on a reading speaks for DEGRADED.",
+        "A reading with at least this share of a critical lane's queue in use counts for DEGRADED.",
     )
     .reloads(),
     Row::new(&["safety.emergency_queue_occupancy"], Decimal(0.01, 1.0), "0.95", "The same for EMERGENCY.")
@@ -278,8 +277,8 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.degraded_errors_per_s"],
         Decimal(0.1, 1000000.0),
         "5",
-        "Errors of one process per second from which on a reading speaks for DEGRADED: samples lost in \
-         shared memory, writes that DDS refuses, restarts.",
+        "A reading with at least so many errors of one process per second counts for DEGRADED: samples \
+         lost in shared memory, writes that DDS refuses, restarts.",
     )
     .unit("per s")
     .reloads(),
@@ -287,8 +286,8 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.emergency_errors_per_s"],
         Decimal(0.1, 1000000.0),
         "100",
-        "Samples per second that one process of the critical path loses in shared memory \
-         (`queue_overflow`, `pool_exhausted`) from which on a reading speaks for EMERGENCY.",
+        "A reading with at least so many samples per second that one process of the critical path loses \
+         in shared memory (`queue_overflow`, `pool_exhausted`) counts for EMERGENCY.",
     )
     .unit("per s")
     .reloads(),
@@ -297,8 +296,8 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.silent_ms"],
         Whole(500, 3_600_000),
         "2000",
-        "A process that has not turned for so long is silent: DEGRADED on the critical path, an error a \
-         second elsewhere.",
+        "A process without a turn for so long is silent: this counts for DEGRADED on the critical path, \
+         and as an error a second elsewhere.",
     )
     .unit("ms")
     .reloads(),
@@ -306,7 +305,7 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.emergency_silent_ms"],
         Whole(0, 3_600_000),
         "30000",
-        "Silence on the critical path from which on a reading speaks for EMERGENCY; 0: never.",
+        "A reading with so long a silence on the critical path counts for EMERGENCY; 0: never.",
     )
     .unit("ms")
     .reloads(),
@@ -314,22 +313,22 @@ pub(super) const ROWS: &[Row] = &[
         &["safety.hysteresis_count"],
         Whole(1, 1_000),
         "3",
-        "Consecutive readings that each step up takes.",
+        "Consecutive readings required for each step up.",
     )
     .reloads(),
     Row::new(
         &["safety.recovery_count"],
         Whole(1, 1_000),
         "10",
-        "Consecutive readings that each step back takes.",
+        "Consecutive readings required for each step back.",
     )
     .reloads(),
     Row::new(
         &["security.trust_mode"],
         Choice(|| names(TRUST_MODES)),
         "`default_deny`",
-        "With `enable_probe_hmac`: control messages that do not authenticate are refused \
-         (`default_deny`), accepted and logged (`permissive`), or accepted (`off`).",
+        "With `enable_probe_hmac`: control messages that are not authentic are refused (`default_deny`), \
+         accepted and logged (`permissive`), or accepted (`off`).",
     )
     .reloads(),
     Row::new(
@@ -343,16 +342,16 @@ pub(super) const ROWS: &[Row] = &[
         &["security.enable_probe_hmac"],
         Flag,
         "`false`",
-        "Whether probes and responses are signed ([protocol](../docs/probe-protocol.md)). Takes a secret, \
-         which control and every responder share. Without it nothing is signed or checked, whatever \
-         `trust_mode` is.",
+        "Whether probes and responses are signed ([protocol](../docs/probe-protocol.md)). Needs a secret \
+         that control and every responder share. Without this key nothing is signed or checked, in any \
+         `trust_mode`.",
     )
     .reloads(),
     Row::new(
         &["security.max_probe_rate_hz"],
         Whole(1, 10_000),
         "20",
-        "Probes and responses of one sender that are looked at per second.",
+        "Probes and responses of one sender that are processed per second.",
     )
     .unit("Hz")
     .note(", whole")
@@ -361,8 +360,8 @@ pub(super) const ROWS: &[Row] = &[
         &["security.hmac_secret"],
         Other("text"),
         "none",
-        "The shared secret itself; empty for none. Anyone who can read the file has it: prefer one of the \
-         next two. At most one of the three may be given.",
+        "The shared secret itself; empty for none. Every user who can read the file has it: prefer one of \
+         the next two. At most one of the three may be given.",
     )
     .reloads(),
     Row::new(
@@ -388,21 +387,21 @@ pub(super) const ROWS: &[Row] = &[
     .unit("ms")
     .reloads(),
     Row::new(&["diagnostics.enabled"], Flag, "`true`", "Whether diagnostics are published.").reloads(),
-    Row::new(&["diagnostics.publish_interval_s"], Decimal(0.01, 3600.0), "1", "How often.")
+    Row::new(&["diagnostics.publish_interval_s"], Decimal(0.01, 3600.0), "1", "Interval of publication.")
         .unit("s")
         .reloads(),
     Row::new(
         &["diagnostics.topic"],
         Other("absolute topic name"),
         "`/adaptive_bridge/diagnostics`",
-        "Where: JSON in `std_msgs/String`.",
+        "Topic: JSON in `std_msgs/String`.",
     ),
     Row::new(
         &["diagnostics.verbosity"],
         Choice(|| names(VERBOSITIES)),
         "`info`",
-        "What the processes log where `RUST_LOG` says nothing. Of the libraries only errors are. `up` \
-         itself takes it over with its restart.",
+        "Log level of the processes where `RUST_LOG` sets none. Libraries only log errors. `up` itself \
+         applies it when it restarts.",
     )
     .reloads(),
     Row::new(
@@ -412,6 +411,6 @@ pub(super) const ROWS: &[Row] = &[
              107 bytes",
         ),
         "no page",
-        "Where the Prometheus page is served; this machine only.",
+        "Address of the Prometheus page, on this machine only.",
     ),
 ];

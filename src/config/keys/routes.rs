@@ -11,15 +11,15 @@ pub(super) const ROWS: &[Row] = &[
         &["instance"],
         Other("1 to 24 of `a-z`, `0-9`, `_`, a letter first"),
         "`default`",
-        "Which bridge this is, when there are several on a host. Its shared memory and nodes are named \
-         after it.",
+        "Name of the bridge, if there are several on a host. Its shared memory and nodes are named after \
+         it.",
     ),
     Row::new(
         &["policy_hold_s"],
         Decimal(0.0, 3600.0),
         "5",
-        "How long a lane keeps its last policy when the control process is gone. Then critical lanes go \
-         on at full rate and noncritical ones are degraded.",
+        "How long a lane keeps its last policy after control has died. Then critical lanes are normal and \
+         noncritical ones degraded.",
     )
     .unit("s")
     .reloads(),
@@ -29,8 +29,8 @@ pub(super) const ROWS: &[Row] = &[
         Other("list; empty for all"),
         "all; see [Environment](#environment)",
         "Network interfaces to use there, by name (`wlan0`) or by IPv4 address. Nodes of this host are \
-         reached over loopback in any case. One that is absent at the start is a warning in the log, and \
-         is used as soon as it has an address.",
+         reached over loopback in any case. An interface that is absent at the start causes a warning in \
+         the log, and is used as soon as it has an address.",
     ),
     Row::new(
         &["ros.graph_gid_bytes"],
@@ -195,9 +195,9 @@ pub(super) const ROWS: &[Row] = &[
         &["lanes.<lane>.queue_depth"],
         Whole(1, 4_096),
         "64 critical, 4 noncritical",
-        "Samples of each route that may wait for the lane in shared memory. On the critical lane at least \
-         the rate times the longest time that its process may be held up: 64 is two seconds at 30 Hz, 13 \
-         ms at 5 kHz.",
+        "Samples of each route that may wait for the lane in shared memory. The critical lane needs at \
+         least the rate times the longest delay of its process: 64 is two seconds at 30 Hz, 13 ms at 5 \
+         kHz.",
     )
     .unit("samples"),
     Row::new(
@@ -205,14 +205,14 @@ pub(super) const ROWS: &[Row] = &[
         Whole(1, 4_096),
         "8",
         "Samples of each route that the lane may hold in shared memory at once while DDS sends them. \
-         Beyond it, samples are copied.",
+         Further samples are copied.",
     )
     .unit("samples"),
     Row::new(
         &["lanes.<lane>.by_reference_min_bytes"],
         Whole(0, 67_108_864),
         "65536",
-        "Smaller samples are copied to the DDS writer, others handed over by reference.",
+        "Smaller samples are copied for the DDS writer, others passed by reference.",
     )
     .unit("bytes"),
     Row::new(
@@ -220,8 +220,8 @@ pub(super) const ROWS: &[Row] = &[
         Whole(1, 100_000),
         "256",
         "Samples that a RELIABLE writer of the lane retains for subscribers that have not acknowledged \
-         them, 32 MiB at most. Beyond that the oldest sample goes; only a subscriber that lacks it misses \
-         it, which counts as its `reader_overrun`.",
+         them, 32 MiB at most. Beyond that it evicts the oldest sample; a subscriber that has not \
+         acknowledged that one misses it, which counts as its `reader_overrun`.",
     )
     .unit("samples"),
     Row::new(
@@ -261,11 +261,11 @@ pub(super) const ROWS: &[Row] = &[
         &["lanes.<lane>.stale_threshold_ms"],
         Whole(0, 86_400_000),
         "`routing_policy`: 200",
-        "A sample older than this by its source timestamp is dropped in NORMAL. 0: never. Where the clock \
-         of the publisher's computer is steadily more than 100 ms behind or 50 ms ahead of this one's, \
-         its age runs from its arrival instead, plus the time by which it was later than that publisher's \
-         promptest samples; `status` then names the publisher and the offset. Not on a TRANSIENT_LOCAL \
-         output, whose samples are meant to be old.",
+        "In NORMAL the lane drops a sample whose age, by its source timestamp, is larger. 0: never. If \
+         the clock of the publisher's computer is constantly more than 100 ms behind or 50 ms ahead of \
+         this one's, the age runs from the arrival instead, plus the delay beyond that publisher's \
+         fastest samples; `status` then names the publisher and the offset. It does not apply to a \
+         TRANSIENT_LOCAL output, whose samples may be old.",
     )
     .unit("ms")
     .reloads(),
@@ -281,7 +281,7 @@ pub(super) const ROWS: &[Row] = &[
         &["lanes.<lane>.drop_policy"],
         Choice(|| names(DROP_POLICIES)),
         "`routing_policy`",
-        "What gives way when more samples wait than tokens come, in both modes. See below.",
+        "Which samples are dropped when more wait than tokens accrue, in both modes. See below.",
     )
     .reloads(),
     Row::new(
@@ -289,7 +289,7 @@ pub(super) const ROWS: &[Row] = &[
         Whole(1, 4_096),
         "`noncritical_depth` of the mode",
         "Samples of each route that may wait in the lane for a token, in both modes. Keep it at or below \
-         `safety.max_noncritical_queue`: a queue that is fuller counts as overflowing, and suspends the \
+         `safety.max_noncritical_queue`: a longer queue counts as overflowing, and suspends the \
          noncritical lanes for a while.",
     )
     .unit("samples")
@@ -323,8 +323,8 @@ pub(super) const ROWS: &[Row] = &[
         ],
         Whole(0, 19),
         "10 in noncritical lanes, else 0",
-        "Nice value: processes with a higher one leave the CPU to others. Of no effect with `fifo` and \
-         `rr`, nor below the one that the process was started with.",
+        "Nice value: a process with a higher one gets less CPU time beside others. Without effect with \
+         `fifo` and `rr`, and below the value with which the process was started.",
     ),
     Row::new(
         &[
@@ -334,9 +334,9 @@ pub(super) const ROWS: &[Row] = &[
         ],
         Decimal(0.1, 100.0),
         "0.1 on the critical path, 10 in noncritical lanes, control: the kernel's",
-        "Time slice asked of the kernel's fair scheduler: a process that wakes takes the CPU at once from \
-         one with a longer slice ([why](../docs/decisions/0010-time-slices.md)). Needs no privilege. Of \
-         no effect with `fifo` and `rr`, nor before Linux 6.12.",
+        "Time slice that the process requests from the kernel's fair scheduler: a process that wakes \
+         preempts one with a longer slice at once ([why](../docs/decisions/0010-time-slices.md)). Needs \
+         no privilege. Without effect with `fifo` and `rr`, and before Linux 6.12.",
     ),
     Row::new(
         &[
@@ -356,7 +356,7 @@ pub(super) const ROWS: &[Row] = &[
         ],
         Flag,
         "`false`",
-        "Lock the memory of the process (`mlockall`), so that it never waits for a page.",
+        "Lock the memory of the process (`mlockall`), so that it has no page faults.",
     ),
     Row::new(
         &["shared_memory.root_path"],
@@ -368,7 +368,7 @@ pub(super) const ROWS: &[Row] = &[
         &["shared_memory.max_sample_bytes"],
         Whole(1, 67_108_864),
         "1048576",
-        "The largest sample of a topic that says nothing itself.",
+        "The largest sample of a topic without `max_sample_bytes` of its own.",
     )
     .unit("bytes"),
     Row::new(&["shared_memory.max_taps"], Whole(0, 64), "2", "Local programs that may tap a route at once."),

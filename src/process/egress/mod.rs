@@ -38,8 +38,8 @@ const LAST_SAMPLES_MS: u64 = 200;
 /// and one housekeeping interval is well below the second within which a process has to end.
 const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 
-/// How often a lane checks whether the DDS library has sent the samples that it accepted. The library's thread
-/// takes some 100 µs for a small sample in fragments.
+/// How often a lane checks whether the DDS library has sent the samples that it accepted. The library's
+/// thread takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
 
 /// What the lane does after a turn.

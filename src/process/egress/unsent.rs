@@ -1,8 +1,8 @@
 //! Samples that the DDS library has accepted and not sent yet.
 //!
-//! The library sends a small sample for local readers on the lane's thread. A sample in fragments, or one that
-//! finds a socket full, waits for the library's own thread. A lane that is killed meanwhile takes such a sample
-//! with it, so the sample counts as forwarded only when it was sent.
+//! The library sends a small sample for local readers on the lane's thread. A sample in fragments, or one for
+//! which a socket has no room, waits for the library's own thread. If the lane is killed meanwhile, no reader
+//! receives that sample, so a sample counts as forwarded only when it was sent.
 
 use std::collections::VecDeque;
 
