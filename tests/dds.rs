@@ -1,17 +1,19 @@
 //! The RTPS edge against itself: two participants of this process, over real sockets.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::task::{Wake, Waker};
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter, ReaderEvent,
-    ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
+    Arrival, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter,
+    ReaderEvent, ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
 };
-use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp};
+use adaptive_bridge::model::{
+    Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
+};
 use bytes::Bytes;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
@@ -97,8 +99,18 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
 }
 
 #[test]
-fn the_receiving_thread_calls_the_application_after_each_datagram() {
-    let received = Arc::new(AtomicUsize::new(0));
+fn a_sample_is_told_of_before_it_is_there() {
+    let (arrived, received) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicUsize::new(0)));
+    let expected = Arc::new(Mutex::new(None));
+    let on_arriving = {
+        let (arrived, expected) = (Arc::clone(&arrived), Arc::clone(&expected));
+        move |writer: Guid, sequence: i64, left_bytes: usize| {
+            let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == writer);
+            if is_expected {
+                arrived.lock().unwrap().push((sequence, left_bytes));
+            }
+        }
+    };
     let on_received = {
         let received = Arc::clone(&received);
         move || {
@@ -107,19 +119,35 @@ fn the_receiving_thread_calls_the_application_after_each_datagram() {
         }
     };
     let network = DdsNetwork { domain_id: 69, interfaces: Vec::new() };
-    let mut there = Participant::open_receiving(&options("there", &network), on_received).unwrap();
+    let mut there =
+        Participant::open_receiving(&options("there", &network), on_arriving, on_received).unwrap();
     let mut here = participant("here", 69);
     let reader = there
         .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
         .unwrap();
     let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
     wait_for_reader(&writer);
-    // The last one arrives in fragments.
-    for length in [2_948; 20].into_iter().chain([1 << 20]) {
+    *expected.lock().unwrap() = Some(writer.guid());
+    let send = |length: usize| {
         let payload = Bytes::from(vec![7; length]);
         writer.write(payload, Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
         assert_eq!(take_one(&reader).expect("nothing arrived").0.len(), length);
+    };
+    let told = |sequence: i64| {
+        let arrived = arrived.lock().unwrap();
+        let left: Vec<usize> =
+            arrived.iter().filter(|(of, _)| *of == sequence).map(|(_, left)| *left).collect();
+        left
+    };
+    for sequence in 1..=20 {
+        send(2_948);
+        assert!(told(sequence).contains(&0), "sample {sequence} was not told of");
     }
+    // In fragments, of each of which it is told what comes after it.
+    send(1 << 20);
+    let left = told(21);
+    assert!(left.len() > 10 && left.contains(&0), "{left:?}");
+    assert!(left.is_sorted_by(|one, next| one >= next) && left[0] > 900_000, "{left:?}");
     assert!(received.load(Ordering::Acquire) > 20);
 }
 
@@ -155,6 +183,66 @@ impl Drop for Lent {
     fn drop(&mut self) {
         self.lent.fetch_sub(1, Ordering::AcqRel);
     }
+}
+
+#[test]
+fn an_onlooker_sees_samples_come_and_takes_none() {
+    let network = DdsNetwork { domain_id: 66, interfaces: Vec::new() };
+    // The thread that receives is held up here, so that the onlooker is in time.
+    let hold = Arc::new(Mutex::new(()));
+    let on_received = {
+        let hold = Arc::clone(&hold);
+        move || {
+            drop(hold.lock());
+            false
+        }
+    };
+    let mut there =
+        Participant::open_receiving(&options("there", &network), |_, _, _| {}, on_received).unwrap();
+    let mut here = participant("here", 66);
+    // A RELIABLE one would get what the onlooker took once more.
+    let reader = there
+        .create_reader("rt/blob", TYPE, &reader_qos(Reliability::BestEffort, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    let arrivals = there.arrivals().unwrap();
+    let closer = arrivals.closer();
+    let (tell, seen) = std::sync::mpsc::channel();
+    let onlooker = std::thread::spawn(move || {
+        loop {
+            match arrivals.wait() {
+                Arrival::Closed => return,
+                arrival => tell.send(arrival).unwrap(),
+            }
+        }
+    });
+    let mut sequence = 0;
+    let is_seen = |sequence| {
+        let expected = Arrival::Sample { writer: writer.guid(), sequence, left_bytes: 0 };
+        let give_up = Instant::now() + Duration::from_secs(1);
+        while let Ok(arrival) = seen.recv_timeout(give_up - Instant::now()) {
+            if arrival == expected {
+                return true;
+            }
+        }
+        false
+    };
+    // Of several datagrams that wait the first one is looked at: a heartbeat may be before the sample.
+    let times = (0..20).filter(|_| {
+        let held = hold.lock().unwrap();
+        there.ring();
+        std::thread::sleep(Duration::from_millis(50));
+        writer.write(Bytes::from(vec![7; 2_948]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
+        sequence += 1;
+        let seen = is_seen(sequence);
+        drop(held);
+        assert_eq!(take_one(&reader).expect("the onlooker took it").0.len(), 2_948);
+        seen
+    });
+    assert!(times.count() > 10, "seen too seldom");
+    closer.close();
+    onlooker.join().unwrap();
 }
 
 #[test]

@@ -10,12 +10,14 @@ use std::cell::Cell;
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
 use adaptive_bridge::model::{InstanceName, LaneMode, LanePolicy, LatencyHistogram, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
     Boards, BridgeShape, HeaderError, LaneQueue, LoanError, ProcessRole, RoleLock, RouteChannel,
     SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole, TakeError, Woken,
+    this_cpu,
 };
 use nix::sys::signal::Signal;
 use support::{LANE, Place, Process, channel, deep_channel, header, payload, route, shape, skip, until};
@@ -910,8 +912,15 @@ fn no_wake_is_missed() {
     for turn in 0..200_000 {
         // The other side falls asleep meanwhile, or has done so, or not yet.
         (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
+        if turn % 3 != 0 {
+            waker.announce(ELSEWHERE);
+            (0..turn * 6_091 % 400).for_each(|_| std::hint::spin_loop());
+        }
         waker.wake();
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "turn {turn}");
+        // A wake whose system call comes late looks like an announcement.
+        let woken = sleeper.sleep(support::PATIENCE);
+        let woken = if woken == Woken::Announced { sleeper.sleep(support::PATIENCE) } else { woken };
+        assert_eq!(woken, Woken::Woken, "turn {turn}");
     }
     pong.finish();
     while sleeper.sleep(Duration::from_millis(20)) != Woken::TimedOut {}
@@ -922,6 +931,65 @@ fn no_wake_is_missed() {
     let start = std::time::Instant::now();
     assert_eq!(sleeper.sleep(Duration::from_millis(30)), Woken::TimedOut);
     assert!(start.elapsed() >= Duration::from_millis(30), "the whole time is slept");
+}
+
+/// No CPU that a lane sleeps on.
+const ELSEWHERE: u32 = 0;
+
+#[test]
+fn an_announcement_is_no_wake() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let (waker, mut sleeper) = (boards.waker(1), boards.sleeper(1));
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                waker.announce(ELSEWHERE);
+            }
+        });
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "up for what is to come");
+        // Nothing comes, and no more is believed: it sleeps.
+        let start = std::time::Instant::now();
+        assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
+        assert!(start.elapsed() >= Duration::from_millis(100), "the whole time is slept");
+        waker.wake();
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "a wake counts among them");
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "and they are believed again");
+        waker.wake();
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "it comes while the lane is up");
+        done.store(true, Ordering::Relaxed);
+    });
+}
+
+#[test]
+fn a_lane_is_not_told_by_the_cpu_that_it_sleeps_on() {
+    let place = Place::new();
+    let node = place.node();
+    let boards = node.boards(&shape()).unwrap();
+    let (waker, mut sleeper) = (boards.waker(1), boards.sleeper(1));
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
+    let done = AtomicBool::new(false);
+    let cpu = AtomicU32::new(0);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                waker.announce(cpu.load(Ordering::Relaxed));
+            }
+        });
+        // It stays where it is.
+        let mut here = nix::sched::CpuSet::new();
+        here.set(nix::sched::sched_getcpu().unwrap()).unwrap();
+        nix::sched::sched_setaffinity(nix::unistd::Pid::from_raw(0), &here).unwrap();
+        cpu.store(this_cpu(), Ordering::Relaxed);
+        while sleeper.sleep(Duration::from_millis(10)) == Woken::Announced {}
+        waker.wake();
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "and would believe it");
+        assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
+        done.store(true, Ordering::Relaxed);
+    });
 }
 
 #[test]

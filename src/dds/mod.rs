@@ -4,6 +4,7 @@
 //! decoded; so the bridge forwards any message type. The public interface has no RustDDS types, so that
 //! another DDS library could replace RustDDS.
 
+mod arrivals;
 mod discovery;
 mod error;
 mod graph;
@@ -16,6 +17,7 @@ mod qos;
 mod reader;
 mod writer;
 
+pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};

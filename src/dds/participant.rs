@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::arrivals::Arrivals;
 use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
@@ -82,19 +83,25 @@ impl Participant {
 
     /// Like [`open`](Self::open), but the thread that receives calls `on_received` after each datagram,
     /// before it acknowledges it, and after [`ring`](Self::ring). Taking a sample there saves the wake-up of
-    /// another thread.
+    /// another thread. Some microseconds earlier, for a datagram with a sample or a fragment of one, the
+    /// thread calls `on_arriving` with the writer, the sequence number, and the bytes of the sample that are
+    /// still missing after this datagram, as the datagram claims.
     ///
-    /// While it runs, nothing is received, acknowledged or sent. It must be short, wait for nothing and not
-    /// panic, and may take from readers and arm them, but not call the participant. It returns true if it has
-    /// left work undone; it is then called again soon.
+    /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
+    /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
+    /// true if it has left work undone; it is then called again soon.
     ///
     /// # Errors
     /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
+        mut on_arriving: impl FnMut(Guid, i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        Self::build(options, |builder| builder.on_received(on_received))
+        let on_arriving = move |writer: GUID, sequence, left_bytes| {
+            on_arriving(Guid(writer.to_bytes()), sequence, left_bytes);
+        };
+        Self::build(options, |builder| builder.on_sample_arriving(on_arriving).on_received(on_received))
     }
 
     fn build(
@@ -148,6 +155,16 @@ impl Participant {
     /// Makes the thread that receives call `on_received` of [`open_receiving`](Self::open_receiving) once.
     pub fn ring(&self) {
         self.participant.wake_event_loop();
+    }
+
+    /// Returns a watch of the sockets on which samples arrive, for a thread that peeks at datagrams before
+    /// they are received. Drop it before the participant, because it keeps the participant's ports bound.
+    ///
+    /// # Errors
+    /// The process has no file descriptor left, the participant is not from
+    /// [`open_receiving`](Self::open_receiving), or this was called before.
+    pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
+        Arrivals::new(self.participant.onlooker_sockets())
     }
 
     /// Announces that a participant whose process died has left. Remote participants then drop its readers

@@ -154,15 +154,16 @@ impl Role {
         Ok(participant)
     }
 
-    /// Like [`join`](Self::join), with a callback for the receiving thread; see
+    /// Like [`join`](Self::join), with callbacks for the receiving thread; see
     /// [`Participant::open_receiving`]. Leaves the predecessor's participant to a later call of
     /// [`dispose_former`](Self::dispose_former).
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
+        on_arriving: impl FnMut(Guid, i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
-        let participant = Participant::open_receiving(options, on_received)?;
+        let participant = Participant::open_receiving(options, on_arriving, on_received)?;
         self.record_participant(&participant);
         Ok(participant)
     }

@@ -38,4 +38,4 @@ pub use node::{CleanUp, ShmNode};
 pub use root::{RoleLock, default_root};
 pub use sample_error::{LoanError, PublishError, TakeError};
 pub use slot::{LentSlot, Slot};
-pub use wake::{LaneSleeper, LaneWaker, Woken};
+pub use wake::{LaneSleeper, LaneWaker, Woken, this_cpu};

@@ -8,6 +8,7 @@ use super::super::inbox::{Bell, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
 use super::clocks::Clocks;
+use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};
 use super::source::{ReaderPlan, Source, label};
@@ -131,6 +132,11 @@ impl Input {
             Take::Malformed => self.count_malformed(),
         }
         true
+    }
+
+    /// The high-water marks of the publishers.
+    pub fn followed(&self) -> Arc<Followed> {
+        self.publishers.followed()
     }
 
     fn publish(

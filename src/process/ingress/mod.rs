@@ -2,10 +2,13 @@
 //!
 //! Ingress never waits for a lane: a full queue overwrites its oldest sample, and waking a lane does not
 //! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
-//! does the housekeeping.
+//! does the housekeeping; a third thread wakes critical lanes early ([`lookout`]).
 
 mod clocks;
+mod expected;
+mod followed;
 mod input;
+mod lookout;
 mod pool;
 mod publishers;
 mod receiving;
@@ -27,8 +30,9 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::ProcessRole;
+use crate::shm::{ProcessRole, this_cpu};
 use input::Input;
+use lookout::Lookout;
 use receiving::{Receiving, ServedLane};
 
 /// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
@@ -69,6 +73,8 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
 }
 
 struct Ingress {
+    /// Before the participant, whose sockets it watches.
+    _lookout: Option<Lookout>,
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
@@ -108,10 +114,16 @@ impl Ingress {
                 let serves = (0..settings.routes.len())
                     .map(|route| lane.outputs.iter().any(|output| output.route == route))
                     .collect();
-                lanes.push(ServedLane { waker: role.boards.waker(index), serves });
+                lanes.push(ServedLane { waker: role.boards.waker(index), class, serves });
             }
         }
         let receiving = Arc::new(Receiving::new(inputs, lanes));
+        let on_arriving = {
+            let receiving = Arc::clone(&receiving);
+            move |writer, sequence, left_bytes| {
+                receiving.expect(writer, sequence, left_bytes, this_cpu());
+            }
+        };
         let on_received = {
             let receiving = Arc::clone(&receiving);
             move || receiving.turn()
@@ -122,10 +134,12 @@ impl Ingress {
             node_name: "ingress".to_owned(),
             graph_gid_bytes: settings.graph_gid_bytes,
         };
-        let participant = role.join_receiving(&options, on_received)?;
+        let participant = role.join_receiving(&options, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
+        let lookout = Lookout::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
+            _lookout: lookout,
             receiving,
             participant,
             role,

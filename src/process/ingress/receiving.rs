@@ -5,12 +5,15 @@
 //! that is not needed for each sample, and locks a route meanwhile. The receiving thread never waits for a
 //! lock: it skips a locked route, and is rung when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::Bell;
+use super::expected::Expected;
+use super::followed::Followed;
 use super::input::Input;
-use crate::shm::LaneWaker;
+use crate::model::{Guid, TrafficClass};
+use crate::shm::{LaneWaker, this_cpu};
 
 /// Samples taken from one route before the next route, and then the DDS library, is served.
 const SAMPLES_PER_TURN: usize = 32;
@@ -21,11 +24,15 @@ struct SharedRoute {
     bell: Arc<Bell>,
     /// Whether the receiving thread has skipped the route because the main thread had locked it.
     skipped: AtomicBool,
+    followed: Arc<Followed>,
+    /// Whether a critical lane serves the route.
+    is_critical: bool,
 }
 
 /// A lane that samples are published to.
 pub(super) struct ServedLane {
     pub waker: LaneWaker,
+    pub class: TrafficClass,
     /// For each route, whether the lane serves it.
     pub serves: Vec<bool>,
 }
@@ -33,37 +40,83 @@ pub(super) struct ServedLane {
 /// All routes and lanes, as the receiving thread and the main thread share them.
 pub(super) struct Receiving {
     routes: Vec<SharedRoute>,
-    /// Critical lanes first, so that they are woken first.
+    /// Critical lanes first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
+    expected: Expected,
+    /// The CPU on which the receiving thread ran last.
+    cpu: AtomicU32,
 }
 
 impl Receiving {
     pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
-        let shared = |(input, bell): (Input, _)| SharedRoute {
+        let is_critical = |route: usize| {
+            lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
+        };
+        let shared = |(route, (input, bell)): (usize, (Input, _))| SharedRoute {
+            followed: input.followed(),
             input: Mutex::new(input),
             bell,
             skipped: AtomicBool::new(false),
+            is_critical: is_critical(route),
         };
-        Self { routes: inputs.into_iter().map(shared).collect(), lanes, turns: AtomicU64::new(0) }
+        Self {
+            routes: inputs.into_iter().enumerate().map(shared).collect(),
+            lanes,
+            turns: AtomicU64::new(0),
+            expected: Expected::new(),
+            cpu: AtomicU32::new(0),
+        }
+    }
+
+    /// Wakes the critical lanes of a route early. A datagram has arrived that seems to hold a sample of
+    /// `writer`, or a part of one of which `left_bytes` are missing, and `cpu` receives it. A sample that was
+    /// received before wakes no lane: many publishers send each one to all addresses of this host. Returns
+    /// whether the lanes were woken.
+    pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
+        // Checked before the search, which would find nothing to do for all but the last of many fragments.
+        if !self.expected.may_tell(left_bytes) {
+            return false;
+        }
+        let awaits = |shared: &SharedRoute| shared.is_critical && shared.followed.awaits(writer, sequence);
+        let Some(route) = self.routes.iter().position(awaits) else {
+            return false;
+        };
+        let tells = self.expected.tell(route, left_bytes);
+        if tells {
+            self.announce(route, cpu);
+        }
+        tells
+    }
+
+    /// The CPU on which the receiving thread ran last.
+    pub fn cpu(&self) -> u32 {
+        self.cpu.load(Ordering::Relaxed)
     }
 
     /// Takes and publishes the samples that have arrived; on the receiving thread. Returns whether more may
     /// wait.
     pub fn turn(&self) -> bool {
+        let cpu = this_cpu();
+        self.cpu.store(cpu, Ordering::Relaxed);
         let mut more = false;
         for (route, shared) in self.routes.iter().enumerate() {
             if shared.bell.is_rung()
                 && let Some(mut input) = shared.try_lock()
             {
+                if shared.is_critical && self.expected.came(route) {
+                    self.announce(route, cpu);
+                }
                 more |= self.drain(route, &mut input);
+                self.expected.came_meanwhile(route);
             }
         }
+        self.expected.turn_ends();
         self.turns.fetch_add(1, Ordering::Release);
         more
     }
 
-    /// Like [`turn`](Self::turn), but on any thread, and waits for the locks.
+    /// Like [`turn`](Self::turn), but on any thread: waits for the locks, and wakes no lane early.
     pub fn turn_blocking(&self) -> bool {
         let mut more = false;
         for (route, shared) in self.routes.iter().enumerate() {
@@ -102,6 +155,16 @@ impl Receiving {
             }
         }
         true
+    }
+
+    /// Wakes the critical lanes that serve the route while its sample is being taken on `cpu`. A noncritical
+    /// lane needs no early wake-up.
+    fn announce(&self, route: usize, cpu: u32) {
+        for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
+            if lane.serves[route] {
+                lane.waker.announce(cpu);
+            }
+        }
     }
 
     /// Wakes the lanes that serve the route.

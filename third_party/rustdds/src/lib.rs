@@ -235,6 +235,8 @@ pub use serialization::RepresentationIdentifier;
 pub use serialization::{
   CDRDeserializerAdapter, CDRSerializerAdapter, CdrDeserializer, CdrSerializer,
 };
+/// What a datagram claims to hold, for one who looks at it.
+pub use rtps::arriving::sample_arriving;
 pub use rtps::reader_progress::MatchedReader;
 /// Part of RTPS DATA submessage: 4-byte header + serialized data
 pub use messages::submessages::elements::serialized_payload::SerializedPayload;

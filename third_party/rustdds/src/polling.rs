@@ -16,7 +16,7 @@ use std::{
 
 use mio1::{Poll, Token, Waker};
 
-use crate::structure::guid::EntityId;
+use crate::structure::guid::{EntityId, GUID};
 
 /// One waker for one `Poll`. Share clones freely. `wake` before [`install`](Self::install)
 /// is a no-op; the event loop drains its queues once after installing so anything
@@ -52,9 +52,14 @@ impl LoopWaker {
   }
 }
 
-/// What an application lets the event loop of its participant do: see
-/// `DomainParticipantBuilder::on_received`.
-pub(crate) type ReceivedHook = Box<dyn FnMut() -> bool + Send>;
+/// What an application lets the event loop of its participant do.
+#[derive(Default)]
+pub(crate) struct Hooks {
+  /// See `DomainParticipantBuilder::on_received`.
+  pub on_received: Option<Box<dyn FnMut() -> bool + Send>>,
+  /// See `DomainParticipantBuilder::on_sample_arriving`.
+  pub on_sample_arriving: Option<Box<dyn FnMut(GUID, i64, usize) + Send>>,
+}
 
 /// Bounded queue whose send wakes `waker`'s poll.
 pub(crate) struct WakeSender<T> {

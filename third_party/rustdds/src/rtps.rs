@@ -1,6 +1,7 @@
 #[allow(dead_code)] // We allow this, since extra constants are not too harmful.
 pub(crate) mod constant;
 
+pub(crate) mod arriving;
 pub(crate) mod direct_send;
 pub(crate) mod dp_event_loop;
 pub(crate) mod fragment_assembler;

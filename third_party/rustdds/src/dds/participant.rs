@@ -43,7 +43,7 @@ use crate::{
     util::{listener_locators, local_interface_table, IfAddr, NetworkSelector},
   },
   polling::{
-    ready_channel, wake_channel, wake_channel_unbounded, LoopWaker, ReadySender, ReceivedHook,
+    ready_channel, wake_channel, wake_channel_unbounded, Hooks, LoopWaker, ReadySender,
     WakeReceiver, WakeSender, WakeUnboundedSender,
   },
   rtps::{
@@ -85,7 +85,7 @@ pub struct DomainParticipantBuilder {
   socket_receive_buffer_size: usize,
   socket_send_buffer_size: usize,
 
-  received_hook: Option<ReceivedHook>,
+  hooks: Hooks,
 
   #[cfg(feature = "security")]
   security_plugins: Option<SecurityPlugins>,
@@ -101,7 +101,7 @@ impl DomainParticipantBuilder {
       same_host_loopback: true,
       socket_receive_buffer_size: Self::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
       socket_send_buffer_size: Self::DEFAULT_SOCKET_SEND_BUFFER_SIZE,
-      received_hook: None,
+      hooks: Hooks::default(),
       #[cfg(feature = "security")]
       security_plugins: None,
       #[cfg(feature = "security")]
@@ -200,7 +200,21 @@ impl DomainParticipantBuilder {
   /// of the participant, of topics, publishers or subscribers may wait for the
   /// event loop, for ever.
   pub fn on_received(mut self, hook: impl FnMut() -> bool + Send + 'static) -> Self {
-    self.received_hook = Some(Box::new(hook));
+    self.hooks.on_received = Some(Box::new(hook));
+    self
+  }
+
+  /// Lets the participant's event loop call `hook` when it has a datagram that
+  /// holds a sample of a user's writer or a part of one, before it looks who wants
+  /// it: some microseconds before that of [`Self::on_received`]. The writer, its
+  /// sequence number, and how many bytes of the sample come after this datagram,
+  /// are what the datagram claims; nothing was checked. The rules for that hook
+  /// hold.
+  pub fn on_sample_arriving(
+    mut self,
+    hook: impl FnMut(GUID, i64, usize) + Send + 'static,
+  ) -> Self {
+    self.hooks.on_sample_arriving = Some(Box::new(hook));
     self
   }
 
@@ -385,7 +399,7 @@ impl DomainParticipantBuilder {
       self.only_networks,
       self.same_host_loopback,
       dp_waker,
-      self.received_hook,
+      self.hooks,
       discovery_sample_sender,
     )?;
 
@@ -585,6 +599,23 @@ impl DomainParticipant {
       dpi.dpi.event_loop_waker.wake();
     }
   }
+
+  /// The sockets that user traffic comes to, for a thread of the application that
+  /// the kernel wakes together with the event loop. It may look at datagrams
+  /// (`peek`, and [`sample_arriving`](crate::sample_arriving)) and must take none,
+  /// nor change anything of the sockets, which do not block. For a participant with
+  /// the hook [`DomainParticipantBuilder::on_sample_arriving`], once; an error
+  /// otherwise, or if there were no descriptors. The ports stay bound as long as they
+  /// are open.
+  #[cfg(unix)]
+  pub fn onlooker_sockets(&self) -> io::Result<Vec<std::net::UdpSocket>> {
+    let sockets = match self.dpi.lock() {
+      Ok(mut dpi) => dpi.dpi.onlooker_sockets.take(),
+      Err(_) => None,
+    };
+    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets for an onlooker")))
+  }
+
 
   /// Gets all DiscoveredTopics from DDS network
   ///
@@ -1055,7 +1086,7 @@ impl DomainParticipantDisc {
     only_networks: Option<Vec<NetworkSelector>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
-    received_hook: Option<ReceivedHook>,
+    hooks: Hooks,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     let dpi = DomainParticipantInner::new(
@@ -1073,7 +1104,7 @@ impl DomainParticipantDisc {
       only_networks,
       same_host_loopback,
       dp_waker,
-      received_hook,
+      hooks,
       discovery_sample_sender,
     )?;
 
@@ -1280,6 +1311,10 @@ pub(crate) struct DomainParticipantInner {
   security_plugins_handle: Option<SecurityPluginsHandle>,
 
   only_networks: Option<Arc<[NetworkSelector]>>,
+
+  /// See `DomainParticipant::onlooker_sockets`.
+  #[cfg(unix)]
+  onlooker_sockets: Option<io::Result<Vec<std::net::UdpSocket>>>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1323,7 +1358,7 @@ impl DomainParticipantInner {
     only_networks: Option<Vec<NetworkSelector>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
-    received_hook: Option<ReceivedHook>,
+    hooks: Hooks,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     #[cfg(not(feature = "security"))]
@@ -1421,6 +1456,15 @@ impl DomainParticipantInner {
 
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
 
+    #[cfg(unix)]
+    let onlooker_sockets = hooks.on_sample_arriving.is_some().then(|| {
+      [USER_TRAFFIC_LISTENER_TOKEN, USER_TRAFFIC_MUL_LISTENER_TOKEN]
+        .iter()
+        .filter_map(|token| listeners.get(token))
+        .map(UDPListener::onlooker)
+        .collect()
+    });
+
     // construct our own Locators
     let listener_kinds = listeners
       .iter()
@@ -1513,7 +1557,7 @@ impl DomainParticipantInner {
           reader_ready_rx,
           writer_ready_rx,
           dp_waker,
-          received_hook,
+          hooks,
         ) {
           Ok(dp_event_loop) => {
             let _ = ev_ready_tx.send(Ok(()));
@@ -1565,6 +1609,8 @@ impl DomainParticipantInner {
       listener_kinds,
       security_plugins_handle,
       only_networks,
+      #[cfg(unix)]
+      onlooker_sockets,
     })
   }
 

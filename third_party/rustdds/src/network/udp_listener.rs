@@ -269,6 +269,13 @@ impl UDPListener {
     Ok(listener)
   }
 
+  /// The socket once more, for one who looks at what comes and takes nothing.
+  #[cfg(unix)]
+  pub fn onlooker(&self) -> io::Result<std::net::UdpSocket> {
+    use std::os::fd::AsFd;
+    Ok(self.socket.as_fd().try_clone_to_owned()?.into())
+  }
+
   pub fn mio_socket(&mut self) -> &mut mio1::net::UdpSocket {
     &mut self.socket
   }

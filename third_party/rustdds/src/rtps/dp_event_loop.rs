@@ -30,11 +30,12 @@ use crate::{
     util::{localhost_spdp_peer_locators, IfAddr, NetworkSelector},
   },
   polling::{
-    new_shared_timer, timeout_until, wake_channel, LoopWaker, ReadyReceiver, ReceivedHook,
+    new_shared_timer, timeout_until, wake_channel, Hooks, LoopWaker, ReadyReceiver,
     SharedTimer, WakeReceiver, WakeSender,
   },
   //qos::HasQoSPolicy,
   rtps::{
+    arriving::sample_in,
     constant::*,
     message_receiver::MessageReceiver,
     outbound::SocketId,
@@ -154,7 +155,7 @@ pub struct DPEventLoop {
   same_host_loopback: bool,
 
   // Of the application, called on this thread when something was received.
-  received_hook: Option<ReceivedHook>,
+  hooks: Hooks,
 }
 
 // Datagrams of one socket that are handled before timers and commands.
@@ -186,7 +187,7 @@ impl DPEventLoop {
     reader_ready: ReadyReceiver<EntityId>,
     writer_ready: ReadyReceiver<EntityId>,
     waker: LoopWaker,
-    received_hook: Option<ReceivedHook>,
+    hooks: Hooks,
   ) -> CreateResult<Self> {
     macro_rules! try_init {
       ($result:expr, $msg:literal) => {
@@ -291,7 +292,7 @@ impl DPEventLoop {
       participant_status_sender,
       discovery_command_sender,
       same_host_loopback,
-      received_hook,
+      hooks,
     })
   }
 
@@ -451,6 +452,15 @@ impl DPEventLoop {
       let Some((packet, origin)) = listener.next_message() else {
         return false;
       };
+      if let Some(hook) = &mut self.hooks.on_sample_arriving {
+        if let Some(arriving) = sample_in(&packet) {
+          hook(
+            arriving.writer,
+            arriving.number.into(),
+            arriving.left_bytes as usize,
+          );
+        }
+      }
       self
         .message_receiver
         .handle_received_packet(&packet, origin);
@@ -461,7 +471,7 @@ impl DPEventLoop {
 
   // Whether the application asks for another call soon.
   fn call_application(&mut self) -> bool {
-    self.received_hook.as_mut().is_some_and(|hook| hook())
+    self.hooks.on_received.as_mut().is_some_and(|hook| hook())
   }
 
   // Returns true when the loop should exit.
@@ -1564,7 +1574,7 @@ mod tests {
         reader_ready,
         writer_ready,
         waker,
-        None,
+        Hooks::default(),
       )
       .expect("DPEventLoop::new in test");
       dp_event_loop.event_loop();

@@ -154,7 +154,7 @@ impl<C: Context> Writable<C> for Message {
 pub(crate) const RTPS_MESSAGE_HEADER_SIZE: usize = 20;
 /// Serialized size of a [`SubmessageHeader`] (kind + flags +
 /// octetsToNextHeader).
-const SUBMESSAGE_HEADER_SIZE: usize = 4;
+pub(crate) const SUBMESSAGE_HEADER_SIZE: usize = 4;
 
 fn try_submessage_content_length(len: usize) -> Result<u16, ()> {
   u16::try_from(len).map_err(|_| ())
