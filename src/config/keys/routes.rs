@@ -48,7 +48,7 @@ pub(super) const ROWS: &[Row] = &[
         &["topics[].input_topic"],
         Other("absolute topic name, at most 246 characters"),
         "must be given",
-        "What the bridge subscribes to.",
+        "The topic that the bridge subscribes to.",
     ),
     Row::new(
         &["topics[].message_type"],
@@ -66,26 +66,26 @@ pub(super) const ROWS: &[Row] = &[
         &["topics[].critical_output"],
         Other("absolute topic name"),
         "`/adaptive_bridge/critical` and the input topic",
-        "What the critical lane publishes to.",
+        "The topic that the critical lane publishes.",
     ),
     Row::new(
         &["topics[].noncritical_output"],
         Other("absolute topic name"),
         "`/adaptive_bridge/noncritical` and the input topic",
-        "What the lane `noncritical` publishes to.",
+        "The topic that the lane `noncritical` publishes.",
     ),
     Row::new(
         &["topics[].outputs.<lane>"],
         Other("absolute topic name"),
         "`/adaptive_bridge/<lane>` and the input topic",
-        "The same for any lane. For `critical` and `noncritical` this or the key above, not both.",
+        "The same for any lane. For `critical` and `noncritical` give this or the key above, not both.",
     ),
     Row::new(
         &["topics[].max_sample_bytes"],
         Whole(1, 67_108_864),
         "`shared_memory.max_sample_bytes`",
-        "The largest serialized sample that is taken in; a larger one is dropped and counted as \
-         `too_large`. Shared memory is reserved for it.",
+        "The largest serialized sample; ingress drops a larger one as `too_large`. Shared memory is \
+         reserved for samples of this size.",
     )
     .unit("bytes"),
     Row::new(
@@ -93,8 +93,8 @@ pub(super) const ROWS: &[Row] = &[
         Whole(1, 10_000),
         "the largest depth among the route's TRANSIENT_LOCAL outputs (KEEP_ALL counts as the lane's \
          `window_samples`), else 8",
-        "Samples kept in shared memory for a lane that was restarted: what it catches up with, and what \
-         its TRANSIENT_LOCAL writer offers to late joiners.",
+        "Samples retained in shared memory for a lane that restarts, which it then forwards, and which its \
+         TRANSIENT_LOCAL writer offers to late joiners.",
     )
     .unit("samples"),
     Row::new(
@@ -117,7 +117,7 @@ pub(super) const ROWS: &[Row] = &[
         ],
         Choice(|| names(HISTORIES)),
         "as above",
-        "HISTORY: the last `depth` samples, or all that there is room for (`window_samples`).",
+        "HISTORY: the last `depth` samples, or as many as fit (`window_samples`).",
     ),
     // DDS allows 2^31; with 10,000 a route of 1 KiB samples takes 10 MiB on each lane.
     Row::new(
@@ -151,7 +151,7 @@ pub(super) const ROWS: &[Row] = &[
         ],
         Whole(1, 86_400_000),
         "infinite",
-        "LIFESPAN: how long a sample is worth sending. A policy of writers: an input has none.",
+        "LIFESPAN: the age at which a writer discards a sample. An input has none.",
     )
     .unit("ms"),
     Row::new(
