@@ -142,8 +142,7 @@ impl<'a> Field<'a> {
     /// The default that the row of the key declares.
     fn default<T>(&self, parse: impl Fn(&str) -> Option<T>) -> T {
         let text = self.key.and_then(|key| key.row).map_or("", |row| row.default);
-        // A file without any key reads all of them, as the tests do.
-        #[allow(clippy::expect_used)]
+        #[allow(clippy::expect_used, reason = "the tests read a file without keys, so every default")]
         parse(text.trim_matches('`')).expect("the default of a key is one of its values")
     }
 

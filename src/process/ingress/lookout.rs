@@ -93,6 +93,7 @@ fn run(arrivals: &Arrivals, receiving: &Receiving) {
         if told {
             looks_away = LOOKS_AWAY;
         } else {
+            #[allow(clippy::disallowed_methods, reason = "the pause keeps the CPU time of this thread low")]
             thread::sleep(looks_away);
             looks_away = (looks_away * 2).min(LOOKS_AWAY_AT_MOST);
         }

@@ -104,6 +104,7 @@ impl MetricsServer {
 
     /// Serves this report from now on. It waits at most for another thread to copy a pointer.
     pub fn show(&self, report: Arc<Report>) {
+        #[allow(clippy::disallowed_methods, reason = "held for the copy of a pointer")]
         let former = self.latest.lock().unwrap_or_else(PoisonError::into_inner).replace(report);
         // The former report is freed after the lock is released.
         drop(former);
@@ -259,6 +260,7 @@ fn respond(request: &Request<Incoming>, latest: &Latest) -> Response<Full<Bytes>
     if request.uri().path() != "/metrics" {
         return refusal(StatusCode::NOT_FOUND, "no such page; the metrics are at /metrics\n");
     }
+    #[allow(clippy::disallowed_methods, reason = "held for the copy of a pointer")]
     let report = latest.lock().unwrap_or_else(PoisonError::into_inner).clone();
     match report {
         Some(report) => response(page::CONTENT_TYPE, metrics_page(&report).into()),
