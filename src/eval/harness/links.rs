@@ -1,6 +1,7 @@
 //! The impaired links of a run: an `impair` process for each direction, and bandwidth caps on the ports of
 //! the switch.
 
+use std::fmt::Display;
 use std::path::Path;
 use std::time::Duration;
 
@@ -130,12 +131,14 @@ impl Links {
                     "kernel_dropped",
                     "overflowed",
                 ];
-                let counts: Vec<String> = counts.iter().map(|key| number(key).to_string()).collect();
+                let counts = counts.map(number);
                 let expected = counters["lost_expected"].as_f64().unwrap_or(0.0);
                 let trace_row =
                     counters["trace"]["row"].as_u64().map_or(String::new(), |row| row.to_string());
-                let counts = counts.join(",");
-                self.csv.row(&[&time.0, &link.entry.name, &state, &counts, &expected, &trace_row])?;
+                let mut row: Vec<&dyn Display> = vec![&time.0, &link.entry.name, &state];
+                row.extend(counts.iter().map(|count| count as &dyn Display));
+                row.extend([&expected as &dyn Display, &trace_row]);
+                self.csv.row(&row)?;
             }
             link.program.send_line("counters");
         }
