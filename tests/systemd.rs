@@ -360,7 +360,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
         });
     };
     says(INGRESS, "reading 0 of 1 routes, 0.0 samples/s; no publisher found yet for /scan");
-    says(EGRESS_CRITICAL, "type not known yet of route scan");
+    says(EGRESS_CRITICAL, "type not known yet for route scan");
     says(CONTROL, "safety mode normal");
     bed.machine.run(&["systemctl", "start", RESPONDER]);
     says(RESPONDER, "probes answered per s; 0 refused");
@@ -373,7 +373,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     // Structured fields, and a reload that is refused.
     let reading = |entry: &Value| {
         entry["BRIDGE_ROUTE"] == "scan"
-            && entry["MESSAGE"].as_str().is_some_and(|text| text.starts_with("reading route=scan"))
+            && entry["MESSAGE"].as_str().is_some_and(|text| text.starts_with("DDS reader created route=scan"))
     };
     let log = bed.machine.journal(INGRESS);
     assert!(log.iter().any(reading), "{log:?}");

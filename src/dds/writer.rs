@@ -89,8 +89,8 @@ impl RawWriter {
     }
 
     /// Writes a sample. Returns at once; a blocking writer returns within its blocking time. The DDS library
-    /// keeps `payload` until every matched RELIABLE reader has acknowledged it, or until newer samples evict it
-    /// from the history. [`sent_through`](Self::sent_through) tells when it was sent.
+    /// keeps `payload` until every matched RELIABLE reader has acknowledged it, or until newer samples evict
+    /// it from the history. [`sent_through`](Self::sent_through) tells when it was sent.
     ///
     /// # Errors
     /// The library did not accept the sample, and `payload` is dropped.
