@@ -256,13 +256,14 @@ impl DiscoveryDB {
     #[cfg(feature = "security")]
     self.authentication_statuses.remove(&guid_prefix);
 
-    if let Some(participant_data) = participant_data {
+    if participant_data.is_some() {
       self.remember_in_attic(guid_prefix);
-      self.participant_attic.insert(guid_prefix, participant_data);
     }
     if active_disposal {
       // A datagram that it sent before is no sign of life.
       self.participant_attic.remove(&guid_prefix);
+    } else if let Some(participant_data) = participant_data {
+      self.participant_attic.insert(guid_prefix, participant_data);
     }
     if !self.attic_order.contains(&guid_prefix) {
       // Endpoints of a participant that was never discovered.
