@@ -492,7 +492,7 @@ fn a_second_reader_of_a_participant_costs_the_first_no_sample() {
             }
             let guid = second.guid();
             drop(second);
-            there.forget(guid);
+            there.remove_endpoint(guid);
         }
         stop.store(true, Ordering::Relaxed);
         publisher.join().unwrap()

@@ -237,7 +237,7 @@ fn twenty_hostile_readers_cost_the_others_no_sample() {
         for reader in &mut readers {
             reader.receive();
             if reader.writer().is_none() {
-                reader.announce(CRITICAL, SCAN_TYPE);
+                reader.announce_endpoint(CRITICAL, SCAN_TYPE);
             }
         }
         std::thread::sleep(Duration::from_millis(50));

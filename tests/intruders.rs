@@ -15,7 +15,7 @@ use adaptive_bridge::dds::{
 };
 use adaptive_bridge::model::{Durability, Guid, Reliability, TopicName};
 use adaptive_bridge::policy::{
-    Guarded, GuardedTopic, IntruderCounts, IntruderEvent, IntruderWatch, Whereabouts,
+    Guarded, GuardedTopic, IntruderCounts, IntruderEvent, IntruderWatch, Locality,
 };
 use nix::sys::signal::Signal;
 
@@ -80,7 +80,7 @@ fn readers_of_every_library_are_told_by_their_host() {
     let mut peers = Vec::new();
     let mut nodes = Vec::new();
     let mut expected = BTreeMap::new();
-    for (host, place) in [(&robot, Whereabouts::Local), (&laptop, Whereabouts::Remote)] {
+    for (host, place) in [(&robot, Locality::Local), (&laptop, Locality::Remote)] {
         for library in LIBRARIES {
             let topic = format!("rt/{library:?}_on_{}", host.name());
             peers.push(Peer::on(library).subscriber().topic(&topic).start_on(host));
@@ -94,7 +94,7 @@ fn readers_of_every_library_are_told_by_their_host() {
     }
     // Announces shared memory beside its addresses, or serves this host alone.
     peers.push(Peer::fast().shared_memory().subscriber().topic("rt/shared_memory").start_on(&robot));
-    expected.insert("rt/shared_memory".to_owned(), Whereabouts::Local);
+    expected.insert("rt/shared_memory".to_owned(), Locality::Local);
     let loopback = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface address='127.0.0.1' \
                     multicast='true'/></Interfaces></General></Domain></CycloneDDS>";
     robot.run("ip", &["link", "set", "lo", "multicast", "on"]);
@@ -112,8 +112,8 @@ fn readers_of_every_library_are_told_by_their_host() {
     for (topic, place) in &expected {
         let location = &readers[topic].location;
         println!("{topic}: {location:?}");
-        assert_eq!(location.whereabouts(&own), *place, "{topic}: {location:?} of {own:?}");
-        if *place == Whereabouts::Remote {
+        assert_eq!(location.locality(&own), *place, "{topic}: {location:?} of {own:?}");
+        if *place == Locality::Remote {
             let host = location.host().unwrap().to_string();
             assert!([laptop.address().to_string(), "192.168.7.2".to_owned()].contains(&host), "{host}");
         }
@@ -121,7 +121,7 @@ fn readers_of_every_library_are_told_by_their_host() {
     // One that only listens on loopback may not be heard here at all.
     if let Some(reader) = readers.get("rt/loopback") {
         println!("rt/loopback: {:?}", reader.location);
-        assert_eq!(reader.location.whereabouts(&own), Whereabouts::Local);
+        assert_eq!(reader.location.locality(&own), Locality::Local);
     }
     for peer in peers {
         let _: Received = peer.end();
@@ -142,8 +142,8 @@ impl Turn {
         let participant = node_on(host, "bridge", 16);
         let graph = participant.watch_graph().unwrap();
         let topic = |name| TopicName::try_from(name).unwrap();
-        let instead = Some(topic("/adaptive_bridge/noncritical/scan"));
-        let guarded = |topic, guarded| GuardedTopic { topic, guarded, instead: instead.clone() };
+        let alternative = Some(topic("/adaptive_bridge/noncritical/scan"));
+        let guarded = |topic, guarded| GuardedTopic { topic, guarded, alternative: alternative.clone() };
         let watch = IntruderWatch::new(vec![
             guarded(topic("/scan"), Guarded::Input),
             guarded(topic("/adaptive_bridge/critical/scan"), Guarded::CriticalOutput),
@@ -157,12 +157,18 @@ impl Turn {
         while let Some(change) = self.participant.poll_discovery() {
             match change {
                 Discovery::Reader(reader) => {
-                    self.watch.found(reader.guid, &reader.topic, &reader.location, &self.own, now);
+                    self.watch.endpoint_discovered(
+                        reader.guid,
+                        &reader.topic,
+                        &reader.location,
+                        &self.own,
+                        now,
+                    );
                 }
-                Discovery::ReaderGone(guid) => self.watch.gone(guid, now),
+                Discovery::ReaderGone(guid) => self.watch.endpoint_lost(guid, now),
                 Discovery::ParticipantGone { prefix, .. } => {
                     self.graph.participant_gone(prefix);
-                    self.watch.participant_gone(prefix, now);
+                    self.watch.participant_lost(prefix, now);
                 }
                 _ => {}
             }
@@ -195,17 +201,17 @@ fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     let mut turn = Turn::new(&robot);
 
-    // On the robot it may: neither of these is told.
+    // On the robot it may: neither of these is reported.
     let mut planner = node_on(&robot, "planner", 16);
     let _planner_reader = read(&mut planner, "rt/scan");
     let local = Peer::fast().subscriber().start_on(&robot);
 
-    let mut told = 0;
+    let mut reported = 0;
     for (gid_bytes, topic) in [(16, "rt/scan"), (24, "rt/adaptive_bridge/critical/scan")] {
         let mut rviz = node_on(&laptop, &format!("rviz_{gid_bytes}"), gid_bytes);
         let reader = read(&mut rviz, topic);
         let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
-        told += 1;
+        reported += 1;
         assert_eq!(intruder.reader, reader.guid());
         assert_eq!(intruder.topic.topic.to_dds(), topic);
         assert_eq!(intruder.node.as_deref(), Some(format!("/fleet/rviz_{gid_bytes}").as_str()));
@@ -215,9 +221,9 @@ fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
         // One that is taken away while its participant stays, then the participant.
         let (guid, second) = (reader.guid(), read(&mut rviz, "rt/scan"));
         let IntruderEvent::Appeared(_) = turn.next("a second warning") else { panic!("{:?}", turn.events) };
-        told += 1;
+        reported += 1;
         drop(reader);
-        rviz.forget(guid);
+        rviz.remove_endpoint(guid);
         assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == guid));
         let guid = second.guid();
         drop((second, rviz));
@@ -230,14 +236,14 @@ fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
     for library in LIBRARIES {
         let mut peer = Peer::on(library).subscriber().start_on(&laptop);
         let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
-        told += 1;
+        reported += 1;
         assert_eq!(intruder.node, None);
         assert!(intruder.to_string().contains("a reader without a known node"), "{intruder}");
         peer.signal(Signal::SIGKILL);
         peer.wait();
         assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == intruder.reader));
     }
-    assert_eq!(turn.watch.counts(), IntruderCounts { present: 0, told, untold: 0 });
+    assert_eq!(turn.watch.counts(), IntruderCounts { present: 0, reported, unreported: 0 });
     let _: Received = local.end();
 }
 
@@ -255,7 +261,7 @@ fn one_whose_link_fails_for_a_while_is_warned_of_once() {
     laptop.set_link(true);
     let IntruderEvent::Returned(intruder) = turn.next("its return") else { panic!("{:?}", turn.events) };
     assert_eq!((intruder.reader, intruder.node.as_deref()), (reader.guid(), Some("/fleet/rviz")));
-    assert_eq!(turn.watch.counts(), IntruderCounts { present: 1, told: 1, untold: 0 });
+    assert_eq!(turn.watch.counts(), IntruderCounts { present: 1, reported: 1, unreported: 0 });
 }
 
 #[test]

@@ -87,7 +87,7 @@ fn report() -> Report {
         absences: Vec::new(),
         intruders: Vec::new(),
     };
-    let mut report = snapshot.since(&snapshot);
+    let mut report = snapshot.report_since(&snapshot);
     report.subscribers[0].id = HOSTILE.to_owned();
     report
 }
@@ -97,7 +97,7 @@ fn scrape(report: Report) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("metrics.sock");
     let server = MetricsServer::start(&MetricsListener::Unix(path.clone())).unwrap();
-    server.show(Arc::new(report));
+    server.set_report(Arc::new(report));
     let mut client = UnixStream::connect(&path).unwrap();
     client.set_read_timeout(Some(Duration::from_secs(120))).unwrap();
     client.write_all(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();

@@ -10,8 +10,8 @@ use adaptive_bridge::model::{
     TrafficClass, WallNs,
 };
 use adaptive_bridge::policy::{
-    Allowance, ByteBudget, Decision, LaneQueue, RouteShaper, SequenceTracker, Sighting, Stamps, TokenBucket,
-    TurnOrder, burst_for, critical_drop, effective_mode,
+    Allowance, ByteBudget, Decision, LaneQueue, PollOrder, RouteShaper, SampleStamps, SequenceOutcome,
+    SequenceTracker, TokenBucket, burst_for, critical_drop, effective_mode,
 };
 use proptest::prelude::*;
 use proptest::test_runner::FileFailurePersistence;
@@ -131,7 +131,7 @@ impl Outcome {
 
 /// What decides between the publisher and the wire.
 trait Gate {
-    fn offer(&mut self, sequence: u64, stamps: Stamps);
+    fn offer(&mut self, sequence: u64, stamps: SampleStamps);
     fn poll(&mut self, now: MonotonicNs) -> Decision<u64>;
     /// Samples dropped and samples waiting.
     fn rest(&self) -> u64;
@@ -153,7 +153,7 @@ impl Shaper {
 }
 
 impl Gate for Shaper {
-    fn offer(&mut self, sequence: u64, stamps: Stamps) {
+    fn offer(&mut self, sequence: u64, stamps: SampleStamps) {
         self.shaper.offer(sequence, stamps, |_, _, _| self.dropped += 1);
     }
 
@@ -187,7 +187,7 @@ impl WithBurst {
 }
 
 impl Gate for WithBurst {
-    fn offer(&mut self, sequence: u64, stamps: Stamps) {
+    fn offer(&mut self, sequence: u64, stamps: SampleStamps) {
         self.queue.offer(sequence, stamps, |_, _, _| self.dropped += 1);
     }
 
@@ -226,8 +226,12 @@ fn run(setup: &Setup, gate: &mut impl Gate) -> Outcome {
         while publisher.next_at <= now.0 {
             let taken_at = MonotonicNs(publisher.next_at);
             let source_timestamp = SourceTimestamp::from_wall(wall(taken_at));
-            let stamps =
-                Stamps { sequence: publisher.sequence, source_timestamp, taken_at, bytes: SAMPLE_BYTES };
+            let stamps = SampleStamps {
+                sequence: publisher.sequence,
+                source_timestamp,
+                taken_at,
+                bytes: SAMPLE_BYTES,
+            };
             gate.offer(publisher.sequence, stamps);
             offered += 1;
             publisher.advance();
@@ -315,12 +319,12 @@ fn any_setup() -> impl Strategy<Value = Setup> {
 struct IntervalGate {
     interval_ns: u64,
     passed_at: Option<u64>,
-    passed: Option<(u64, Stamps)>,
+    passed: Option<(u64, SampleStamps)>,
     dropped: u64,
 }
 
 impl Gate for IntervalGate {
-    fn offer(&mut self, sequence: u64, stamps: Stamps) {
+    fn offer(&mut self, sequence: u64, stamps: SampleStamps) {
         if self.passed_at.is_some_and(|at| stamps.taken_at.0 < at + self.interval_ns) {
             self.dropped += 1;
         } else {
@@ -588,9 +592,14 @@ proptest! {
     }
 }
 
-fn aged(sequence: u64, now: MonotonicNs, age_ms: u64) -> Stamps {
+fn aged(sequence: u64, now: MonotonicNs, age_ms: u64) -> SampleStamps {
     let taken_at = MonotonicNs(now.0 - age_ms * 1_000_000);
-    Stamps { sequence, source_timestamp: SourceTimestamp::from_wall(wall(taken_at)), taken_at, bytes: 1 }
+    SampleStamps {
+        sequence,
+        source_timestamp: SourceTimestamp::from_wall(wall(taken_at)),
+        taken_at,
+        bytes: 1,
+    }
 }
 
 fn allowance(now: MonotonicNs, tokens: u64) -> Allowance {
@@ -687,7 +696,8 @@ proptest! {
                         let source_ns = now_wall.0.saturating_add_signed(-age_ms * 1_000_000);
  SourceTimestamp::from_wall(WallNs(source_ns))
                     });
-                    let stamps = Stamps { sequence: ledger.offered, source_timestamp, taken_at: now, bytes };
+                    let sequence = ledger.offered;
+                    let stamps = SampleStamps { sequence, source_timestamp, taken_at: now, bytes };
                     shaper.offer(ledger.offered, stamps, |item, _, reason| {
                         let expected = match (rate, mode) {
                             (None, LaneMode::Stopped) => DropReason::Stopped,
@@ -700,7 +710,7 @@ proptest! {
                     });
                 }
                 Event::Poll => {
-                    let age_ns = |stamps: &Stamps| match stamps.source_timestamp.to_wall() {
+                    let age_ns = |stamps: &SampleStamps| match stamps.source_timestamp.to_wall() {
                         Some(source) => now_wall.0.saturating_sub(source.0),
                         None => now.0 - stamps.taken_at.0,
                     };
@@ -814,14 +824,14 @@ proptest! {
                 tracker = SequenceTracker::resume(tracker.first(), tracker.last());
             }
             sequence = sequence.saturating_add_signed(jump);
-            match tracker.see(sequence) {
-                Sighting::InOrder => seen += 1,
-                Sighting::AfterGap(lost) => {
+            match tracker.record(sequence) {
+                SequenceOutcome::InOrder => seen += 1,
+                SequenceOutcome::AfterGap(lost) => {
                     prop_assert!(lost > 0);
                     missing += lost;
                     seen += 1;
                 }
-                Sighting::Duplicate => prop_assert!(sequence <= highest || sequence == 0),
+                SequenceOutcome::Duplicate => prop_assert!(sequence <= highest || sequence == 0),
             }
             highest = highest.max(sequence);
             prop_assert_eq!(tracker.last(), highest);
@@ -851,7 +861,7 @@ fn the_freshest_sample_is_sent_also_when_bytes_and_not_tokens_are_scarce() {
     // 200 Hz of 1,000 bytes into 5,000 bytes a second: one sample in forty.
     for sequence in 1..=2_000_u64 {
         let now = MonotonicNs(sequence * 5_000_000);
-        let stamps = Stamps { bytes: 1_000, ..aged(sequence, now, 0) };
+        let stamps = SampleStamps { bytes: 1_000, ..aged(sequence, now, 0) };
         shaper.offer(sequence, stamps, |_, _, _| {});
         while let Decision::Send(item, _) = shaper.poll(&mut budget, now, wall(now), |_, _, _| {}) {
             assert_eq!(item, sequence);
@@ -868,13 +878,13 @@ fn routes_that_share_a_byte_budget_share_it_fairly() {
     let start = MonotonicNs(0);
     let mut budget = ByteBudget::new(Some(20_000), start);
     let mut shapers: Vec<_> = (0..3).map(|_| RouteShaper::new(rates, start)).collect();
-    let mut turns = TurnOrder::default();
+    let mut turns = PollOrder::default();
     let mut sent = [0_u64; 3];
     // Each route alone would take the 20 samples of 1,000 bytes that the budget has for a second.
     for sequence in 1..=60_000_u64 {
         let now = MonotonicNs(sequence * 10_000_000);
         for shaper in &mut shapers {
-            let stamps = Stamps { bytes: 1_000, ..aged(sequence, now, 0) };
+            let stamps = SampleStamps { bytes: 1_000, ..aged(sequence, now, 0) };
             shaper.offer(sequence, stamps, |_, _, _| {});
         }
         for index in turns.order(3) {

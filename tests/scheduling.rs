@@ -69,12 +69,12 @@ fn the_threads_of_a_data_path_have_one_priority() {
 }
 
 /// Policy, as proc_pid_stat(5) counts, and CPUs of the thread that gets critical lanes up, if there is one.
-fn lookout(ingress: &Process) -> Option<(u32, String)> {
+fn early_waker(ingress: &Process) -> Option<(u32, String)> {
     let tasks = fs::read_dir(format!("/proc/{}/task", ingress.pid())).unwrap();
     tasks.filter_map(Result::ok).find_map(|task| {
         let stat = fs::read_to_string(task.path().join("stat")).ok()?;
         let (before, after) = stat.rsplit_once(')')?;
-        if before.split_once('(')?.1 != "lookout" {
+        if before.split_once('(')?.1 != "early-waker" {
             return None;
         }
         let policy = after.split_whitespace().nth(38)?.parse().ok()?;
@@ -103,36 +103,36 @@ fn pinned(ingress: &str, lane: &str) -> (Bridge, Process) {
     (bridge, process)
 }
 
-/// Where a lane could get in the way of ingress nobody gets it up: `docs/decisions/0013-lookout.md`.
+/// Where a lane could get in the way of ingress nobody gets it up: `docs/decisions/0013-early-waker.md`.
 #[test]
-fn the_lookout_is_where_the_critical_lane_is() {
+fn the_early_waker_runs_on_the_cpus_of_the_critical_lanes() {
     let Some([here, there]) = two_cpus() else {
-        return skip("the_lookout_is_where_the_critical_lane_is", "one CPU");
+        return skip("the_early_waker_runs_on_the_cpus_of_the_critical_lanes", "one CPU");
     };
     let (here, there) = (format!("cpus: [{here}]"), format!("cpus: [{there}]"));
     let (_bridge, mut ingress) = pinned(&here, &there);
     // It sets what it runs as by itself.
-    wait_for("a lookout that runs where the lane does when nothing else does", || {
-        let (policy, cpus) = lookout(&ingress)?;
+    wait_for("an early waker that runs where the lane does when nothing else does", || {
+        let (policy, cpus) = early_waker(&ingress)?;
         (policy == libc::SCHED_BATCH as u32 && there == format!("cpus: [{cpus}]")).then_some(())
     });
     assert!(ingress.terminate().success());
     for (of_ingress, of_lane) in [("", ""), (&here, ""), ("", &there), (&there, &there)] {
         let (_bridge, ingress) = pinned(of_ingress, of_lane);
-        assert_eq!(lookout(&ingress), None, "ingress {of_ingress:?}, lane {of_lane:?}");
+        assert_eq!(early_waker(&ingress), None, "ingress {of_ingress:?}, lane {of_lane:?}");
     }
     // A CPU that is not there.
     let (_bridge, mut ingress) = pinned(&here, "cpus: [1023]");
-    ingress.wait_for_log("no lookout");
-    wait_for("an end of the lookout", || lookout(&ingress).is_none().then_some(()));
+    ingress.wait_for_log("no early waker");
+    wait_for("an end of the early waker", || early_waker(&ingress).is_none().then_some(()));
     assert!(ingress.terminate().success());
 }
 
 /// While a program of higher priority keeps ingress from receiving, a lane can have heard of a sample from
-/// nobody but the lookout.
+/// nobody but the early waker.
 #[test]
-fn the_lookout_gets_a_lane_up_before_its_sample_is_received() {
-    let test = "the_lookout_gets_a_lane_up_before_its_sample_is_received";
+fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
+    let test = "the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample";
     let Some([here, there]) = two_cpus() else {
         return skip(test, "one CPU");
     };

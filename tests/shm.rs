@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use adaptive_bridge::model::{InstanceName, LaneMode, LanePolicy, LatencyHistogram, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
-    Boards, BridgeShape, HeaderError, LaneQueue, LoanError, ProcessRole, RoleLock, RouteChannel,
+    Boards, BridgeShape, HeaderError, LoanError, ProcessRole, QueueLimits, RoleLock, RouteChannel,
     SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole, TakeError, Woken,
     this_cpu,
 };
@@ -168,7 +168,7 @@ fn the_pool_suffices_when_everybody_holds_all_it_may() {
     let place = Place::new();
     let node = place.node();
     let shares =
-        [LaneQueue { queue_depth: 5, max_borrowed: 3 }, LaneQueue { queue_depth: 2, max_borrowed: 7 }];
+        [QueueLimits { queue_depth: 5, max_borrowed: 3 }, QueueLimits { queue_depth: 2, max_borrowed: 7 }];
     let channel = RouteChannel { lanes: shares.to_vec(), max_taps: 1, retained_samples: 2, ..channel(1_000) };
     assert_eq!(channel.pool_size().slots, (5 + 3) + (2 + 7) + (4 + 2) + 2 + 3);
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
@@ -310,7 +310,7 @@ fn a_lane_outlives_more_publishers_than_it_holds_samples_of() {
 fn retained_samples_come_to_those_who_ask_also_without_new_ones() {
     let place = Place::new();
     let node = place.node();
-    let shallow = LaneQueue { queue_depth: 1, max_borrowed: 2 };
+    let shallow = QueueLimits { queue_depth: 1, max_borrowed: 2 };
     let channel = RouteChannel { lanes: vec![shallow; 2], retained_samples: 3, ..channel(100) };
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
     for sequence in 1..=10 {
@@ -319,7 +319,7 @@ fn retained_samples_come_to_those_who_ask_also_without_new_ones() {
     let asks = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), true).unwrap();
     let does_not = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), false).unwrap();
     assert_eq!(sequences(&asks), [0u64; 0]);
-    publisher.attend();
+    publisher.connect_subscribers();
     assert_eq!(sequences(&asks), [8, 9, 10]);
     assert_eq!(sequences(&does_not), [0u64; 0]);
     publish(&publisher, 11, 100);
@@ -599,7 +599,7 @@ fn lanes_go_on_when_ingress_is_killed_again_and_again() {
     for number in 0..2 {
         until("the lane has them all", || boards().lane(number, 0).unwrap().last_sequence == published);
         let counters = boards().lane(number, 0).unwrap();
-        assert!(counters.is_whole(), "{counters:?}");
+        assert!(counters.is_accounted_for(), "{counters:?}");
         if number == 0 {
             // One for each death: numbered, and not published.
             assert!(counters.drops.total() <= 10, "{counters:?}");
@@ -663,7 +663,7 @@ fn a_stopped_lane_holds_up_nobody_and_goes_on_after_a_gap() {
         (0..2).all(|lane| boards.lane(lane, 0).unwrap().last_sequence == published)
     });
     let counters = [0, 1].map(|lane| boards.lane(lane, 0).unwrap());
-    assert!(counters.iter().all(|counters| counters.is_whole()), "{counters:?}");
+    assert!(counters.iter().all(|counters| counters.is_accounted_for()), "{counters:?}");
     assert_eq!(counters[0].drops.total(), 0, "{counters:?}");
     assert!(counters[1].drops.total() >= 19_000, "{counters:?}");
     for lane in lanes {
@@ -778,7 +778,7 @@ fn counters_survive_their_writer_whole() {
             let n = counters.received;
             let whole = (n, n, n) == (counters.received_bytes, counters.published, counters.lost_upstream);
             assert!(whole, "a torn value: {counters:?}");
-            assert!(boards.lane(1, 0).unwrap().is_whole());
+            assert!(boards.lane(1, 0).unwrap().is_accounted_for());
             read += 1;
         }
         writer.kill();

@@ -688,7 +688,7 @@ impl Counters {
             counters.by_reference += lane.by_reference;
             counters.in_place += ingress.in_place;
             counters.noncritical_forwarded += noncritical(boards, route);
-            counters.whole &= lane.is_whole();
+            counters.whole &= lane.is_accounted_for();
             counters.shm.add(&boards.histogram(Stage::Shm(CRITICAL), route));
             counters.hand_over.add(&boards.histogram(Stage::DdsOut(CRITICAL), route));
             let mut add = |process: &str, drops: &DropCounts| {

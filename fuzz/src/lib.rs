@@ -139,7 +139,7 @@ impl Foreign {
         assert!(drops.len() <= DropReason::COUNT && !drops.contains(&0));
         let _ = ingress.drops.total();
         let lane = self.boards.lane(0, 0).expect("nobody writes");
-        let _ = (lane.received(), lane.is_whole());
+        let _ = (lane.received(), lane.is_accounted_for());
         self.boards.lane_writer(0, 0).update(|counters| {
             counters.drops.add(DropReason::Stale, 1);
         });

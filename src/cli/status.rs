@@ -57,7 +57,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
     #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
     std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
     match read_bridge(&root, &settings) {
-        Ok(Some(second)) => match show(&second.since(&first), arguments.json) {
+        Ok(Some(second)) => match show(&second.report_since(&first), arguments.json) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => output_ended(&error),
         },
@@ -102,7 +102,7 @@ fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first
         };
         let shown = match (&next, &last) {
             (Some(next), before) => {
-                let report = next.since(before.as_ref().unwrap_or(next));
+                let report = next.report_since(before.as_ref().unwrap_or(next));
                 if in_place { redraw(&report.to_string()) } else { show(&report, arguments.json) }
             }
             (None, Some(_)) => {

@@ -15,7 +15,7 @@ use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge, root}
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{Encapsulation, MonotonicNs};
-use crate::policy::{SequenceTracker, Sighting};
+use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::process::Stop;
 use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError};
 use crate::telemetry::Intervals;
@@ -187,9 +187,9 @@ impl Tap {
         if let Some(left) = &mut self.left {
             *left = left.saturating_sub(1);
         }
-        let missed = match self.tracker.see(header.sequence) {
-            Sighting::AfterGap(missed) => missed,
-            Sighting::InOrder | Sighting::Duplicate => 0,
+        let missed = match self.tracker.record(header.sequence) {
+            SequenceOutcome::AfterGap(missed) => missed,
+            SequenceOutcome::InOrder | SequenceOutcome::Duplicate => 0,
         };
         match &mut self.format {
             Format::Lines => {
@@ -202,7 +202,7 @@ impl Tap {
             Format::Hz { intervals, lost, new, .. } => {
                 *lost += missed;
                 *new += 1;
-                intervals.see(header);
+                intervals.record(header);
                 Ok(())
             }
         }

@@ -62,7 +62,7 @@ fn host_interfaces() -> Result<Vec<(String, Ipv4Addr)>, DdsError> {
 }
 
 /// The IPv4 and IPv6 addresses of this host at present, with which
-/// [`Location::whereabouts`](crate::policy::Location::whereabouts) compares. They change when the host joins
+/// [`Location::locality`](crate::policy::Location::locality) compares. They change when the host joins
 /// or leaves a network.
 ///
 /// # Errors

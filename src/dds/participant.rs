@@ -170,7 +170,7 @@ impl Participant {
     /// Announces that a participant whose process died has left. Remote participants then drop its readers
     /// and writers at once, instead of when its lease expires, 15 s later. Until then a RELIABLE, KEEP_ALL
     /// publisher waits for acknowledgements of a reader that no longer exists.
-    pub fn say_goodbye_for(&self, dead: Guid) {
+    pub fn dispose_participant(&self, dead: Guid) {
         if dead != Guid::default() && self.participant.dispose_participant(GUID::from_bytes(dead.0)).is_err()
         {
             tracing::warn!(
@@ -325,7 +325,7 @@ impl Participant {
     }
 
     /// Removes a dropped reader or writer from the node's graph entry.
-    pub fn forget(&mut self, endpoint: Guid) {
+    pub fn remove_endpoint(&mut self, endpoint: Guid) {
         self.readers.retain(|guid| *guid != endpoint);
         self.writers.retain(|guid| *guid != endpoint);
         self.publish_graph_entry();

@@ -192,7 +192,7 @@ impl LaneCounters {
     }
 
     /// Whether every sample is accounted for: forwarded, waiting, or dropped for a named reason.
-    pub fn is_whole(&self) -> bool {
+    pub fn is_accounted_for(&self) -> bool {
         let counted = self.forwarded.saturating_add(self.drops.total()).saturating_add(self.waiting);
         self.received() == counted
     }
@@ -429,10 +429,10 @@ mod tests {
     fn a_lane_is_whole_when_every_sample_is_accounted_for() {
         let mut counters =
             LaneCounters { first_sequence: 10, last_sequence: 20, forwarded: 7, ..Default::default() };
-        assert!(!counters.is_whole());
+        assert!(!counters.is_accounted_for());
         counters.drops.add(DropReason::Stale, 2);
         counters.waiting = 1;
-        assert!(counters.is_whole());
+        assert!(counters.is_accounted_for());
     }
 
     #[test]

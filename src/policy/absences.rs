@@ -175,7 +175,7 @@ impl AbsenceWatch {
     }
 
     /// Compares with the interfaces that this host has now, and removes expired absences.
-    pub fn look(&mut self, present: &[HostInterface], now: MonotonicNs) {
+    pub fn update_interfaces(&mut self, present: &[HostInterface], now: MonotonicNs) {
         let is_expired = |presence: Presence, is_configured: bool| match presence {
             Presence::Present => false,
             Presence::Away { since } => !is_configured && now >= since.plus_ms(REMEMBER_ABSENCE_MS),
@@ -242,7 +242,7 @@ impl AbsenceWatch {
 
     /// Records a reader or writer, new or changed, that discovery found on another host in network number
     /// `network`.
-    pub fn found(
+    pub fn endpoint_discovered(
         &mut self,
         network: usize,
         guid: Guid,
@@ -301,7 +301,7 @@ impl AbsenceWatch {
     }
 
     /// Removes a reader or writer that was deleted in order.
-    pub fn gone(&mut self, guid: Guid) {
+    pub fn endpoint_lost(&mut self, guid: Guid) {
         for peer in &mut self.peers {
             peer.endpoints.retain(|endpoint| endpoint.guid != guid);
         }
@@ -309,7 +309,7 @@ impl AbsenceWatch {
     }
 
     /// Removes a participant that left in order, or marks one as away whose lease expired after `silent_ms`.
-    pub fn participant_gone(
+    pub fn participant_lost(
         &mut self,
         network: usize,
         prefix: [u8; 12],
@@ -408,26 +408,26 @@ mod tests {
     fn a_configured_interface_is_away_until_it_has_an_address_and_a_link() {
         let mut watch = AbsenceWatch::new(["wlan0".to_owned(), "10.0.0.9".to_owned(), "lo".to_owned()]);
         let lo = interface("lo", Some([127, 0, 0, 1]), true);
-        watch.look(std::slice::from_ref(&lo), at(0));
+        watch.update_interfaces(std::slice::from_ref(&lo), at(0));
         assert_eq!(
             absences(&watch),
             ["away wlan0 is not on this host", "away 10.0.0.9 is the address of no interface"]
         );
         assert!(matches!(watch.poll(), Some(AbsenceEvent::Away(absence)) if absence.name == "wlan0"));
         let other = interface("eth0", Some([10, 0, 0, 9]), true);
-        watch.look(&[lo.clone(), other.clone(), interface("wlan0", None, true)], at(1_000));
+        watch.update_interfaces(&[lo.clone(), other.clone(), interface("wlan0", None, true)], at(1_000));
         assert_eq!(
             absences(&watch),
             ["away wlan0 has no IPv4 address", "back 10.0.0.9 is the address of no interface"]
         );
         let wlan = |has_link| interface("wlan0", Some([10, 0, 1, 2]), has_link);
-        watch.look(&[lo.clone(), other.clone(), wlan(false)], at(2_000));
+        watch.update_interfaces(&[lo.clone(), other.clone(), wlan(false)], at(2_000));
         assert_eq!(absences(&watch)[0], "away wlan0 has no link");
-        watch.look(&[lo.clone(), other.clone(), wlan(true)], at(3_000));
+        watch.update_interfaces(&[lo.clone(), other.clone(), wlan(true)], at(3_000));
         let back = &watch.absences()[0];
         assert_eq!((back.since, back.back_at), (at(0), Some(at(3_000))));
         assert_eq!(back.host, Some(IpAddr::V4(Ipv4Addr::new(10, 0, 1, 2))));
-        watch.look(&[lo, other, wlan(true)], at(3_000 + REMEMBER_ABSENCE_MS));
+        watch.update_interfaces(&[lo, other, wlan(true)], at(3_000 + REMEMBER_ABSENCE_MS));
         assert_eq!(absences(&watch), [""; 0], "expired");
     }
 
@@ -436,32 +436,32 @@ mod tests {
         let mut watch = AbsenceWatch::new([]);
         let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);
         let docker = |has_link| interface("docker0", Some([172, 17, 0, 1]), has_link);
-        watch.look(&[eth(true), docker(true)], at(0));
-        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
-        watch.look(&[eth(true), docker(true)], at(1_000));
-        watch.look(&[eth(false), docker(false)], at(2_000));
+        watch.update_interfaces(&[eth(true), docker(true)], at(0));
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.update_interfaces(&[eth(true), docker(true)], at(1_000));
+        watch.update_interfaces(&[eth(false), docker(false)], at(2_000));
         assert_eq!(absences(&watch), ["away eth0 has no link"]);
-        watch.look(&[], at(2_000 + REMEMBER_ABSENCE_MS));
+        watch.update_interfaces(&[], at(2_000 + REMEMBER_ABSENCE_MS));
         assert_eq!(absences(&watch), [""; 0], "an interface that is not configured expires");
     }
 
     #[test]
     fn a_peer_is_away_when_its_lease_expires_and_not_when_it_leaves_in_order() {
         let mut watch = AbsenceWatch::new([]);
-        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
-        watch.found(0, guid(1, 3), "/odom", true, LAPTOP, at(0));
-        watch.found(0, guid(2, 4), "/scan", false, LAPTOP, at(0));
-        watch.found(0, guid(3, 4), "/scan", false, LAPTOP, at(0));
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.endpoint_discovered(0, guid(1, 3), "/odom", true, LAPTOP, at(0));
+        watch.endpoint_discovered(0, guid(2, 4), "/scan", false, LAPTOP, at(0));
+        watch.endpoint_discovered(0, guid(3, 4), "/scan", false, LAPTOP, at(0));
         watch.name_nodes(0, |endpoint| (endpoint.prefix() == [1; 12]).then_some("/rviz"));
-        watch.participant_gone(0, [2; 12], None, at(100));
-        watch.gone(guid(3, 4));
-        watch.participant_gone(0, [3; 12], Some(10_000), at(20_000));
-        watch.participant_gone(1, [1; 12], Some(10_000), at(20_000));
+        watch.participant_lost(0, [2; 12], None, at(100));
+        watch.endpoint_lost(guid(3, 4));
+        watch.participant_lost(0, [3; 12], Some(10_000), at(20_000));
+        watch.participant_lost(1, [1; 12], Some(10_000), at(20_000));
         assert_eq!(absences(&watch), [""; 0]);
-        watch.participant_gone(0, [1; 12], Some(10_000), at(20_000));
+        watch.participant_lost(0, [1; 12], Some(10_000), at(20_000));
         assert_eq!(absences(&watch), ["away /rviz subscribes to /scan and publishes /odom"]);
         assert_eq!(watch.absences()[0].since, at(10_000));
-        watch.found(0, guid(1, 4), "/scan", false, LAPTOP, at(25_000));
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(25_000));
         assert_eq!(absences(&watch), ["back /rviz subscribes to /scan and publishes /odom"]);
         let events: Vec<_> = std::iter::from_fn(|| watch.poll()).collect();
         assert!(matches!(&events[..], [AbsenceEvent::Away(_), AbsenceEvent::Back(_)]), "{events:?}");
@@ -471,14 +471,14 @@ mod tests {
     fn a_restarted_program_is_back_and_one_that_is_not_restarted_expires() {
         let mut watch = AbsenceWatch::new([]);
         for participant in [1, 2] {
-            watch.found(0, guid(participant, 4), "/scan", false, LAPTOP, at(0));
+            watch.endpoint_discovered(0, guid(participant, 4), "/scan", false, LAPTOP, at(0));
         }
         for participant in [1, 2] {
-            watch.participant_gone(0, [participant; 12], Some(10_000), at(20_000));
+            watch.participant_lost(0, [participant; 12], Some(10_000), at(20_000));
         }
-        watch.found(0, guid(3, 4), "/scan", false, LAPTOP, at(30_000));
+        watch.endpoint_discovered(0, guid(3, 4), "/scan", false, LAPTOP, at(30_000));
         assert_eq!(absences(&watch), ["away  subscribes to /scan", "back  subscribes to /scan"]);
-        watch.look(&[], at(20_000 + REMEMBER_ABSENCE_MS));
+        watch.update_interfaces(&[], at(20_000 + REMEMBER_ABSENCE_MS));
         assert_eq!(absences(&watch), ["back  subscribes to /scan"]);
     }
 
@@ -487,7 +487,7 @@ mod tests {
         let mut watch = AbsenceWatch::new([]);
         for participant in 0..=255 {
             for entity in 0..=255 {
-                watch.found(0, guid(participant, entity), "/scan", false, LAPTOP, at(0));
+                watch.endpoint_discovered(0, guid(participant, entity), "/scan", false, LAPTOP, at(0));
             }
         }
         assert_eq!(watch.peers.len(), MAX_WATCHED_PEERS);

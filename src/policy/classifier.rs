@@ -208,8 +208,8 @@ const fn is_sufficient(reading: &LinkReading) -> bool {
     reading.settled >= MIN_SETTLED || reading.full
 }
 
-/// Whether to remove a subscriber that the configuration does not list; `heard_at` is its last response. Such
-/// a subscriber becomes known with its first response, so that there always is one.
-pub const fn is_forgotten(heard_at: MonotonicNs, now: MonotonicNs) -> bool {
-    now.since(heard_at) > FORGET_UNLISTED_MS * 1_000_000
+/// Whether to remove a subscriber that the configuration does not list; `last_response_at` is its last
+/// response. Such a subscriber becomes known with its first response, so that there always is one.
+pub const fn is_forgotten(last_response_at: MonotonicNs, now: MonotonicNs) -> bool {
+    now.since(last_response_at) > FORGET_UNLISTED_MS * 1_000_000
 }

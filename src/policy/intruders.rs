@@ -8,12 +8,12 @@ use core::net::IpAddr;
 use std::collections::VecDeque;
 use std::fmt;
 
-use super::whereabouts::{Location, Whereabouts};
+use super::locality::{Locality, Location};
 use crate::model::{Guid, MonotonicNs, TopicName};
 
 /// How long a warning waits for the name of the reader's node. Reader and node are announced on different
 /// topics, in any order and within a second of each other.
-pub const NODE_PATIENCE_MS: u64 = 2_000;
+pub const NODE_NAME_TIMEOUT_MS: u64 = 2_000;
 
 /// The most readers that are remembered, including those that were reported and have left; further ones are
 /// only counted. More than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)).
@@ -41,7 +41,7 @@ pub struct GuardedTopic {
     /// Why other hosts should not read it.
     pub guarded: Guarded,
     /// The route's output on a noncritical lane, which other hosts should read; `None` if it has none.
-    pub instead: Option<TopicName>,
+    pub alternative: Option<TopicName>,
 }
 
 /// A remote reader of a guarded topic. Its text form is the warning, with the remedy.
@@ -61,12 +61,12 @@ pub struct Intruder {
 
 impl Intruder {
     /// The remedy, as an imperative.
-    pub fn mending_step(&self) -> String {
-        match (self.topic.guarded, &self.topic.instead) {
-            (Guarded::Input, Some(instead)) => format!("point it at {instead}"),
+    pub fn remedy(&self) -> String {
+        match (self.topic.guarded, &self.topic.alternative) {
+            (Guarded::Input, Some(alternative)) => format!("point it at {alternative}"),
             (Guarded::Input, None) => "give the route a noncritical lane and point it at that".to_owned(),
-            (Guarded::CriticalOutput, Some(instead)) => {
-                format!("point it at {instead}, or give it a lane of its own")
+            (Guarded::CriticalOutput, Some(alternative)) => {
+                format!("point it at {alternative}, or give it a lane of its own")
             }
             (Guarded::CriticalOutput, None) => "give it a lane of its own".to_owned(),
         }
@@ -93,7 +93,7 @@ impl fmt::Display for Intruder {
                 write!(f, " subscribes to {topic}, and can slow down the critical subscribers")?;
             }
         }
-        write!(f, ": {}", self.mending_step())
+        write!(f, ": {}", self.remedy())
     }
 }
 
@@ -114,10 +114,10 @@ pub struct IntruderCounts {
     /// Intruders present, of those that were reported.
     pub present: u64,
     /// Intruders reported so far.
-    pub told: u64,
+    pub reported: u64,
     /// Discoveries of further readers while [`MAX_REMEMBERED_INTRUDERS`] were remembered; a reader that is
     /// announced again counts again.
-    pub untold: u64,
+    pub unreported: u64,
 }
 
 /// Watches for remote readers of guarded topics, and returns each event once. Memory is bounded by
@@ -169,7 +169,7 @@ impl IntruderWatch {
 
     /// Records a reader, new or changed, that discovery found on any DDS topic. `own` are the addresses of
     /// this host. A reader on this host or on an unknown one is no intruder.
-    pub fn found(
+    pub fn endpoint_discovered(
         &mut self,
         reader: Guid,
         dds_topic: &str,
@@ -178,7 +178,7 @@ impl IntruderWatch {
         now: MonotonicNs,
     ) {
         let Some(at) = self.dds_names.iter().position(|name| name == dds_topic) else { return };
-        if location.whereabouts(own) != Whereabouts::Remote {
+        if location.locality(own) != Locality::Remote {
             // It may have counted as remote before this host had all its addresses.
             self.gone_where(|guid| guid == reader, now);
             return;
@@ -200,18 +200,18 @@ impl IntruderWatch {
     }
 
     /// Records that a reader is gone.
-    pub fn gone(&mut self, reader: Guid, now: MonotonicNs) {
+    pub fn endpoint_lost(&mut self, reader: Guid, now: MonotonicNs) {
         self.gone_where(|guid| guid == reader, now);
     }
 
     /// Records that a participant is gone, with all its readers.
-    pub fn participant_gone(&mut self, prefix: [u8; 12], now: MonotonicNs) {
+    pub fn participant_lost(&mut self, prefix: [u8; 12], now: MonotonicNs) {
         self.gone_where(|guid| guid.prefix() == prefix, now);
     }
 
     /// The next event, if there is one. `node_of` returns the node of a reader if it is known.
     ///
-    /// A new reader is reported as soon as its node is known, or without it after [`NODE_PATIENCE_MS`]; a
+    /// A new reader is reported as soon as its node is known, or without it after [`NODE_NAME_TIMEOUT_MS`]; a
     /// name that arrives later is added without an event.
     pub fn poll<'graph>(
         &mut self,
@@ -226,7 +226,7 @@ impl IntruderWatch {
                 tracked.intruder.node = node_of(tracked.intruder.reader).map(str::to_owned);
             }
             let State::Waiting { found_at } = tracked.state else { continue };
-            if tracked.intruder.node.is_some() || now >= found_at.plus_ms(NODE_PATIENCE_MS) {
+            if tracked.intruder.node.is_some() || now >= found_at.plus_ms(NODE_NAME_TIMEOUT_MS) {
                 tracked.state = State::Present;
                 self.reported += 1;
                 return Some(IntruderEvent::Appeared(tracked.intruder.clone()));
@@ -244,7 +244,7 @@ impl IntruderWatch {
     /// Counts of intruders.
     pub fn counts(&self) -> IntruderCounts {
         let present = self.present().count() as u64;
-        IntruderCounts { present, told: self.reported, untold: self.unreported }
+        IntruderCounts { present, reported: self.reported, unreported: self.unreported }
     }
 
     fn gone_where(&mut self, is_gone: impl Fn(Guid) -> bool, now: MonotonicNs) {
@@ -303,12 +303,12 @@ mod tests {
             GuardedTopic {
                 topic: topic("/scan"),
                 guarded: Guarded::Input,
-                instead: Some(topic("/adaptive_bridge/noncritical/scan")),
+                alternative: Some(topic("/adaptive_bridge/noncritical/scan")),
             },
             GuardedTopic {
                 topic: topic("/adaptive_bridge/critical/scan"),
                 guarded: Guarded::CriticalOutput,
-                instead: Some(topic("/adaptive_bridge/noncritical/scan")),
+                alternative: Some(topic("/adaptive_bridge/noncritical/scan")),
             },
         ])
     }
@@ -329,7 +329,7 @@ mod tests {
     }
 
     fn find(watch: &mut IntruderWatch, reader: Guid, now: MonotonicNs) {
-        watch.found(reader, "rt/scan", &at("10.0.0.9"), &own(), now);
+        watch.endpoint_discovered(reader, "rt/scan", &at("10.0.0.9"), &own(), now);
     }
 
     fn nameless(_: Guid) -> Option<&'static str> {
@@ -353,7 +353,13 @@ mod tests {
     fn an_intruder_is_reported_once_with_host_node_and_remedy() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
-        watch.found(guid(1, 2), "rt/adaptive_bridge/critical/scan", &at("10.0.0.9"), &own(), START);
+        watch.endpoint_discovered(
+            guid(1, 2),
+            "rt/adaptive_bridge/critical/scan",
+            &at("10.0.0.9"),
+            &own(),
+            START,
+        );
         let expected = [
             "appeared: node /rviz on host 10.0.0.9 subscribes to /scan directly, bypasses the bridge, and can slow \
              down the publisher: point it at /adaptive_bridge/noncritical/scan",
@@ -364,17 +370,23 @@ mod tests {
         // Discovery reports the same reader repeatedly.
         find(&mut watch, guid(1, 1), START.plus_ms(10));
         assert_eq!(events(&mut watch, START.plus_ms(10), Some("/rviz")), [""; 0]);
-        assert_eq!(watch.counts(), IntruderCounts { present: 2, told: 2, untold: 0 });
+        assert_eq!(watch.counts(), IntruderCounts { present: 2, reported: 2, unreported: 0 });
     }
 
     #[test]
     fn readers_on_this_host_on_an_unknown_host_and_of_other_topics_are_no_intruders() {
         let mut watch = watch();
         assert!(watch.guards("rt/scan") && !watch.guards("rt/adaptive_bridge/noncritical/scan"));
-        watch.found(guid(1, 1), "rt/scan", &at("10.0.0.5"), &own(), START);
-        watch.found(guid(1, 2), "rt/scan", &at("127.0.0.1"), &own(), START);
-        watch.found(guid(1, 3), "rt/scan", &Location::default(), &own(), START);
-        watch.found(guid(1, 4), "rt/adaptive_bridge/noncritical/scan", &at("10.0.0.9"), &own(), START);
+        watch.endpoint_discovered(guid(1, 1), "rt/scan", &at("10.0.0.5"), &own(), START);
+        watch.endpoint_discovered(guid(1, 2), "rt/scan", &at("127.0.0.1"), &own(), START);
+        watch.endpoint_discovered(guid(1, 3), "rt/scan", &Location::default(), &own(), START);
+        watch.endpoint_discovered(
+            guid(1, 4),
+            "rt/adaptive_bridge/noncritical/scan",
+            &at("10.0.0.9"),
+            &own(),
+            START,
+        );
         assert_eq!(events(&mut watch, START.plus_ms(60_000), None), [""; 0]);
         assert_eq!(watch.counts(), IntruderCounts::default());
     }
@@ -383,14 +395,14 @@ mod tests {
     fn a_warning_waits_a_limited_time_for_the_name_of_the_node() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
-        assert_eq!(watch.poll(START.plus_ms(NODE_PATIENCE_MS - 1), nameless), None);
-        let named = events(&mut watch, START.plus_ms(NODE_PATIENCE_MS - 1), Some("/late"));
+        assert_eq!(watch.poll(START.plus_ms(NODE_NAME_TIMEOUT_MS - 1), nameless), None);
+        let named = events(&mut watch, START.plus_ms(NODE_NAME_TIMEOUT_MS - 1), Some("/late"));
         assert!(named[0].contains("node /late on host 10.0.0.9"), "{named:?}");
 
         find(&mut watch, guid(2, 2), START);
-        let nameless = events(&mut watch, START.plus_ms(NODE_PATIENCE_MS), None);
+        let nameless = events(&mut watch, START.plus_ms(NODE_NAME_TIMEOUT_MS), None);
         assert!(nameless[0].contains("a reader without a known node on host 10.0.0.9"), "{nameless:?}");
-        assert_eq!(events(&mut watch, START.plus_ms(NODE_PATIENCE_MS + 1), Some("/later")), [""; 0]);
+        assert_eq!(events(&mut watch, START.plus_ms(NODE_NAME_TIMEOUT_MS + 1), Some("/later")), [""; 0]);
         let nodes: Vec<_> = watch.present().map(|intruder| intruder.node.as_deref()).collect();
         assert_eq!(nodes, [Some("/late"), Some("/later")]);
     }
@@ -401,10 +413,10 @@ mod tests {
         find(&mut watch, guid(1, 1), START);
         find(&mut watch, guid(1, 2), START);
         assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 2);
-        watch.gone(guid(1, 1), START);
-        watch.gone(guid(1, 1), START);
+        watch.endpoint_lost(guid(1, 1), START);
+        watch.endpoint_lost(guid(1, 1), START);
         assert_eq!(events(&mut watch, START, None), ["left: 1"]);
-        watch.participant_gone(guid(1, 0).prefix(), START);
+        watch.participant_lost(guid(1, 0).prefix(), START);
         assert_eq!(events(&mut watch, START, None), ["left: 2"]);
         assert_eq!(watch.counts().present, 0);
         find(&mut watch, guid(1, 2), START.plus_ms(REMEMBER_MS - 1));
@@ -415,15 +427,15 @@ mod tests {
             1,
             "no longer remembered"
         );
-        assert_eq!(watch.counts(), IntruderCounts { present: 2, told: 3, untold: 0 });
+        assert_eq!(watch.counts(), IntruderCounts { present: 2, reported: 3, unreported: 0 });
     }
 
     #[test]
     fn a_reader_that_is_gone_before_it_is_reported_causes_no_event() {
         let mut watch = watch();
         find(&mut watch, guid(1, 1), START);
-        watch.gone(guid(1, 1), START.plus_ms(1_000));
-        assert_eq!(events(&mut watch, START.plus_ms(NODE_PATIENCE_MS), Some("/brief")), [""; 0]);
+        watch.endpoint_lost(guid(1, 1), START.plus_ms(1_000));
+        assert_eq!(events(&mut watch, START.plus_ms(NODE_NAME_TIMEOUT_MS), Some("/brief")), [""; 0]);
     }
 
     #[test]
@@ -432,12 +444,12 @@ mod tests {
         find(&mut watch, guid(1, 1), START);
         assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 1);
         for _ in 0..1_000 {
-            watch.gone(guid(1, 1), START);
+            watch.endpoint_lost(guid(1, 1), START);
             find(&mut watch, guid(1, 1), START);
         }
         assert!(watch.events.len() <= 1);
         assert_eq!(events(&mut watch, START, None), [""; 0]);
-        watch.gone(guid(1, 1), START);
+        watch.endpoint_lost(guid(1, 1), START);
         assert_eq!(events(&mut watch, START, None), ["left: 1"]);
     }
 
@@ -448,7 +460,7 @@ mod tests {
         assert_eq!(events(&mut watch, START, Some("/rviz")).len(), 1);
         // The host has joined the network since.
         let own = [own(), vec!["10.0.0.9".parse().unwrap()]].concat();
-        watch.found(guid(1, 1), "rt/scan", &at("10.0.0.9"), &own, START);
+        watch.endpoint_discovered(guid(1, 1), "rt/scan", &at("10.0.0.9"), &own, START);
         assert_eq!(events(&mut watch, START, None), ["left: 1"]);
     }
 
@@ -465,7 +477,7 @@ mod tests {
             count += events(&mut watch, now, Some("/flood")).len();
             if let Some(old) = number.checked_sub(100) {
                 reader[..4].copy_from_slice(&old.to_le_bytes());
-                watch.gone(Guid(reader), now);
+                watch.endpoint_lost(Guid(reader), now);
             }
             count += events(&mut watch, now, None).len();
             assert!(
@@ -476,6 +488,6 @@ mod tests {
         // Each of those reported appeared and left.
         assert_eq!(count, 2 * MAX_REMEMBERED_INTRUDERS);
         let counts = watch.counts();
-        assert_eq!(counts.told + counts.untold, 100_000);
+        assert_eq!(counts.reported + counts.unreported, 100_000);
     }
 }

@@ -1,6 +1,6 @@
 //! Decides what a lane does with a sample, from its rate, bytes, staleness and mode.
 
-use super::lane_queue::{Allowance, LaneQueue, Stamps};
+use super::lane_queue::{Allowance, LaneQueue, SampleStamps};
 use super::token_bucket::{ByteBudget, TokenBucket, burst_for};
 use crate::model::{
     DropReason, LaneMode, LanePolicy, LaneRates, MonotonicNs, RatePolicy, TrafficClass, WallNs,
@@ -10,7 +10,7 @@ use crate::model::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision<T> {
     /// Send this sample, whose token and bytes are taken; then poll again, as there may be another.
-    Send(T, Stamps),
+    Send(T, SampleStamps),
     /// Sleep: nothing can be sent until that instant. Samples that arrive in the meantime may wait in shared
     /// memory, without a wake-up.
     SleepUntil(MonotonicNs),
@@ -59,7 +59,12 @@ impl<T> RouteShaper<T> {
 
     /// Changes the mode from the next sample on. A mode that forwards nothing drops all waiting samples; any
     /// other drops those above the limit of its queue. No tokens accrue while a lane is suspended.
-    pub fn set_mode(&mut self, mode: LaneMode, now: MonotonicNs, on_drop: impl FnMut(T, Stamps, DropReason)) {
+    pub fn set_mode(
+        &mut self,
+        mode: LaneMode,
+        now: MonotonicNs,
+        on_drop: impl FnMut(T, SampleStamps, DropReason),
+    ) {
         self.mode = mode;
         match self.forwarding() {
             Ok(rate) => {
@@ -79,7 +84,7 @@ impl<T> RouteShaper<T> {
         &mut self,
         rates: LaneRates,
         now: MonotonicNs,
-        on_drop: impl FnMut(T, Stamps, DropReason),
+        on_drop: impl FnMut(T, SampleStamps, DropReason),
     ) {
         self.rates = rates;
         self.queue.set_capacity(capacity_for(&rates));
@@ -87,7 +92,12 @@ impl<T> RouteShaper<T> {
     }
 
     /// Queues or drops a sample. The caller offers samples in the order of their sequence numbers.
-    pub fn offer(&mut self, item: T, stamps: Stamps, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
+    pub fn offer(
+        &mut self,
+        item: T,
+        stamps: SampleStamps,
+        mut on_drop: impl FnMut(T, SampleStamps, DropReason),
+    ) {
         match self.forwarding() {
             Ok(_) => self.queue.offer(item, stamps, on_drop),
             Err(reason) => on_drop(item, stamps, reason),
@@ -95,13 +105,13 @@ impl<T> RouteShaper<T> {
     }
 
     /// Decides what to do at `now`. `budget` is that of the lane, in the same mode
-    /// ([`ByteBudget::set_mode`]); the caller polls the routes that share it in [`TurnOrder`].
+    /// ([`ByteBudget::set_mode`]); the caller polls the routes that share it in [`PollOrder`].
     pub fn poll(
         &mut self,
         budget: &mut ByteBudget,
         now: MonotonicNs,
         now_wall: WallNs,
-        on_drop: impl FnMut(T, Stamps, DropReason),
+        on_drop: impl FnMut(T, SampleStamps, DropReason),
     ) -> Decision<T> {
         let stale_threshold_ms = match self.forwarding() {
             Ok(rate) => rate.stale_threshold_ms,
@@ -132,7 +142,7 @@ impl<T> RouteShaper<T> {
     }
 
     /// Drops every waiting sample for `reason`, such as at shutdown.
-    pub fn clear(&mut self, reason: DropReason, on_drop: impl FnMut(T, Stamps, DropReason)) {
+    pub fn clear(&mut self, reason: DropReason, on_drop: impl FnMut(T, SampleStamps, DropReason)) {
         self.queue.clear(reason, on_drop);
     }
 
@@ -156,11 +166,11 @@ fn capacity_for(rates: &LaneRates) -> usize {
 /// after the one that sent last: in a fixed order the first route would take all bytes when they do not
 /// suffice.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct TurnOrder {
+pub struct PollOrder {
     first: usize,
 }
 
-impl TurnOrder {
+impl PollOrder {
     /// The indices of `routes` routes, in the order in which to poll them now.
     pub fn order(self, routes: usize) -> impl Iterator<Item = usize> {
         let first = if self.first < routes { self.first } else { 0 };
@@ -248,8 +258,8 @@ mod tests {
         MonotonicNs(ms * 1_000_000)
     }
 
-    fn stamps(sequence: u64, taken_at: MonotonicNs) -> Stamps {
-        Stamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
+    fn stamps(sequence: u64, taken_at: MonotonicNs) -> SampleStamps {
+        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
     }
 
     /// A route, its budget, and the dropped samples; each item is its sequence number.
@@ -334,7 +344,7 @@ mod tests {
     fn a_lane_in_byte_debt_sleeps_until_it_is_paid_off() {
         let mut bench = Bench::new(RATES);
         bench.set_mode(LaneMode::Degraded, 0);
-        let big = Stamps { bytes: 3_000, ..stamps(1, at_ms(0)) };
+        let big = SampleStamps { bytes: 3_000, ..stamps(1, at_ms(0)) };
         bench.shaper.offer(1, big, |_, _, _| {});
         assert_eq!(sent(bench.poll(0)), Some(1));
         bench.offer(2, 1_000);
@@ -450,7 +460,7 @@ mod tests {
 
     #[test]
     fn the_order_starts_after_the_route_that_sent_last() {
-        let mut turns = TurnOrder::default();
+        let mut turns = PollOrder::default();
         assert_eq!(turns.order(3).collect::<Vec<_>>(), [0, 1, 2]);
         turns.sent(0);
         assert_eq!(turns.order(3).collect::<Vec<_>>(), [1, 2, 0]);

@@ -7,7 +7,7 @@ use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SourceTime
 
 /// The metadata by which the queue decides; it does not read the sample itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Stamps {
+pub struct SampleStamps {
     /// The sample's sequence number in its route.
     pub sequence: u64,
     /// The publisher's DDS source timestamp; none if the publisher's clock disagrees with this host's.
@@ -19,7 +19,7 @@ pub struct Stamps {
     pub bytes: u64,
 }
 
-impl Stamps {
+impl SampleStamps {
     /// The stamps of a sample with that header and a payload of `bytes`.
     pub const fn new(header: &SampleHeader, bytes: u64) -> Self {
         Self {
@@ -47,7 +47,7 @@ pub struct Allowance {
 }
 
 impl Allowance {
-    fn is_stale(&self, stamps: &Stamps) -> bool {
+    fn is_stale(&self, stamps: &SampleStamps) -> bool {
         let age_ns = age_ns(stamps.source_timestamp, stamps.taken_at, self.now, self.now_wall);
         is_stale(age_ns, self.stale_threshold_ms)
     }
@@ -61,7 +61,7 @@ impl Allowance {
 #[derive(Debug)]
 pub struct LaneQueue<T> {
     /// The oldest is at the front.
-    waiting: VecDeque<(T, Stamps)>,
+    waiting: VecDeque<(T, SampleStamps)>,
     capacity: usize,
     limit: usize,
     policy: DropPolicy,
@@ -97,7 +97,7 @@ impl<T> LaneQueue<T> {
         &mut self,
         policy: DropPolicy,
         limit: usize,
-        mut on_drop: impl FnMut(T, Stamps, DropReason),
+        mut on_drop: impl FnMut(T, SampleStamps, DropReason),
     ) {
         self.policy = policy;
         self.limit = limit.clamp(1, self.capacity);
@@ -108,7 +108,12 @@ impl<T> LaneQueue<T> {
 
     /// Adds a sample. When the queue is full, it drops one: with `DropOldest` the oldest as superseded, with
     /// `DropStale` the oldest and with `DropLatest` the new one as queue full.
-    pub fn offer(&mut self, item: T, stamps: Stamps, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
+    pub fn offer(
+        &mut self,
+        item: T,
+        stamps: SampleStamps,
+        mut on_drop: impl FnMut(T, SampleStamps, DropReason),
+    ) {
         if self.waiting.len() >= self.limit {
             if self.policy == DropPolicy::DropLatest {
                 on_drop(item, stamps, DropReason::QueueFull);
@@ -133,8 +138,8 @@ impl<T> LaneQueue<T> {
     pub fn take(
         &mut self,
         allowance: &Allowance,
-        mut on_drop: impl FnMut(T, Stamps, DropReason),
-    ) -> Option<(T, Stamps)> {
+        mut on_drop: impl FnMut(T, SampleStamps, DropReason),
+    ) -> Option<(T, SampleStamps)> {
         if allowance.tokens == 0 {
             return None;
         }
@@ -153,14 +158,14 @@ impl<T> LaneQueue<T> {
     }
 
     /// Drops every waiting sample for `reason`.
-    pub fn clear(&mut self, reason: DropReason, mut on_drop: impl FnMut(T, Stamps, DropReason)) {
+    pub fn clear(&mut self, reason: DropReason, mut on_drop: impl FnMut(T, SampleStamps, DropReason)) {
         while let Some((item, stamps)) = self.waiting.pop_front() {
             on_drop(item, stamps, reason);
         }
     }
 
     /// Drops the sample that the policy chooses when the queue is full.
-    fn drop_one(&mut self, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
+    fn drop_one(&mut self, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
         let (dropped, reason) = match self.policy {
             DropPolicy::DropOldest => (self.waiting.pop_front(), DropReason::Superseded),
             DropPolicy::DropStale => (self.waiting.pop_front(), DropReason::QueueFull),
@@ -172,7 +177,7 @@ impl<T> LaneQueue<T> {
     }
 
     /// Keeps as many of the newest samples as the allowance permits, and drops all older ones.
-    fn supersede(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
+    fn supersede(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
         let mut kept = 0;
         let mut older_bytes = 0_u64;
         let mut oldest_kept = self.waiting.len();
@@ -204,7 +209,7 @@ impl<T> LaneQueue<T> {
 
     /// Drops all stale samples. One may wait behind a fresh one, because each publisher of a topic has its
     /// own clock.
-    fn drop_stale(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, Stamps, DropReason)) {
+    fn drop_stale(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
         for _ in 0..self.waiting.len() {
             let Some((item, stamps)) = self.waiting.pop_front() else { return };
             if allowance.is_stale(&stamps) {
@@ -223,9 +228,9 @@ mod tests {
 
     const NOW_MS: u64 = 10_000;
 
-    fn stamps(sequence: u64, age_ms: u64) -> Stamps {
+    fn stamps(sequence: u64, age_ms: u64) -> SampleStamps {
         let taken_at = MonotonicNs((NOW_MS - age_ms) * 1_000_000);
-        Stamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
+        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
     }
 
     fn allowance(tokens: u64) -> Allowance {

@@ -29,6 +29,7 @@ mod intruders;
 mod lane;
 mod lane_mode;
 mod lane_queue;
+mod locality;
 mod probe_window;
 mod publisher_places;
 mod replay_guard;
@@ -38,7 +39,6 @@ mod sequence;
 mod staleness;
 mod token_bucket;
 mod warnings;
-mod whereabouts;
 
 pub use absences::{
     Absence, AbsenceEvent, AbsenceWatch, HostInterface, MAX_WATCHED_PEERS, REMEMBER_ABSENCE_MS,
@@ -49,23 +49,24 @@ pub use classifier::{
 pub use clock_offset::ClockOffset;
 pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
-    NODE_PATIENCE_MS, REMEMBER_MS,
+    NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
-pub use lane::{Decision, RouteShaper, TurnOrder, critical_drop, effective_mode};
+pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, effective_mode};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
-pub use lane_queue::{Allowance, LaneQueue, Stamps};
-pub use probe_window::{Answer, LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, STOPPED_NS};
+pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
+pub use locality::{Locality, Location};
+pub use probe_window::{LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, ResponseOutcome, STOPPED_NS};
 pub use publisher_places::{PUBLISHER_SILENT_MS, publisher_place};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};
 pub use restart::{
-    ChildExit, FIRST_BACKOFF_MS, GOOD_RUN_MS, GiveUpReason, MAX_BACKOFF_MS, RestartBackoff, RestartDecision,
+    ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, MAX_BACKOFF_MS, RestartBackoff,
+    RestartDecision,
 };
 pub use safety::{
     ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetyInputs, SafetySupervisor,
     SafetyTrouble, SourceLag,
 };
-pub use sequence::{SequenceTracker, Sighting};
+pub use sequence::{SequenceOutcome, SequenceTracker};
 pub use staleness::{age_ns, is_stale};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
 pub use warnings::{SubscriberWarnings, WarningThresholds};
-pub use whereabouts::{Location, Whereabouts};

@@ -14,12 +14,12 @@ pub const MAX_OUTSTANDING: usize = 4_096;
 const REMEMBERED: usize = 64;
 
 /// A control process that wakes this much later than planned was stopped, or got no CPU time: round trips
-/// that it measures then include its own delay. See [`ProbeWindow::stopped`].
+/// that it measures then include its own delay. See [`ProbeWindow::excuse_pause`].
 pub const STOPPED_NS: u64 = 100_000_000;
 
 /// How the window counts a probe response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Answer {
+pub enum ResponseOutcome {
     /// The probe's first response, in time.
     Counted {
         /// From the sending of the probe to the response.
@@ -102,7 +102,7 @@ pub struct ProbeWindow {
     /// By ascending number, which is also the order of sending.
     probes: VecDeque<Probe>,
     totals: ProbeTotals,
-    heard_at: Option<MonotonicNs>,
+    last_response_at: Option<MonotonicNs>,
     /// A buffer for the quantile.
     scratch: Vec<u64>,
 }
@@ -117,7 +117,7 @@ impl ProbeWindow {
             settled: VecDeque::with_capacity(window_size),
             probes: VecDeque::with_capacity(2 * REMEMBERED),
             totals: ProbeTotals::default(),
-            heard_at: None,
+            last_response_at: None,
             scratch: Vec::with_capacity(window_size),
         }
     }
@@ -149,28 +149,28 @@ impl ProbeWindow {
     }
 
     /// Records a response to probe `seq`.
-    pub fn answered(&mut self, seq: u64, at: MonotonicNs) -> Answer {
+    pub fn answered(&mut self, seq: u64, at: MonotonicNs) -> ResponseOutcome {
         self.settle(at);
         let Ok(index) = self.probes.binary_search_by_key(&seq, |probe| probe.seq) else {
-            return Answer::Unknown;
+            return ResponseOutcome::Unknown;
         };
         let probe = self.probes[index];
         if probe.outcome == Outcome::Answered {
-            return Answer::Repeated;
+            return ResponseOutcome::Repeated;
         }
-        if self.heard_at.is_none() {
+        if self.last_response_at.is_none() {
             self.excuse(|earlier| earlier.seq < seq);
         }
-        self.heard_at = Some(at);
+        self.last_response_at = Some(at);
         if probe.outcome != Outcome::Outstanding {
-            return Answer::Late;
+            return ResponseOutcome::Late;
         }
         let rtt_ns = at.since(probe.sent_at);
         self.probes[index].outcome = Outcome::Answered;
         self.totals.answered += 1;
         self.push_settled(Some(rtt_ns));
         self.trim();
-        Answer::Counted { rtt_ns }
+        ResponseOutcome::Counted { rtt_ns }
     }
 
     /// Excuses every probe that was outstanding at any time from `from` to `until`, while the control process
@@ -179,15 +179,15 @@ impl ProbeWindow {
     ///
     /// The caller detects the pause, because it knows when it should have woken. It calls this first in a
     /// turn that began more than [`STOPPED_NS`] late, before it passes the responses that queued up.
-    pub fn stopped(&mut self, from: MonotonicNs, until: MonotonicNs) {
+    pub fn excuse_pause(&mut self, from: MonotonicNs, until: MonotonicNs) {
         self.settle(from);
         self.excuse(|probe| probe.sent_at <= until);
         self.trim();
     }
 
     /// When the subscriber's last response arrived, in time or late; `None` for never.
-    pub const fn heard_at(&self) -> Option<MonotonicNs> {
-        self.heard_at
+    pub const fn last_response_at(&self) -> Option<MonotonicNs> {
+        self.last_response_at
     }
 
     /// Counts of all probes so far, by outcome.
@@ -226,7 +226,7 @@ impl ProbeWindow {
 
     /// Times out outstanding probes: they are lost, or excused before the subscriber's first response.
     fn settle(&mut self, now: MonotonicNs) {
-        let heard = self.heard_at.is_some();
+        let heard = self.last_response_at.is_some();
         let mut lost = 0;
         for probe in &mut self.probes {
             if now.since(probe.sent_at) <= self.timeout_ns {

@@ -128,7 +128,7 @@ pub struct SenderLimits<K> {
 struct Sender<K> {
     key: K,
     bucket: TokenBucket,
-    heard_at: MonotonicNs,
+    last_request_at: MonotonicNs,
 }
 
 impl<K: PartialEq> SenderLimits<K> {
@@ -157,7 +157,7 @@ impl<K: PartialEq> SenderLimits<K> {
         let allowed = match self.senders.iter().position(|sender| sender.key == key) {
             Some(index) => {
                 let sender = &mut self.senders[index];
-                sender.heard_at = now;
+                sender.last_request_at = now;
                 sender.bucket.try_take(now)
             }
             None => self.allow_new(key, now),
@@ -186,13 +186,13 @@ impl<K: PartialEq> SenderLimits<K> {
         let idle_ns = IDLE_SENDER_MS * 1_000_000;
         if self.senders.len() < self.capacity {
             let allowed = bucket.try_take(now);
-            self.senders.push(Sender { key, bucket, heard_at: now });
+            self.senders.push(Sender { key, bucket, last_request_at: now });
             return allowed;
         }
-        match self.senders.iter_mut().find(|sender| now.since(sender.heard_at) > idle_ns) {
+        match self.senders.iter_mut().find(|sender| now.since(sender.last_request_at) > idle_ns) {
             Some(idle) => {
                 let allowed = bucket.try_take(now);
-                *idle = Sender { key, bucket, heard_at: now };
+                *idle = Sender { key, bucket, last_request_at: now };
                 allowed
             }
             None => self.others.try_take(now),

@@ -12,7 +12,7 @@ pub const MAX_BACKOFF_MS: u64 = 5_000;
 
 /// A child that ran this long was healthy: the next restart is immediate again. Twice the longest wait, so
 /// that a child which dies shortly after each start does not count as healthy.
-pub const GOOD_RUN_MS: u64 = 10_000;
+pub const HEALTHY_RUN_MS: u64 = 10_000;
 
 /// How a child process ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,7 +42,7 @@ pub enum RestartDecision {
 }
 
 /// The restart waits of one child: 0, 100, 200, 400, … 5,000 ms, and from the beginning after a run of
-/// [`GOOD_RUN_MS`].
+/// [`HEALTHY_RUN_MS`].
 #[derive(Clone, Copy, Debug)]
 pub struct RestartBackoff {
     started_at: MonotonicNs,
@@ -69,7 +69,7 @@ impl RestartBackoff {
             ChildExit::Code(78) => return RestartDecision::GiveUp(GiveUpReason::BadConfiguration),
             ChildExit::Code(_) | ChildExit::Signal(_) => {}
         }
-        if now.since(self.started_at) >= GOOD_RUN_MS * 1_000_000 {
+        if now.since(self.started_at) >= HEALTHY_RUN_MS * 1_000_000 {
             self.next_wait_ms = 0;
         }
         let wait_ms = self.next_wait_ms;
@@ -113,8 +113,8 @@ mod tests {
         for _ in 0..5 {
             wait_ms(&mut backoff, &mut now, 1);
         }
-        assert_eq!(wait_ms(&mut backoff, &mut now, GOOD_RUN_MS - 1), 1_600);
-        assert_eq!(wait_ms(&mut backoff, &mut now, GOOD_RUN_MS), 0);
+        assert_eq!(wait_ms(&mut backoff, &mut now, HEALTHY_RUN_MS - 1), 1_600);
+        assert_eq!(wait_ms(&mut backoff, &mut now, HEALTHY_RUN_MS), 0);
         assert_eq!(wait_ms(&mut backoff, &mut now, 1), 100);
     }
 

@@ -199,7 +199,7 @@ impl SafetyTrouble {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SafetyCause {
     /// The name of the process.
-    pub who: FixedText,
+    pub process: FixedText,
     /// Whether it is on the critical path.
     pub class: TrafficClass,
     /// The trouble.
@@ -449,7 +449,8 @@ impl Reading {
         });
         if is_worse {
             let speaks_for = if is_extreme { SafetyMode::Emergency } else { SafetyMode::Degraded };
-            self.worst = Some(SafetyCause { who: FixedText::new(process.name), class, trouble, speaks_for });
+            self.worst =
+                Some(SafetyCause { process: FixedText::new(process.name), class, trouble, speaks_for });
         }
     }
 }

@@ -5,7 +5,7 @@
 
 /// How the sequence number of a sample relates to those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sighting {
+pub enum SequenceOutcome {
     /// The next number, or the first that the lane ever took.
     InOrder,
     /// This many samples before it are missing. The caller knows why: its queue overflowed, no process served
@@ -51,19 +51,19 @@ impl SequenceTracker {
 
     /// Accounts for `sequence` and the numbers missing before it. 0, which ingress never assigns, counts as a
     /// duplicate.
-    pub const fn see(&mut self, sequence: u64) -> Sighting {
+    pub const fn record(&mut self, sequence: u64) -> SequenceOutcome {
         if sequence <= self.last || sequence == 0 {
-            return Sighting::Duplicate;
+            return SequenceOutcome::Duplicate;
         }
         if !self.begun {
             self.begun = true;
             self.first = sequence - 1;
             self.last = sequence;
-            return Sighting::InOrder;
+            return SequenceOutcome::InOrder;
         }
         let missing = sequence - self.last - 1;
         self.last = sequence;
-        if missing == 0 { Sighting::InOrder } else { Sighting::AfterGap(missing) }
+        if missing == 0 { SequenceOutcome::InOrder } else { SequenceOutcome::AfterGap(missing) }
     }
 }
 
@@ -74,46 +74,46 @@ mod tests {
     #[test]
     fn the_account_begins_at_the_first_sample() {
         let mut tracker = SequenceTracker::new();
-        assert_eq!(tracker.see(500), Sighting::InOrder);
+        assert_eq!(tracker.record(500), SequenceOutcome::InOrder);
         assert_eq!((tracker.first(), tracker.last()), (499, 500));
-        assert_eq!(tracker.see(501), Sighting::InOrder);
+        assert_eq!(tracker.record(501), SequenceOutcome::InOrder);
     }
 
     #[test]
     fn a_gap_counts_only_the_missing_samples() {
         let mut tracker = SequenceTracker::new();
-        tracker.see(1);
-        assert_eq!(tracker.see(5), Sighting::AfterGap(3));
-        assert_eq!(tracker.see(6), Sighting::InOrder);
+        tracker.record(1);
+        assert_eq!(tracker.record(5), SequenceOutcome::AfterGap(3));
+        assert_eq!(tracker.record(6), SequenceOutcome::InOrder);
     }
 
     #[test]
     fn repeated_and_older_numbers_are_duplicates_and_change_nothing() {
         let mut tracker = SequenceTracker::new();
-        tracker.see(3);
+        tracker.record(3);
         let before = tracker;
         for sequence in [3, 2, 1, 0] {
-            assert_eq!(tracker.see(sequence), Sighting::Duplicate);
+            assert_eq!(tracker.record(sequence), SequenceOutcome::Duplicate);
         }
         assert_eq!(tracker, before);
-        assert_eq!(SequenceTracker::new().see(0), Sighting::Duplicate);
+        assert_eq!(SequenceTracker::new().record(0), SequenceOutcome::Duplicate);
     }
 
     #[test]
     fn a_resumed_account_counts_the_samples_missed_in_between() {
         let mut tracker = SequenceTracker::resume(10, 40);
-        assert_eq!(tracker.see(40), Sighting::Duplicate);
-        assert_eq!(tracker.see(43), Sighting::AfterGap(2));
+        assert_eq!(tracker.record(40), SequenceOutcome::Duplicate);
+        assert_eq!(tracker.record(43), SequenceOutcome::AfterGap(2));
         assert_eq!(tracker.first(), 10);
-        assert_eq!(SequenceTracker::resume(0, 0).see(7), Sighting::InOrder);
+        assert_eq!(SequenceTracker::resume(0, 0).record(7), SequenceOutcome::InOrder);
         assert_eq!(SequenceTracker::resume(9, 4), SequenceTracker::resume(9, 9));
     }
 
     #[test]
     fn the_largest_number_does_not_overflow() {
         let mut tracker = SequenceTracker::new();
-        tracker.see(1);
-        assert_eq!(tracker.see(u64::MAX), Sighting::AfterGap(u64::MAX - 2));
-        assert_eq!(tracker.see(u64::MAX), Sighting::Duplicate);
+        tracker.record(1);
+        assert_eq!(tracker.record(u64::MAX), SequenceOutcome::AfterGap(u64::MAX - 2));
+        assert_eq!(tracker.record(u64::MAX), SequenceOutcome::Duplicate);
     }
 }

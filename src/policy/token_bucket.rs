@@ -131,7 +131,7 @@ impl TokenBucket {
 /// same two parts as in [`burst_for`]. In any window of `t` seconds at most `rate × t` bytes, that burst, and
 /// one sample of debt pass.
 ///
-/// The caller polls routes that share a budget in turn, see [`TurnOrder`](super::TurnOrder): otherwise the
+/// The caller polls routes that share a budget in turn, see [`PollOrder`](super::PollOrder): otherwise the
 /// route polled first takes all of it.
 #[derive(Clone, Debug)]
 pub struct ByteBudget {

@@ -9,42 +9,42 @@ use std::thread::Thread;
 use crate::dds::{Payload, RawReader, Take};
 use crate::model::{Encapsulation, Guid};
 
-/// A flag that the DDS library raises (rings) when a sample has arrived, and the thread to wake then.
-pub(super) struct Bell {
-    rung: AtomicBool,
+/// A flag that the DDS library raises when a sample has arrived, and the thread to wake then.
+pub(super) struct ArrivalFlag {
+    raised: AtomicBool,
     /// The thread to unpark; `None` where the DDS library's own thread checks the flag.
     thread: Option<Thread>,
 }
 
-impl Bell {
+impl ArrivalFlag {
     /// Creates a flag that wakes no thread.
-    pub fn silent() -> Self {
-        Self { rung: AtomicBool::new(false), thread: None }
+    pub fn passive() -> Self {
+        Self { raised: AtomicBool::new(false), thread: None }
     }
 
-    pub fn ring(&self) {
-        self.rung.store(true, Ordering::Release);
+    pub fn raise(&self) {
+        self.raised.store(true, Ordering::Release);
         if let Some(thread) = &self.thread {
             thread.unpark();
         }
     }
 
-    pub fn silence(&self) {
-        self.rung.store(false, Ordering::Release);
+    pub fn clear(&self) {
+        self.raised.store(false, Ordering::Release);
     }
 
-    pub fn is_rung(&self) -> bool {
-        self.rung.load(Ordering::Acquire)
+    pub fn is_raised(&self) -> bool {
+        self.raised.load(Ordering::Acquire)
     }
 }
 
-impl Wake for Bell {
+impl Wake for ArrivalFlag {
     fn wake(self: Arc<Self>) {
-        self.ring();
+        self.raise();
     }
 
     fn wake_by_ref(self: &Arc<Self>) {
-        self.ring();
+        self.raise();
     }
 }
 
@@ -57,7 +57,7 @@ const LAST_READER_FIRST_EVERY: u64 = 32;
 pub(super) struct Inbox {
     /// In the order in which samples are taken from them.
     readers: Vec<RawReader>,
-    bell: Arc<Bell>,
+    flag: Arc<ArrivalFlag>,
     waker: Waker,
     takes: Cell<u64>,
 }
@@ -66,21 +66,21 @@ impl Inbox {
     /// Creates an inbox with one reader; arrivals wake the calling thread.
     pub fn new(reader: RawReader) -> Self {
         let thread = Some(std::thread::current());
-        let mut inbox = Self::with_bell(Arc::new(Bell { rung: AtomicBool::new(false), thread }));
+        let mut inbox = Self::with_flag(Arc::new(ArrivalFlag { raised: AtomicBool::new(false), thread }));
         inbox.add(reader);
         inbox
     }
 
-    /// Creates an inbox without readers; arrivals ring `bell`, which the caller checks.
-    pub fn with_bell(bell: Arc<Bell>) -> Self {
-        Self { readers: Vec::new(), waker: Waker::from(Arc::clone(&bell)), bell, takes: Cell::new(0) }
+    /// Creates an inbox without readers; arrivals raise `flag`, which the caller checks.
+    pub fn with_flag(flag: Arc<ArrivalFlag>) -> Self {
+        Self { readers: Vec::new(), waker: Waker::from(Arc::clone(&flag)), flag, takes: Cell::new(0) }
     }
 
     /// Adds a reader, from which samples are taken after the others.
     pub fn add(&mut self, reader: RawReader) {
         self.readers.push(reader);
         // A new reader is not armed yet, so the next take must poll it.
-        self.bell.ring();
+        self.flag.raise();
     }
 
     /// Removes a reader and returns it.
@@ -106,7 +106,7 @@ impl Inbox {
     }
 
     fn take_with(&self, mut take_one: impl FnMut(&RawReader) -> Take) -> Take {
-        if !self.bell.is_rung() {
+        if !self.flag.is_raised() {
             return Take::Empty;
         }
         let take = self.take_first(&mut take_one);
@@ -114,13 +114,13 @@ impl Inbox {
             return take;
         }
         // Arm the readers, then poll once more for a sample that arrived before they were armed.
-        self.bell.silence();
+        self.flag.clear();
         for reader in &self.readers {
             reader.arm(&self.waker);
         }
         let take = self.take_first(&mut take_one);
         if take != Take::Empty {
-            self.bell.rung.store(true, Ordering::Release);
+            self.flag.raised.store(true, Ordering::Release);
         }
         take
     }

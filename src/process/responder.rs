@@ -12,7 +12,7 @@ use super::HOUSEKEEPING_MS;
 use super::inbox::Inbox;
 use super::notify::{Meter, Notifier};
 use super::probes::{
-    Answers, MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RefusalWatch, Trust,
+    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RefusalLog, RequestHandler, Trust,
 };
 use super::role::RoleError;
 use super::stop::Stop;
@@ -71,8 +71,8 @@ pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleE
     }
     responder.notifier.stopping();
     info!(
-        answered = responder.answers.answered,
-        refused = responder.answers.refused.total(),
+        answered = responder.handler.answered,
+        refused = responder.handler.refused.total(),
         "responder is done"
     );
     Ok(())
@@ -83,11 +83,11 @@ struct Responder {
     requests: Inbox,
     responses: RawWriter,
     _participant: Participant,
-    answers: Answers,
+    handler: RequestHandler,
     /// The current request, cut at one byte more than the longest valid request.
     request: Vec<u8>,
-    refused: RefusalWatch,
-    accepted: RefusalWatch,
+    refused: RefusalLog,
+    accepted: RefusalLog,
     housekeeping_at: MonotonicNs,
     /// When the last request was accepted; before the first, when the responder started.
     last_request_at: MonotonicNs,
@@ -128,10 +128,10 @@ impl Responder {
             requests: Inbox::new(requests),
             responses,
             _participant: participant,
-            answers: Answers::new(options.id, options.trust, options.max_probe_rate_hz, now),
+            handler: RequestHandler::new(options.id, options.trust, options.max_probe_rate_hz, now),
             request: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
-            refused: RefusalWatch::of_refused(),
-            accepted: RefusalWatch::of_accepted(),
+            refused: RefusalLog::of_refused(),
+            accepted: RefusalLog::of_accepted(),
             housekeeping_at: MonotonicNs(0),
             last_request_at: now,
             logged: LoggedState::Nothing,
@@ -165,15 +165,15 @@ impl Responder {
             (Take::Empty, _) => return false,
             (Take::Sample(origin), Some(encapsulation)) => (origin, encapsulation),
             (Take::Sample(_) | Take::Malformed, _) => {
-                self.answers.count_malformed();
+                self.handler.count_malformed();
                 return true;
             }
         };
         let now = clock::monotonic();
-        if !self.answers.is_within_rate(origin.writer, now) {
+        if !self.handler.is_within_rate(origin.writer, now) {
             return true;
         }
-        let Some(request) = self.answers.judge(&self.request, encapsulation, received) else {
+        let Some(request) = self.handler.check(&self.request, encapsulation, received) else {
             return true;
         };
         let begun = clock::wall();
@@ -183,7 +183,7 @@ impl Responder {
         }
         self.last_request_at = now;
         let sent = clock::wall();
-        let response = self.answers.respond(request, received, begun, sent).encode();
+        let response = self.handler.respond(request, received, begun, sent).encode();
         let timestamp = SourceTimestamp::from_wall(sent);
         if let Err(error) = self.responses.write(response, Encapsulation::CDR_LE, timestamp) {
             debug!(%error, "response not sent");
@@ -192,8 +192,8 @@ impl Responder {
     }
 
     fn housekeeping(&mut self, now: MonotonicNs) {
-        self.refused.look(&self.answers.refused, now);
-        self.accepted.look(&self.answers.accepted_anyway, now);
+        self.refused.log_new(&self.handler.refused, now);
+        self.accepted.log_new(&self.handler.accepted_anyway, now);
         if self.logged != LoggedState::Silent && now.since(self.last_request_at) >= SILENCE_MS * 1_000_000 {
             self.logged = LoggedState::Silent;
             warn!(
@@ -206,11 +206,11 @@ impl Responder {
         // Reports readiness at the first housekeeping, when all endpoints exist.
         self.notifier.ready();
         self.notifier.feed_watchdog(now);
-        let (answers, answered) = (&self.answers, &mut self.answered);
+        let (handler, answered) = (&self.handler, &mut self.answered);
         self.notifier.status(now, |line| {
-            let per_s = answered.per_s(answers.answered, now);
+            let per_s = answered.per_s(handler.answered, now);
             // Writing to a String cannot fail.
-            let _ = write!(line, "{per_s:.1} probes answered per s; {} refused", answers.refused.total());
+            let _ = write!(line, "{per_s:.1} probes answered per s; {} refused", handler.refused.total());
         });
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }

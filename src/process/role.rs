@@ -171,7 +171,7 @@ impl Role {
     /// Announces to the other participants, once, that the participant of a killed predecessor is gone. A
     /// writer then releases the samples that only the predecessor had not acknowledged.
     pub fn dispose_former(&mut self, participant: &Participant) {
-        participant.say_goodbye_for(std::mem::take(&mut self.former_participant));
+        participant.dispose_participant(std::mem::take(&mut self.former_participant));
     }
 
     /// Whether the participant of a killed predecessor is not disposed of yet.
@@ -223,7 +223,7 @@ impl Role {
     }
 
     /// Records a turn of the data path, and the mode and policy that it applies; feeds the watchdog.
-    pub fn turned(&mut self, mode: u8, policy_epoch: u64) {
+    pub fn report_turn(&mut self, mode: u8, policy_epoch: u64) {
         let now = clock::monotonic();
         self.health.update(|health| {
             health.alive_at = now;

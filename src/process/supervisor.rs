@@ -192,7 +192,7 @@ impl<'a> ManagerReport<'a> {
         if children.iter().all(has_turned) {
             self.notifier.ready();
         }
-        let report = next.since(self.last.as_ref().unwrap_or(&next));
+        let report = next.report_since(self.last.as_ref().unwrap_or(&next));
         self.notifier.status(now, |line| {
             let running = children.iter().filter(|child| child.state == State::Running).count();
             // Writing to a String cannot fail.

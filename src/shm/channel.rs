@@ -33,7 +33,7 @@ use crate::model::{RouteId, SampleHeader, fnv1a};
 /// the DDS library assembles samples.
 const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
 /// The queue of a tap.
-const TAP: LaneQueue = LaneQueue { queue_depth: 4, max_borrowed: 2 };
+const TAP: QueueLimits = QueueLimits { queue_depth: 4, max_borrowed: 2 };
 /// The most publishers of a route: ingress, and one for a future standby.
 const PUBLISHERS: usize = 2;
 /// Attempts to open a service whose creator has died or whose last user is removing it, and the pause between
@@ -43,14 +43,14 @@ const OPEN_PAUSE: Duration = Duration::from_millis(25);
 
 /// The most samples of a route that a lane may hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct LaneQueue {
+pub struct QueueLimits {
     /// Samples that wait in the queue of the lane.
     pub queue_depth: usize,
     /// Samples that the lane holds while DDS sends them.
     pub max_borrowed: usize,
 }
 
-impl LaneQueue {
+impl QueueLimits {
     /// The limits of a configured lane.
     pub fn of(lane: &Lane) -> Self {
         Self { queue_depth: lane.queue_depth, max_borrowed: lane.max_borrowed_in_all() }
@@ -65,7 +65,7 @@ pub struct RouteChannel {
     /// The largest payload that the route allows.
     pub max_sample_bytes: usize,
     /// The queues of the lanes that serve the route.
-    pub lanes: Vec<LaneQueue>,
+    pub lanes: Vec<QueueLimits>,
     /// The most taps of the route at the same time.
     pub max_taps: usize,
     /// Samples that are retained for subscribers that join later.
@@ -94,7 +94,7 @@ impl RouteChannel {
         Self {
             route: configured.id.clone(),
             max_sample_bytes: configured.max_sample_bytes,
-            lanes: settings.lanes.iter().filter(serves).map(LaneQueue::of).collect(),
+            lanes: settings.lanes.iter().filter(serves).map(QueueLimits::of).collect(),
             max_taps: settings.shared_memory.max_taps,
             retained_samples: configured.retained_samples,
         }
@@ -105,7 +105,7 @@ impl RouteChannel {
     /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. So
     /// the sum of these limits is enough, whatever the lanes do.
     pub fn pool_size(&self) -> PoolSize {
-        let share = |queue: LaneQueue| self.depth(queue) + queue.max_borrowed.max(1);
+        let share = |queue: QueueLimits| self.depth(queue) + queue.max_borrowed.max(1);
         let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
         let slots = lanes + self.max_taps * share(TAP) + self.retained_samples + LOANED_SLOTS;
         // The layout of iceoryx2: its header, the bridge's header, the payload, each aligned, and the slot
@@ -121,12 +121,12 @@ impl RouteChannel {
 
     /// The depth of a queue; it must have room for the retained samples, which a new subscriber receives
     /// first.
-    fn depth(&self, queue: LaneQueue) -> usize {
+    fn depth(&self, queue: QueueLimits) -> usize {
         queue.queue_depth.max(self.retained_samples).max(1)
     }
 
     /// The queues of all lanes, and one of a tap if taps are allowed.
-    fn queues(&self) -> impl Iterator<Item = LaneQueue> + '_ {
+    fn queues(&self) -> impl Iterator<Item = QueueLimits> + '_ {
         self.lanes.iter().copied().chain((self.max_taps > 0).then_some(TAP))
     }
 
@@ -328,7 +328,7 @@ impl SamplePublisher {
     /// sample.
     ///
     /// May be called on any thread. It waits for no other process, but iceoryx2 takes a lock, so it waits for
-    /// a thread of this process that is in [`attend`](Self::attend).
+    /// a thread of this process that is in [`connect_subscribers`](Self::connect_subscribers).
     pub fn lend(&self, len: usize) -> Option<LentSlot> {
         if len > self.max_sample_bytes {
             return None;
@@ -344,7 +344,7 @@ impl SamplePublisher {
     /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
     /// subscribers that have left. Publishing does the same; on a route where nothing is published, call this
     /// periodically, for example 10 times a second. Cheap when nothing has changed.
-    pub fn attend(&self) {
+    pub fn connect_subscribers(&self) {
         // iceoryx2 logs a failed connection to a subscriber, and still connects to the others.
         let _ = self.port.update_connections();
     }
@@ -354,7 +354,7 @@ impl SamplePublisher {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SubscriberRole {
     /// A lane, with its queue and borrow limit.
-    Lane(LaneQueue),
+    Lane(QueueLimits),
     /// A tap: a queue of 4 samples, at most 2 borrowed.
     Tap,
 }
@@ -367,20 +367,20 @@ pub struct SampleSubscriber {
     port: Subscriber<Service, [u8], WireHeader>,
     max_borrowed: usize,
     max_sample_bytes: usize,
-    borrowed: Arc<Borrowed>,
+    borrowed: Arc<BorrowCount>,
     _tap: Option<RoleLock>,
 }
 
 /// The number of samples that a subscriber has borrowed, and the membership that they need.
 #[derive(Debug)]
-struct Borrowed {
+struct BorrowCount {
     count: AtomicUsize,
     _node: Arc<NodeShared>,
 }
 
-/// One borrowed sample in [`Borrowed`]; dropping it decrements the count.
+/// One borrowed sample in [`BorrowCount`]; dropping it decrements the count.
 #[derive(Debug)]
-struct Borrow(Arc<Borrowed>);
+struct Borrow(Arc<BorrowCount>);
 
 impl Drop for Borrow {
     fn drop(&mut self) {
@@ -433,7 +433,7 @@ impl SampleSubscriber {
             port,
             max_borrowed: queue.max_borrowed.max(1),
             max_sample_bytes: channel.max_sample_bytes,
-            borrowed: Arc::new(Borrowed { count: AtomicUsize::new(0), _node: shared.clone() }),
+            borrowed: Arc::new(BorrowCount { count: AtomicUsize::new(0), _node: shared.clone() }),
             _tap: tap,
         })
     }
@@ -550,7 +550,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let instance = InstanceName::try_from("unit").unwrap();
         let node = ShmNode::open(root.path(), &instance, "test").unwrap();
-        let lane = LaneQueue { queue_depth: 4, max_borrowed: 2 };
+        let lane = QueueLimits { queue_depth: 4, max_borrowed: 2 };
         let route = RouteId::try_from("scan").unwrap();
         let channel = RouteChannel {
             route,

@@ -28,7 +28,7 @@ mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage};
 pub use channel::{
-    LaneQueue, PoolSize, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, SubscriberRole,
+    PoolSize, QueueLimits, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, SubscriberRole,
 };
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};

@@ -7,7 +7,8 @@
 //! up while a lane is stopped. `docs/decisions/0004-shared-memory.md` has the measurements.
 //!
 //! Ingress can announce a wake to a lane that sleeps on another CPU: the lane then leaves its sleep while the
-//! sample is still being received (`docs/decisions/0006-hand-overs.md`, `docs/decisions/0013-lookout.md`).
+//! sample is still being received (`docs/decisions/0006-hand-overs.md` and
+//! `0013-early-waker.md`).
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};

@@ -47,7 +47,7 @@ impl Intervals {
 
     /// Adds a sample. A sequence number that is not above the last one comes from a restarted bridge: the
     /// window is cleared first.
-    pub fn see(&mut self, header: &SampleHeader) {
+    pub fn record(&mut self, header: &SampleHeader) {
         if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
             self.arrivals.clear();
         }
@@ -106,7 +106,7 @@ mod tests {
     fn statistics_of(samples: &[(u64, u64)], window: usize) -> Option<IntervalStatistics> {
         let mut intervals = Intervals::new(window);
         for &(sequence, at_ms) in samples {
-            intervals.see(&sample(sequence, at_ms));
+            intervals.record(&sample(sequence, at_ms));
         }
         intervals.statistics()
     }

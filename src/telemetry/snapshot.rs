@@ -376,7 +376,7 @@ fn read_publishers(
 fn read_lane(boards: &Boards, lane: usize, route: usize) -> Result<LaneCounters, ShmError> {
     let mut counters = consistent(boards.lane(lane, route))?;
     for _ in 0..WHOLE_ATTEMPTS {
-        if counters.is_whole() {
+        if counters.is_accounted_for() {
             break;
         }
         #[allow(clippy::disallowed_methods, reason = "readers of the boards handle no samples")]

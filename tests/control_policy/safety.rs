@@ -100,7 +100,7 @@ fn the_decision_says_who_and_what() {
     let decision = bench.next(&[waiting, EXTREME]);
     assert_eq!((decision.mode, decision.changed_from), (Degraded, Some(Normal)));
     let cause = decision.cause.unwrap();
-    assert_eq!((cause.who.as_str(), cause.class, cause.speaks_for), ("critical", Critical, Emergency));
+    assert_eq!((cause.process.as_str(), cause.class, cause.speaks_for), ("critical", Critical, Emergency));
     assert_eq!(cause.trouble, SafetyTrouble::WriterLag { lag_ms: 2_000.0, limit_ms: 2_000.0 });
     assert!(decision.critical_trouble && !decision.clean);
     // It stays known on the way back, and no longer.

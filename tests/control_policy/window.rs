@@ -1,7 +1,7 @@
 //! The window of probes: what counts, what doesn't, and that no probe is lost from the account.
 
 use adaptive_bridge::model::{ClassifierThresholds, MonotonicNs, SubscriberState};
-use adaptive_bridge::policy::{Answer, MAX_OUTSTANDING, ProbeWindow, SubscriberClassifier};
+use adaptive_bridge::policy::{MAX_OUTSTANDING, ProbeWindow, ResponseOutcome, SubscriberClassifier};
 use proptest::prelude::*;
 
 use super::{MS, at_ms, config};
@@ -10,11 +10,11 @@ use super::{MS, at_ms, config};
 fn open_window(window_size: usize) -> ProbeWindow {
     let mut window = ProbeWindow::new(window_size, 500);
     window.sent(0, at_ms(0));
-    assert_eq!(window.answered(0, at_ms(10)), Answer::Counted { rtt_ns: 10 * MS });
+    assert_eq!(window.answered(0, at_ms(10)), ResponseOutcome::Counted { rtt_ns: 10 * MS });
     window
 }
 
-fn is_whole(window: &ProbeWindow) -> bool {
+fn is_accounted_for(window: &ProbeWindow) -> bool {
     let totals = window.totals();
     totals.sent == totals.answered + totals.lost + totals.excused + window.outstanding() as u64
 }
@@ -27,16 +27,16 @@ fn a_probe_is_lost_after_its_timeout_and_not_before() {
     let reading = window.reading(MonotonicNs(700 * MS + 1));
     assert_eq!((reading.settled, reading.answered, reading.lost), (2, 1, 1));
     assert_eq!(reading.loss, 0.5);
-    assert_eq!(window.answered(1, at_ms(701)), Answer::Late);
+    assert_eq!(window.answered(1, at_ms(701)), ResponseOutcome::Late);
     assert_eq!(window.reading(at_ms(701)).lost, 1);
 }
 
 #[test]
 fn answers_count_once_and_only_for_probes_that_were_sent() {
     let mut window = open_window(50);
-    assert_eq!(window.answered(0, at_ms(20)), Answer::Repeated);
-    assert_eq!(window.answered(7, at_ms(20)), Answer::Unknown);
-    assert_eq!(window.answered(u64::MAX, at_ms(20)), Answer::Unknown);
+    assert_eq!(window.answered(0, at_ms(20)), ResponseOutcome::Repeated);
+    assert_eq!(window.answered(7, at_ms(20)), ResponseOutcome::Unknown);
+    assert_eq!(window.answered(u64::MAX, at_ms(20)), ResponseOutcome::Unknown);
     assert_eq!(window.totals().answered, 1);
 }
 
@@ -63,19 +63,19 @@ fn a_subscriber_never_heard_has_no_data_and_one_that_falls_silent_has_loss() {
     }
     let reading = window.reading(at_ms(60_000));
     assert_eq!((reading.settled, reading.loss, reading.rtt_mean_ms), (0, 0.0, None));
-    assert!(window.heard_at().is_none() && is_whole(&window));
+    assert!(window.last_response_at().is_none() && is_accounted_for(&window));
     // The probe before the first one that is answered doesn't count either.
     window.sent(100, at_ms(60_000));
     window.sent(101, at_ms(60_200));
     window.answered(101, at_ms(60_210));
-    assert_eq!(window.answered(100, at_ms(60_220)), Answer::Late);
+    assert_eq!(window.answered(100, at_ms(60_220)), ResponseOutcome::Late);
     assert_eq!(window.reading(at_ms(61_000)).loss, 0.0);
     for seq in 102..152 {
         window.sent(seq, at_ms(60_400 + seq * 200));
     }
     let reading = window.reading(at_ms(120_000));
     assert_eq!((reading.settled, reading.loss, reading.rtt_mean_ms), (50, 1.0, None));
-    assert_eq!(window.heard_at(), Some(at_ms(60_220)));
+    assert_eq!(window.last_response_at(), Some(at_ms(60_220)));
 }
 
 #[test]
@@ -84,7 +84,7 @@ fn a_subscriber_whose_answers_are_all_late_has_loss() {
     for seq in 0..40 {
         window.sent(seq, at_ms(seq * 200));
         if seq >= 3 {
-            assert_eq!(window.answered(seq - 3, at_ms(seq * 200 + 50)), Answer::Late);
+            assert_eq!(window.answered(seq - 3, at_ms(seq * 200 + 50)), ResponseOutcome::Late);
         }
     }
     let reading = window.reading(at_ms(8_500));
@@ -97,14 +97,14 @@ fn what_was_under_way_while_the_control_process_was_stopped_is_excused() {
     // Lost before the stop, under way at its beginning, and sent at its very end.
     window.sent(1, at_ms(200));
     window.sent(2, at_ms(900));
-    window.stopped(at_ms(1_000), at_ms(61_000));
-    assert_eq!(window.answered(2, at_ms(61_001)), Answer::Late);
+    window.excuse_pause(at_ms(1_000), at_ms(61_000));
+    assert_eq!(window.answered(2, at_ms(61_001)), ResponseOutcome::Late);
     let reading = window.reading(at_ms(61_100));
     assert_eq!((reading.answered, reading.lost), (1, 1));
     window.sent(3, at_ms(61_200));
-    assert_eq!(window.answered(3, at_ms(61_203)), Answer::Counted { rtt_ns: 3 * MS });
+    assert_eq!(window.answered(3, at_ms(61_203)), ResponseOutcome::Counted { rtt_ns: 3 * MS });
     assert_eq!(window.totals().excused, 1);
-    assert!(is_whole(&window));
+    assert!(is_accounted_for(&window));
 }
 
 #[test]
@@ -112,8 +112,8 @@ fn a_numbering_that_begins_anew_excuses_what_was_under_way() {
     let mut window = open_window(50);
     window.sent(1_000_000, at_ms(200));
     window.sent(0, at_ms(300));
-    assert_eq!(window.answered(1_000_000, at_ms(310)), Answer::Unknown);
-    assert_eq!(window.answered(0, at_ms(310)), Answer::Counted { rtt_ns: 10 * MS });
+    assert_eq!(window.answered(1_000_000, at_ms(310)), ResponseOutcome::Unknown);
+    assert_eq!(window.answered(0, at_ms(310)), ResponseOutcome::Counted { rtt_ns: 10 * MS });
     let reading = window.reading(at_ms(2_000));
     assert_eq!((reading.answered, reading.lost, window.totals().excused), (2, 0, 1));
 }
@@ -128,7 +128,7 @@ fn more_probes_under_way_than_the_window_holds_are_lost_oldest_first() {
     }
     assert!(window.outstanding() <= MAX_OUTSTANDING + 64);
     assert_eq!(window.reading(at_ms(1)).loss, 1.0);
-    assert!(is_whole(&window));
+    assert!(is_accounted_for(&window));
 }
 
 #[test]
@@ -158,7 +158,7 @@ fn a_stopped_control_process_demotes_nobody() {
         // Every 100th turn comes 40 s late.
         now_ms += if seq % 100 == 99 { 40_000 } else { 200 };
         if now_ms - before_ms > 300 {
-            window.stopped(at_ms(before_ms + 200), at_ms(now_ms));
+            window.excuse_pause(at_ms(before_ms + 200), at_ms(now_ms));
             window.answered(seq - 1, at_ms(now_ms));
         }
         window.sent(seq, at_ms(now_ms));
@@ -227,7 +227,7 @@ proptest! {
                 Step::AnswerAny { seq } => Some(window.answered(seq, now)),
                 Step::Stop { ms } => {
                     now_ms += ms;
-                    window.stopped(now, at_ms(now_ms));
+                    window.excuse_pause(now, at_ms(now_ms));
                     None
                 }
                 Step::Limits { window_size, timeout_ms } => {
@@ -236,10 +236,10 @@ proptest! {
                     None
                 }
             };
-            counted += u64::from(matches!(answer, Some(Answer::Counted { .. })));
-            prop_assert!(is_whole(&window), "{window:?}");
+            counted += u64::from(matches!(answer, Some(ResponseOutcome::Counted { .. })));
+            prop_assert!(is_accounted_for(&window), "{window:?}");
             let reading = window.reading(at_ms(now_ms));
-            prop_assert!(is_whole(&window));
+            prop_assert!(is_accounted_for(&window));
             prop_assert_eq!(reading.settled, reading.answered + reading.lost);
             prop_assert!(reading.settled <= limit);
             prop_assert!((0.0..=1.0).contains(&reading.loss));
@@ -265,7 +265,7 @@ proptest! {
             if kind == 0 {
                 window.sent(seq, at_ms(ms));
             } else {
-                let counted = matches!(window.answered(seq, at_ms(ms)), Answer::Counted { .. });
+                let counted = matches!(window.answered(seq, at_ms(ms)), ResponseOutcome::Counted { .. });
                 prop_assert!(counted);
             }
         }

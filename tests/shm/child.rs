@@ -298,7 +298,7 @@ impl Child {
             latencies.record(sample.header().sequence);
             assert_eq!(sample.payload().len(), 2_948);
             assert!(lane.take().unwrap().is_none());
-            publisher.attend();
+            publisher.connect_subscribers();
         };
         turn(1);
         let before = allocations();

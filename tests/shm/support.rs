@@ -11,7 +11,7 @@ use adaptive_bridge::model::{
     AgeBasis, Encapsulation, Guid, InstanceName, LaneName, MonotonicNs, RouteId, SampleHeader,
     SourceTimestamp,
 };
-use adaptive_bridge::shm::{BridgeShape, LaneQueue, RouteChannel, ShmNode};
+use adaptive_bridge::shm::{BridgeShape, QueueLimits, RouteChannel, ShmNode};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
@@ -100,8 +100,8 @@ pub fn shape() -> BridgeShape {
 }
 
 /// Lane 0 must not lose a sample because the machine is busy with other tests; lane 1 may.
-pub const DEEP: LaneQueue = LaneQueue { queue_depth: 8_192, max_borrowed: 8 };
-pub const LANE: LaneQueue = LaneQueue { queue_depth: 64, max_borrowed: 8 };
+pub const DEEP: QueueLimits = QueueLimits { queue_depth: 8_192, max_borrowed: 8 };
+pub const LANE: QueueLimits = QueueLimits { queue_depth: 64, max_borrowed: 8 };
 
 /// A channel whose lanes both have a queue of 64.
 pub fn channel(max_sample_bytes: usize) -> RouteChannel {

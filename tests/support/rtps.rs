@@ -249,7 +249,7 @@ impl ForgedReader {
 
     /// Announces the participant by multicast (SPDP), and its reader of a topic to all participants that have
     /// announced themselves (SEDP).
-    pub fn announce(&self, topic: &str, type_name: &str) {
+    pub fn announce_endpoint(&self, topic: &str, type_name: &str) {
         let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
         let participant = Parameters::default()
             .with(pid::PROTOCOL_VERSION, &[2, 3])

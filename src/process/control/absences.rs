@@ -9,7 +9,7 @@ use super::networks;
 use crate::config::{NetworkSelector, Settings};
 use crate::dds::{self, Discovery, GraphWatch, Participant};
 use crate::model::{AbsenceKind, AbsenceRecord, FixedText, MAX_ABSENCES, MonotonicNs};
-use crate::policy::{Absence, AbsenceEvent, AbsenceWatch, Whereabouts};
+use crate::policy::{Absence, AbsenceEvent, AbsenceWatch, Locality};
 use crate::shm::{BoardWriter, Boards};
 
 /// Detects absences and writes their table to the boards.
@@ -49,20 +49,22 @@ impl Absences {
         let (endpoint, publishes) = match change {
             Discovery::Reader(reader) => (reader, false),
             Discovery::Writer(writer) => (writer, true),
-            Discovery::ReaderGone(guid) | Discovery::WriterGone(guid) => return self.watch.gone(*guid),
+            Discovery::ReaderGone(guid) | Discovery::WriterGone(guid) => {
+                return self.watch.endpoint_lost(*guid);
+            }
             Discovery::ParticipantGone { prefix, silent_ms } => {
-                return self.watch.participant_gone(network, *prefix, *silent_ms, now);
+                return self.watch.participant_lost(network, *prefix, *silent_ms, now);
             }
             Discovery::Incompatible { .. } => return,
         };
-        let is_remote = endpoint.location.whereabouts(own_addresses) == Whereabouts::Remote;
+        let is_remote = endpoint.location.locality(own_addresses) == Locality::Remote;
         if participant.owns(endpoint.guid) || !is_remote || !is_bridge_topic(&endpoint.topic, publishes) {
             return;
         }
         if let Some(host) = endpoint.location.host() {
             // The ROS 2 name of the topic.
             let topic = endpoint.topic.strip_prefix("rt").unwrap_or(&endpoint.topic);
-            self.watch.found(network, endpoint.guid, topic, publishes, host, now);
+            self.watch.endpoint_discovered(network, endpoint.guid, topic, publishes, host, now);
         }
     }
 
@@ -74,7 +76,7 @@ impl Absences {
     /// Reads the state of the interfaces, logs changes and updates the table.
     pub fn update(&mut self, now: MonotonicNs) {
         match dds::interfaces() {
-            Ok(present) => self.watch.look(&present, now),
+            Ok(present) => self.watch.update_interfaces(&present, now),
             Err(error) => warn!(%error, "cannot read the network interfaces"),
         }
         while let Some(event) = self.watch.poll() {

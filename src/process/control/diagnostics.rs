@@ -171,7 +171,7 @@ impl Reporter {
             match Snapshot::read(&self.boards, &settings) {
                 Ok(snapshot) => {
                     if let Some(previous) = &previous {
-                        self.publish(snapshot.since(previous), settings.diagnostics.enabled);
+                        self.publish(snapshot.report_since(previous), settings.diagnostics.enabled);
                     }
                     previous = Some(snapshot);
                 }
@@ -188,7 +188,7 @@ impl Reporter {
             write(&self.json, telemetry::diagnostics_json(&report));
         }
         if let Some(metrics) = &self.metrics {
-            metrics.show(Arc::new(report));
+            metrics.set_report(Arc::new(report));
         }
     }
 }

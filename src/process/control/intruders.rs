@@ -76,7 +76,7 @@ impl EndpointMonitor {
                     GuardedTopic {
                         topic: route_settings.input_topic.clone(),
                         guarded: Guarded::Input,
-                        instead: noncritical_output(settings, route),
+                        alternative: noncritical_output(settings, route),
                     }
                 }));
             }
@@ -92,7 +92,7 @@ impl EndpointMonitor {
                     guarded.push(GuardedTopic {
                         topic: output.topic.clone(),
                         guarded: Guarded::CriticalOutput,
-                        instead: noncritical_output(settings, output.route),
+                        alternative: noncritical_output(settings, output.route),
                     });
                 }
             }
@@ -135,7 +135,7 @@ impl EndpointMonitor {
     /// The number of intruders seen since control started.
     pub fn intruders_seen(&self) -> u64 {
         let counts = self.networks.iter().map(|network| network.watch.counts());
-        counts.map(|counts| counts.told + counts.untold).sum()
+        counts.map(|counts| counts.reported + counts.unreported).sum()
     }
 
     /// Handles discovery events and logs new intruders; once a second also updates node names, absences and
@@ -206,7 +206,7 @@ impl EndpointMonitor {
                     topic: FixedText::new(intruder.topic.topic.as_str()),
                     node: FixedText::new(intruder.node.as_deref().unwrap_or("")),
                     host: FixedText::new(&host),
-                    remedy: FixedText::new(&intruder.mending_step()),
+                    remedy: FixedText::new(&intruder.remedy()),
                     since: intruder.since,
                 }
             });
@@ -285,7 +285,13 @@ impl WatchedNetwork {
                 if self.outputs.contains_key(&reader.topic) {
                     self.remember(&reader);
                 }
-                self.watch.found(reader.guid, &reader.topic, &reader.location, own_addresses, now);
+                self.watch.endpoint_discovered(
+                    reader.guid,
+                    &reader.topic,
+                    &reader.location,
+                    own_addresses,
+                    now,
+                );
             }
             Discovery::Writer(writer)
                 if !participant.owns(writer.guid) && self.inputs.contains(&writer.topic) =>
@@ -295,11 +301,11 @@ impl WatchedNetwork {
             Discovery::WriterGone(guid) => self.endpoints.retain(|(writer, _)| *writer != guid),
             Discovery::ReaderGone(guid) => {
                 self.endpoints.retain(|(reader, _)| *reader != guid);
-                self.watch.gone(guid, now);
+                self.watch.endpoint_lost(guid, now);
             }
             Discovery::ParticipantGone { prefix, .. } => {
                 self.endpoints.retain(|(endpoint, _)| endpoint.prefix() != prefix);
-                self.watch.participant_gone(prefix, now);
+                self.watch.participant_lost(prefix, now);
                 self.graph.participant_gone(prefix);
             }
             _ => {}

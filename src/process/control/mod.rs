@@ -18,7 +18,7 @@ use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
 use super::notify::write_list;
-use super::probes::{RefusalWatch, Trust};
+use super::probes::{RefusalLog, Trust};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
@@ -85,8 +85,8 @@ struct Control {
     subscribers: Subscribers,
     supervision: Supervision,
     invalid_responses: InvalidResponses,
-    refused_log: RefusalWatch,
-    accepted_log: RefusalWatch,
+    refused_log: RefusalLog,
+    accepted_log: RefusalLog,
     /// The last decision for each lane as text, to log changes only.
     decisions: Vec<String>,
     next_probe_at: MonotonicNs,
@@ -138,8 +138,8 @@ impl Control {
             participants,
             record,
             invalid_responses: InvalidResponses::default(),
-            refused_log: RefusalWatch::of_refused(),
-            accepted_log: RefusalWatch::of_accepted(),
+            refused_log: RefusalLog::of_refused(),
+            accepted_log: RefusalLog::of_accepted(),
             decisions: vec![String::new(); settings.lanes.len()],
             next_probe_at: now,
             next_evaluation_at: now,
@@ -316,10 +316,10 @@ impl Control {
             self.decide(now);
         }
         self.endpoints.housekeeping(&mut self.participants, &self.settings, now);
-        self.refused_log.look(&self.invalid_responses.refused, now);
-        self.accepted_log.look(&self.invalid_responses.accepted, now);
+        self.refused_log.log_new(&self.invalid_responses.refused, now);
+        self.accepted_log.log_new(&self.invalid_responses.accepted, now);
         self.write_record();
-        self.role.turned(self.supervision.mode() as u8, 0);
+        self.role.report_turn(self.supervision.mode() as u8, 0);
         // Only the first call has an effect: control has completed its first turn.
         self.role.ready();
         self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decisions, line));

@@ -248,7 +248,7 @@ fn queued_samples(counters: &LaneCounters, published: u64) -> u64 {
 
 /// The cause of a safety mode, as a sentence that fits into [`FixedText`](crate::model::FixedText).
 fn cause_text(cause: &SafetyCause) -> String {
-    let process = cause.who.as_str();
+    let process = cause.process.as_str();
     match cause.trouble {
         SafetyTrouble::Queue { queued, capacity } => {
             // A stopped lane can fall behind by more samples than its queue holds.

@@ -9,8 +9,8 @@ use crate::model::{
     FixedText, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, SubscriberRecord, SubscriberState,
 };
 use crate::policy::{
-    Answer, LaneDecision, LinkReading, ProbeWindow, STOPPED_NS, SubscriberClassifier, SubscriberWarnings,
-    Transition, TransitionReason, WarningThresholds, is_forgotten, lane_mode,
+    LaneDecision, LinkReading, ProbeWindow, ResponseOutcome, STOPPED_NS, SubscriberClassifier,
+    SubscriberWarnings, Transition, TransitionReason, WarningThresholds, is_forgotten, lane_mode,
 };
 use crate::shm::{BoardWriter, Boards};
 
@@ -113,7 +113,7 @@ impl Subscribers {
             if lane != subscriber.lane {
                 if link_of_lane[lane] != subscriber.link {
                     // Responses to outstanding probes would arrive on the previous link and would not count.
-                    subscriber.window.stopped(now, now);
+                    subscriber.window.excuse_pause(now, now);
                 }
                 (subscriber.lane, subscriber.link) = (lane, link_of_lane[lane]);
             }
@@ -153,7 +153,7 @@ impl Subscribers {
     pub fn note_awake(&mut self, now: MonotonicNs) {
         if now.since(self.expected_awake_at) > STOPPED_NS {
             for subscriber in &mut self.list {
-                subscriber.window.stopped(self.expected_awake_at, now);
+                subscriber.window.excuse_pause(self.expected_awake_at, now);
             }
         }
         self.expected_awake_at = now;
@@ -184,7 +184,7 @@ impl Subscribers {
             return Ok(());
         }
         match subscriber.window.answered(response.seq, response.arrived_at) {
-            Answer::Counted { rtt_ns } => {
+            ResponseOutcome::Counted { rtt_ns } => {
                 trace!(
                     subscriber = subscriber.id,
                     seq = response.seq,
@@ -193,9 +193,9 @@ impl Subscribers {
                 );
                 Ok(())
             }
-            Answer::Late => Err(ProbeRefusal::Late),
-            Answer::Repeated => Err(ProbeRefusal::Replayed),
-            Answer::Unknown => Err(ProbeRefusal::Unsolicited),
+            ResponseOutcome::Late => Err(ProbeRefusal::Late),
+            ResponseOutcome::Repeated => Err(ProbeRefusal::Replayed),
+            ResponseOutcome::Unknown => Err(ProbeRefusal::Unsolicited),
         }
     }
 
@@ -274,7 +274,7 @@ impl Subscribers {
         self.list.retain(|subscriber| {
             // An unlisted subscriber without any response was listed until the last reload.
             let is_removed = !subscriber.listed
-                && subscriber.window.heard_at().is_none_or(|heard_at| is_forgotten(heard_at, now));
+                && subscriber.window.last_response_at().is_none_or(|at| is_forgotten(at, now));
             if is_removed {
                 info!(subscriber = subscriber.id, "removed a subscriber that is silent and not listed");
             }
@@ -359,7 +359,7 @@ impl Subscriber {
             rtt_mean_us: us(self.reading.rtt_mean_ms),
             rtt_p95_us: us(self.reading.rtt_p95_ms),
             jitter_us: us(self.reading.jitter_ms),
-            last_response_at: self.window.heard_at().unwrap_or_default(),
+            last_response_at: self.window.last_response_at().unwrap_or_default(),
             state: state as u8,
             forced: u8::from(self.classifier.is_forced()),
             listed: u8::from(self.listed),

@@ -212,7 +212,7 @@ impl Egress {
             output.housekeeping(&mut self.participant, &self.role.boards, now);
         }
         self.reload(now);
-        self.role.turned(self.policy.mode as u8, self.policy.epoch);
+        self.role.report_turn(self.policy.mode as u8, self.policy.epoch);
         self.role.status(now, |line| describe(&self.outputs, self.policy.mode, &mut self.meters, line, now));
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }

@@ -7,7 +7,7 @@ use crate::clock;
 use crate::config::{DropPolicy, Lane, LaneRates};
 use crate::dds::Participant;
 use crate::model::{DropReason, Durability, LaneMode, MonotonicNs};
-use crate::policy::{ByteBudget, Decision, RouteShaper, Stamps, TurnOrder};
+use crate::policy::{ByteBudget, Decision, PollOrder, RouteShaper, SampleStamps};
 use crate::shm::ShmSample;
 
 /// Rate limits and queues of a noncritical lane.
@@ -15,7 +15,7 @@ pub(super) struct Noncritical {
     rates: LaneRates,
     mode: LaneMode,
     budget: ByteBudget,
-    turn_order: TurnOrder,
+    turn_order: PollOrder,
     /// One for each output.
     shapers: Vec<RouteShaper<ShmSample>>,
 }
@@ -31,7 +31,7 @@ impl Noncritical {
             rates: lane.rates,
             mode: LaneMode::Normal,
             budget: ByteBudget::new(lane.rates.normal.max_bytes_per_s, now),
-            turn_order: TurnOrder::default(),
+            turn_order: PollOrder::default(),
             shapers,
         }
     }
@@ -119,7 +119,7 @@ impl Noncritical {
 /// Moves the route's samples from the channel in shared memory to the lane's own queue.
 fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
     while let Some(sample) = output.take() {
-        let stamps = Stamps::new(sample.header(), sample.payload().len() as u64);
+        let stamps = SampleStamps::new(sample.header(), sample.payload().len() as u64);
         shaper.offer(sample, stamps, |dropped, _, reason| output.drop_sample(&dropped, reason));
     }
 }

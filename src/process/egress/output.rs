@@ -17,10 +17,10 @@ use crate::model::{
     DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
     ReaderRecord, Reliability, SampleHeader, TrafficClass,
 };
-use crate::policy::{SequenceTracker, Sighting};
+use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
-    BoardWriter, Boards, HistogramWriter, LaneQueue, ProcessRole, RouteChannel, SampleSubscriber, ShmSample,
-    Stage, SubscriberRole, TakeError,
+    BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
+    ShmSample, Stage, SubscriberRole, TakeError,
 };
 
 /// After a restart, how long the lane expects the readers of its predecessor to match again. A live one
@@ -110,7 +110,7 @@ impl Output {
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
-            SubscriberRole::Lane(LaneQueue::of(lane)),
+            SubscriberRole::Lane(QueueLimits::of(lane)),
             true,
         )?;
         let mut opened = Self {
@@ -189,10 +189,10 @@ impl Output {
                 }
             };
             let sequence = sample.header().sequence;
-            match self.tracker.see(sequence) {
-                Sighting::InOrder => {}
-                Sighting::AfterGap(missing) => self.count_missing(missing, sample.header()),
-                Sighting::Duplicate => {
+            match self.tracker.record(sequence) {
+                SequenceOutcome::InOrder => {}
+                SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),
+                SequenceOutcome::Duplicate => {
                     if self.qos.durability == Durability::TransientLocal && !self.caught_up {
                         self.restore(&sample);
                     }

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use tracing::{error, info, warn};
 
-use super::super::inbox::{Bell, Inbox};
+use super::super::inbox::{ArrivalFlag, Inbox};
 use super::super::role::{Role, RoleError};
 use super::super::watch::DropWatch;
 use super::clocks::Clocks;
-use super::followed::Followed;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};
 use super::source::{ReaderPlan, Source, label};
+use super::writer_sequences::WriterSequences;
 use crate::clock;
 use crate::config::{Route, Settings};
 use crate::dds::{Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
@@ -63,7 +63,12 @@ struct ActiveReader {
 }
 
 impl Input {
-    pub fn open(role: &Role, settings: &Settings, index: usize, bell: &Arc<Bell>) -> Result<Self, RoleError> {
+    pub fn open(
+        role: &Role,
+        settings: &Settings,
+        index: usize,
+        flag: &Arc<ArrivalFlag>,
+    ) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
@@ -73,7 +78,7 @@ impl Input {
             dds_topic: route.input_topic.to_dds(),
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
-            inbox: Inbox::with_bell(Arc::clone(bell)),
+            inbox: Inbox::with_flag(Arc::clone(flag)),
             reliable: None,
             best_effort: None,
             settled_type: None,
@@ -113,7 +118,7 @@ impl Input {
     }
 
     /// Takes one sample and publishes it; `wake` wakes the lanes. Returns whether there was a sample. If not,
-    /// the bell is silent until the next arrival.
+    /// the flag is cleared until the next arrival.
     pub fn step(&mut self, wake: impl FnOnce()) -> bool {
         let pool = &self.pool;
         let mut received: Option<(Filled, Encapsulation)> = None;
@@ -135,8 +140,8 @@ impl Input {
     }
 
     /// The high-water marks of the publishers.
-    pub fn followed(&self) -> Arc<Followed> {
-        self.publishers.followed()
+    pub fn writer_sequences(&self) -> Arc<WriterSequences> {
+        self.publishers.writer_sequences()
     }
 
     fn publish(
@@ -402,7 +407,7 @@ impl Input {
     fn remove_reader(&mut self, participant: &mut Participant, reliability: Reliability) {
         if let Some(former) = self.reader_of(reliability).take() {
             drop(self.inbox.remove(former.guid));
-            participant.forget(former.guid);
+            participant.remove_endpoint(former.guid);
             self.lend_memory();
         }
     }

@@ -2,17 +2,17 @@
 //!
 //! Ingress never waits for a lane: a full queue overwrites its oldest sample, and waking a lane does not
 //! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
-//! does the housekeeping; a third thread wakes critical lanes early ([`lookout`]).
+//! does the housekeeping; a third thread wakes critical lanes early ([`early_waker`]).
 
 mod clocks;
-mod expected;
-mod followed;
+mod early_waker;
 mod input;
-mod lookout;
+mod pending_wake;
 mod pool;
 mod publishers;
 mod receiving;
 mod source;
+mod writer_sequences;
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use std::time::Duration;
 use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
-use super::inbox::Bell;
+use super::inbox::ArrivalFlag;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
@@ -31,8 +31,8 @@ use crate::config::Settings;
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::{ProcessRole, this_cpu};
+use early_waker::EarlyWaker;
 use input::Input;
-use lookout::Lookout;
 use receiving::{Receiving, ServedLane};
 
 /// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
@@ -74,7 +74,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
 
 struct Ingress {
     /// Before the participant, whose sockets it watches.
-    _lookout: Option<Lookout>,
+    _early_waker: Option<EarlyWaker>,
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
@@ -105,8 +105,8 @@ impl Ingress {
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
-            let bell = Arc::new(Bell::silent());
-            inputs.push((Input::open(&role, settings, route, &bell)?, bell));
+            let flag = Arc::new(ArrivalFlag::passive());
+            inputs.push((Input::open(&role, settings, route, &flag)?, flag));
         }
         let mut lanes = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
@@ -121,7 +121,7 @@ impl Ingress {
         let on_arriving = {
             let receiving = Arc::clone(&receiving);
             move |writer, sequence, left_bytes| {
-                receiving.expect(writer, sequence, left_bytes, this_cpu());
+                receiving.wake_early(writer, sequence, left_bytes, this_cpu());
             }
         };
         let on_received = {
@@ -136,10 +136,10 @@ impl Ingress {
         };
         let participant = role.join_receiving(&options, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
-        let lookout = Lookout::start(&participant, &receiving, settings);
+        let early_waker = EarlyWaker::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
-            _lookout: lookout,
+            _early_waker: early_waker,
             receiving,
             participant,
             role,
@@ -210,7 +210,7 @@ impl Ingress {
         let turns = self.receiving.turns();
         if turns != self.turns_seen {
             self.turns_seen = turns;
-            self.role.turned(LaneMode::Normal as u8, 0);
+            self.role.report_turn(LaneMode::Normal as u8, 0);
         }
         self.role.reload();
         self.role.status(now, |line| describe(&self.receiving, &mut self.received, line, now));

@@ -46,7 +46,7 @@ impl PoolOwner {
         while let Ok(slot) = self.abandoned.try_recv() {
             drop(slot);
         }
-        self.pool.publisher.attend();
+        self.pool.publisher.connect_subscribers();
     }
 
     /// Returns the slot in which the DDS library assembled the payload, or copies the payload into a new one.
@@ -115,13 +115,13 @@ impl Drop for Borrowed {
 mod tests {
     use super::*;
     use crate::model::{InstanceName, RouteId};
-    use crate::shm::{LaneQueue, RouteChannel, ShmNode};
+    use crate::shm::{QueueLimits, RouteChannel, ShmNode};
 
     /// A pool for samples of 100 bytes, with the node and the folder that it needs.
     fn owner() -> (PoolOwner, ShmNode, tempfile::TempDir) {
         let root = tempfile::tempdir().unwrap();
         let node = ShmNode::open(root.path(), &InstanceName::try_from("pool").unwrap(), "test").unwrap();
-        let lanes = vec![LaneQueue { queue_depth: 4, max_borrowed: 2 }];
+        let lanes = vec![QueueLimits { queue_depth: 4, max_borrowed: 2 }];
         let route = RouteId::try_from("scan").unwrap();
         let channel = RouteChannel { route, max_sample_bytes: 100, lanes, max_taps: 0, retained_samples: 0 };
         (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap()), node, root)

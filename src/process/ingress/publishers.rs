@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::followed::Followed;
+use super::writer_sequences::WriterSequences;
 use crate::model::{Guid, IngressCounters, MAX_PUBLISHERS, MonotonicNs, PublisherAccount, Reliability};
 use crate::policy::publisher_place;
 use crate::shm::{BoardWriter, Boards};
@@ -19,7 +19,7 @@ pub(super) struct Publishers {
     /// For each account, whether its publisher is expected to send more and has not since this process
     /// started.
     expected: [bool; MAX_PUBLISHERS],
-    followed: Arc<Followed>,
+    writer_sequences: Arc<WriterSequences>,
     /// The place of the account of the last sample, which is looked up first: most routes have one publisher.
     last_place: usize,
 }
@@ -48,21 +48,21 @@ impl Publishers {
         {
             account.update(|account| *account = counters.changed_account);
         }
-        let followed = Followed::default();
+        let writer_sequences = WriterSequences::default();
         let mut expected = [false; MAX_PUBLISHERS];
         for (place, account) in accounts.iter().map(BoardWriter::get).enumerate() {
             if !account.is_vacant() {
-                followed.set(place, account.writer, account.last_sequence);
+                writer_sequences.set(place, account.writer, account.last_sequence);
                 expected[place] = now.since(account.last_at) < EXPECTED_MS * 1_000_000;
             }
         }
         let gone = [false; MAX_PUBLISHERS];
-        Self { accounts, gone, expected, followed: Arc::new(followed), last_place: 0 }
+        Self { accounts, gone, expected, writer_sequences: Arc::new(writer_sequences), last_place: 0 }
     }
 
     /// The high-water marks, for other threads.
-    pub fn followed(&self) -> Arc<Followed> {
-        Arc::clone(&self.followed)
+    pub fn writer_sequences(&self) -> Arc<WriterSequences> {
+        Arc::clone(&self.writer_sequences)
     }
 
     /// Returns the writers that have accounts, with their high-water marks.
@@ -75,7 +75,7 @@ impl Publishers {
     /// an account.
     pub fn check(&mut self, writer: Guid, sequence: i64, now: MonotonicNs) -> SequenceCheck {
         let is_of = |place: &usize| self.accounts[*place].get().writer == writer;
-        let known = Some(self.last_place).filter(is_of).or_else(|| self.followed.place_of(writer));
+        let known = Some(self.last_place).filter(is_of).or_else(|| self.writer_sequences.position(writer));
         let Some(place) = known else {
             return self.open_account(writer, sequence, now);
         };
@@ -140,7 +140,7 @@ impl Publishers {
             result
         });
         self.accounts[place].update(|account| *account = changed);
-        self.followed.set(place, changed.writer, changed.last_sequence);
+        self.writer_sequences.set(place, changed.writer, changed.last_sequence);
         result
     }
 
@@ -240,7 +240,9 @@ mod tests {
         let account = fixture.boards.publisher(0, 0).unwrap();
         assert_eq!((account.first_sequence, account.last_sequence), (10, 20));
         assert_eq!((account.received, account.lost_upstream), (3, 8));
-        assert!(successor.1.followed().awaits(ONE, 21) && !successor.1.followed().awaits(ONE, 20));
+        assert!(
+            successor.1.writer_sequences().is_new(ONE, 21) && !successor.1.writer_sequences().is_new(ONE, 20)
+        );
     }
 
     #[test]
@@ -273,7 +275,7 @@ mod tests {
         // A publisher that is gone is replaced at once.
         route.1.writer_gone(flood(5));
         assert_eq!(take(&mut route, TWO, 1, at(1_000)), Some(0));
-        assert_eq!(route.1.followed().place_of(flood(5)), None);
+        assert_eq!(route.1.writer_sequences().position(flood(5)), None);
         assert_eq!(take(&mut route, ONE, 1, at(1_000)), None);
     }
 }

@@ -3,15 +3,15 @@
 //! Taking a sample on the thread that receives it saves one wake-up, compared with handing it to a thread of
 //! ingress first; `docs/decisions/0006-hand-overs.md` has the measurements. The main thread does the work
 //! that is not needed for each sample, and locks a route meanwhile. The receiving thread never waits for a
-//! lock: it skips a locked route, and is rung when the lock is free.
+//! lock: it skips a locked route, and is woken when the lock is free.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
-use super::super::inbox::Bell;
-use super::expected::Expected;
-use super::followed::Followed;
+use super::super::inbox::ArrivalFlag;
 use super::input::Input;
+use super::pending_wake::PendingWake;
+use super::writer_sequences::WriterSequences;
 use crate::model::{Guid, TrafficClass};
 use crate::shm::{LaneWaker, this_cpu};
 
@@ -21,10 +21,10 @@ const SAMPLES_PER_TURN: usize = 32;
 /// One route, as the receiving thread and the main thread share it.
 struct SharedRoute {
     input: Mutex<Input>,
-    bell: Arc<Bell>,
+    flag: Arc<ArrivalFlag>,
     /// Whether the receiving thread has skipped the route because the main thread had locked it.
     skipped: AtomicBool,
-    followed: Arc<Followed>,
+    writer_sequences: Arc<WriterSequences>,
     /// Whether a critical lane serves the route.
     is_critical: bool,
 }
@@ -43,20 +43,20 @@ pub(super) struct Receiving {
     /// Critical lanes first.
     lanes: Vec<ServedLane>,
     turns: AtomicU64,
-    expected: Expected,
+    pending_wake: PendingWake,
     /// The CPU on which the receiving thread ran last.
     cpu: AtomicU32,
 }
 
 impl Receiving {
-    pub fn new(inputs: Vec<(Input, Arc<Bell>)>, lanes: Vec<ServedLane>) -> Self {
+    pub fn new(inputs: Vec<(Input, Arc<ArrivalFlag>)>, lanes: Vec<ServedLane>) -> Self {
         let is_critical = |route: usize| {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
         };
-        let shared = |(route, (input, bell)): (usize, (Input, _))| SharedRoute {
-            followed: input.followed(),
+        let shared = |(route, (input, flag)): (usize, (Input, _))| SharedRoute {
+            writer_sequences: input.writer_sequences(),
             input: Mutex::new(input),
-            bell,
+            flag,
             skipped: AtomicBool::new(false),
             is_critical: is_critical(route),
         };
@@ -64,7 +64,7 @@ impl Receiving {
             routes: inputs.into_iter().enumerate().map(shared).collect(),
             lanes,
             turns: AtomicU64::new(0),
-            expected: Expected::new(),
+            pending_wake: PendingWake::new(),
             cpu: AtomicU32::new(0),
         }
     }
@@ -73,20 +73,21 @@ impl Receiving {
     /// `writer`, or a part of one of which `left_bytes` are missing, and `cpu` receives it. A sample that was
     /// received before wakes no lane: many publishers send each one to all addresses of this host. Returns
     /// whether the lanes were woken.
-    pub fn expect(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
+    pub fn wake_early(&self, writer: Guid, sequence: i64, left_bytes: usize, cpu: u32) -> bool {
         // Checked before the search, which would find nothing to do for all but the last of many fragments.
-        if !self.expected.may_tell(left_bytes) {
+        if !self.pending_wake.may_claim(left_bytes) {
             return false;
         }
-        let awaits = |shared: &SharedRoute| shared.is_critical && shared.followed.awaits(writer, sequence);
-        let Some(route) = self.routes.iter().position(awaits) else {
+        let is_new =
+            |shared: &SharedRoute| shared.is_critical && shared.writer_sequences.is_new(writer, sequence);
+        let Some(route) = self.routes.iter().position(is_new) else {
             return false;
         };
-        let tells = self.expected.tell(route, left_bytes);
-        if tells {
-            self.announce(route, cpu);
+        let claimed = self.pending_wake.claim(route, left_bytes);
+        if claimed {
+            self.wake_critical(route, cpu);
         }
-        tells
+        claimed
     }
 
     /// The CPU on which the receiving thread ran last.
@@ -101,17 +102,17 @@ impl Receiving {
         self.cpu.store(cpu, Ordering::Relaxed);
         let mut more = false;
         for (route, shared) in self.routes.iter().enumerate() {
-            if shared.bell.is_rung()
+            if shared.flag.is_raised()
                 && let Some(mut input) = shared.try_lock()
             {
-                if shared.is_critical && self.expected.came(route) {
-                    self.announce(route, cpu);
+                if shared.is_critical && self.pending_wake.take_pending(route) {
+                    self.wake_critical(route, cpu);
                 }
                 more |= self.drain(route, &mut input);
-                self.expected.came_meanwhile(route);
+                self.pending_wake.end_late_claim(route);
             }
         }
-        self.expected.turn_ends();
+        self.pending_wake.count_turn();
         self.turns.fetch_add(1, Ordering::Release);
         more
     }
@@ -120,7 +121,7 @@ impl Receiving {
     pub fn turn_blocking(&self) -> bool {
         let mut more = false;
         for (route, shared) in self.routes.iter().enumerate() {
-            if shared.bell.is_rung() {
+            if shared.flag.is_raised() {
                 more |= self.drain(route, &mut shared.lock());
             }
         }
@@ -142,7 +143,7 @@ impl Receiving {
         let mut outcome = Ok(());
         for shared in &self.routes {
             outcome = outcome.and(work(&mut shared.lock()));
-            ring |= shared.take_skipped() || shared.bell.is_rung();
+            ring |= shared.take_skipped() || shared.flag.is_raised();
         }
         outcome.map(|()| ring)
     }
@@ -159,7 +160,7 @@ impl Receiving {
 
     /// Wakes the critical lanes that serve the route while its sample is being taken on `cpu`. A noncritical
     /// lane needs no early wake-up.
-    fn announce(&self, route: usize, cpu: u32) {
+    fn wake_critical(&self, route: usize, cpu: u32) {
         for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
             if lane.serves[route] {
                 lane.waker.announce(cpu);

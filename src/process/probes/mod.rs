@@ -1,7 +1,7 @@
 //! The probe protocol: encoding, signing and checking of its messages (docs/probe-protocol.md).
 
-mod answers;
 mod message;
+mod request_handler;
 mod secret;
 mod trust;
 mod watch;
@@ -9,11 +9,11 @@ mod watch;
 use crate::dds::ReaderQos;
 use crate::model::{Durability, History, QosProfile, Reliability};
 
-pub use answers::Answers;
 pub use message::{MAX_MESSAGE_BYTES, PROBE_TYPE, ProbeId, ProbeRequest, ProbeResponse, Signature};
+pub use request_handler::RequestHandler;
 pub use secret::{Secret, SecretError};
 pub use trust::{Signed, Trust};
-pub use watch::RefusalWatch;
+pub use watch::RefusalLog;
 
 /// History depth of the readers: one message each of 64 senders that send at the same time.
 const PROBE_DEPTH: u32 = 64;

@@ -10,13 +10,13 @@ const REPEAT_MS: u64 = 10_000;
 /// Logs increases of the counts of refused messages, or of messages that only trust mode `permissive`
 /// accepted.
 #[derive(Debug)]
-pub struct RefusalWatch {
+pub struct RefusalLog {
     logged: [u64; ProbeRefusal::COUNT],
     next_at: [MonotonicNs; ProbeRefusal::COUNT],
     subject: &'static str,
 }
 
-impl RefusalWatch {
+impl RefusalLog {
     /// A log of refused messages.
     pub fn of_refused() -> Self {
         Self::new("probe messages refused")
@@ -33,7 +33,7 @@ impl RefusalWatch {
     }
 
     /// Logs the increases of `counts` since they were last logged.
-    pub fn look(&mut self, counts: &RefusalCounts, now: MonotonicNs) {
+    pub fn log_new(&mut self, counts: &RefusalCounts, now: MonotonicNs) {
         for (reason, count) in counts.iter() {
             let index = reason as usize;
             let new = count.saturating_sub(self.logged[index]);

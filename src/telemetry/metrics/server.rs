@@ -103,7 +103,7 @@ impl MetricsServer {
     }
 
     /// Serves this report from now on. It waits at most for another thread to copy a pointer.
-    pub fn show(&self, report: Arc<Report>) {
+    pub fn set_report(&self, report: Arc<Report>) {
         #[allow(clippy::disallowed_methods, reason = "held for the copy of a pointer")]
         let former = self.latest.lock().unwrap_or_else(PoisonError::into_inner).replace(report);
         // The former report is freed after the lock is released.

@@ -138,7 +138,7 @@ fn about_lane(lane: &LaneReading) -> String {
 /// A lane's counts of an output that do not add up.
 fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<Problem> {
     let counters = &output.counters;
-    (!counters.is_whole()).then(|| {
+    (!counters.is_accounted_for()).then(|| {
         let text = format!(
             "lane {}, route {}: the sample counts do not add up: {} received, but {} forwarded + {} waiting + {} \
              dropped; unless egress-{} is stopped (SIGSTOP), this is a bug: report it with \
@@ -158,7 +158,7 @@ fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading)
 /// Ingress's counts of a route that do not add up.
 fn unaccounted_by_ingress(route: &RouteReading) -> Option<Problem> {
     let counters = &route.counters;
-    (!route.is_whole()).then(|| {
+    (!route.is_accounted_for()).then(|| {
         let text = format!(
             "ingress, route {}: the sample counts do not add up: {} received, but {} published + {} dropped; this is \
              a bug: report it with `adaptive-bridge status --json`",

@@ -257,7 +257,7 @@ impl Serialize for Drops {
 impl Snapshot {
     /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in
     /// between has no rates yet.
-    pub fn since(&self, earlier: &Self) -> Report {
+    pub fn report_since(&self, earlier: &Self) -> Report {
         let window_ms = self.at.since(earlier.at) as f64 / 1e6;
         Report {
             instance: self.instance.to_string(),
@@ -322,7 +322,7 @@ impl Snapshot {
             publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
             drops: Drops(counters.drops),
             drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
-            whole: now.is_whole(),
+            whole: now.is_accounted_for(),
             rate_hz: per_s(counters.received, former.map(|former| former.received), window_ms),
             bytes_per_s: per_s(
                 counters.received_bytes,
@@ -386,7 +386,7 @@ impl Snapshot {
             waiting: counters.waiting,
             drops: Drops(counters.drops),
             drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
-            whole: counters.is_whole(),
+            whole: counters.is_accounted_for(),
             received_hz: rate(counters.received(), former.map(|former| former.received())),
             rate_hz: rate(counters.forwarded, former.map(|former| former.forwarded)),
             bytes_per_s: rate(counters.forwarded_bytes, former.map(|former| former.forwarded_bytes)),
@@ -441,7 +441,7 @@ impl Snapshot {
 
 impl RouteReading {
     /// Whether every received sample was published or dropped for a named reason.
-    pub fn is_whole(&self) -> bool {
+    pub fn is_accounted_for(&self) -> bool {
         self.counters.received == self.counters.published + self.counters.drops.total()
     }
 

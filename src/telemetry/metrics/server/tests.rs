@@ -38,9 +38,9 @@ fn the_page_is_that_of_the_latest_report() {
     let (server, path) = server(&folder);
     let get = "GET /metrics HTTP/1.1\r\nHost: robot\r\n\r\n";
     assert_eq!(status(&request(&path, get)), "HTTP/1.1 503 Service Unavailable");
-    server.show(Arc::new(Report { instance: "old".into(), ..wide_report() }));
+    server.set_report(Arc::new(Report { instance: "old".into(), ..wide_report() }));
     let report = wide_report();
-    server.show(Arc::new(report.clone()));
+    server.set_report(Arc::new(report.clone()));
     let response = request(&path, get);
     let (head, body) = response.split_once("\r\n\r\n").unwrap();
     assert_eq!(body, metrics_page(&report));
@@ -58,7 +58,7 @@ fn the_page_is_that_of_the_latest_report() {
 fn the_page_is_also_served_over_tcp() {
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let server = MetricsServer::start(&MetricsListener::Tcp("127.0.0.1".parse().unwrap(), port)).unwrap();
-    server.show(Arc::new(wide_report()));
+    server.set_report(Arc::new(wide_report()));
     let mut client = TcpStream::connect(("127.0.0.1", port)).unwrap();
     // The request is sent in pieces, followed by unneeded bytes.
     for piece in ["GET /met", "rics HTTP/1.1\r\n", "\r", "\nunasked"] {
@@ -77,7 +77,7 @@ fn the_page_is_also_served_over_tcp() {
 fn bad_requests_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
-    server.show(Arc::new(wide_report()));
+    server.set_report(Arc::new(wide_report()));
     for (bad, expected) in [
         ("POST /metrics HTTP/1.1\r\n\r\n", "405 Method Not Allowed"),
         ("GET / HTTP/1.1\r\n\r\n", "404 Not Found"),
@@ -99,7 +99,7 @@ fn bad_requests_are_refused() {
 fn silent_clients_delay_others_only_until_their_timeout() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = server(&folder);
-    server.show(Arc::new(wide_report()));
+    server.set_report(Arc::new(wide_report()));
     // All places are taken: a later client waits in the kernel's queue.
     let silent: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| client(&path)).collect();
     let mut slow = client(&path);
@@ -126,7 +126,7 @@ fn the_socket_file_is_for_its_owner_and_is_removed_with_the_server() {
     drop(UnixListener::bind(&path).unwrap());
     assert!(path.exists());
     let (third, _) = server(&folder);
-    third.show(Arc::new(wide_report()));
+    third.set_report(Arc::new(wide_report()));
     assert_eq!(status(&request(&path, "GET /metrics HTTP/1.1\r\n\r\n")), "HTTP/1.1 200 OK");
     drop(third);
     // A file that is not a socket is kept.

@@ -9,7 +9,7 @@ use crate::model::{Guid, MAX_PUBLISHERS};
 /// The thread that holds the route's lock writes; any thread may read meanwhile, without a lock. A read while
 /// a publisher replaces another may see a mix of both, so that a lane is woken in vain, or only when the
 /// sample is published.
-pub(super) struct Followed {
+pub(super) struct WriterSequences {
     marks: [Mark; MAX_PUBLISHERS],
 }
 
@@ -18,21 +18,21 @@ struct Mark {
     last: AtomicI64,
 }
 
-impl Default for Followed {
+impl Default for WriterSequences {
     fn default() -> Self {
         let vacant = |_| Mark { writer: Default::default(), last: AtomicI64::new(i64::MAX) };
         Self { marks: std::array::from_fn(vacant) }
     }
 }
 
-impl Followed {
+impl WriterSequences {
     /// Whether `writer` has a mark, and `sequence` is above it.
-    pub fn awaits(&self, writer: Guid, sequence: i64) -> bool {
-        self.place_of(writer).is_some_and(|place| sequence > self.marks[place].last.load(Ordering::Relaxed))
+    pub fn is_new(&self, writer: Guid, sequence: i64) -> bool {
+        self.position(writer).is_some_and(|place| sequence > self.marks[place].last.load(Ordering::Relaxed))
     }
 
     /// The place of the mark of `writer`.
-    pub fn place_of(&self, writer: Guid) -> Option<usize> {
+    pub fn position(&self, writer: Guid) -> Option<usize> {
         let halves = halves(writer);
         self.marks.iter().position(|mark| {
             mark.writer.iter().zip(halves).all(|(word, half)| word.load(Ordering::Relaxed) == half)
@@ -60,13 +60,13 @@ mod tests {
 
     #[test]
     fn a_sample_above_the_mark_of_its_publisher_is_awaited() {
-        let followed = Followed::default();
-        assert!(!followed.awaits(Guid([1; 16]), 1), "a publisher without a mark");
-        assert!(!followed.awaits(Guid([0; 16]), i64::MAX), "a vacant place");
-        followed.set(3, Guid([1; 16]), 10);
-        assert!(!followed.awaits(Guid([1; 16]), 10), "a second copy, from another address");
-        assert!(followed.awaits(Guid([1; 16]), 11) && !followed.awaits(Guid([3; 16]), 11));
-        followed.set(3, Guid([3; 16]), 10);
-        assert!(!followed.awaits(Guid([1; 16]), 11) && followed.awaits(Guid([3; 16]), 11));
+        let writer_sequences = WriterSequences::default();
+        assert!(!writer_sequences.is_new(Guid([1; 16]), 1), "a publisher without a mark");
+        assert!(!writer_sequences.is_new(Guid([0; 16]), i64::MAX), "a vacant place");
+        writer_sequences.set(3, Guid([1; 16]), 10);
+        assert!(!writer_sequences.is_new(Guid([1; 16]), 10), "a second copy, from another address");
+        assert!(writer_sequences.is_new(Guid([1; 16]), 11) && !writer_sequences.is_new(Guid([3; 16]), 11));
+        writer_sequences.set(3, Guid([3; 16]), 10);
+        assert!(!writer_sequences.is_new(Guid([1; 16]), 11) && writer_sequences.is_new(Guid([3; 16]), 11));
     }
 }

@@ -10,7 +10,7 @@ const MAX_SENDERS: usize = 64;
 
 /// Checks requests and makes the responses. Time is an argument; memory is bounded for any input.
 #[derive(Debug)]
-pub struct Answers {
+pub struct RequestHandler {
     responder_id: String,
     trust: Trust,
     limits: SenderLimits<Guid>,
@@ -22,7 +22,7 @@ pub struct Answers {
     pub accepted_anyway: RefusalCounts,
 }
 
-impl Answers {
+impl RequestHandler {
     /// Creates the request handling of the responder `responder_id`, which answers each sender at most
     /// `max_rate_hz` times a second.
     pub fn new(responder_id: &str, trust: Trust, max_rate_hz: u32, now: MonotonicNs) -> Self {
@@ -51,7 +51,7 @@ impl Answers {
 
     /// Decodes and checks a request that was received at `received`; `None` if it is refused, which is
     /// counted.
-    pub fn judge(
+    pub fn check(
         &mut self,
         payload: &[u8],
         encapsulation: Encapsulation,
@@ -111,7 +111,10 @@ mod tests {
     const WALL: WallNs = WallNs(1_763_000_000_000_000_000);
 
     /// A responder and the signing of a bridge with the same secret.
-    fn responder_and_bridge(secret: Option<&std::path::Path>, trust_mode: TrustMode) -> (Answers, Trust) {
+    fn responder_and_bridge(
+        secret: Option<&std::path::Path>,
+        trust_mode: TrustMode,
+    ) -> (RequestHandler, Trust) {
         let security = Security {
             trust_mode,
             enable_probe_hmac: secret.is_some(),
@@ -121,10 +124,10 @@ mod tests {
             allow_legacy_node_name_overrides: true,
         };
         let trust = || Trust::load(&security, None).unwrap();
-        (Answers::new("laptop", trust(), 20, MonotonicNs(0)), trust())
+        (RequestHandler::new("laptop", trust(), 20, MonotonicNs(0)), trust())
     }
 
-    fn unsigned() -> (Answers, Trust) {
+    fn unsigned() -> (RequestHandler, Trust) {
         responder_and_bridge(None, TrustMode::DefaultDeny)
     }
 
@@ -142,17 +145,17 @@ mod tests {
         MonotonicNs(0).plus_ms(ms)
     }
 
-    impl Answers {
+    impl RequestHandler {
         fn accepts(&mut self, request: &ProbeRequest) -> bool {
-            self.judge(&request.encode(), Encapsulation::CDR_LE, WALL).is_some()
+            self.check(&request.encode(), Encapsulation::CDR_LE, WALL).is_some()
         }
     }
 
     #[test]
     fn a_response_echoes_the_request_and_has_three_timestamps() {
-        let (mut answers, _) = unsigned();
-        let accepted = answers.judge(&request("robot", 7).encode(), Encapsulation::CDR_LE, WALL).unwrap();
-        let response = answers.respond(accepted, WallNs(1), WallNs(2), WallNs(3));
+        let (mut handler, _) = unsigned();
+        let accepted = handler.check(&request("robot", 7).encode(), Encapsulation::CDR_LE, WALL).unwrap();
+        let response = handler.respond(accepted, WallNs(1), WallNs(2), WallNs(3));
         let expected = ProbeResponse {
             seq: 7,
             probe_id: ProbeId::Text("robot-7".to_owned()),
@@ -162,22 +165,22 @@ mod tests {
             responder_id: "laptop".to_owned(),
             signature: None,
         };
-        assert_eq!((response, answers.answered), (expected, 1));
+        assert_eq!((response, handler.answered), (expected, 1));
     }
 
     #[test]
     fn a_flood_of_one_sender_is_counted_and_does_not_limit_another_sender() {
-        let (mut answers, _) = unsigned();
+        let (mut handler, _) = unsigned();
         let mut allowed = [0_u64; 2];
         for ms in 0..10_000 {
-            allowed[0] += u64::from(answers.is_within_rate(Guid([1; 16]), at_ms(ms)));
+            allowed[0] += u64::from(handler.is_within_rate(Guid([1; 16]), at_ms(ms)));
             if ms % 200 == 0 {
-                allowed[1] += u64::from(answers.is_within_rate(Guid([2; 16]), at_ms(ms)));
+                allowed[1] += u64::from(handler.is_within_rate(Guid([2; 16]), at_ms(ms)));
             }
         }
         assert!((190..=210).contains(&allowed[0]), "{allowed:?}");
         assert_eq!(allowed[1], 50);
-        assert_eq!(answers.refused.get(ProbeRefusal::RateLimited), 10_000 - allowed[0]);
+        assert_eq!(handler.refused.get(ProbeRefusal::RateLimited), 10_000 - allowed[0]);
     }
 
     #[test]
@@ -185,23 +188,23 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("secret");
         std::fs::write(&path, "a secret of the bridge's own").unwrap();
-        let (mut answers, mut bridge) = responder_and_bridge(Some(&path), TrustMode::DefaultDeny);
+        let (mut handler, mut bridge) = responder_and_bridge(Some(&path), TrustMode::DefaultDeny);
         let mut first = request("robot", 0);
         bridge.sign(&mut first);
-        assert!(answers.accepts(&first));
+        assert!(handler.accepts(&first));
         for seq in 1..1_000 {
-            assert!(!answers.accepts(&first));
-            assert!(!answers.accepts(&request("robot", seq)));
+            assert!(!handler.accepts(&first));
+            assert!(!handler.accepts(&request("robot", seq)));
             let forged = ProbeRequest { signature: first.signature, ..request("robot", seq) };
-            assert!(!answers.accepts(&forged));
+            assert!(!handler.accepts(&forged));
             let mut good = request("robot", seq);
             bridge.sign(&mut good);
-            assert!(answers.accepts(&good), "{seq}");
+            assert!(handler.accepts(&good), "{seq}");
         }
         for reason in [ProbeRefusal::Replayed, ProbeRefusal::Unsigned, ProbeRefusal::BadSignature] {
-            assert_eq!(answers.refused.get(reason), 999, "{reason}");
+            assert_eq!(handler.refused.get(reason), 999, "{reason}");
         }
-        assert_eq!(answers.refused.total(), 3 * 999);
+        assert_eq!(handler.refused.total(), 3 * 999);
     }
 
     #[test]
@@ -209,8 +212,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("secret");
         std::fs::write(&path, "a secret of the bridge's own").unwrap();
-        let (mut answers, _) = responder_and_bridge(Some(&path), TrustMode::Permissive);
-        assert!(answers.accepts(&request("robot", 1)));
-        assert_eq!((answers.refused.total(), answers.accepted_anyway.get(ProbeRefusal::Unsigned)), (0, 1));
+        let (mut handler, _) = responder_and_bridge(Some(&path), TrustMode::Permissive);
+        assert!(handler.accepts(&request("robot", 1)));
+        assert_eq!((handler.refused.total(), handler.accepted_anyway.get(ProbeRefusal::Unsigned)), (0, 1));
     }
 }

@@ -15,7 +15,7 @@ pub struct Location {
 
 /// Whether an endpoint is on this host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Whereabouts {
+pub enum Locality {
     /// On this host.
     Local,
     /// On another host.
@@ -40,25 +40,21 @@ impl Location {
     /// A container that shares the host's network is this host. One with its own network is another host: its
     /// traffic crosses a virtual switch, which cannot be distinguished from a real one. Shared-memory
     /// locators are not addresses: an endpoint with no others is unknown.
-    pub fn whereabouts(&self, own: &[IpAddr]) -> Whereabouts {
+    pub fn locality(&self, own: &[IpAddr]) -> Locality {
         let is_here = |address: &IpAddr| {
             let address = address.to_canonical();
             address.is_loopback() || own.iter().any(|own| own.to_canonical() == address)
         };
         if let Some(source) = &self.seen_from {
-            return if is_here(source) { Whereabouts::Local } else { Whereabouts::Remote };
+            return if is_here(source) { Locality::Local } else { Locality::Remote };
         }
         let mut distinctive = self.distinctive().peekable();
         if distinctive.peek().is_some() {
-            if distinctive.any(|address| is_here(&address)) {
-                Whereabouts::Local
-            } else {
-                Whereabouts::Remote
-            }
+            if distinctive.any(|address| is_here(&address)) { Locality::Local } else { Locality::Remote }
         } else if self.announced.iter().any(|address| address.to_canonical().is_loopback()) {
-            Whereabouts::Local
+            Locality::Local
         } else {
-            Whereabouts::Unknown
+            Locality::Unknown
         }
     }
 
@@ -84,11 +80,11 @@ mod tests {
         texts.iter().map(|text| text.parse().unwrap()).collect()
     }
 
-    fn place(seen_from: Option<&str>, announced: &[&str]) -> Whereabouts {
+    fn place(seen_from: Option<&str>, announced: &[&str]) -> Locality {
         let own =
             addresses(&["127.0.0.1", "10.0.0.5", "192.168.1.5", "172.17.0.1", "fe80::5", "2001:db8::5"]);
         let seen_from = seen_from.map(|text| text.parse().unwrap());
-        Location { seen_from, announced: addresses(announced) }.whereabouts(&own)
+        Location { seen_from, announced: addresses(announced) }.locality(&own)
     }
 
     #[test]
@@ -96,31 +92,31 @@ mod tests {
         for here in
             ["127.0.0.1", "127.0.1.1", "10.0.0.5", "192.168.1.5", "2001:db8::5", "::1", "::ffff:10.0.0.5"]
         {
-            assert_eq!(place(Some(here), &["192.168.1.9"]), Whereabouts::Local, "{here}");
+            assert_eq!(place(Some(here), &["192.168.1.9"]), Locality::Local, "{here}");
         }
         // A laptop with Docker, which the robot has too, and a library that announces 127.0.0.1.
         let laptop = place(Some("192.168.1.9"), &["127.0.0.1", "192.168.1.9", "172.17.0.1"]);
-        assert_eq!(laptop, Whereabouts::Remote);
-        assert_eq!(place(Some("2001:db8::9"), &[]), Whereabouts::Remote);
+        assert_eq!(laptop, Locality::Remote);
+        assert_eq!(place(Some("2001:db8::9"), &[]), Locality::Remote);
     }
 
     #[test]
     fn without_datagrams_the_announced_addresses_decide() {
-        assert_eq!(place(None, &["10.0.0.5"]), Whereabouts::Local);
-        assert_eq!(place(None, &["10.0.0.77", "192.168.1.5"]), Whereabouts::Local, "it had 10.0.0.77 once");
-        assert_eq!(place(None, &["127.0.0.1"]), Whereabouts::Local);
-        assert_eq!(place(None, &["10.0.0.9", "192.168.1.9"]), Whereabouts::Remote);
-        assert_eq!(place(None, &["127.0.0.1", "10.0.0.9"]), Whereabouts::Remote);
-        assert_eq!(place(None, &["::1", "2001:db8::9"]), Whereabouts::Remote);
-        assert_eq!(place(None, &["2001:db8::5"]), Whereabouts::Local);
+        assert_eq!(place(None, &["10.0.0.5"]), Locality::Local);
+        assert_eq!(place(None, &["10.0.0.77", "192.168.1.5"]), Locality::Local, "it had 10.0.0.77 once");
+        assert_eq!(place(None, &["127.0.0.1"]), Locality::Local);
+        assert_eq!(place(None, &["10.0.0.9", "192.168.1.9"]), Locality::Remote);
+        assert_eq!(place(None, &["127.0.0.1", "10.0.0.9"]), Locality::Remote);
+        assert_eq!(place(None, &["::1", "2001:db8::9"]), Locality::Remote);
+        assert_eq!(place(None, &["2001:db8::5"]), Locality::Local);
         // A container on a bridge of this host.
-        assert_eq!(place(None, &["172.17.0.2"]), Whereabouts::Remote);
+        assert_eq!(place(None, &["172.17.0.2"]), Locality::Remote);
     }
 
     #[test]
     fn without_an_address_the_host_is_unknown() {
-        assert_eq!(place(None, &[]), Whereabouts::Unknown);
-        assert_eq!(place(None, &["0.0.0.0", "239.255.0.1", "::"]), Whereabouts::Unknown);
+        assert_eq!(place(None, &[]), Locality::Unknown);
+        assert_eq!(place(None, &["0.0.0.0", "239.255.0.1", "::"]), Locality::Unknown);
     }
 
     #[test]

@@ -1,9 +1,9 @@
-//! The lookout: a thread that wakes critical lanes as soon as a datagram arrives.
+//! The early waker: a thread that wakes critical lanes as soon as a datagram arrives.
 //!
 //! The kernel wakes it right after the receiving thread. A lane that it wakes is awake by the time that the
-//! sample is in shared memory, and saves the receiving thread a system call. The lookout consumes no
+//! sample is in shared memory, and saves the receiving thread a system call. The early waker consumes no
 //! datagram and delays none; for datagrams that it misses, the receiving thread wakes the lanes.
-//! `docs/decisions/0013-lookout.md` has the measurements.
+//! `docs/decisions/0013-early-waker.md` has the measurements.
 
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -18,19 +18,19 @@ use crate::config::Settings;
 use crate::dds::{Arrival, Arrivals, ArrivalsCloser, Participant};
 use crate::model::TrafficClass;
 
-/// How long the lookout sleeps after a datagram for which it woke no lane: a heartbeat, a part of a large
+/// How long the early waker sleeps after a datagram for which it woke no lane: a heartbeat, a part of a large
 /// sample, or a sample that no critical lane serves. The time doubles after each further one, so that the
-/// lookout checks some 300 of them per second.
-const LOOKS_AWAY: Duration = Duration::from_micros(200);
-const LOOKS_AWAY_AT_MOST: Duration = Duration::from_micros(3_200);
+/// early waker checks some 300 of them per second.
+const MIN_PAUSE: Duration = Duration::from_micros(200);
+const MAX_PAUSE: Duration = Duration::from_micros(3_200);
 
-/// Handle of the lookout thread, which ends when this is dropped.
-pub(super) struct Lookout {
+/// Handle of the early waker thread, which ends when this is dropped.
+pub(super) struct EarlyWaker {
     closer: ArrivalsCloser,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Lookout {
+impl EarlyWaker {
     /// Starts the thread if ingress is pinned, and each critical lane to other CPUs; else returns `None`. A
     /// lane that waits awake on the CPU that receives the sample delays it: without pinning, on two CPUs, the
     /// hop took 11 µs longer at 1 kHz.
@@ -40,21 +40,21 @@ impl Lookout {
             let arrivals = participant.arrivals()?;
             let closer = arrivals.closer();
             let receiving = Arc::clone(receiving);
-            let look_out = move || {
-                if scheduling::apply_to_lookout(&cpus) {
+            let wake_early = move || {
+                if scheduling::apply_to_early_waker(&cpus) {
                     run(&arrivals, &receiving);
                 }
             };
-            let thread = thread::Builder::new().name("lookout".to_owned()).spawn(look_out)?;
+            let thread = thread::Builder::new().name("early-waker".to_owned()).spawn(wake_early)?;
             Ok(Self { closer, thread: Some(thread) })
         };
         start()
-            .inspect_err(|error: &RoleError| warn!(%error, "no lookout: critical lanes wake up later"))
+            .inspect_err(|error: &RoleError| warn!(%error, "no early waker: critical lanes wake up later"))
             .ok()
     }
 }
 
-impl Drop for Lookout {
+impl Drop for EarlyWaker {
     fn drop(&mut self) {
         self.closer.close();
         if let Some(thread) = self.thread.take() {
@@ -79,23 +79,23 @@ fn apart(settings: &Settings) -> Option<Vec<usize>> {
 }
 
 fn run(arrivals: &Arrivals, receiving: &Receiving) {
-    let mut looks_away = LOOKS_AWAY;
+    let mut pause = MIN_PAUSE;
     loop {
-        let told = match arrivals.wait() {
+        let woke = match arrivals.wait() {
             // Only for the last fragment: until then the publisher still sends, perhaps on this CPU, and must
             // not be preempted.
             Arrival::Sample { writer, sequence, left_bytes: 0 } => {
-                receiving.expect(writer, sequence, 0, receiving.cpu())
+                receiving.wake_early(writer, sequence, 0, receiving.cpu())
             }
             Arrival::Sample { .. } | Arrival::Other => false,
             Arrival::Closed => return,
         };
-        if told {
-            looks_away = LOOKS_AWAY;
+        if woke {
+            pause = MIN_PAUSE;
         } else {
             #[allow(clippy::disallowed_methods, reason = "the pause keeps the CPU time of this thread low")]
-            thread::sleep(looks_away);
-            looks_away = (looks_away * 2).min(LOOKS_AWAY_AT_MOST);
+            thread::sleep(pause);
+            pause = (pause * 2).min(MAX_PAUSE);
         }
     }
 }
