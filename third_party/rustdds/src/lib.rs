@@ -235,6 +235,8 @@ pub use serialization::RepresentationIdentifier;
 pub use serialization::{
   CDRDeserializerAdapter, CDRSerializerAdapter, CdrDeserializer, CdrSerializer,
 };
+/// How often the threads of a participant have turned.
+pub use polling::ThreadTurns;
 /// What a datagram claims to hold, for one who looks at it.
 pub use rtps::arriving::sample_arriving;
 pub use rtps::reader_progress::MatchedReader;

@@ -10,7 +10,10 @@
 
 use std::{
   collections::BTreeMap,
-  sync::{mpsc, Arc, OnceLock},
+  sync::{
+    atomic::{AtomicU64, Ordering},
+    mpsc, Arc, OnceLock,
+  },
   time::{Duration, Instant},
 };
 
@@ -23,13 +26,20 @@ use crate::structure::guid::{EntityId, GUID};
 /// enqueued earlier is still observed.
 #[derive(Clone)]
 pub(crate) struct LoopWaker {
-  slot: Arc<OnceLock<Waker>>,
+  slot: Arc<WakerSlot>,
+}
+
+#[derive(Default)]
+struct WakerSlot {
+  waker: OnceLock<Waker>,
+  // Turns that the loop has begun.
+  turns: AtomicU64,
 }
 
 impl LoopWaker {
   pub(crate) fn new() -> Self {
     Self {
-      slot: Arc::new(OnceLock::new()),
+      slot: Arc::default(),
     }
   }
 
@@ -37,19 +47,38 @@ impl LoopWaker {
   /// happens once: mio 1.2 allows only one `Waker` per `Poll`.
   pub(crate) fn install(&self, poll: &Poll, token: Token) -> std::io::Result<()> {
     let waker = Waker::new(poll.registry(), token)?;
-    if self.slot.set(waker).is_err() {
+    if self.slot.waker.set(waker).is_err() {
       debug_assert!(false, "LoopWaker::install called twice for one poll");
     }
     Ok(())
   }
 
+  /// Counts a turn of the loop; for the thread of the loop.
+  pub(crate) fn count_turn(&self) {
+    self.slot.turns.fetch_add(1, Ordering::Release);
+  }
+
+  /// The turns that the loop has begun.
+  pub(crate) fn turns(&self) -> u64 {
+    self.slot.turns.load(Ordering::Acquire)
+  }
+
   pub(crate) fn wake(&self) {
-    if let Some(waker) = self.slot.get() {
+    if let Some(waker) = self.slot.waker.get() {
       if let Err(e) = waker.wake() {
         log::debug!("LoopWaker::wake: {e}");
       }
     }
   }
+}
+
+/// How often the two threads of a participant have begun a turn of their loops.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ThreadTurns {
+  /// Of the event loop, which receives, acknowledges, repairs and sends.
+  pub event_loop: u64,
+  /// Of the discovery thread.
+  pub discovery: u64,
 }
 
 /// What an application lets the event loop of its participant do.
@@ -77,6 +106,10 @@ impl<T> Clone for WakeSender<T> {
 }
 
 impl<T> WakeSender<T> {
+  pub(crate) fn waker(&self) -> &LoopWaker {
+    &self.waker
+  }
+
   pub(crate) fn try_send(&self, value: T) -> Result<(), mpsc::TrySendError<T>> {
     match self.tx.try_send(value) {
       Ok(()) => {

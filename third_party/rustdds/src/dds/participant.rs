@@ -43,7 +43,7 @@ use crate::{
     util::{listener_locators, local_interface_table, IfAddr, NetworkSelector},
   },
   polling::{
-    ready_channel, wake_channel, wake_channel_unbounded, Hooks, LoopWaker, ReadySender,
+    ready_channel, wake_channel, wake_channel_unbounded, Hooks, LoopWaker, ReadySender, ThreadTurns,
     WakeReceiver, WakeSender, WakeUnboundedSender,
   },
   rtps::{
@@ -598,6 +598,23 @@ impl DomainParticipant {
     if let Ok(dpi) = self.dpi.lock() {
       dpi.dpi.event_loop_waker.wake();
     }
+  }
+
+  /// Lets the event loop and the discovery thread turn once, and returns how often each had begun a turn before.
+  /// A count that does not grow from one call to the next, some time later, is that of a thread that hangs or
+  /// has ended.
+  pub fn wake_threads(&self) -> ThreadTurns {
+    let Ok(dpi) = self.dpi.lock() else {
+      return ThreadTurns::default();
+    };
+    let (event_loop, discovery) = (&dpi.dpi.event_loop_waker, dpi.discovery_command_sender.waker());
+    let turns = ThreadTurns {
+      event_loop: event_loop.turns(),
+      discovery: discovery.turns(),
+    };
+    event_loop.wake();
+    discovery.wake();
+    turns
   }
 
   /// The sockets that user traffic comes to, for a thread of the application that

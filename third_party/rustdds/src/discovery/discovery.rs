@@ -802,6 +802,7 @@ impl Discovery {
 
     let mut events = Events::with_capacity(32);
     loop {
+      self.waker.count_turn();
       let poll_timeout = timeout_until(
         self.discovery_timer.borrow().next_deadline(),
         std::time::Duration::from_millis(5000),

@@ -334,6 +334,7 @@ impl DPEventLoop {
 
     // loop starts here
     loop {
+      ev_wrapper.waker.count_turn();
       // The poll wakes for a socket, the shared waker, or the sooner of the next
       // deadline and the outbound fallback. Non-unix has no write-readiness
       // registration, so a short cap flushes queued sends.
