@@ -15,8 +15,8 @@ use crate::model::{Encapsulation, Guid, MonotonicNs, SourceTimestamp};
 /// 100 ms on a local network, but DDS does not signal its end.
 const SETTLING_MS: u64 = 1_000;
 
-/// The most late joiners that may wait at once; further ones get no history.
-const MAX_WAITING: usize = 64;
+/// The most late joiners that may wait at once, 24 bytes each. Further ones get no history and are counted.
+const MAX_WAITING: usize = 4_096;
 
 /// A sample of the history, as it was written.
 #[derive(Clone, Debug)]
@@ -37,11 +37,7 @@ pub(super) struct LateJoiners {
 impl LateJoiners {
     /// Creates an empty history of `depth` samples.
     pub fn new(depth: usize) -> Self {
-        Self {
-            depth: depth.max(1),
-            history: VecDeque::with_capacity(depth.max(1)),
-            waiting: VecDeque::with_capacity(MAX_WAITING),
-        }
+        Self { depth: depth.max(1), history: VecDeque::with_capacity(depth.max(1)), waiting: VecDeque::new() }
     }
 
     /// Adds a written sample, and removes the oldest one from a full history.
@@ -52,11 +48,16 @@ impl LateJoiners {
         self.history.push_back(sample);
     }
 
-    /// Adds a matched reader, which is due after the settling time.
-    pub fn joined(&mut self, reader: Guid, now: MonotonicNs) {
-        if self.waiting.len() < MAX_WAITING && !self.waiting.iter().any(|(waiting, _)| *waiting == reader) {
+    /// Adds a matched reader, which is due after the settling time. Returns whether there was room for it.
+    pub fn joined(&mut self, reader: Guid, now: MonotonicNs) -> bool {
+        if self.waiting.iter().any(|(waiting, _)| *waiting == reader) {
+            return true;
+        }
+        let has_room = self.waiting.len() < MAX_WAITING;
+        if has_room {
             self.waiting.push_back((reader, now.plus_ms(SETTLING_MS)));
         }
+        has_room
     }
 
     /// Removes a reader that is no longer matched.
@@ -109,9 +110,15 @@ mod tests {
         late.joined(Guid([1; 16]), MonotonicNs(0));
         late.left(Guid([1; 16]));
         assert!(late.next_due(MonotonicNs(u64::MAX)).is_none());
-        for reader in 0..=255 {
-            late.joined(Guid([reader; 16]), MonotonicNs(0));
+        let reader = |number: usize| Guid((number as u128).to_be_bytes());
+        for number in 0..MAX_WAITING {
+            assert!(late.joined(reader(number), MonotonicNs(0)), "{number}");
         }
-        assert_eq!(late.waiting.len(), MAX_WAITING);
+        assert!(!late.joined(reader(MAX_WAITING), MonotonicNs(0)));
+        assert!(late.joined(reader(7), MonotonicNs(0)), "it waits already");
+        for number in 0..MAX_WAITING {
+            assert_eq!(late.next_due(MonotonicNs(u64::MAX)).unwrap().0, reader(number));
+        }
+        assert!(late.next_due(MonotonicNs(u64::MAX)).is_none());
     }
 }

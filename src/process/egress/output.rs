@@ -380,7 +380,15 @@ impl Output {
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
                     if let Some(late_joiners) = &mut self.late_joiners {
                         if joined {
-                            late_joiners.joined(reader, now);
+                            if !late_joiners.joined(reader, now) {
+                                warn!(
+                                    route = self.id,
+                                    lane = self.lane,
+                                    ?reader,
+                                    "too many late joiners wait \
+                                      for the history; this one gets only new samples"
+                                );
+                            }
                         } else {
                             late_joiners.left(reader);
                         }
