@@ -119,7 +119,7 @@ impl Subscribers {
             }
         }
         let listed = settings.subscribers.keys().chain(settings.classifier.subscriber_id.iter());
-        for id in listed {
+        for id in listed.chain(settings.overrides.keys()) {
             if self.list.iter().any(|known| known.id == *id) {
                 continue;
             }
@@ -370,9 +370,12 @@ impl Subscriber {
     }
 }
 
-/// Whether the configuration lists a subscriber.
+/// Whether the configuration names a subscriber: under `subscribers` or `overrides`, or as the only one. Its
+/// state, and so an override, holds whether or not it responds.
 fn is_listed(settings: &Settings, id: &str) -> bool {
-    settings.subscribers.contains_key(id) || settings.classifier.subscriber_id.as_deref() == Some(id)
+    settings.subscribers.contains_key(id)
+        || settings.overrides.contains_key(id)
+        || settings.classifier.subscriber_id.as_deref() == Some(id)
 }
 
 /// The index of a subscriber's lane: the configured lane, or else `noncritical`, which always exists.
