@@ -68,6 +68,13 @@ impl TokenBucket {
         bucket
     }
 
+    /// Like [`new`](Self::new), but full.
+    pub fn full(rate_hz: f64, burst: f64, now: MonotonicNs) -> Self {
+        let mut bucket = Self::new(rate_hz, burst, now);
+        bucket.credit = bucket.cap;
+        bucket
+    }
+
     /// Accrues at `rate_hz` from `now` on. The credit stays, up to the new `burst`.
     pub fn set_rate(&mut self, rate_hz: f64, burst: f64, now: MonotonicNs) {
         self.settle(now);

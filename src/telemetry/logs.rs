@@ -9,6 +9,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, reload};
 
 use super::journal::Journal;
+use super::log_limit::LogLimit;
 use crate::config::Verbosity;
 
 /// The handle that changes the filter; set only when `RUST_LOG` is unset and the configuration decides.
@@ -32,7 +33,7 @@ pub fn start_logs() {
             .log_internal_errors(false)
             .with_ansi(std::io::stderr().is_terminal())
     });
-    match tracing_subscriber::registry().with(filter).with(journal).with(lines).try_init() {
+    match tracing_subscriber::registry().with(filter).with(LogLimit).with(journal).with(lines).try_init() {
         Ok(()) if is_configured => {
             // `try_init` succeeds only once, so this is set only once.
             let _ = CONFIGURED.set(handle);

@@ -7,6 +7,7 @@ mod intervals;
 mod journal;
 mod json;
 mod liveness;
+mod log_limit;
 mod logs;
 mod metrics;
 mod problems;
@@ -22,6 +23,7 @@ pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES,
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};
 pub use liveness::ProcessState;
+pub use log_limit::log_left_out;
 pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problems::{Level, Problem};
