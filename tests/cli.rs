@@ -664,3 +664,25 @@ fn every_subcommand_has_completions_and_a_manual_page() {
     }
     assert_eq!(run(&["man", "/no/such/folder"]).status.code(), Some(1));
 }
+
+#[test]
+fn a_lane_on_which_no_route_has_an_output_has_no_process() {
+    let bridge = Bridge::new(
+        "instance: {instance}\nshared_memory: {root_path: {folder}/root}\nros: {domain_id: 118}\n\
+         topics: [{id: scan, input_topic: /scan, lanes: [critical]}]\n",
+    );
+    let mut up = bridge.start("up");
+    let status = wait_status(&bridge, "all processes", |status| {
+        let processes = status["processes"].as_array().unwrap();
+        processes.len() == 3 && processes.iter().all(|process| process["state"] == "running")
+    });
+    let names: Vec<&str> =
+        status["processes"].as_array().unwrap().iter().filter_map(|one| one["name"].as_str()).collect();
+    assert_eq!(names, ["ingress", "control", "egress-critical"]);
+    assert_eq!(status["lanes"].as_array().unwrap().len(), 1, "{status}");
+    assert!(!problems(&status).contains("noncritical"), "{status}");
+    let unused = bridge.run("egress --lane noncritical");
+    assert_eq!(unused.status.code(), Some(3));
+    assert!(text(&unused.stderr).contains("no route has an output on this lane"), "{}", text(&unused.stderr));
+    assert!(up.terminate().success());
+}

@@ -33,6 +33,9 @@ use crate::telemetry::{self, Snapshot};
 /// Exit code of `reload` when some changes of the file wait for a restart of the whole bridge.
 const EXIT_WAITS: u8 = 5;
 
+/// Exit code of `egress` for a lane on which no route has an output. The service units do not restart it.
+const EXIT_UNUSED: u8 = 3;
+
 /// Exit code for a bad configuration (`EX_CONFIG` of sysexits.h).
 const EXIT_CONFIG: u8 = 78;
 

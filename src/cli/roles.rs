@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, bad_configuration, failed, pause};
+use super::{ConfigArguments, EXIT_UNUSED, bad_configuration, failed, pause};
 use crate::config::Configuration;
 use crate::process::{self, HangUp, InForce, InForceError, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
@@ -29,9 +29,17 @@ pub(super) fn ingress(arguments: &ConfigArguments) -> ExitCode {
 }
 
 pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
-    role(&arguments.config, |configuration, reloads, stop| {
-        process::egress(&configuration.settings, &arguments.lane, reloads, stop)
-    })
+    let mut unused = false;
+    let code = role(&arguments.config, |configuration, reloads, stop| {
+        let settings = &configuration.settings;
+        unused = settings.lanes.iter().any(|lane| lane.name.as_str() == arguments.lane && !lane.is_used());
+        if unused {
+            process::end_unused(&arguments.lane);
+            return Ok(());
+        }
+        process::egress(settings, &arguments.lane, reloads, stop)
+    });
+    if unused { ExitCode::from(EXIT_UNUSED) } else { code }
 }
 
 pub(super) fn control(arguments: &ConfigArguments) -> ExitCode {
@@ -81,6 +89,7 @@ fn role(
 
 /// Runs `role` until it returns or a signal stops it, and returns the exit code of the process.
 pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {
+    process::abort_on_panic();
     let stop = match Stop::on_signals() {
         Ok(stop) => stop,
         Err(error) => return failed(&error),

@@ -151,6 +151,12 @@ pub struct Lane {
 }
 
 impl Lane {
+    /// Whether any route has an output on this lane. The two built-in lanes always exist; a lane without an
+    /// output has no process.
+    pub fn is_used(&self) -> bool {
+        !self.outputs.is_empty()
+    }
+
     /// The most samples of each route that the lane holds in shared memory: a noncritical lane also holds
     /// those in its own queue, the sample that it takes next and the one that it sends.
     pub fn max_borrowed_in_all(&self) -> usize {

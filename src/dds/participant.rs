@@ -14,7 +14,7 @@ use super::qos::{self, ReaderQos};
 use super::reader::{RawReader, Take};
 use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
-    QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, Topic, TopicKind,
+    QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic, TopicKind,
 };
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
@@ -47,6 +47,8 @@ pub struct Participant {
     graph_gid_bytes: usize,
     readers: Vec<Guid>,
     writers: Vec<Guid>,
+    /// The turns of the library's threads at the last call of `have_threads_turned` that returned true.
+    turns_seen: ThreadTurns,
 }
 
 /// The QoS of the graph entries, as in `rmw_dds_common`: the last entry is delivered reliably, also to late
@@ -142,6 +144,7 @@ impl Participant {
             graph_gid_bytes: options.graph_gid_bytes,
             readers: Vec::new(),
             writers: Vec::new(),
+            turns_seen: ThreadTurns::default(),
         };
         opened.publish_graph_entry();
         Ok(opened)
@@ -155,6 +158,18 @@ impl Participant {
     /// Makes the thread that receives call `on_received` of [`open_receiving`](Self::open_receiving) once.
     pub fn ring(&self) {
         self.participant.wake_event_loop();
+    }
+
+    /// Whether the receiving thread and the discovery thread have each begun a turn since the last call that
+    /// returned true. Wakes both, so that the next call, some milliseconds later, returns true unless one of
+    /// them hangs or has ended: then the participant receives nothing or finds no peer, without an error.
+    pub fn have_threads_turned(&mut self) -> bool {
+        let (seen, turns) = (self.turns_seen, self.participant.wake_threads());
+        let turned = turns.event_loop != seen.event_loop && turns.discovery != seen.discovery;
+        if turned {
+            self.turns_seen = turns;
+        }
+        turned
     }
 
     /// Returns a watch of the sockets on which samples arrive, for a thread that peeks at datagrams before

@@ -59,7 +59,7 @@ pub use probe_window::{LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, R
 pub use publisher_places::{PUBLISHER_SILENT_MS, publisher_place};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};
 pub use restart::{
-    ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, MAX_BACKOFF_MS, RestartBackoff,
+    ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, HangWatch, MAX_BACKOFF_MS, RestartBackoff,
     RestartDecision,
 };
 pub use safety::{

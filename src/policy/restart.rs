@@ -78,6 +78,40 @@ impl RestartBackoff {
     }
 }
 
+/// The longest step that [`HangWatch`] counts between two checks. A longer pause is one of the supervisor
+/// itself, which was stopped, and with it perhaps its children.
+const MAX_STEP_MS: u64 = 500;
+
+/// Finds a child process that runs but makes no progress.
+#[derive(Clone, Copy, Debug)]
+pub struct HangWatch {
+    limit_ms: u64,
+    alive_at: MonotonicNs,
+    checked_at: MonotonicNs,
+    stalled_ns: u64,
+}
+
+impl HangWatch {
+    /// A watch of a child that was started at `now` and must show progress every `limit_ms`.
+    pub const fn new(limit_ms: u64, now: MonotonicNs) -> Self {
+        Self { limit_ms, alive_at: MonotonicNs(0), checked_at: now, stalled_ns: 0 }
+    }
+
+    /// Compares when the child last made progress, by its own account, with the last check. Returns whether
+    /// it has made none for the limit, in the time that the supervisor itself was running.
+    pub fn has_hung(&mut self, alive_at: MonotonicNs, now: MonotonicNs) -> bool {
+        let step_ns = now.since(self.checked_at).min(MAX_STEP_MS * 1_000_000);
+        self.checked_at = now;
+        if alive_at == self.alive_at {
+            self.stalled_ns += step_ns;
+        } else {
+            self.alive_at = alive_at;
+            self.stalled_ns = 0;
+        }
+        self.stalled_ns >= self.limit_ms * 1_000_000
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -137,5 +171,27 @@ mod tests {
                 "{exit:?}"
             );
         }
+    }
+
+    #[test]
+    fn a_child_hangs_when_it_makes_no_progress_for_the_limit() {
+        let at = |ms| MonotonicNs(1).plus_ms(ms);
+        let mut watch = HangWatch::new(2_000, at(0));
+        for ms in (250..60_000).step_by(250) {
+            assert!(!watch.has_hung(at(ms - 100), at(ms)), "a turn each 250 ms");
+        }
+        for ms in (60_000..61_750).step_by(250) {
+            assert!(!watch.has_hung(at(59_650), at(ms)), "{ms}");
+        }
+        assert!(watch.has_hung(at(59_650), at(61_750)));
+    }
+
+    #[test]
+    fn a_pause_of_the_supervisor_is_not_a_hang_of_its_children() {
+        let at = |ms| MonotonicNs(1).plus_ms(ms);
+        let mut watch = HangWatch::new(2_000, at(0));
+        assert!(!watch.has_hung(at(200), at(250)));
+        assert!(!watch.has_hung(at(200), at(3_600_250)), "an hour in SIGSTOP counts as 500 ms");
+        assert!(!watch.has_hung(at(3_600_300), at(3_600_500)));
     }
 }

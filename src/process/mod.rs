@@ -23,14 +23,14 @@ mod supervisor;
 mod watch;
 
 pub use control::control;
-pub use egress::egress;
+pub use egress::{egress, end_unused};
 pub use in_force::{InForce, InForceError};
 pub use ingress::ingress;
 pub use lane_override::set_mode;
 pub use reload::{HangUp, ReloadAnswer, ReloadRequests, ReloadResult, reload_all};
 pub use responder::{ResponderOptions, responder};
 pub use role::RoleError;
-pub use stop::Stop;
+pub use stop::{Stop, abort_on_panic};
 pub use supervisor::{SupervisorError, end_with_supervisor, up};
 
 /// Interval of housekeeping. A process checks for a request to stop at least this often, so that it ends

@@ -20,6 +20,7 @@ use crate::clock;
 use crate::config::DdsNetwork;
 use crate::dds::{Participant, ParticipantOptions, RawWriter, Take};
 use crate::model::{Encapsulation, MonotonicNs, SourceTimestamp, TopicName};
+use crate::telemetry;
 
 /// How long the responder waits for a probe request before it logs a warning.
 const SILENCE_MS: u64 = 10_000;
@@ -82,7 +83,7 @@ struct Responder {
     /// Before the participant: the DDS library wants its readers and writers gone first.
     requests: Inbox,
     responses: RawWriter,
-    _participant: Participant,
+    participant: Participant,
     handler: RequestHandler,
     /// The current request, cut at one byte more than the longest valid request.
     request: Vec<u8>,
@@ -127,7 +128,7 @@ impl Responder {
         Ok(Self {
             requests: Inbox::new(requests),
             responses,
-            _participant: participant,
+            participant,
             handler: RequestHandler::new(options.id, options.trust, options.max_probe_rate_hz, now),
             request: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
             refused: RefusalLog::of_refused(),
@@ -203,9 +204,12 @@ impl Responder {
                 self.listens_on
             );
         }
+        telemetry::log_left_out();
         // Reports readiness at the first housekeeping, when all endpoints exist.
         self.notifier.ready();
-        self.notifier.feed_watchdog(now);
+        if self.participant.have_threads_turned() {
+            self.notifier.feed_watchdog(now);
+        }
         let (handler, answered) = (&self.handler, &mut self.answered);
         self.notifier.status(now, |line| {
             let per_s = answered.per_s(handler.answered, now);

@@ -1,4 +1,4 @@
-//! The request to stop a process, which SIGINT and SIGTERM set.
+//! What ends a process: the request to stop, which SIGINT and SIGTERM set, and a panic.
 
 use std::io;
 use std::sync::Arc;
@@ -32,4 +32,15 @@ impl Stop {
     pub fn is_requested(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }
+}
+
+/// Ends this process with SIGABRT when any of its threads panics, after the message of the panic, so that its
+/// supervisor restarts it. By default a panic ends only its thread: a process without the receiving thread of
+/// the DDS library runs on, and forwards nothing.
+pub fn abort_on_panic() {
+    let print = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        print(panic);
+        std::process::abort();
+    }));
 }

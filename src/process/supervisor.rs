@@ -24,20 +24,27 @@ use super::role::root;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Settings};
-use crate::model::MonotonicNs;
-use crate::policy::{ChildExit, GiveUpReason, RestartBackoff, RestartDecision};
+use crate::model::{MonotonicNs, TrafficClass};
+use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError};
 use crate::telemetry::Snapshot;
 
 /// Interval at which the supervisor checks its children.
 const POLL_MS: u64 = 20;
 
-/// Interval at which the supervisor reads the boards for its report to the service manager.
-const REPORT_MS: u64 = 250;
+/// Interval at which the supervisor reads the boards, for the progress of its children and its report to the
+/// service manager.
+const READ_BOARDS_MS: u64 = 250;
 
-/// How long a child may take to end after SIGTERM; then it is killed. A process ends within a second of a
-/// request to stop.
-const GRACE_MS: u64 = 900;
+/// How long ingress or a critical lane, and how long another child, may make no progress before it is killed
+/// and restarted. The service units have the same as `WatchdogSec`.
+const HANG_CRITICAL_MS: u64 = 2_000;
+const HANG_MS: u64 = 5_000;
+
+/// How long a child may take to end after SIGTERM; then it is killed, and `up` fails. A process ends within a
+/// second of a request to stop, unless it has many endpoints to remove on a loaded machine. Less than the 5 s
+/// that the service units give (`TimeoutStopSec`), and than the 10 s of Docker.
+const GRACE_MS: u64 = 4_500;
 
 /// Environment variable that `up` sets for its children, to its own process id.
 const SUPERVISOR_VARIABLE: &str = "ADAPTIVE_BRIDGE_SUPERVISOR";
@@ -54,6 +61,11 @@ pub enum SupervisorError {
     },
     /// Every child has failed in a way that a restart does not cure.
     AllGaveUp,
+    /// Children did not end in time after SIGTERM and were killed.
+    Killed {
+        /// Their names.
+        names: Vec<String>,
+    },
     /// The bridge runs already, or the folder of the instance cannot be used.
     Shm(ShmError),
 }
@@ -63,6 +75,9 @@ impl fmt::Display for SupervisorError {
         match self {
             Self::Start { name, error } => write!(f, "cannot start {name}: {error}"),
             Self::AllGaveUp => f.write_str("every process of the bridge has given up; see the log above"),
+            Self::Killed { names } => {
+                write!(f, "killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))
+            }
             Self::Shm(error) => error.fmt(f),
         }
     }
@@ -111,13 +126,14 @@ pub fn up(
     // The lock file tells another `up` the process id of this one.
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
-    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments, &folder)];
-    for lane in &settings.lanes {
+    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments, &folder, HANG_CRITICAL_MS)];
+    for lane in settings.lanes.iter().filter(|lane| lane.is_used()) {
         let name = format!("egress-{}", lane.name);
         let own = ["egress", "--lane", lane.name.as_str()];
-        children.push(Supervised::new(&name, &own, arguments, &folder));
+        let hang_ms = if lane.class == TrafficClass::Critical { HANG_CRITICAL_MS } else { HANG_MS };
+        children.push(Supervised::new(&name, &own, arguments, &folder, hang_ms));
     }
-    children.push(Supervised::new("control", &["control"], arguments, &folder));
+    children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));
     let mut outcome = Ok(());
     for child in &mut children {
         if let Err(error) = child.start() {
@@ -144,38 +160,39 @@ pub fn up(
         for child in &mut children {
             child.poll(now);
         }
-        report.send(&children, now);
+        report.send(&mut children, now);
         if children.iter().all(|child| child.state == State::GaveUp) {
             outcome = Err(SupervisorError::AllGaveUp);
         }
     }
     report.notifier.stopping();
-    stop_all(&mut children);
-    outcome
+    let killed = stop_all(&mut children);
+    if killed.is_empty() { outcome } else { outcome.and(Err(SupervisorError::Killed { names: killed })) }
 }
 
-/// Reports the state of all children to the service manager of `up`, where there is one.
+/// Reads the boards: kills children that hang, and reports the state of all children to the service
+/// manager of `up`, where there is one.
 struct ManagerReport<'a> {
     settings: &'a Settings,
     notifier: Notifier,
-    report_at: MonotonicNs,
+    read_at: MonotonicNs,
     last: Option<Snapshot>,
 }
 
 impl<'a> ManagerReport<'a> {
     fn new(settings: &'a Settings) -> Self {
-        Self { settings, notifier: Notifier::new(), report_at: MonotonicNs(0), last: None }
+        Self { settings, notifier: Notifier::new(), read_at: MonotonicNs(0), last: None }
     }
 
-    /// Feeds the watchdog, reports readiness, and sends the status line. `up` is ready when each child has
-    /// completed a turn, which is when the child itself is ready. As `up` has no data path, its watchdog
-    /// shows that it checks its children; the caller has just done so.
-    fn send(&mut self, children: &[Supervised], now: MonotonicNs) {
+    /// Kills children that hang, feeds the watchdog, reports readiness, and sends the status line. `up` is
+    /// ready when each child has completed a turn, which is when the child itself is ready. As `up` has no
+    /// data path, its watchdog shows that it checks its children; the caller has just done so.
+    fn send(&mut self, children: &mut [Supervised], now: MonotonicNs) {
         self.notifier.feed_watchdog(now);
-        if !self.notifier.is_enabled() || now < self.report_at {
+        if now < self.read_at {
             return;
         }
-        self.report_at = now.plus_ms(REPORT_MS);
+        self.read_at = now.plus_ms(READ_BOARDS_MS);
         let next = match Snapshot::take(&root(self.settings), self.settings) {
             Ok(Some(next)) => next,
             // The children have not created the boards yet, or the boards are of another configuration.
@@ -185,11 +202,20 @@ impl<'a> ManagerReport<'a> {
                 return;
             }
         };
-        let has_turned = |child: &Supervised| {
+        let mut turned = 0;
+        for child in &mut *children {
             let reading = next.processes.iter().find(|reading| reading.name == child.name);
-            reading.is_some_and(|reading| reading.health.turns > 0 && Some(reading.health.pid) == child.pid())
-        };
-        if children.iter().all(has_turned) {
+            let health = reading.map(|reading| &reading.health);
+            // A child that has not completed its first turn is still starting.
+            if let Some(health) = health.filter(|one| one.turns > 0 && Some(one.pid) == child.pid()) {
+                turned += 1;
+                child.check_progress(health.alive_at, now);
+            }
+        }
+        if !self.notifier.is_enabled() {
+            return;
+        }
+        if turned == children.len() {
             self.notifier.ready();
         }
         let report = next.report_since(self.last.as_ref().unwrap_or(&next));
@@ -212,8 +238,10 @@ impl<'a> ManagerReport<'a> {
     }
 }
 
-/// Stops all children: sends SIGTERM, waits for `GRACE_MS`, and kills the ones that still run.
-fn stop_all(children: &mut [Supervised]) {
+/// Stops all children: sends SIGTERM, waits for `GRACE_MS`, and kills the ones that still run, whose names it
+/// returns.
+fn stop_all(children: &mut [Supervised]) -> Vec<String> {
+    let mut killed = Vec::new();
     for child in children.iter() {
         child.signal(Signal::SIGTERM);
     }
@@ -222,17 +250,19 @@ fn stop_all(children: &mut [Supervised]) {
         if clock::monotonic() >= deadline {
             for child in children.iter_mut().filter(|child| child.process.is_some()) {
                 warn!(child = child.name, "did not end in time after SIGTERM; killed");
+                killed.push(child.name.clone());
                 child.signal(Signal::SIGKILL);
                 // A process cannot block SIGKILL, not even in SIGSTOP, so this wait is short.
                 if let Some(mut process) = child.process.take() {
                     let _ = process.wait();
                 }
             }
-            return;
+            break;
         }
         #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
         std::thread::sleep(Duration::from_millis(5));
     }
+    killed
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -251,10 +281,14 @@ struct Supervised {
     process: Option<Child>,
     backoff: RestartBackoff,
     state: State,
+    /// How long it may make no progress.
+    hang_ms: u64,
+    hang_watch: HangWatch,
 }
 
 impl Supervised {
-    fn new(name: &str, own: &[&str], common: &[OsString], folder: &Path) -> Self {
+    fn new(name: &str, own: &[&str], common: &[OsString], folder: &Path, hang_ms: u64) -> Self {
+        let now = clock::monotonic();
         let mut arguments: Vec<OsString> = own.iter().map(OsString::from).collect();
         arguments.extend_from_slice(common);
         Self {
@@ -262,8 +296,10 @@ impl Supervised {
             arguments,
             folder: folder.to_owned(),
             process: None,
-            backoff: RestartBackoff::new(clock::monotonic()),
+            backoff: RestartBackoff::new(now),
             state: State::Running,
+            hang_ms,
+            hang_watch: HangWatch::new(hang_ms, now),
         }
     }
 
@@ -285,6 +321,7 @@ impl Supervised {
         info!(child = self.name, pid = process.id(), "started");
         self.process = Some(process);
         self.state = State::Running;
+        self.hang_watch = HangWatch::new(self.hang_ms, clock::monotonic());
         Ok(())
     }
 
@@ -321,6 +358,14 @@ impl Supervised {
                     Some(Ok(None)) | None => {}
                 }
             }
+        }
+    }
+
+    /// Kills the child if it has made no progress since `alive_at` for too long; `poll` then restarts it.
+    fn check_progress(&mut self, alive_at: MonotonicNs, now: MonotonicNs) {
+        if self.hang_watch.has_hung(alive_at, now) {
+            error!(child = self.name, "no progress for {} ms; killed, to be restarted", self.hang_ms);
+            self.signal(Signal::SIGKILL);
         }
     }
 

@@ -33,7 +33,7 @@ pub struct Snapshot {
     pub at: MonotonicNs,
     /// The time of the reading by the wall clock.
     pub at_wall: WallNs,
-    /// Ingress, control if it ever ran, then the egress of each lane.
+    /// Ingress, control if it ever ran, then the egress of each lane that has an output.
     pub processes: Vec<ProcessReading>,
     /// The lanes, in the order of the configuration.
     pub lanes: Vec<LaneReading>,
@@ -92,6 +92,8 @@ pub struct LaneReading {
     pub ends_at: Option<MonotonicNs>,
     /// The health record of its process, which includes the applied mode.
     pub health: ProcessHealth,
+    /// Whether it has an output; else it has no process and is not shown.
+    pub is_used: bool,
 }
 
 /// The reason of a lane's mode.
@@ -200,8 +202,9 @@ impl Snapshot {
                 reason,
                 ends_at,
                 health: egress.health,
+                is_used: lane.is_used(),
             });
-            processes.push(egress);
+            processes.extend(lane.is_used().then_some(egress));
         }
         let routes = (0..settings.routes.len())
             .map(|route| read_route(boards, settings, route))

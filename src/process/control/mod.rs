@@ -319,7 +319,11 @@ impl Control {
         self.refused_log.log_new(&self.invalid_responses.refused, now);
         self.accepted_log.log_new(&self.invalid_responses.accepted, now);
         self.write_record();
-        self.role.report_turn(self.supervision.mode() as u8, 0);
+        // Every participant is asked, so that each one's threads are woken.
+        let stuck = self.participants.iter_mut().filter_map(|one| (!one.have_threads_turned()).then_some(()));
+        if stuck.count() == 0 {
+            self.role.report_turn(self.supervision.mode() as u8, 0);
+        }
         // Only the first call has an effect: control has completed its first turn.
         self.role.ready();
         self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decisions, line));

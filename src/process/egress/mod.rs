@@ -18,7 +18,7 @@ use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::arena::CopyArena;
-use super::notify::{Meter, write_drops, write_list};
+use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
@@ -80,6 +80,13 @@ pub fn egress(
     egress.shut_down();
     info!(lane = name, "egress is done");
     Ok(())
+}
+
+/// Logs that the process of lane `name` ends because the lane has no output, and reports to the service
+/// manager that it has started as it should.
+pub fn end_unused(name: &str) {
+    info!(lane = name, "no route has an output on this lane, so its process ends");
+    Notifier::new().ready();
 }
 
 struct Egress {
@@ -212,7 +219,10 @@ impl Egress {
             output.housekeeping(&mut self.participant, &self.role.boards, now);
         }
         self.reload(now);
-        self.role.report_turn(self.policy.mode as u8, self.policy.epoch);
+        // A turn of this thread forwards nothing if a thread of the DDS library hangs.
+        if self.participant.have_threads_turned() {
+            self.role.report_turn(self.policy.mode as u8, self.policy.epoch);
+        }
         self.role.status(now, |line| describe(&self.outputs, self.policy.mode, &mut self.meters, line, now));
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }

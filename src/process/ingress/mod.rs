@@ -78,8 +78,6 @@ struct Ingress {
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
-    /// Turns of the receiving thread at the last housekeeping.
-    turns_seen: u64,
     /// Whether each publisher that wrote until the predecessor died has sent a sample to this process.
     has_resumed: bool,
     /// The latest time to dispose of the participant of a killed predecessor.
@@ -143,7 +141,6 @@ impl Ingress {
             receiving,
             participant,
             role,
-            turns_seen: 0,
             has_resumed: false,
             resume_until,
             housekeeping_at,
@@ -204,17 +201,13 @@ impl Ingress {
         if self.role.has_former() && now >= self.resume_until {
             self.role.dispose_former(&self.participant);
         }
-        // The health board shows that the receiving thread is alive, not this one. A turn is recorded only if
-        // the receiving thread has completed one since the last housekeeping; the ring below makes it take
-        // the next one, whether or not a sample arrives.
-        let turns = self.receiving.turns();
-        if turns != self.turns_seen {
-            self.turns_seen = turns;
-            self.role.report_turn(LaneMode::Normal as u8, 0);
-        }
         self.role.reload();
         self.role.status(now, |line| describe(&self.receiving, &mut self.received, line, now));
-        self.participant.ring();
+        // After the last lock of an input, because this wakes the receiving thread, which may have skipped a
+        // locked one.
+        if self.participant.have_threads_turned() {
+            self.role.report_turn(LaneMode::Normal as u8, 0);
+        }
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
         outcome
     }

@@ -5,7 +5,7 @@
 //! that is not needed for each sample, and locks a route meanwhile. The receiving thread never waits for a
 //! lock: it skips a locked route, and is woken when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use super::super::inbox::ArrivalFlag;
@@ -42,7 +42,6 @@ pub(super) struct Receiving {
     routes: Vec<SharedRoute>,
     /// Critical lanes first.
     lanes: Vec<ServedLane>,
-    turns: AtomicU64,
     pending_wake: PendingWake,
     /// The CPU on which the receiving thread ran last.
     cpu: AtomicU32,
@@ -63,7 +62,6 @@ impl Receiving {
         Self {
             routes: inputs.into_iter().enumerate().map(shared).collect(),
             lanes,
-            turns: AtomicU64::new(0),
             pending_wake: PendingWake::new(),
             cpu: AtomicU32::new(0),
         }
@@ -113,7 +111,6 @@ impl Receiving {
             }
         }
         self.pending_wake.count_turn();
-        self.turns.fetch_add(1, Ordering::Release);
         more
     }
 
@@ -126,11 +123,6 @@ impl Receiving {
             }
         }
         more
-    }
-
-    /// The number of turns that the receiving thread has completed.
-    pub fn turns(&self) -> u64 {
-        self.turns.load(Ordering::Acquire)
     }
 
     /// Locks each input in turn and calls `work` with it. Returns whether the caller has to ring the

@@ -359,6 +359,7 @@ pub(super) mod tests {
             reason: ModeReason::Default,
             ends_at: None,
             health,
+            is_used: true,
         };
         let output = |lane, topic| OutputReading {
             lane,

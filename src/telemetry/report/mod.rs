@@ -270,6 +270,7 @@ impl Snapshot {
                 .lanes
                 .iter()
                 .enumerate()
+                .filter(|(_, lane)| lane.is_used)
                 .map(|(number, lane)| self.lane_report(number, lane))
                 .collect(),
             routes: self
