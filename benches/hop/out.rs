@@ -114,6 +114,7 @@ impl Output {
         if options.save {
             let saved = manifest.join("benches").join("runs").join(&self.summary.date);
             write_to(&saved, &self.summary, &raw, &self.files)?;
+            compress(&saved.join("raw.csv"));
             println!("saved in {}", saved.display());
         }
         Ok(folder)
@@ -122,7 +123,7 @@ impl Output {
 
 fn write_to(folder: &Path, summary: &Summary, raw: &[u8], files: &[(String, String)]) -> Result<(), String> {
     fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-    let json = serde_json::to_string_pretty(summary).map_err(|error| error.to_string())?;
+    let json = serde_json::to_string(summary).map_err(|error| error.to_string())?;
     write(&folder.join("summary.json"), (json + "\n").as_bytes())?;
     write(&folder.join("raw.csv"), raw)?;
     write(&folder.join("README.md"), readme(summary).as_bytes())?;
@@ -130,6 +131,14 @@ fn write_to(folder: &Path, summary: &Summary, raw: &[u8], files: &[(String, Stri
         write(&folder.join(name), text.as_bytes())?;
     }
     Ok(())
+}
+
+/// Replaces a file by a compressed one, with the `xz` command; without the command the file stays as it is.
+fn compress(path: &Path) {
+    let status = Command::new("xz").args(["-9e", "--force"]).arg(path).status();
+    if !status.is_ok_and(|status| status.success()) {
+        eprintln!("not compressed, as xz failed: {}", path.display());
+    }
 }
 
 /// Adds a row to a file that is kept in memory, which does not fail.
