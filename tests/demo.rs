@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, geteuid};
+use roxmltree::Document;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -163,12 +164,43 @@ fn assert_shows_what_the_bridge_is_for(stdout: &str) {
 
 #[test]
 fn the_demo_shows_what_the_bridge_is_for_and_leaves_nothing_behind() {
-    let mut demo = Demo::start(&["--seconds", "8", "--json"]);
+    let folder = tempfile::tempdir().unwrap();
+    let picture = folder.path().join("demo.svg");
+    let mut demo = Demo::start(&["--seconds", "8", "--json", "--svg", picture.to_str().unwrap()]);
     let (code, stdout, stderr) = demo.end();
     assert_eq!(code, Some(0), "{stderr}");
     assert_shows_what_the_bridge_is_for(&stdout);
     assert_eq!(stderr, "");
     demo.assert_nothing_is_left();
+    assert_is_a_picture_of(&stdout, &fs::read_to_string(picture).unwrap());
+}
+
+/// Checks that the picture has the figures of the result, and a curve for each phase.
+fn assert_is_a_picture_of(result: &str, svg: &str) {
+    let result: Value = serde_json::from_str(result).unwrap();
+    let document = Document::parse(svg).unwrap_or_else(|error| panic!("{error}: {svg}"));
+    let nodes = |name: &'static str| document.descendants().filter(move |node| node.has_tag_name(name));
+    let texts: Vec<&str> = nodes("text").filter_map(|node| node.text()).collect();
+    let [without, with] = ["without_bridge", "with_bridge"].map(|phase| &result[phase]["critical"]);
+    let title = format!(
+        "Critical subscriber: {} of 240 scans missed, {} with the bridge",
+        without["lost"], with["lost"]
+    );
+    assert!(texts.contains(&title.as_str()), "{title}: {texts:?}");
+    let curves: Vec<_> = nodes("polyline").collect();
+    assert_eq!(curves.len(), 2);
+    for (critical, curve) in [without, with].into_iter().zip(curves) {
+        let silence_s = critical["silence_max_ms"].as_f64().unwrap() / 1e3;
+        let figures = format!("{} of 240 scans, longest silence {silence_s:.2} s", critical["received"]);
+        assert!(texts.contains(&figures.as_str()), "{figures}: {texts:?}");
+        // Two points for each half second.
+        let points: Vec<f64> =
+            curve.attribute("points").unwrap().split([' ', ',']).map(|at| at.parse().unwrap()).collect();
+        assert_eq!(points.len(), 2 * 2 * 16);
+        assert!(points.iter().all(|at| (0.0..=800.0).contains(at)), "{points:?}");
+    }
+    assert_eq!(nodes("rect").filter(|node| node.attribute("class") == Some("stall")).count(), 2);
+    assert!(svg.contains("prefers-color-scheme:dark"));
 }
 
 /// A small container: another user than root, no network but loopback, 64 MB of shared memory.

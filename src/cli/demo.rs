@@ -10,6 +10,7 @@ mod children;
 mod outcome;
 mod peers;
 mod phase;
+mod picture;
 mod report;
 mod sandbox;
 mod scan;
@@ -18,6 +19,7 @@ mod tally;
 
 use std::fmt;
 use std::io;
+use std::path::PathBuf;
 use std::process::{ExitCode, ExitStatus};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -61,6 +63,9 @@ pub(super) struct Arguments {
     /// Print only the result, as JSON
     #[arg(long)]
     json: bool,
+    /// Write a picture of the result to this file, as SVG
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
 }
 
 /// The instant at which a scan is due.
@@ -153,11 +158,10 @@ impl Interrupt {
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
     let mut screen = Screen::new(arguments.json);
     match show(arguments, &mut screen) {
-        Ok(outcome) if arguments.json => print_json(&outcome),
-        Ok(outcome) => {
-            screen.print(&outcome.text());
-            ExitCode::SUCCESS
-        }
+        Ok(outcome) => match print(&outcome, arguments, &mut screen) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => super::failed(&error),
+        },
         Err(DemoError::Interrupted) => {
             screen.print("\nStopped. All processes and files of the demo are removed.");
             ExitCode::SUCCESS
@@ -208,15 +212,24 @@ fn introduction(seconds: u64, domain: u16) -> String {
     format!("{}\n\n{}", wrapped(&scenario), wrapped(&publisher))
 }
 
-fn print_json(outcome: &Outcome) -> ExitCode {
-    use io::Write;
-    let printed = serde_json::to_string_pretty(outcome)
-        .map_err(io::Error::from)
-        .and_then(|json| writeln!(io::stdout().lock(), "{json}"));
-    match printed {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => super::failed(&error),
+/// Prints the result, and writes its picture if there is a file for it.
+fn print(outcome: &Outcome, arguments: &Arguments, screen: &mut Screen) -> Result<(), String> {
+    if arguments.json {
+        print_json(outcome).map_err(|error| error.to_string())?;
+    } else {
+        screen.print(&outcome.text());
     }
+    match &arguments.svg {
+        None => Ok(()),
+        Some(path) => std::fs::write(path, picture::picture(outcome))
+            .map_err(|error| format!("{}: {error}", path.display())),
+    }
+}
+
+fn print_json(outcome: &Outcome) -> io::Result<()> {
+    use io::Write;
+    let json = serde_json::to_string_pretty(outcome)?;
+    writeln!(io::stdout().lock(), "{json}")
 }
 
 #[cfg(test)]

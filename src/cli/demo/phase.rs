@@ -1,5 +1,6 @@
 //! One phase of a demo: starts its processes, periodically stops the remote subscriber, and measures.
 
+use std::ops::Range;
 use std::time::Duration;
 
 use super::children::{Children, Role};
@@ -46,6 +47,7 @@ pub(super) fn run(
         interrupt,
         stalls: Stalls::default(),
         stalled_since: None,
+        stalled: Vec::new(),
     };
     phase.start(sandbox, setup)?;
     let window = phase.wait_until_ready(seconds)?;
@@ -56,6 +58,7 @@ pub(super) fn run(
     };
     phase.measure(setup, &window, screen)?;
     let mut figures = phase.tally.figures(&window, phase.stalls, window.end());
+    figures.timeline = phase.tally.timeline(&window, &phase.stalled);
     figures.drops = drops.as_ref().map(DropMeter::end);
     Ok(figures)
 }
@@ -66,6 +69,8 @@ struct Phase<'a> {
     interrupt: &'a Interrupt,
     stalls: Stalls,
     stalled_since: Option<MonotonicNs>,
+    /// The stalls that have ended.
+    stalled: Vec<Range<MonotonicNs>>,
 }
 
 impl Phase<'_> {
@@ -172,7 +177,7 @@ impl Phase<'_> {
             self.stalled_since = Some(now);
         } else {
             self.stalls = self.stalls_until(now);
-            self.stalled_since = None;
+            self.stalled.extend(self.stalled_since.take().map(|since| since..now));
         }
     }
 

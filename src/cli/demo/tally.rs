@@ -6,6 +6,7 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::children::Role;
+use super::picture::{BIN_MS, Timeline};
 use super::report::Report;
 use super::{RATE_HZ, due_at};
 use crate::model::{DropCounts, MonotonicNs};
@@ -77,6 +78,20 @@ impl Tally {
         arrivals.range(window.numbers.clone()).filter(|(_, one)| interval.contains(&one.arrived_at)).count()
     }
 
+    /// What the picture shows of a window in which the remote subscriber was stalled at these times.
+    pub fn timeline(&self, window: &Window, stalls: &[Range<MonotonicNs>]) -> Timeline {
+        let since_start_s = |instant: MonotonicNs| instant.since(window.start()) as f64 / 1e9;
+        let bins = window.end().since(window.start()) / (BIN_MS * 1_000_000);
+        let arrived = |bin| {
+            let from = window.start().plus_ms(bin * BIN_MS);
+            self.arrived_in(Role::Critical, window, from..from.plus_ms(BIN_MS))
+        };
+        Timeline {
+            critical: (0..bins).map(arrived).collect(),
+            stalls_s: stalls.iter().map(|one| since_start_s(one.start)..since_start_s(one.end)).collect(),
+        }
+    }
+
     /// The time since the last arrival at the critical subscriber.
     pub fn silent_ns(&self, window: &Window, now: MonotonicNs) -> u64 {
         let last = self.critical.range(window.numbers.clone()).next_back();
@@ -129,6 +144,7 @@ impl Tally {
                 stalled_s: stalls.ns as f64 / 1e9,
             },
             drops: None,
+            timeline: Timeline::default(),
         }
     }
 }
@@ -176,6 +192,9 @@ pub(super) struct Figures {
     pub remote: RemoteFigures,
     /// The samples that the bridge dropped, by process and drop reason; `None` without a bridge.
     pub drops: Option<BridgeDrops>,
+    /// The phase over time, for the picture.
+    #[serde(skip)]
+    pub timeline: Timeline,
 }
 
 /// The figures of the publisher: `due = written + timed_out + skipped`.
