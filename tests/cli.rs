@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use adaptive_bridge::config::DdsNetwork;
+use adaptive_bridge::config::{self, DdsNetwork};
 use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, WriterEvent};
 use adaptive_bridge::model::{
     DropReason, Durability, Encapsulation, ProbeRefusal, QosProfile, Reliability, SourceTimestamp,
@@ -627,6 +627,52 @@ fn check_prints_json_of_good_and_of_bad_configurations() {
     let problem = &bad["problems"][0];
     assert_eq!(problem["key"], "topics[0].max_sample_bytes");
     assert_eq!((&problem["line"], &problem["value"]), (&Value::from(2), &Value::from("0")));
+}
+
+#[test]
+fn check_explains_a_key_from_its_declaration() {
+    let explain = |key: &str| {
+        let output = run(&["check", "--explain", key]);
+        (output.status.code(), text(&output.stdout), text(&output.stderr))
+    };
+    let (code, explained, _) = explain("safety.silent_ms");
+    assert_eq!(code, Some(0));
+    let row = config::rows().find(|row| row.paths == ["safety.silent_ms"]).unwrap();
+    for part in ["safety.silent_ms\n", row.documentation, row.default, &row.range(), "reload:  applies"] {
+        assert!(explained.contains(part), "{part}: {explained}");
+    }
+    // The user's own names, items of a list, and what a shell completes.
+    for key in ["lanes.rviz.queue_depth", "lanes.<lane>.queue_depth", "lanes.LANE.queue_depth"] {
+        let (code, explained, _) = explain(key);
+        assert!(code == Some(0) && explained.starts_with("lanes.<lane>.queue_depth\n"), "{explained}");
+    }
+    for key in ["topics[0].input_topic", "topics.input_topic"] {
+        assert!(explain(key).1.starts_with("topics[].input_topic\n"), "{key}");
+    }
+    // All keys, as they are declared and as a shell completes them.
+    let script = text(&run(&["completions", "bash"]).stdout);
+    let offered: BTreeSet<&str> = script.split([' ', '"', '\n']).collect();
+    for key in config::KEYS.iter() {
+        assert!(config::keys_at(key).iter().any(|(found, _)| found == key), "{key}");
+        let names = key.replace("[]", "").replace(['<', '>'], " ");
+        let plain = names.split(' ').enumerate().map(|(index, name)| match index % 2 {
+            0 => name.to_owned(),
+            _ => name.to_uppercase(),
+        });
+        let plain: String = plain.collect();
+        assert!(offered.contains(plain.as_str()), "bash does not complete {plain}");
+    }
+    let (code, section, _) = explain("safety");
+    let declared = config::KEYS.iter().filter(|key| key.starts_with("safety.")).count();
+    assert_eq!((code, section.matches("reload:").count()), (Some(0), declared));
+
+    let (code, _, error) = explain("safety.silnt_ms");
+    assert!(code == Some(2) && error.contains("did you mean `safety.silent_ms`?"), "{error}");
+    for key in ["", "safety..silent_ms", "safety.silent_ms.more", "nonsense"] {
+        let (code, explained, error) = explain(key);
+        assert!(code == Some(2) && explained.is_empty() && !error.is_empty(), "{key}");
+    }
+    assert_eq!(run(&["check", "--explain", "safety", "--json"]).status.code(), Some(2));
 }
 
 /// The subcommands that the help lists.

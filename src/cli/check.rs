@@ -1,15 +1,18 @@
-//! `check`: checks a configuration file and shows the shared memory that it needs.
+//! `check`: checks a configuration file and shows the shared memory that it needs; explains a key.
 
+use std::ffi::OsStr;
 use std::fmt::{self, Write as _};
 use std::io::{self, Write as _};
 use std::process::ExitCode;
+use std::sync::LazyLock;
 
-use clap::Args;
+use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
+use clap::{Arg, Args, Command};
 use serde::Serialize;
 use serde_json::json;
 
-use super::{ConfigArguments, EXIT_CONFIG, output_ended};
-use crate::config::{ConfigError, Place, Settings};
+use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, output_ended};
+use crate::config::{self, ConfigError, Place, Row, Settings};
 use crate::process::InForce;
 use crate::shm::RouteChannel;
 
@@ -19,11 +22,20 @@ pub(super) struct Arguments {
     /// Print JSON, for the problems of a bad file too
     #[arg(long)]
     json: bool,
+    /// Print what a key means, its range and default, and whether a reload applies it, such as
+    /// `safety.silent_ms` or `lanes.rviz.queue_depth`; a section, such as `safety`, prints all its keys.
+    /// Reads no file
+    #[arg(long, value_name = "KEY", value_parser = KeyParser, hide_possible_values = true)]
+    #[arg(conflicts_with_all = ["json", "config"])]
+    explain: Option<String>,
     #[command(flatten)]
     config: ConfigArguments,
 }
 
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
+    if let Some(path) = &arguments.explain {
+        return explain(path);
+    }
     let (text, code) = if arguments.json {
         match arguments.config.try_load() {
             Ok(settings) => (json!(Summary::of(&settings)).to_string() + "\n", ExitCode::SUCCESS),
@@ -46,6 +58,65 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(()) => code,
         Err(error) => output_ended(&error),
     }
+}
+
+/// Reads the path of a key, and offers all paths to the completions of a shell.
+#[derive(Clone)]
+struct KeyParser;
+
+impl TypedValueParser for KeyParser {
+    type Value = String;
+
+    fn parse_ref(
+        &self,
+        command: &Command,
+        argument: Option<&Arg>,
+        value: &OsStr,
+    ) -> Result<String, clap::Error> {
+        // `explain` checks the path, because it need not be one of those that are offered.
+        StringValueParser::new().parse_ref(command, argument, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(OFFERED_PATHS.iter().map(|path| PossibleValue::new(path.as_str()))))
+    }
+}
+
+/// The paths of all keys without characters that a shell interprets: `lanes.LANE.queue_depth`, `topics.id`.
+static OFFERED_PATHS: LazyLock<Vec<String>> = LazyLock::new(|| {
+    let offered = |name: &str| {
+        let name = name.trim_end_matches("[]");
+        let chosen = name.strip_prefix('<').and_then(|name| name.strip_suffix('>'));
+        chosen.map_or_else(|| name.to_owned(), str::to_uppercase)
+    };
+    let path = |path: &&str| path.split('.').map(offered).collect::<Vec<_>>().join(".");
+    config::KEYS.iter().map(path).collect()
+});
+
+/// Prints the declaration of a key, or of all keys of a section.
+fn explain(path: &str) -> ExitCode {
+    let keys = config::keys_at(path);
+    if keys.is_empty() {
+        let hint = config::nearest_key(path).map(|key| format!("; did you mean `{key}`?"));
+        failed(&format!("{path} is no key of the configuration{}", hint.unwrap_or_default()));
+        return ExitCode::from(EXIT_USAGE);
+    }
+    let explained: Vec<String> = keys.iter().map(|(path, row)| explained(path, row)).collect();
+    match io::stdout().write_all(explained.join("\n").as_bytes()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => output_ended(&error),
+    }
+}
+
+fn explained(path: &str, row: &Row) -> String {
+    let reload =
+        if row.reloads { "applies a change" } else { "a change waits for a restart of the whole bridge" };
+    format!(
+        "{path}\n  {}\n  allowed: {}\n  default: {}\n  reload:  {reload}\n",
+        row.documentation,
+        row.range(),
+        row.default
+    )
 }
 
 /// The lanes, routes and shared memory of a good configuration.

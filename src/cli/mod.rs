@@ -33,6 +33,9 @@ use crate::telemetry::{self, Snapshot};
 /// Exit code of `reload` when some changes of the file wait for a restart of the whole bridge.
 const EXIT_WAITS: u8 = 5;
 
+/// Exit code for a wrong command line, as of clap.
+const EXIT_USAGE: u8 = 2;
+
 /// Exit code of `egress` for a lane on which no route has an output. The service units do not restart it.
 const EXIT_UNUSED: u8 = 3;
 
@@ -50,7 +53,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Check a configuration file: list all its problems, or the shared memory that it needs
+    /// Check a configuration file: list all its problems, or the shared memory that it needs; explain a key
     Check(check::Arguments),
     /// Run ingress: receive each input topic once from DDS and publish it in shared memory
     Ingress(ConfigArguments),

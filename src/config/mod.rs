@@ -23,7 +23,7 @@ mod tests;
 mod yaml;
 
 pub use in_force::{Configuration, DecodeError, InlineSecret};
-pub use keys::{KEYS, Kind, Row, rows};
+pub use keys::{KEYS, Kind, Row, keys_at, nearest_key, rows};
 pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, parse};
 pub use problem::{ConfigError, Place, Problem};
 pub use reload::{Change, Reload};

@@ -145,7 +145,7 @@ pub(super) fn shown(text: &str) -> String {
 }
 
 /// The most similar name: at most a third of the letters of `word` differ, ignoring case.
-fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
+pub(super) fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
     if word.len() > MAX_COMPARED_BYTES {
         return None;
     }

@@ -10,7 +10,7 @@ use std::sync::LazyLock;
 
 pub use row::{Kind, Row};
 
-use super::problem::{Place, Problem, Problems, did_you_mean, shown};
+use super::problem::{Place, Problem, Problems, did_you_mean, nearest, shown};
 use super::yaml::{Content, Entry, Node};
 
 /// The rows of all keys, in the order of `config/README.md`.
@@ -22,6 +22,31 @@ pub fn rows() -> impl Iterator<Item = &'static Row> {
 /// chooses.
 pub static KEYS: LazyLock<Vec<&str>> =
     LazyLock::new(|| rows().flat_map(|row| row.paths.iter().copied()).collect());
+
+/// The keys at and below a path, each with its row; empty for an unknown path. The path may have items of
+/// lists and names that the user chose, such as `topics[0].id` and `lanes.rviz.queue_depth`.
+pub fn keys_at(path: &str) -> Vec<(String, &'static Row)> {
+    let mut key = Key::root();
+    let mut found_path = String::new();
+    for name in path.split('.') {
+        let name = name.split('[').next().unwrap_or_default();
+        let Some((known, below)) = key.entry(name).filter(|_| !name.is_empty()) else { return Vec::new() };
+        found_path = joined(&found_path, known);
+        key = below;
+        if let Some(item) = key.item() {
+            found_path.push_str("[]");
+            key = item;
+        }
+    }
+    let mut found = Vec::new();
+    key.list(found_path, &mut found);
+    found
+}
+
+/// The known path that is most similar to an unknown one.
+pub fn nearest_key(path: &str) -> Option<&'static str> {
+    nearest(path, &KEYS)
+}
 
 static TREE: LazyLock<Key> = LazyLock::new(|| {
     let mut root = Key::default();
@@ -57,9 +82,24 @@ impl Key {
 
     /// The key of this name below this one: one of that name, else one that stands for names of the user.
     pub fn get(&self, name: &str) -> Option<&Self> {
+        self.entry(name).map(|(_, key)| key)
+    }
+
+    /// As `get`, with the name as declared.
+    fn entry(&self, name: &str) -> Option<&(&'static str, Self)> {
         let named = |own: &&(&str, Self)| own.0 == name;
         let placeholder = |own: &&(&str, Self)| own.0.starts_with('<');
-        self.below.iter().find(named).or_else(|| self.below.iter().find(placeholder)).map(|(_, key)| key)
+        self.below.iter().find(named).or_else(|| self.below.iter().find(placeholder))
+    }
+
+    /// Adds this key and all below it to `found`.
+    fn list(&self, path: String, found: &mut Vec<(String, &'static Row)>) {
+        for (name, key) in &self.below {
+            let below = if *name == "[]" { format!("{path}[]") } else { joined(&path, name) };
+            key.list(below, found);
+        }
+        // A section that may also be a value comes after its keys.
+        found.extend(self.row.map(|row| (path, row)));
     }
 
     /// The items of a list.
