@@ -138,6 +138,43 @@ fn every_file_and_function_that_the_guides_name_is_there() {
     assert!(named > 10, "{named} functions are named");
 }
 
+/// The tests that a text names in back quotes after the file that has them.
+fn tests_by_file(text: &str) -> Vec<(&str, &str)> {
+    let mut file = "";
+    let mut tests = Vec::new();
+    for word in text.split('`').skip(1).step_by(2) {
+        if word.ends_with(".rs") {
+            file = word;
+        } else if word.matches('_').count() > 1 && word.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+        {
+            tests.push((file, word));
+        }
+    }
+    tests
+}
+
+#[test]
+fn every_file_and_test_that_the_page_of_rustdds_names_is_there() {
+    let page = std::fs::read_to_string(root().join("docs/rustdds-changes.md")).unwrap();
+    let read = |file: &str| {
+        let path = match file.strip_prefix("rustdds/") {
+            Some(inside) => root().join("third_party/rustdds/src").join(inside),
+            None => root().join(file),
+        };
+        std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+    };
+    for line in page.lines() {
+        files_and_functions(line).0.iter().filter(|file| file.ends_with(".rs")).for_each(|file| {
+            read(file);
+        });
+    }
+    let tests = tests_by_file(&page);
+    assert!(tests.len() > 30, "{} tests", tests.len());
+    for (file, test) in tests {
+        assert!(read(file).contains(&format!("fn {test}(")), "no test {test} in {file}");
+    }
+}
+
 #[test]
 fn every_decision_record_has_a_number_of_its_own() {
     let records: Vec<String> = files("docs/decisions", "md").into_iter().map(|page| page.path).collect();
