@@ -28,8 +28,8 @@ pub mod config;
 pub mod dds;
 #[cfg(feature = "eval")]
 pub mod eval;
-pub mod model;
-pub mod policy;
 pub mod process;
 pub mod shm;
 pub mod telemetry;
+
+pub use adaptive_bridge_policy::{model, policy};

@@ -1,6 +1,6 @@
 //! The class and mode of a lane, the state of a subscriber and the safety mode of the bridge.
 
-use std::fmt;
+use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -59,6 +59,7 @@ impl LaneMode {
     }
 
     /// The mode with that number in shared memory; `None` for an undefined number.
+    #[inline]
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Normal),
@@ -102,6 +103,7 @@ impl SubscriberState {
 
 impl SubscriberState {
     /// The state with that number in shared memory; `None` for an undefined number.
+    #[inline]
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Unknown),
@@ -144,6 +146,7 @@ impl SafetyMode {
 
 impl SafetyMode {
     /// The mode with that number in shared memory; `None` for an undefined number.
+    #[inline]
     pub const fn from_u8(value: u8) -> Option<Self> {
         match value {
             0 => Some(Self::Normal),

@@ -1,6 +1,6 @@
 //! Valid ids in probe messages, and the reasons for which a probe message is refused.
 
-use std::fmt;
+use core::fmt;
 
 /// The longest id of a sender, a responder or a probe, in bytes.
 pub const MAX_ID_BYTES: usize = 127;

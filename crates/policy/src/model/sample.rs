@@ -1,6 +1,6 @@
 //! The header that ingress passes to the lanes with each serialized sample.
 
-use std::fmt;
+use core::fmt;
 
 use super::time::{MonotonicNs, SourceTimestamp};
 
@@ -16,11 +16,13 @@ impl Encapsulation {
     pub const CDR_LE: Self = Self([0, 1, 0, 0]);
 
     /// The representation identifier.
+    #[inline]
     pub const fn representation(self) -> [u8; 2] {
         [self.0[0], self.0[1]]
     }
 
     /// The representation options.
+    #[inline]
     pub const fn options(self) -> [u8; 2] {
         [self.0[2], self.0[3]]
     }
@@ -33,6 +35,7 @@ pub struct Guid(pub [u8; 16]);
 
 impl Guid {
     /// The prefix, which all entities of a participant share.
+    #[inline]
     pub const fn prefix(self) -> [u8; 12] {
         let [a, b, c, d, e, f, g, h, i, j, k, l, ..] = self.0;
         [a, b, c, d, e, f, g, h, i, j, k, l]
@@ -74,6 +77,7 @@ pub struct SampleHeader {
 
 impl SampleHeader {
     /// The source timestamp if the sample's age is measured from it, otherwise [`SourceTimestamp::NONE`].
+    #[inline]
     pub const fn age_source(&self) -> SourceTimestamp {
         match self.age_basis.late_ns() {
             Some(_) => SourceTimestamp::NONE,
@@ -82,6 +86,7 @@ impl SampleHeader {
     }
 
     /// The instant from which the sample's age is measured when it is not measured from a source timestamp.
+    #[inline]
     pub const fn age_from(&self) -> MonotonicNs {
         match self.age_basis.late_ns() {
             Some(late_ns) => MonotonicNs(self.taken_at.0.saturating_sub(late_ns)),
@@ -101,12 +106,14 @@ impl AgeBasis {
     pub const SOURCE: Self = Self(0);
 
     /// From `late_ns` before the arrival; at most 71 minutes.
+    #[inline]
     pub const fn arrival(late_ns: u64) -> Self {
         let late_us = late_ns / 1_000;
         Self(if late_us >= u32::MAX as u64 { u32::MAX } else { late_us as u32 + 1 })
     }
 
     /// The age of the sample on its arrival; `None` when its age is measured from the source timestamp.
+    #[inline]
     pub const fn late_ns(self) -> Option<u64> {
         match self.0 {
             0 => None,
@@ -115,11 +122,13 @@ impl AgeBasis {
     }
 
     /// The encoding in shared memory.
+    #[inline]
     pub const fn bits(self) -> u32 {
         self.0
     }
 
     /// The basis with this encoding in shared memory.
+    #[inline]
     pub const fn from_bits(bits: u32) -> Self {
         Self(bits)
     }

@@ -1,6 +1,6 @@
 //! The queue of one route in a noncritical lane: which samples wait, and which are dropped.
 
-use std::collections::VecDeque;
+use alloc::collections::VecDeque;
 
 use super::staleness::{age_ns, is_stale};
 use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SourceTimestamp, WallNs};
@@ -21,6 +21,7 @@ pub struct SampleStamps {
 
 impl SampleStamps {
     /// The stamps of a sample with that header and a payload of `bytes`.
+    #[inline]
     pub const fn new(header: &SampleHeader, bytes: u64) -> Self {
         Self {
             sequence: header.sequence,

@@ -2,7 +2,7 @@
 
 /// An instant of `CLOCK_MONOTONIC`, in nanoseconds.
 ///
-/// Unlike [`std::time::Instant`] it can be stored in shared memory and written as a literal in a test. It is
+/// Unlike `std::time::Instant` it can be stored in shared memory and written as a literal in a test. It is
 /// comparable only between processes of one host since one boot.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(transparent)]
@@ -10,16 +10,19 @@ pub struct MonotonicNs(pub u64);
 
 impl MonotonicNs {
     /// Nanoseconds from `earlier` to `self`; 0 when `earlier` is the later one.
+    #[inline]
     pub const fn since(self, earlier: Self) -> u64 {
         self.0.saturating_sub(earlier.0)
     }
 
     /// The instant `ns` nanoseconds later.
+    #[inline]
     pub const fn plus_ns(self, ns: u64) -> Self {
         Self(self.0.saturating_add(ns))
     }
 
     /// The instant `ms` milliseconds later.
+    #[inline]
     pub const fn plus_ms(self, ms: u64) -> Self {
         self.plus_ns(ms.saturating_mul(1_000_000))
     }
@@ -32,6 +35,7 @@ pub struct WallNs(pub u64);
 
 impl WallNs {
     /// Nanoseconds from `earlier` to `self`; 0 when `earlier` is the later one.
+    #[inline]
     pub const fn since(self, earlier: Self) -> u64 {
         self.0.saturating_sub(earlier.0)
     }
@@ -50,6 +54,7 @@ impl SourceTimestamp {
     pub const NONE: Self = Self(0);
 
     /// The instant as nanoseconds since the Unix epoch, rounded down; `None` for [`Self::NONE`].
+    #[inline]
     pub const fn to_wall(self) -> Option<WallNs> {
         if self.0 == 0 {
             return None;
@@ -61,6 +66,7 @@ impl SourceTimestamp {
 
     /// The nearest timestamp that is not before `wall`, so that a round trip through
     /// [`to_wall`](Self::to_wall) gives `wall` back. Seconds beyond 2106 wrap, as `Time_t` does.
+    #[inline]
     pub const fn from_wall(wall: WallNs) -> Self {
         let seconds = (wall.0 / 1_000_000_000) & 0xffff_ffff;
         let nanos = wall.0 % 1_000_000_000;

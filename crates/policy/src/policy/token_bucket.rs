@@ -80,13 +80,14 @@ impl TokenBucket {
         self.settle(now);
         let rate_nhz = usable_rate(rate_hz) * 1e9;
         // A rate above 0 is never rounded to 0, at which no token accrues.
-        self.rate_nhz = if rate_nhz > 0.0 { rate_nhz.round().max(1.0) as u64 } else { 0 };
+        self.rate_nhz = if rate_nhz > 0.0 { libm::round(rate_nhz).max(1.0) as u64 } else { 0 };
         // `as` saturates, and converts NaN to 0.
         self.cap = ((burst * TOKEN as f64) as u128).max(TOKEN);
         self.credit = self.credit.min(self.cap);
     }
 
     /// The instant of the next token: `now` if the bucket has one, else later; `None` if the rate is 0.
+    #[inline]
     pub fn ready_at(&self, now: MonotonicNs) -> Option<MonotonicNs> {
         let missing = TOKEN.saturating_sub(self.credit);
         if missing == 0 {
@@ -106,6 +107,7 @@ impl TokenBucket {
     }
 
     /// Takes a token if the bucket has one, and returns whether it had.
+    #[inline]
     pub fn try_take(&mut self, now: MonotonicNs) -> bool {
         self.settle(now);
         match self.credit.checked_sub(TOKEN) {
@@ -172,6 +174,7 @@ impl ByteBudget {
     }
 
     /// The instant from which the balance is not negative: `now` or later; `None` in debt at rate 0.
+    #[inline]
     pub fn ready_at(&self, now: MonotonicNs) -> Option<MonotonicNs> {
         match self.bytes_per_s {
             None => Some(now),
@@ -186,6 +189,7 @@ impl ByteBudget {
     }
 
     /// Takes `bytes` if the balance is not negative, and returns whether it did.
+    #[inline]
     pub fn try_take(&mut self, bytes: u64, now: MonotonicNs) -> bool {
         if self.bytes_per_s.is_none() {
             return true;

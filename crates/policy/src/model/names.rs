@@ -1,6 +1,10 @@
 //! Names that are checked on construction: a value of these types is always valid.
 
-use std::fmt;
+use alloc::borrow::ToOwned;
+use alloc::format;
+use alloc::string::String;
+use alloc::vec::Vec;
+use core::fmt;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -19,7 +23,7 @@ impl fmt::Display for NameError {
     }
 }
 
-impl std::error::Error for NameError {}
+impl core::error::Error for NameError {}
 
 /// Serializes a type as its text, and checks the text when it deserializes it.
 macro_rules! text_in_serde {

@@ -55,6 +55,8 @@ pub enum DropPolicy {
 
 /// Serializes a rate as text: that of a critical lane is infinite, and JSON has no number for infinity.
 mod rate_as_text {
+    use alloc::string::String;
+
     use serde::de::Error;
     use serde::{Deserialize, Deserializer, Serializer};
 

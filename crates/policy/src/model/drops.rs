@@ -1,6 +1,6 @@
 //! Drop reasons: a closed list, so that every sample that ingress takes is accounted for.
 
-use std::fmt;
+use core::fmt;
 
 macro_rules! drop_reasons {
     ($($(#[doc = $doc:literal])+ $variant:ident = $label:literal,)+) => {
@@ -100,12 +100,14 @@ pub struct DropCounts([u64; DropReason::COUNT]);
 
 impl DropCounts {
     /// Counts `n` more drops for `reason`.
+    #[inline]
     pub fn add(&mut self, reason: DropReason, n: u64) {
         let count = &mut self.0[reason as usize];
         *count = count.saturating_add(n);
     }
 
     /// Drops for `reason`.
+    #[inline]
     pub const fn get(&self, reason: DropReason) -> u64 {
         self.0[reason as usize]
     }

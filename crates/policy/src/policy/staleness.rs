@@ -5,6 +5,7 @@ use crate::model::{MonotonicNs, SourceTimestamp, WallNs};
 /// The age of a sample in nanoseconds: since its source timestamp, or, without one, since ingress took it at
 /// `taken_at`. 0 when that instant is in the future, because a clock stepped back or the publisher's clock is
 /// ahead.
+#[inline]
 pub fn age_ns(
     source_timestamp: SourceTimestamp,
     taken_at: MonotonicNs,
@@ -18,6 +19,7 @@ pub fn age_ns(
 }
 
 /// Whether a sample of that age is older than `threshold_ms`; a threshold of 0 is never exceeded.
+#[inline]
 pub const fn is_stale(age_ns: u64, threshold_ms: u64) -> bool {
     threshold_ms != 0 && age_ns > threshold_ms.saturating_mul(1_000_000)
 }

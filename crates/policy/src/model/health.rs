@@ -59,12 +59,14 @@ impl PublisherAccount {
     }
 
     /// Whether no publisher has this account.
+    #[inline]
     pub fn is_vacant(&self) -> bool {
         self.writer == Guid::default()
     }
 
     /// Counts a sample whose sequence number is above the high-water mark, and returns the number of sequence
     /// numbers skipped before it.
+    #[inline]
     pub fn take(&mut self, sequence: i64, now: MonotonicNs) -> u64 {
         let skipped = sequence.saturating_sub(self.last_sequence).saturating_sub(1).max(0).unsigned_abs();
         self.last_sequence = sequence;
@@ -261,11 +263,13 @@ pub struct LanePolicy {
 
 impl LanePolicy {
     /// Whether an override by hand is in force.
+    #[inline]
     pub const fn is_overridden(&self, now: MonotonicNs) -> bool {
         self.by_hand != 0 && (self.expires_at.0 == 0 || now.0 < self.expires_at.0)
     }
 
     /// Whether control has written or confirmed its part within `policy_hold_ms`.
+    #[inline]
     pub const fn is_confirmed(&self, now: MonotonicNs, policy_hold_ms: u64) -> bool {
         self.written_at.0 != 0 && now.since(self.written_at) <= policy_hold_ms.saturating_mul(1_000_000)
     }
@@ -294,7 +298,7 @@ impl FixedText {
     /// The text; empty when the bytes are not UTF-8, which happens only if a foreign program wrote them.
     pub fn as_str(&self) -> &str {
         let length = usize::from(self.length).min(self.bytes.len());
-        std::str::from_utf8(&self.bytes[..length]).unwrap_or("")
+        core::str::from_utf8(&self.bytes[..length]).unwrap_or("")
     }
 }
 
@@ -337,6 +341,7 @@ impl Default for LatencyHistogram {
 
 impl LatencyHistogram {
     /// Counts one latency; one outside the range counts in the first or last bucket.
+    #[inline]
     pub fn record(&mut self, latency_ns: u64) {
         self.counts[Self::bucket(latency_ns)] += 1;
         self.max_ns = self.max_ns.max(latency_ns);
@@ -355,7 +360,7 @@ impl LatencyHistogram {
         if total == 0 {
             return None;
         }
-        let rank = ((quantile.clamp(0.0, 1.0) * total as f64).ceil() as u64).max(1);
+        let rank = (libm::ceil(quantile.clamp(0.0, 1.0) * total as f64) as u64).max(1);
         let mut seen = 0;
         for (bucket, count) in self.counts.iter().enumerate() {
             seen = u64::saturating_add(seen, *count);

@@ -1,7 +1,8 @@
 //! Measures the link to one subscriber with probes (paper, section III-C), over a sliding window of the
 //! newest probes that were answered or lost.
 
-use std::collections::VecDeque;
+use alloc::collections::VecDeque;
+use alloc::vec::Vec;
 
 use crate::model::MonotonicNs;
 

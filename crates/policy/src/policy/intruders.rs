@@ -3,10 +3,13 @@
 //! The bridge cannot prevent a laptop from subscribing to an input topic or to a topic of the critical lane.
 //! The link of that laptop can then slow down what the bridge protects. The bridge can warn of it.
 
-// Addresses only: `core::net` has no sockets.
+use alloc::borrow::ToOwned;
+use alloc::collections::VecDeque;
+use alloc::format;
+use alloc::string::String;
+use alloc::vec::Vec;
+use core::fmt;
 use core::net::IpAddr;
-use std::collections::VecDeque;
-use std::fmt;
 
 use super::locality::{Locality, Location};
 use crate::model::{Guid, MonotonicNs, TopicName};

@@ -1,8 +1,11 @@
 //! Detects network interfaces and peers on other hosts that are away, and records when they come back.
 
-// Addresses only: `core::net` has no sockets.
+use alloc::borrow::ToOwned;
+use alloc::collections::VecDeque;
+use alloc::format;
+use alloc::string::{String, ToString};
+use alloc::vec::Vec;
 use core::net::{IpAddr, Ipv4Addr};
-use std::collections::VecDeque;
 
 use crate::model::{AbsenceKind, Guid, MonotonicNs};
 

@@ -1,6 +1,6 @@
 //! Decides whether a DDS endpoint is on this host.
 
-// Addresses only: `core::net` has no sockets.
+use alloc::vec::Vec;
 use core::net::IpAddr;
 
 /// The addresses of an endpoint's participant.

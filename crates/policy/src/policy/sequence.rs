@@ -40,17 +40,20 @@ impl SequenceTracker {
     }
 
     /// The number before the first one accounted for.
+    #[inline]
     pub const fn first(&self) -> u64 {
         self.first
     }
 
     /// The highest number accounted for.
+    #[inline]
     pub const fn last(&self) -> u64 {
         self.last
     }
 
     /// Accounts for `sequence` and the numbers missing before it. 0, which ingress never assigns, counts as a
     /// duplicate.
+    #[inline]
     pub const fn record(&mut self, sequence: u64) -> SequenceOutcome {
         if sequence <= self.last || sequence == 0 {
             return SequenceOutcome::Duplicate;

@@ -1,6 +1,7 @@
 //! Protection of the probe protocol: each signed message is accepted once, and each sender has a rate limit.
 
-use std::collections::VecDeque;
+use alloc::collections::VecDeque;
+use alloc::vec::Vec;
 
 use super::token_bucket::{TokenBucket, burst_for};
 use crate::model::{MonotonicNs, WallNs};

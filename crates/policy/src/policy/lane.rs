@@ -185,6 +185,7 @@ impl PollOrder {
 
 /// The reason for which a critical lane drops a sample in `mode`; `None` to forward it. Only the stopped mode
 /// drops: the degraded and suspended modes limit noncritical lanes in favour of critical ones.
+#[inline]
 pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
     match mode {
         LaneMode::Normal | LaneMode::Degraded | LaneMode::Suspended => None,
@@ -201,6 +202,7 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
 /// - in each case at least the safety floor, while control confirms it.
 ///
 /// A stop by control therefore ends when control dies, and an override cannot lift an emergency.
+#[inline]
 pub const fn effective_mode(
     policy: &LanePolicy,
     class: TrafficClass,
