@@ -6,15 +6,11 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-#[allow(dead_code, unused_imports, reason = "the bench uses the rest")]
-#[path = "../benches/hop/report/mod.rs"]
-mod report;
-
-use report::statistics::{growth, median, median_interval, quantile};
-use report::{
+use adaptive_bridge_measure::hop::{
     Attempt, Call, Isolation, Latency, Loss, Lossy, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
     Throughput, figures, fill, readme, runs_named, soak_failures,
 };
+use adaptive_bridge_measure::statistics::{growth, median, median_interval, quantile};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 
 use adaptive_bridge::model::LatencyHistogram;
-
-use super::report::Quantiles;
+use adaptive_bridge_measure::hop::Quantiles;
 
 /// The sum of one or more histograms: the count of each bucket by its upper bound in nanoseconds.
 #[derive(Clone, Debug, Default)]

@@ -12,13 +12,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use adaptive_bridge_measure::hop::{Isolation, Quantiles};
 use nix::sys::signal::Signal;
 
 use super::beds::{Bed, Beds, Plan, Process, Program, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
-use super::report::{Isolation, Quantiles};
 use super::scale::latencies_us;
 use super::system::Scheduling;
 

@@ -3,12 +3,13 @@
 
 use std::collections::BTreeMap;
 
+use adaptive_bridge_measure::hop::{Latency, Loss, Quantiles, targets};
+use adaptive_bridge_measure::statistics::median;
+
 use super::beds::{Beds, Kind, Run, add_up};
 use super::histogram::Buckets;
 use super::options::{Case, Options, SCAN, SWEEP_ROUTES};
 use super::out::{Output, RowKey};
-use super::report::statistics::median;
-use super::report::{Latency, Loss, Quantiles, targets};
 use super::system::Scheduling;
 use super::throughput;
 use super::wakeup;

@@ -21,7 +21,6 @@ mod latency;
 mod link;
 mod options;
 mod out;
-mod report;
 mod resources;
 mod scale;
 mod soak;
@@ -34,10 +33,10 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use adaptive_bridge::telemetry::CpuTime;
+use adaptive_bridge_measure::hop::{self, Summary};
 use clap::Parser;
 use options::Options;
 use out::Output;
-use report::Summary;
 use system::Scheduling;
 
 fn main() -> ExitCode {
@@ -101,7 +100,7 @@ fn measure(options: &Options) -> Result<(), String> {
     let line =
         format!("steal: the hypervisor gave {stolen_percent:.0} % of the CPUs' time to other machines");
     output.summary.parameters.push(line);
-    let failures = report::soak_failures(&output.summary);
+    let failures = hop::soak_failures(&output.summary);
     let folder = output.finish(&options)?;
     println!("raw data: {}", folder.display());
     if failures.is_empty() { Ok(()) } else { Err(failures.join("; ")) }
@@ -118,7 +117,7 @@ fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
     let saved = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/runs");
     let mut runs = runs.to_vec();
     if runs.is_empty() {
-        runs.extend(report::runs_named(&text).iter().map(|name| saved.join(name)));
+        runs.extend(hop::runs_named(&text).iter().map(|name| saved.join(name)));
     }
     let mut summaries = Vec::new();
     for run in &runs {
@@ -129,7 +128,7 @@ fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
         let summary: Summary = serde_json::from_str(&text).map_err(|error| with_path(&path)(&error))?;
         summaries.push((name, summary));
     }
-    let filled = report::fill(&text, &summaries)?;
+    let filled = hop::fill(&text, &summaries)?;
     fs::write(&page, filled).map_err(|error| with_path(&page)(&error))?;
     println!("filled {} with the figures of {} runs", page.display(), summaries.len());
     Ok(())

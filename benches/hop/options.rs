@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use adaptive_bridge_measure::hop::payload;
 use clap::Parser;
 use clap::builder::ArgPredicate;
 
-use super::report::payload;
 use super::system::{Placement, Scheduling};
 
 /// One load: samples of one size at one rate, spread over one or more routes.

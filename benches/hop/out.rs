@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::SystemTime;
 
+use adaptive_bridge_measure::hop::{Quantiles, Summary, figures, readme};
+
 use super::link::Record;
 use super::options::Options;
-use super::report::{Quantiles, Summary, figures, readme};
 
 /// The results of a run so far.
 pub struct Output {

@@ -3,13 +3,13 @@
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use adaptive_bridge_measure::hop::{Call, Resource, TARGET_HZ};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::beds::{Bed, Beds, Kind, Plan};
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
-use super::report::{Call, Resource, TARGET_HZ};
 use super::system::Usage;
 
 /// The rates of the loads.

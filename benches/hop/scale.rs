@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use adaptive_bridge_measure::hop::{Quantiles, Scale};
+
 use super::beds::{Beds, Kind, Plan, Run, add_up};
 use super::link::Record;
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
-use super::report::{Quantiles, Scale};
 use super::system::Usage;
 
 const ROUTES: [usize; 4] = [1, 4, 16, 64];

@@ -4,11 +4,12 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::time::{Duration, Instant};
 
+use adaptive_bridge_measure::hop::{Lossy, Soak, SoakSeries};
+
 use super::beds::{Beds, Plan, add_up};
 use super::cpu_delay::CpuDelayMonitor;
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
-use super::report::{Lossy, Soak, SoakSeries};
 use super::system::{Usage, descriptors};
 
 /// The part of each turn in which scans are sent.

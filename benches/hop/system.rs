@@ -6,6 +6,7 @@ use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::process::Command;
 
+use adaptive_bridge_measure::hop::Machine;
 use clap::ValueEnum;
 use nix::errno::Errno;
 use nix::libc;
@@ -15,7 +16,6 @@ use nix::time::{ClockId, ClockNanosleepFlags, clock_nanosleep};
 use nix::unistd::Pid;
 
 use super::options::Options;
-use super::report::Machine;
 
 /// The placement of the programs on CPUs. Stages are the processes that a sample passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

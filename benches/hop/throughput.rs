@@ -2,11 +2,12 @@
 //! by bisection. A run passes when no sample is refused, lost or damaged and the publisher keeps its
 //! schedule. The resulting rate must pass twice.
 
+use adaptive_bridge_measure::hop::{Attempt, Throughput, payload};
+
 use super::beds::{Bed, Beds, Run};
 use super::latency::loss;
 use super::options::{Case, Options, PAYLOADS};
 use super::out::{Output, RowKey};
-use super::report::{Attempt, Throughput, payload};
 use super::system::Scheduling;
 
 /// The data rate of the first run, which any machine sustains.

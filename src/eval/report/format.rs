@@ -85,25 +85,6 @@ pub fn interval(estimate: &Estimate, shown: fn(f64) -> String) -> Option<String>
     (estimate.count > 1 && (low != median || high != median)).then(|| format!("{low} to {high}"))
 }
 
-/// Escapes text for XML: replaces markup, quotes and control characters.
-pub fn escape(text: &str) -> String {
-    let mut escaped = String::with_capacity(text.len());
-    for char in text.chars() {
-        match char {
-            '&' => escaped.push_str("&amp;"),
-            '<' => escaped.push_str("&lt;"),
-            '>' => escaped.push_str("&gt;"),
-            '"' => escaped.push_str("&quot;"),
-            '\'' => escaped.push_str("&#39;"),
-            '\n' | '\t' => escaped.push(' '),
-            // XML forbids control characters and the noncharacters U+FFFE and U+FFFF.
-            char if char.is_control() || matches!(char, '\u{fffe}' | '\u{ffff}') => escaped.push('\u{fffd}'),
-            char => escaped.push(char),
-        }
-    }
-    escaped
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -140,10 +121,5 @@ mod tests {
         ] {
             assert_eq!(deviation(ours, paper, ms), expected, "{ours} {paper}");
         }
-    }
-
-    #[test]
-    fn markup_and_control_characters_are_escaped() {
-        assert_eq!(escape("<a b='c'>&\"\u{1b}\n"), "&lt;a b=&#39;c&#39;&gt;&amp;&quot;\u{fffd} ");
     }
 }

@@ -3,10 +3,11 @@
 
 use std::fmt::Write as _;
 
+use adaptive_bridge_measure::format::escape;
+
 use super::cells::{Cell, Place, Results, reading_name};
 use super::context::Context;
 use super::figures;
-use super::format::escape;
 use super::tables::{self, Field, Table};
 use super::verdict::{Finding, Verdict, mechanism};
 

@@ -4,14 +4,11 @@
 //! arguments. Definitions are the paper's where it gives them (section IV-D); otherwise the function's
 //! comment gives the choice.
 
-mod distribution;
-mod repetitions;
 mod sequence;
 mod states;
 mod windows;
 
-pub use distribution::Distribution;
-pub use repetitions::Estimate;
+pub use adaptive_bridge_measure::statistics::{Distribution, Estimate};
 pub use sequence::{Received, Reception, longest_silence_s, outstanding, received};
 pub use states::{Change, Reaction, reactions, share_in, transitions};
 pub use windows::{RateOverTime, Spread, WINDOW_S, mean_level, sliding_rate};

@@ -1,9 +1,9 @@
 //! Bar charts by impairment (Figure 4 of the paper).
 
-use super::axis::Axis;
-use super::frame::{Entry, LEFT, RIGHT, grid_y, legend};
-use super::svg::{Anchor, Svg, TEXT};
 use crate::eval::statistics::Estimate;
+use adaptive_bridge_measure::plot::axis::Axis;
+use adaptive_bridge_measure::plot::frame::{Entry, LEFT, RIGHT, grid_y, legend};
+use adaptive_bridge_measure::plot::svg::{Anchor, Svg, TEXT};
 
 const HEIGHT: f64 = 170.0;
 

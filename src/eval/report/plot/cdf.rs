@@ -1,9 +1,9 @@
 //! Cumulative distributions of latency (Figure 5 of the paper).
 
-use super::axis::Axis;
-use super::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
-use super::svg::{Anchor, Svg, TEXT};
 use crate::eval::statistics::Distribution;
+use adaptive_bridge_measure::plot::axis::Axis;
+use adaptive_bridge_measure::plot::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
+use adaptive_bridge_measure::plot::svg::{Anchor, Svg, TEXT};
 
 const HEIGHT: f64 = 190.0;
 

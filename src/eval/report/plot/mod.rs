@@ -1,11 +1,7 @@
-//! Draws plots as inline SVG, without a library, as no small one has what the report needs
-//! (docs/decisions/0008-report.md).
+//! Draws the charts of the report as inline SVG.
 
-mod axis;
 mod bars;
 mod cdf;
-mod frame;
-mod svg;
 mod timeline;
 
 pub use bars::{Bars, Series};

@@ -1,9 +1,9 @@
 //! Time lines of runs: panels of several quantities above each other, with one time axis.
 
-use super::axis::Axis;
-use super::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
-use super::svg::{Anchor, Svg, TEXT};
 use crate::eval::statistics::Change;
+use adaptive_bridge_measure::plot::axis::Axis;
+use adaptive_bridge_measure::plot::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
+use adaptive_bridge_measure::plot::svg::{Anchor, Svg, TEXT};
 
 const PANEL: f64 = 78.0;
 const STRIP: f64 = 20.0;

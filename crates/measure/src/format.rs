@@ -1,8 +1,22 @@
-//! Formatting of values in tables and plots.
+//! Formats values and text for tables and plots.
 
-/// Escapes text for attributes and text of SVG.
+/// Escapes text for XML: replaces markup, quotes and control characters.
 pub fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    let mut escaped = String::with_capacity(text.len());
+    for char in text.chars() {
+        match char {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\'' => escaped.push_str("&#39;"),
+            '\n' | '\t' => escaped.push(' '),
+            // XML forbids control characters and the noncharacters U+FFFE and U+FFFF.
+            char if char.is_control() || matches!(char, '\u{fffe}' | '\u{ffff}') => escaped.push('\u{fffd}'),
+            char => escaped.push(char),
+        }
+    }
+    escaped
 }
 
 /// A value with about three significant digits and a comma between thousands; a dash without a value.
@@ -35,4 +49,14 @@ pub fn range(values: &[f64]) -> String {
 /// A count with a comma between thousands.
 pub fn count(value: u64) -> String {
     number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn markup_and_control_characters_are_escaped() {
+        assert_eq!(escape("<a b='c'>&\"\u{1b}\n"), "&lt;a b=&#39;c&#39;&gt;&amp;&quot;\u{fffd} ");
+    }
 }

@@ -3,7 +3,7 @@
 
 use std::fmt::{Display, Write as _};
 
-use super::super::format::escape;
+use crate::format::escape;
 
 /// The width of every plot in its own units. On a phone's screen, about 340 pixels wide, a text of [`TEXT`]
 /// units is 9 pixels high.

@@ -3,8 +3,9 @@
 use super::axis::Axis;
 use super::svg::{Anchor, Svg, TEXT, WIDTH, text_width};
 
-/// The left and right edge of the frame.
+/// The left edge of the frame.
 pub const LEFT: f64 = 52.0;
+/// The right edge of the frame.
 pub const RIGHT: f64 = WIDTH - 18.0;
 
 /// Height below a frame for the labels of its marks and of its axis.
@@ -12,7 +13,9 @@ pub const BELOW: f64 = 2.0 * TEXT + 14.0;
 
 /// An entry of a legend: a text and the class of its swatch.
 pub struct Entry<'a> {
+    /// The text.
     pub text: &'a str,
+    /// The CSS class of the swatch's colour.
     pub class: &'a str,
     /// Whether the swatch is a line; otherwise it is a filled square.
     pub is_line: bool,

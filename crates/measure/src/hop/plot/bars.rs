@@ -1,9 +1,9 @@
 //! Bar charts with groups of bars.
 
-use super::axis::Axis;
 use super::file;
-use super::frame::{Entry, LEFT, RIGHT, grid_y, legend};
-use super::svg::{Anchor, Svg, TEXT};
+use crate::plot::axis::Axis;
+use crate::plot::frame::{Entry, LEFT, RIGHT, grid_y, legend};
+use crate::plot::svg::{Anchor, Svg, TEXT};
 
 const HEIGHT: f64 = 190.0;
 

@@ -1,21 +1,7 @@
-//! Plots as SVG files. Axes, frames and SVG elements are shared with the report of the evaluation; the charts
-//! are the bench's own.
+//! Plots as SVG files: bars and lines.
 
-#[allow(
-    dead_code,
-    unused_imports,
-    reason = "shared with the report of the evaluation, which uses and tests it all"
-)]
-#[path = "../../../../src/eval/report/plot/axis.rs"]
-mod axis;
 mod bars;
-#[allow(dead_code, unused_imports, reason = "as above")]
-#[path = "../../../../src/eval/report/plot/frame.rs"]
-mod frame;
 mod lines;
-#[allow(dead_code, unused_imports, reason = "as above")]
-#[path = "../../../../src/eval/report/plot/svg.rs"]
-mod svg;
 
 pub use bars::{Bars, Series};
 pub use lines::{Line, Panel, lines};

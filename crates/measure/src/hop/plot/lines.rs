@@ -1,9 +1,9 @@
 //! Line charts: panels above each other with a common x axis.
 
-use super::axis::Axis;
 use super::file;
-use super::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
-use super::svg::{Anchor, Svg, TEXT};
+use crate::plot::axis::Axis;
+use crate::plot::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
+use crate::plot::svg::{Anchor, Svg, TEXT};
 
 const PANEL: f64 = 130.0;
 

@@ -1,9 +1,9 @@
 //! The plots of a run.
 
-use super::format::number;
 use super::plot::{Bars, Line, Panel, Series, lines};
 use super::summary::{Isolation, Summary};
 use super::tables::{PROGRAMS, payload, payloads};
+use crate::format::number;
 
 const CLASSES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
 

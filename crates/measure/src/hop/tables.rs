@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use super::format::{count, number, range};
-use super::statistics::median;
 use super::summary::{Call, Latency, Resource, Soak, Summary};
-use super::table::Table;
 use super::targets;
+use crate::format::{count, number, range};
+use crate::statistics::median;
+use crate::table::Table;
 
+/// The programs that are compared, in the order of the tables.
 pub const PROGRAMS: [&str; 4] = ["wake-up", "direct", "relay", "bridge"];
 
 /// The size of a payload with a unit: `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.

@@ -9,6 +9,7 @@ const MAX_FIGURE_CHARS: u16 = 24;
 pub struct Table(comfy_table::Table);
 
 impl Table {
+    /// A table with these heads of columns and no row.
     pub fn new(heads: &[&str]) -> Self {
         let mut table = comfy_table::Table::new();
         table.load_preset(presets::ASCII_MARKDOWN).set_header(heads);
@@ -22,10 +23,12 @@ impl Table {
         self.0.add_row(cells.into_iter().map(|cell| cell.replace('|', "/")));
     }
 
+    /// Whether it has no row.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
+    /// The table as text.
     pub fn text(&self) -> String {
         let mut table = self.0.clone();
         let widths = table.column_max_content_widths();

@@ -1,5 +1,7 @@
 //! Quantiles, medians with their confidence interval, and growth.
 
+use super::repetitions::Estimate;
+
 /// The quantile of unsorted values by nearest rank; `NaN` without values.
 pub fn quantile(values: &[f64], quantile: f64) -> f64 {
     let sorted = sorted(values);
@@ -21,21 +23,11 @@ pub fn median(values: &[f64]) -> f64 {
     if sorted.len() % 2 == 1 { sorted[middle] } else { f64::midpoint(sorted[middle - 1], sorted[middle]) }
 }
 
-/// The 95 % confidence interval of the median of the distribution that the values are drawn from. Its bounds
-/// are two of the values, chosen by the binomial distribution (as in the sign test), so it holds for any
-/// distribution. `None` with fewer than six values, which are not enough.
+/// The 95 % confidence interval of the median of the distribution that the values are drawn from, which is
+/// that of [`Estimate`]. `None` with fewer than six values, which are not enough.
 pub fn median_interval(values: &[f64]) -> Option<(f64, f64)> {
-    let sorted = sorted(values);
-    // `total` is the probability that at most `below` of the values are less than the median.
-    let (mut below, mut chance) = (0, 0.5_f64.powi(i32::try_from(sorted.len()).ok()?));
-    let mut total = chance;
-    while 2.0 * total <= 0.05 {
-        chance *= (sorted.len() - below) as f64 / (below + 1) as f64;
-        below += 1;
-        total += chance;
-    }
-    let first = below.checked_sub(1)?;
-    Some((sorted[first], sorted[sorted.len() - 1 - first]))
+    let estimate = Estimate::of(values.iter().copied()).filter(Estimate::is_confident)?;
+    Some((estimate.low, estimate.high))
 }
 
 fn sorted(values: &[f64]) -> Vec<f64> {

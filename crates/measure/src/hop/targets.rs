@@ -1,14 +1,16 @@
 //! The targets for the bridge's overhead, and whether a run meets them.
 
-use super::format::number;
-use super::statistics::{growth, median, median_interval};
 use super::summary::{Isolation, Latency, SoakSeries, Summary};
-use super::table::Table;
 use super::tables::payload;
+use crate::format::number;
+use crate::statistics::{growth, median, median_interval};
+use crate::table::Table;
 
 /// A target for the bridge's hop at one rate and payload.
 pub struct Hop {
+    /// The rate of the publisher.
     pub rate_hz: u64,
+    /// The size of the payload.
     pub bytes: usize,
     /// The highest ratio to the relay's hop.
     max_ratio: f64,

@@ -2,12 +2,9 @@
 //! docs/performance-runs.md. Pure, so that tests can pass invented runs.
 
 mod figures;
-mod format;
 mod page;
 mod plot;
-pub mod statistics;
 mod summary;
-mod table;
 mod tables;
 pub mod targets;
 

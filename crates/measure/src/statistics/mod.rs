@@ -1,0 +1,9 @@
+//! Figures computed from measured values. Pure: numbers in, numbers out.
+
+mod distribution;
+mod repetitions;
+mod values;
+
+pub use distribution::Distribution;
+pub use repetitions::Estimate;
+pub use values::{growth, median, median_interval, quantile};
