@@ -13,21 +13,14 @@
 //! - [`process`]: ingress, egress, control, responder and supervisor; the only module that combines DDS,
 //!   shared memory and policy.
 //! - [`cli`]: the subcommands.
-//! - [`eval`]: the evaluation harness (feature `eval`).
 
 // Of the library and not of its tests, hence not in Cargo.toml.
 #![cfg_attr(not(test), warn(clippy::disallowed_methods, clippy::expect_used, clippy::unwrap_used))]
-#![cfg_attr(
-    not(feature = "eval"),
-    allow(rustdoc::broken_intra_doc_links, reason = "the module `eval` is left out")
-)]
 
 pub mod cli;
 pub mod clock;
 pub mod config;
 pub mod dds;
-#[cfg(feature = "eval")]
-pub mod eval;
 pub mod process;
 pub mod shm;
 pub mod telemetry;

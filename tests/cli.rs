@@ -1,8 +1,6 @@
 //! The command line from outside, on bridges that really run: the shipped binary as child processes, real
 //! shared memory, and publishers and subscribers of this process on real sockets. Domains 100 to 109.
 
-mod support;
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::{BufRead, BufReader, Read};

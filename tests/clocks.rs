@@ -1,8 +1,6 @@
 //! A publisher whose clock disagrees with the bridge's: the shipped binary, real DDS, source timestamps as an
 //! unsynchronised computer writes them. Domain 119.
 
-mod support;
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::thread::JoinHandle;

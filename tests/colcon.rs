@@ -5,8 +5,6 @@
 //! `ros2 launch` shows the arguments and the output as it should is not tested here. What it is told to run
 //! is run.
 
-mod support;
-
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -91,10 +89,9 @@ impl Workspace {
         );
         // What these tests are built of, so that cargo has nothing left to build: the same features, and
         // those that the dependencies of tests and examples ask for.
-        let features = if cfg!(feature = "eval") { "--all-features;" } else { "" };
         run(workspace.colcon().args(["build", "--cmake-args", "-DCMAKE_BUILD_TYPE=Debug"]).args([
             format!("-DADAPTIVE_BRIDGE_TARGET_DIR={}", source().join("target").display()),
-            format!("-DADAPTIVE_BRIDGE_CARGO_OPTIONS={features}--example;rust_peer"),
+            "-DADAPTIVE_BRIDGE_CARGO_OPTIONS=--example;rust_peer".to_owned(),
         ]));
         Some(workspace)
     }

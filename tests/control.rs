@@ -3,8 +3,6 @@
 //!
 //! Every test ends with the assertion that the critical subscriber has received each sample.
 
-mod support;
-
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 

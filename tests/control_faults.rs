@@ -2,8 +2,6 @@
 //! messages, an overloaded bridge. The shipped binary runs on a separate host, most tests with a flow of 200
 //! samples per second.
 
-mod support;
-
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};

@@ -1,8 +1,6 @@
 //! Crowds of bad subscribers of the critical lane: eight kinds of bad subscribers at the same time, beside
 //! subscribers of three libraries that keep up. Each test has one rate and sample size.
 
-mod support;
-
 use std::time::Duration;
 
 use serde_json::Value;

@@ -1,7 +1,5 @@
 //! The bridge in containers of a real Docker Engine, one for each process, as docker/compose.yaml deploys it.
 
-mod support;
-
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};

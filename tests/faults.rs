@@ -2,8 +2,6 @@
 //! links that break, shared memory that is full. Uses real processes, signals and DDS peers on separate
 //! hosts.
 
-mod support;
-
 use std::time::Duration;
 
 use nix::sys::signal::Signal;

@@ -1,8 +1,6 @@
 //! A hostile network: random, malformed and truncated RTPS datagrams at every port of a running bridge for a
 //! minute, while samples flow. No process crashes or is restarted, and no sample is lost.
 
-mod support;
-
 use std::fs::{self, File};
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};

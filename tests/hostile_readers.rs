@@ -2,8 +2,6 @@
 //! send a thousand false ACKNACKs or NACK_FRAGs a second each, some with the GUID of another reader. Other
 //! subscribers that keep up must receive every sample.
 
-mod support;
-
 use std::time::{Duration, Instant};
 
 use serde_json::Value;

@@ -1,8 +1,6 @@
 //! The bridge between DDS libraries: publishers and subscribers on Cyclone DDS, Fast DDS and RustDDS run on
 //! separate hosts (network namespaces) from the bridge. Every payload is compared by hash.
 
-mod support;
-
 use std::collections::BTreeMap;
 use std::time::Duration;
 

@@ -1,8 +1,6 @@
 //! Readers on other hosts, as the RTPS edge sees them: hosts of their own (network namespaces), programs on
 //! Cyclone DDS, Fast DDS and RustDDS. Which of them is remote, and which node it is.
 
-mod support;
-
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::path::Path;

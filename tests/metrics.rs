@@ -1,7 +1,5 @@
 //! The metrics page as a scraper sees it: over HTTP, through the parser of Prometheus' own Python client.
 
-mod support;
-
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;

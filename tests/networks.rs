@@ -4,8 +4,6 @@
 //! on rclpy, Fast DDS and Cyclone DDS; their own counts are checked. Each event is applied to flows without
 //! the bridge as well.
 
-mod support;
-
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 

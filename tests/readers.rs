@@ -1,8 +1,6 @@
 //! Subscribers of the critical lane that crash, stop, join and leave, beside subscribers that keep up, on
 //! rclpy, Fast DDS and Cyclone DDS. Each event is applied to a second flow without the bridge as well.
 
-mod support;
-
 use std::time::Duration;
 
 use nix::sys::signal::Signal;

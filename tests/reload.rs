@@ -1,8 +1,6 @@
 //! Reload on a bridge that really runs: the shipped binary, real shared memory, real signals, under a flow of
 //! 200 samples per second. Domains 110 to 118.
 
-mod support;
-
 use std::time::Duration;
 
 use adaptive_bridge::config::{self, DdsNetwork, Settings};

@@ -1,8 +1,6 @@
 //! The responder from outside: the shipped binary on one host, and bridges on another that ask it, through
 //! our DDS edge. What they say is what the protocol's page says, or is hostile.
 
-mod support;
-
 use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Command, Output};

@@ -1,8 +1,6 @@
 //! Restarts of a killed ingress while samples flow: no sample is published twice or out of order, and each
 //! publisher's account counts the lost samples. Uses real processes, signals and DDS peers.
 
-mod support;
-
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};

@@ -1,7 +1,5 @@
 //! Which thread of a bridge has which real-time priority: the shipped binary on the real kernel. Domain 115.
 
-mod support;
-
 use std::fs;
 use std::process::Command;
 use std::time::Duration;

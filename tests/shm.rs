@@ -13,6 +13,9 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
+use self::support::{
+    LANE, Place, Process, channel, deep_channel, header, payload, route, shape, skip, until,
+};
 use adaptive_bridge::model::{InstanceName, LaneMode, LanePolicy, LatencyHistogram, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
     Boards, BridgeShape, HeaderError, LoanError, ProcessRole, QueueLimits, RoleLock, RouteChannel,
@@ -20,7 +23,6 @@ use adaptive_bridge::shm::{
     this_cpu,
 };
 use nix::sys::signal::Signal;
-use support::{LANE, Place, Process, channel, deep_channel, header, payload, route, shape, skip, until};
 
 /// Counts the allocations of each thread.
 struct Counting;

@@ -1,8 +1,6 @@
 //! The bridge as services of a real systemd: hardened, supervised, restarted. Machines in containers, real
 //! signals, real DDS peers on hosts of their own.
 
-mod support;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;

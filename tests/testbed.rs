@@ -1,7 +1,5 @@
 //! The test bed tested by itself, without the bridge: real hosts (network namespaces), real DDS peers.
 
-mod support;
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;

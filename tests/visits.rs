@@ -2,8 +2,6 @@
 //! with and without 100 ms of delay. No other subscriber misses or repeats a sample. A VOLATILE visitor
 //! receives no history; a TRANSIENT_LOCAL one receives the history and no gap after it.
 
-mod support;
-
 use support::bed::{Bed, CRITICAL, INPUT, outputs};
 use support::impairment::Impairment;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::LazyLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -14,7 +15,8 @@ use super::process::Process;
 
 /// The path of the `adaptive-bridge` binary.
 pub fn program() -> &'static Path {
-    Path::new(env!("CARGO_BIN_EXE_adaptive-bridge"))
+    static PROGRAM: LazyLock<PathBuf> = LazyLock::new(|| super::built("adaptive-bridge"));
+    &PROGRAM
 }
 
 /// One bridge: an instance name and a folder with its configuration file.

@@ -1,6 +1,7 @@
 //! Impairment of a link at a host, by `adaptive-bridge-eval impair`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -10,7 +11,8 @@ use super::process::Process;
 
 /// The path of the `adaptive-bridge-eval` binary.
 pub fn program() -> &'static Path {
-    Path::new(env!("CARGO_BIN_EXE_adaptive-bridge-eval"))
+    static PROGRAM: LazyLock<PathBuf> = LazyLock::new(|| super::built("adaptive-bridge-eval"));
+    &PROGRAM
 }
 
 /// Loses and delays packets that a host receives from another, until it is dropped or ended. Declare it after

@@ -259,7 +259,7 @@ fn remove_groups(group: &Path) {
 
 /// Copies the program and its units to where a package would install them.
 pub fn install(root: &Path) {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd");
+    let source = super::root().join("systemd");
     let units = root.join("usr/lib/systemd/system");
     for entry in fs::read_dir(&source).unwrap().flatten() {
         let name = entry.file_name().into_string().unwrap();

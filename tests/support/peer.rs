@@ -38,14 +38,12 @@ pub enum Library {
 
 impl Library {
     fn program(self) -> PathBuf {
-        let built_by_make = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers/build");
+        let built_by_make = super::root().join("tests/peers/build");
         match self {
             Library::Cyclone => built_by_make.join("cyclone_peer"),
             Library::Fast => built_by_make.join("fast_peer"),
-            // An example of this package, in the same build profile as the bridge.
-            Library::Rust => {
-                Path::new(env!("CARGO_BIN_EXE_adaptive-bridge")).with_file_name("examples").join("rust_peer")
-            }
+            // An example of the root package, in the same build profile as the bridge.
+            Library::Rust => super::bridge::program().with_file_name("examples").join("rust_peer"),
             Library::Rclpy => ros::python(),
         }
     }

@@ -1,7 +1,7 @@
 //! Paths of the ROS 2 nodes in `tests/ros`, which run on rclpy of Jazzy in the virtual environment that
 //! `scripts/setup.sh` creates. [`Peer::rclpy`](super::peer::Peer::rclpy) starts a node.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The list of required packages; a complete environment contains a copy of it.
 const REQUIREMENTS: &str = "requirements.txt";
@@ -11,7 +11,7 @@ fn environment() -> PathBuf {
 }
 
 fn sources() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros")
+    super::root().join("tests/ros")
 }
 
 /// The Python interpreter that has rclpy.

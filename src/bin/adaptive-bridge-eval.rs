@@ -1,7 +1,0 @@
-//! The `adaptive-bridge-eval` program: runs its command line.
-
-use std::process::ExitCode;
-
-fn main() -> ExitCode {
-    adaptive_bridge::eval::main()
-}
