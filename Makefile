@@ -9,10 +9,10 @@ build:
 setup:
 	scripts/setup.sh
 
-# The DDS peers of the integration tests.
+# The DDS peers of the integration tests, and the programs that tests of another package start.
 peers:
 	$(MAKE) --no-print-directory -C tests/peers
-	cargo build --locked --all-features --example rust_peer
+	cargo build --locked --workspace --bins --example rust_peer
 
 # Sets up, builds and runs everything: lints, unit, property and integration tests, and a bounded fuzz run.
 test:
@@ -21,13 +21,13 @@ test:
 # The checks to run after each edit, within a minute of a build. They need no root and no network namespaces.
 quick:
 	cargo fmt --check
-	cargo clippy --locked --all-targets --all-features -- -D warnings
-	cargo test --locked --all-features --lib $(PURE_TESTS:%=--test %)
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	cargo test --locked --workspace --lib $(PURE_TESTS:%=--test %)
 
 lint:
 	cargo fmt --check
-	cargo clippy --locked --all-targets --all-features -- -D warnings
-	RUSTDOCFLAGS='-D warnings' cargo doc --locked --no-deps --all-features
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS='-D warnings' cargo doc --locked --no-deps --workspace
 	@if cargo deny --version >/dev/null 2>&1; then cargo deny --locked check bans licenses sources; \
 	else echo '*** NOT CHECKED: licences and versions of dependencies: cargo-deny is not installed (make setup)'; \
 	test -z "$$CI"; fi

@@ -33,7 +33,7 @@ step make --no-print-directory peers
 step make --no-print-directory lint
 # Tests that load the machine or use network namespaces exclude each other with a lock (tests/support), so the test
 # programs may run their tests in parallel.
-step cargo test --locked --all-features --no-fail-fast
+step cargo test --locked --workspace --no-fail-fast
 # The tests of the patched DDS library, a separate package with its own development dependencies.
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds
 step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"

@@ -1,4 +1,5 @@
-//! Checks the rules of this source tree: layers, purity, words, sizes, links, dependencies.
+//! Checks the rules of this source tree that neither compiler, clippy nor cargo-deny knows: layers, purity,
+//! words, sizes, links, dependencies.
 //! Pure: reads files, and asks cargo about the dependencies.
 //!
 //! Each rule is a function of a file's path and text that lists what breaks it, so that the tests can also

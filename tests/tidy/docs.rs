@@ -80,7 +80,7 @@ fn every_relative_link_leads_to_a_file() {
 #[test]
 fn every_page_that_the_source_names_is_there() {
     let mut named = 0;
-    for source in ["src", "tests", "benches"].iter().flat_map(|folder| files(folder, "rs")) {
+    for source in ["src", "crates", "tests", "benches"].iter().flat_map(|folder| files(folder, "rs")) {
         for comment in Rust::new(&source.text).comments {
             let words = comment.text.split(|c: char| c.is_whitespace() || "`()[],;:'\"".contains(c));
             for word in words.filter(|word| word.starts_with("docs/") && word.ends_with(".md")) {
@@ -95,8 +95,8 @@ fn every_page_that_the_source_names_is_there() {
 /// The files that a line of a guide names in back quotes, and its functions: those of a table's row with the
 /// cells number, file, function and remark.
 fn files_and_functions(line: &str) -> (Vec<String>, Vec<String>) {
-    const FOLDERS: [&str; 8] =
-        ["src/", "tests/", "benches/", "config/", "docs/", "fuzz/", "scripts/", "rustdds/"];
+    const FOLDERS: [&str; 9] =
+        ["src/", "crates/", "tests/", "benches/", "config/", "docs/", "fuzz/", "scripts/", "rustdds/"];
     let quoted =
         |text: &str| -> Vec<String> { text.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
     let is_file = |word: &String| {

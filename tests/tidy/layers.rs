@@ -1,19 +1,22 @@
 //! Who may use whom.
 
-use super::source::{Rust, SourcePath, files};
+use super::source::{Rust, SourceFile, SourcePath, files};
 
-/// The layers: each may use those before it and none after it.
-const LAYERS: &[&str] =
-    &["model", "policy", "config", "clock", "dds", "shm", "telemetry", "process", "cli", "eval"];
+/// The layers of the root package: each may use those before it and none after it. `model` and `policy` are
+/// a crate of their own, of which the compiler proves that it uses nothing else.
+const LAYERS: &[&str] = &["model", "policy", "config", "clock", "dds", "shm", "telemetry", "process", "cli"];
 
-/// Layers that never name each other, though their order would allow it. The evaluation drives the bridge as
-/// its users do, by its program.
-const STRANGERS: &[(&str, &str)] = &[("dds", "shm"), ("shm", "dds"), ("eval", "process")];
+/// Layers that never name each other, though their order would allow it.
+const STRANGERS: &[(&str, &str)] = &[("dds", "shm"), ("shm", "dds")];
 
-/// Folders that are as pure as `model` and `policy`.
-const PURE: &[&str] = &["src/model/", "src/policy/", "src/eval/statistics/"];
+/// What the evaluation may use of the bridge. It drives the bridge as its users do, by its program.
+const EVALUATION: &str = "crates/eval/src/";
+const USED_BY_EVALUATION: &[&str] = &["clock", "model", "telemetry"];
 
-/// What a pure layer may not reach: clocks, threads, the outside, logs.
+/// Folders of figures and reports, which have the standard library and are as pure as policy nevertheless.
+const PURE: &[&str] = &["crates/measure/src/", "crates/eval/src/statistics/"];
+
+/// What a pure folder may not reach: clocks, threads, the outside, logs.
 const IMPURE: &[&[&str]] = &[
     &["std", "time", "Instant"],
     &["std", "time", "SystemTime"],
@@ -25,9 +28,8 @@ const IMPURE: &[&[&str]] = &[
     &["std", "net"],
     &["std", "os"],
     &["tracing"],
-    &["log"],
     &["nix"],
-    &["crate", "clock"],
+    &["adaptive_bridge", "clock"],
 ];
 
 const PRINTING: &[&str] = &["print", "println", "eprint", "eprintln"];
@@ -40,11 +42,11 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("rustdds", &["src/dds/"]),
     ("ros2_client", &["src/dds/"]),
     ("sd_notify", &["src/process/notify.rs"]),
-    ("serde_yaml", &["src/config/yaml/", "src/eval/scenario/"]),
+    ("serde_yaml", &["src/config/yaml/", "crates/eval/src/scenario/"]),
     ("granit_parser", &["src/config/yaml/"]),
 ];
 
-/// What breaks the rules in a file of `src`.
+/// What breaks the rules in a file of a library or program.
 fn violations(path: &str, text: &str) -> Vec<String> {
     let rust = Rust::new(text);
     let paths = rust.paths();
@@ -58,8 +60,15 @@ fn violations(path: &str, text: &str) -> Vec<String> {
         {
             say(used.line, format!("{}: {what}", used.text()));
         }
+        if path.starts_with(EVALUATION)
+            && used.names[0] == "adaptive_bridge"
+            && let Some(other) = used.names.get(1)
+            && !USED_BY_EVALUATION.contains(&other.as_str())
+        {
+            say(used.line, format!("{}: the evaluation may not use {other}", used.text()));
+        }
         if is_pure && IMPURE.iter().any(|names| used.starts_with(names)) {
-            say(used.line, format!("{} in a pure layer", used.text()));
+            say(used.line, format!("{} in a pure folder", used.text()));
         }
         for (library, homes) in LIBRARIES {
             let is_home = homes.iter().any(|home| path.starts_with(home));
@@ -71,7 +80,7 @@ fn violations(path: &str, text: &str) -> Vec<String> {
     for (at, token) in rust.tokens.iter().enumerate() {
         let prints = PRINTING.contains(&token.text.as_str()) && rust.reads(at + 1, &["!"]);
         if prints && is_pure {
-            say(token.line, format!("{}! in a pure layer", token.text));
+            say(token.line, format!("{}! in a pure folder", token.text));
         }
     }
     found
@@ -81,7 +90,7 @@ fn violations(path: &str, text: &str) -> Vec<String> {
 fn layer_of(path: &str) -> Option<&str> {
     let inside = path.strip_prefix("src/")?.strip_suffix(".rs")?;
     let layer = inside.split('/').next()?;
-    (!["main", "lib", "bin"].contains(&layer)).then_some(layer)
+    (!["main", "lib"].contains(&layer)).then_some(layer)
 }
 
 /// What of the crate a path uses: the name behind `crate`, or behind as many `super` as lead there.
@@ -117,8 +126,8 @@ fn forbidden(layer: &str, other: &str) -> Option<String> {
 
 #[test]
 fn every_layer_uses_only_those_below_it() {
-    let sources = files("src", "rs");
-    assert!(sources.len() > 50, "{} files", sources.len());
+    let sources: Vec<SourceFile> = ["src", "crates"].iter().flat_map(|folder| files(folder, "rs")).collect();
+    assert!(sources.len() > 100, "{} files", sources.len());
     let found: Vec<String> =
         sources.iter().flat_map(|source| violations(&source.path, &source.text)).collect();
     assert!(found.is_empty(), "{}", found.join("\n"));
@@ -129,28 +138,29 @@ fn the_map_of_the_library_lists_the_layers_in_their_order() {
     let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/src/lib.rs")).unwrap();
     let listed: Vec<&str> =
         text.lines().filter_map(|line| line.strip_prefix("//! - [`")?.split('`').next()).collect();
-    let declared = |name: &&&str| text.contains(&format!("pub mod {name};"));
-    let layers: Vec<&str> = LAYERS.iter().filter(declared).copied().collect();
-    assert_eq!(listed, layers);
-    let modules = text.lines().filter(|line| line.starts_with("pub mod ")).count();
-    assert_eq!(modules, layers.len(), "a module of the library is no layer");
+    assert_eq!(listed, LAYERS);
+    let mut modules: Vec<&str> = text.lines().filter_map(|line| line.strip_prefix("pub mod ")).collect();
+    modules.extend(["model;", "policy;"]);
+    assert_eq!(modules.len(), LAYERS.len(), "a module of the library is no layer");
+    for layer in LAYERS {
+        assert!(modules.contains(&format!("{layer};").as_str()), "{layer}");
+    }
 }
 
 #[test]
 fn what_breaks_a_layer_is_found() {
     for (path, text, what) in [
-        ("src/model/a.rs", "use crate::policy::B;", "model may not use policy"),
-        ("src/policy/a.rs", "use crate::{model::B, config::C};", "policy may not use config"),
-        ("src/policy/a.rs", "fn a() { super::super::clock::monotonic(); }", "policy may not use clock"),
-        ("src/policy/mod.rs", "use super::process;", "policy may not use process"),
-        ("src/policy/a.rs", "mod tests { use super::super::super::shm::B; }", "policy may not use shm"),
+        ("src/config/a.rs", "use crate::{model::B, shm::C};", "config may not use shm"),
+        ("src/config/a.rs", "fn a() { super::super::clock::monotonic(); }", "config may not use clock"),
+        ("src/config/mod.rs", "use super::process;", "config may not use process"),
+        ("src/config/a.rs", "mod tests { use super::super::super::shm::B; }", "config may not use shm"),
         ("src/clock.rs", "use super::dds;", "clock may not use dds"),
         ("src/config/a.rs", "fn a() { let b = crate::dds::C::new(); }", "config may not use dds"),
         ("src/dds/a.rs", "use crate::shm::B;", "dds may not know shm"),
         ("src/shm/a.rs", "use crate::{\n    clock,\n    dds::B,\n};", "shm may not know dds"),
         ("src/telemetry/a.rs", "use crate::process;", "telemetry may not use process"),
         ("src/process/a/b.rs", "use super::super::super::cli::C;", "process may not use cli"),
-        ("src/eval/a.rs", "use crate::process::B;", "eval may not know process"),
+        ("crates/eval/src/a.rs", "use adaptive_bridge::process::B;", "the evaluation may not use process"),
         ("src/cli/a.rs", "use crate::helpers::B;", "helpers is no layer"),
         ("src/helpers.rs", "use crate::model::B;", "helpers is no layer"),
         ("src/cli/a.rs", "use crate::*;", "* is no layer"),
@@ -163,18 +173,26 @@ fn what_breaks_a_layer_is_found() {
 #[test]
 fn what_is_impure_or_knows_a_library_is_found() {
     for (path, text, what) in [
-        ("src/policy/a.rs", "use std::time::{Duration, Instant};", "std::time::Instant in a pure layer"),
-        ("src/policy/a.rs", "use std::time::SystemTime;", "in a pure layer"),
-        ("src/policy/a.rs", "fn a() { std::thread::yield_now() }", "std::thread::yield_now in a pure layer"),
-        ("src/policy/a.rs", "use std::{fs, cell};", "std::fs in a pure layer"),
-        ("src/policy/a.rs", "use std::io;", "in a pure layer"),
-        ("src/policy/a.rs", "use std::net::IpAddr;", "in a pure layer"),
-        ("src/policy/a.rs", "fn a() { tracing::info!(\"b\") }", "tracing::info in a pure layer"),
-        ("src/policy/a.rs", "use tracing;", "tracing in a pure layer"),
-        ("src/policy/a.rs", "use crate::clock;", "crate::clock in a pure layer"),
-        ("src/policy/a.rs", "fn a() { println!(\"b\") }", "println! in a pure layer"),
-        ("src/model/a.rs", "use std::env;", "in a pure layer"),
-        ("src/eval/statistics/a.rs", "use std::fs;", "in a pure layer"),
+        (
+            "crates/measure/src/a.rs",
+            "use std::time::{Duration, Instant};",
+            "std::time::Instant in a pure folder",
+        ),
+        ("crates/measure/src/a.rs", "use std::time::SystemTime;", "in a pure folder"),
+        (
+            "crates/measure/src/a.rs",
+            "fn a() { std::thread::yield_now() }",
+            "std::thread::yield_now in a pure folder",
+        ),
+        ("crates/measure/src/a.rs", "use std::{fs, cell};", "std::fs in a pure folder"),
+        ("crates/measure/src/a.rs", "use std::io;", "in a pure folder"),
+        ("crates/measure/src/a.rs", "use std::net::IpAddr;", "in a pure folder"),
+        ("crates/measure/src/a.rs", "fn a() { tracing::info!(\"b\") }", "tracing::info in a pure folder"),
+        ("crates/measure/src/a.rs", "use tracing;", "tracing in a pure folder"),
+        ("crates/measure/src/a.rs", "use adaptive_bridge::clock;", "adaptive_bridge::clock in a pure folder"),
+        ("crates/measure/src/a.rs", "fn a() { println!(\"b\") }", "println! in a pure folder"),
+        ("crates/measure/src/a.rs", "use std::env;", "in a pure folder"),
+        ("crates/eval/src/statistics/a.rs", "use std::fs;", "in a pure folder"),
         ("src/process/a.rs", "use iceoryx2::prelude::*;", "only src/shm/ knows iceoryx2"),
         ("src/process/a.rs", "use ros2_client::dds::rustdds;", "only src/dds/ knows rustdds"),
         ("src/process/a.rs", "use ros2_client::Context;", "only src/dds/ knows ros2_client"),
@@ -182,7 +200,7 @@ fn what_is_impure_or_knows_a_library_is_found() {
         (
             "src/config/load.rs",
             "use serde_yaml;",
-            "only src/config/yaml/, src/eval/scenario/ knows serde_yaml",
+            "only src/config/yaml/, crates/eval/src/scenario/ knows serde_yaml",
         ),
     ] {
         let found = violations(path, text).join("\n");
@@ -193,9 +211,10 @@ fn what_is_impure_or_knows_a_library_is_found() {
 #[test]
 fn what_is_allowed_is_not_found() {
     for (path, text) in [
-        ("src/policy/a.rs", "use crate::model::B; use super::b; use std::time::Duration;"),
-        ("src/policy/mod.rs", "mod tests { use super::*; }"),
-        ("src/policy/a.rs", "mod tests { use super::super::b::C; }"),
+        ("crates/measure/src/a.rs", "use super::b; use std::time::Duration;"),
+        ("crates/eval/src/a.rs", "use adaptive_bridge::model::B; use crate::bed::C;"),
+        ("src/config/mod.rs", "mod tests { use super::*; }"),
+        ("src/config/a.rs", "mod tests { use super::super::b::C; }"),
         ("src/process/a/b.rs", "use super::super::role::Role; use crate::{dds, shm};"),
         ("src/process/a.rs", "// use crate::cli::B;\nconst B: &str = \"use crate::cli::B;\";"),
         ("src/clock.rs", "use crate::model::MonotonicNs;"),
@@ -203,7 +222,7 @@ fn what_is_allowed_is_not_found() {
         ("src/config/yaml/mod.rs", "use granit_parser::Parser;"),
         ("src/lib.rs", "pub mod cli; use crate::cli;"),
         ("src/main.rs", "fn main() { adaptive_bridge::cli::main() }"),
-        ("src/bin/a.rs", "fn main() { adaptive_bridge::eval::main() }"),
+        ("crates/eval/src/main.rs", "fn main() { adaptive_bridge_eval::main() }"),
     ] {
         let found = violations(path, text);
         assert!(found.is_empty(), "{path}: {text}: found: {}", found.join("\n"));

@@ -6,7 +6,7 @@ const MAX_COLUMNS: usize = 110;
 /// Of a line with a string in it, which rustfmt leaves alone: a message is found by its words only where it
 /// stands in one line.
 const MAX_STRING_COLUMNS: usize = 120;
-/// Of `src`. Tests may be longer.
+/// Of libraries and programs. Tests may be longer.
 const MAX_LINES: usize = 600;
 /// The roots of the programs only dispatch.
 const MAX_MAIN_LINES: usize = 20;
@@ -49,7 +49,7 @@ fn violations(path: &str, text: &str) -> Vec<String> {
             say(index + 1, &format!("{columns} columns, at most {max}"));
         }
     }
-    if path.starts_with("src/") && lines.len() > MAX_LINES {
+    if is_shipped(path) && lines.len() > MAX_LINES {
         say(lines.len(), &format!("{} lines, at most {MAX_LINES}", lines.len()));
     }
     if is_program(path) && lines.len() > MAX_MAIN_LINES {
@@ -74,13 +74,18 @@ fn violations(path: &str, text: &str) -> Vec<String> {
     found
 }
 
+/// Whether a file belongs to a library or program, and not to tests or benchmarks.
+fn is_shipped(path: &str) -> bool {
+    path.starts_with("src/") || (path.starts_with("crates/") && path.contains("/src/"))
+}
+
 /// Whether a file is the root of a program.
 fn is_program(path: &str) -> bool {
-    path == "src/main.rs" || path.starts_with("src/bin/")
+    is_shipped(path) && path.ends_with("src/main.rs")
 }
 
 fn rust_files() -> Vec<SourceFile> {
-    ["src", "tests", "benches", "examples", "fuzz"].iter().flat_map(|folder| files(folder, "rs")).collect()
+    ["src", "crates", "tests", "benches", "fuzz"].iter().flat_map(|folder| files(folder, "rs")).collect()
 }
 
 #[test]
@@ -114,8 +119,9 @@ fn what_breaks_a_rule_is_found() {
         ("src/a.rs", long_line.as_str(), ":1: 113 columns"),
         ("src/a.rs", &long_string, ":2: 121 columns"),
         ("src/a.rs", &many_lines, "601 lines"),
+        ("crates/a/src/b.rs", &many_lines, "601 lines"),
         ("src/main.rs", &long_main, "more than dispatch"),
-        ("src/bin/a.rs", &long_main, "more than dispatch"),
+        ("crates/a/src/main.rs", &long_main, "more than dispatch"),
         ("tests/a.rs", "#[test]\n#[ignore]\nfn a() {}", ":2: an ignored test"),
         ("tests/a.rs", "#[ignore = \"slow\"]\nfn a() {}", "an ignored test"),
         ("src/a.rs", "// TODO: b", "TODO"),

@@ -266,7 +266,9 @@ const WARM_UP: f64 = 0.2;
 /// Whether memory grows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trend {
+    /// It grows by at most [`MAX_KIB_PER_HOUR`], or by less than an allocator takes at once.
     Flat,
+    /// It grows by more.
     Grows,
     /// No growth was found, but the run was too short to find one.
     TooShort,
