@@ -3,8 +3,6 @@
 
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
-mod support;
-
 use nix::sys::ptrace;
 use nix::sys::signal::Signal;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};

@@ -59,6 +59,7 @@ fn report() -> Report {
             mode: LaneMode::Degraded,
             reason: ModeReason::Default,
             ends_at: None,
+            is_used: true,
             health,
         }],
         routes: vec![RouteReading {
