@@ -33,7 +33,7 @@ fn report() -> Report {
         latency.record(latency_us * 10_000);
     }
     let mut control = ControlRecord { probes_sent: 50, subscribers: 1, ..ControlRecord::default() };
-    control.refused.add(ProbeRefusal::Replayed);
+    control.refused.add(ProbeRefusal::Replayed, 1);
     let subscriber = SubscriberRecord {
         id: FixedText::new("laptop"),
         settled: 50,

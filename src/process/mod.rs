@@ -7,6 +7,7 @@
 
 mod arena;
 mod control;
+mod count_log;
 mod egress;
 mod in_force;
 mod inbox;
@@ -20,7 +21,6 @@ mod role;
 mod scheduling;
 mod stop;
 mod supervisor;
-mod watch;
 
 pub use control::control;
 pub use egress::{egress, end_unused};

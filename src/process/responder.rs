@@ -9,17 +9,18 @@ use std::time::Duration;
 use tracing::{debug, info, warn};
 
 use super::HOUSEKEEPING_MS;
+use super::count_log::RefusalLog;
 use super::inbox::Inbox;
 use super::notify::{Meter, Notifier};
 use super::probes::{
-    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RefusalLog, RequestHandler, Trust,
+    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RequestHandler, Trust,
 };
 use super::role::RoleError;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::DdsNetwork;
 use crate::dds::{Participant, ParticipantOptions, RawWriter, Take};
-use crate::model::{Encapsulation, MonotonicNs, SourceTimestamp, TopicName};
+use crate::model::{Encapsulation, MonotonicNs, RefusalCounts, SourceTimestamp, TopicName};
 use crate::telemetry;
 
 /// How long the responder waits for a probe request before it logs a warning.
@@ -131,8 +132,8 @@ impl Responder {
             participant,
             handler: RequestHandler::new(options.id, options.trust, options.max_probe_rate_hz, now),
             request: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
-            refused: RefusalLog::of_refused(),
-            accepted: RefusalLog::of_accepted(),
+            refused: RefusalLog::new(RefusalCounts::default()),
+            accepted: RefusalLog::new(RefusalCounts::default()),
             housekeeping_at: MonotonicNs(0),
             last_request_at: now,
             logged: LoggedState::Nothing,
@@ -193,8 +194,8 @@ impl Responder {
     }
 
     fn housekeeping(&mut self, now: MonotonicNs) {
-        self.refused.log_new(&self.handler.refused, now);
-        self.accepted.log_new(&self.handler.accepted_anyway, now);
+        self.refused.log_refused(&self.handler.refused, now);
+        self.accepted.log_accepted(&self.handler.accepted_anyway, now);
         if self.logged != LoggedState::Silent && now.since(self.last_request_at) >= SILENCE_MS * 1_000_000 {
             self.logged = LoggedState::Silent;
             warn!(

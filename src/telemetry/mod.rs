@@ -28,8 +28,8 @@ pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problems::{Level, Problem};
 pub use report::{
-    Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
-    PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport, SubscriberReport,
+    IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
+    PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 pub use snapshot::{
     LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,

@@ -6,10 +6,11 @@ use comfy_table::{CellAlignment, ColumnConstraint, Table, Width, presets};
 
 use super::liveness::ProcessState;
 use super::report::{
-    AbsenceReport, Drops, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
+    AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
     PublisherReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 use super::text::counted;
+use crate::model::DropCounts;
 
 /// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
 const COLUMNS: usize = 100;
@@ -156,7 +157,7 @@ fn safety_text(safety: &SafetyReport) -> String {
 
 fn probes_text(probes: &ProbesReport) -> String {
     let mut text = format!("{} sent, {} answered", probes.sent, probes.accepted);
-    for (reason, count) in probes.refused.0.iter() {
+    for (reason, count) in probes.refused.iter() {
         let _ = write!(text, ", {reason} {count}");
     }
     wrapped("  probes: ", "    ", text.split_inclusive(", "), "")
@@ -230,14 +231,13 @@ fn intruders_text(intruders: &[IntruderReport], seen: u64) -> String {
     text
 }
 
-fn drops_text(drops: &Drops, in_window: &Drops) -> String {
+fn drops_text(drops: &DropCounts, in_window: &DropCounts) -> String {
     let entries: Vec<String> = drops
-        .0
         .iter()
         .enumerate()
         .map(|(index, (reason, count))| {
             let comma = if index == 0 { "" } else { ", " };
-            match in_window.0.get(reason) {
+            match in_window.get(reason) {
                 0 => format!("{comma}{reason} {count}"),
                 new => format!("{comma}{reason} {count} (+{new})"),
             }

@@ -3,18 +3,15 @@
 use super::liveness::ProcessState;
 use super::problems::{Level, Problem};
 use super::report::{
-    AbsenceReport, Drops, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
-    ProcessReport, PublisherReport, ReaderReport, Refusals, Report, RouteReport, SafetyReport,
-    SubscriberReport,
+    AbsenceReport, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
+    ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
-use crate::model::{DropCounts, DropReason, ProbeRefusal, RefusalCounts};
+use crate::model::{Counts, Reason};
 
-fn drops(each: u64) -> Drops {
-    let mut counts = DropCounts::default();
-    for &reason in DropReason::ALL {
-        counts.add(reason, each);
-    }
-    Drops(counts)
+fn counts<R: Reason, const N: usize>(each: u64) -> Counts<R, N> {
+    let mut counts = Counts::default();
+    R::ALL.iter().for_each(|&reason| counts.add(reason, each));
+    counts
 }
 
 /// A report in which every list has an item, and numbers and texts have their maximum length.
@@ -47,8 +44,8 @@ pub(super) fn wide_report() -> Report {
         by_reference: 0,
         caught_up: 0,
         waiting: 0,
-        drops: drops(u64::MAX / 100),
-        drops_in_window: drops(u64::MAX / 100),
+        drops: counts(u64::MAX / 100),
+        drops_in_window: counts(u64::MAX / 100),
         whole: true,
         received_hz: Some(99_999.9),
         rate_hz: Some(99_999.9),
@@ -109,8 +106,8 @@ pub(super) fn wide_report() -> Report {
                 repeated: u64::MAX,
                 last_received_age_ms: Some(1.0),
             }],
-            drops: drops(u64::MAX / 100),
-            drops_in_window: drops(0),
+            drops: counts(u64::MAX / 100),
+            drops_in_window: counts(0),
             whole: true,
             rate_hz: Some(99_999.9),
             bytes_per_s: Some(1e11),
@@ -123,8 +120,8 @@ pub(super) fn wide_report() -> Report {
         probes: ProbesReport {
             sent: u64::MAX,
             accepted: u64::MAX,
-            refused: refusals(99_999_999),
-            refused_in_window: refusals(1),
+            refused: counts(99_999_999),
+            refused_in_window: counts(1),
         },
         subscribers: vec![SubscriberReport {
             id: "x".repeat(127),
@@ -176,14 +173,4 @@ fn process(name: &str) -> ProcessReport {
         refused_reloads: 99_999,
         settings_fingerprint: None,
     }
-}
-
-fn refusals(each: u64) -> Refusals {
-    let mut counts = RefusalCounts::default();
-    for &reason in ProbeRefusal::ALL {
-        for _ in 0..each.min(3) {
-            counts.add(reason);
-        }
-    }
-    Refusals(counts)
 }

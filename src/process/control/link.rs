@@ -125,13 +125,13 @@ impl Link {
             });
             match take {
                 Take::Empty => return None,
-                Take::Malformed => invalid.refused.add(ProbeRefusal::Malformed),
+                Take::Malformed => invalid.refused.add(ProbeRefusal::Malformed, 1),
                 Take::Sample(_) => {
                     let arrived_at = clock::monotonic();
                     match self.check(encapsulation, trust) {
                         Ok((response, tolerated)) => {
                             if let Some(reason) = tolerated {
-                                invalid.accepted.add(reason);
+                                invalid.accepted.add(reason, 1);
                             }
                             *budget -= 1;
                             return Some(Response {
@@ -140,7 +140,7 @@ impl Link {
                                 arrived_at,
                             });
                         }
-                        Err(reason) => invalid.refused.add(reason),
+                        Err(reason) => invalid.refused.add(reason, 1),
                     }
                 }
             }

@@ -17,8 +17,9 @@ use std::time::Duration;
 use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
+use super::count_log::RefusalLog;
 use super::notify::write_list;
-use super::probes::{RefusalLog, Trust};
+use super::probes::Trust;
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
@@ -138,8 +139,8 @@ impl Control {
             participants,
             record,
             invalid_responses: InvalidResponses::default(),
-            refused_log: RefusalLog::of_refused(),
-            accepted_log: RefusalLog::of_accepted(),
+            refused_log: RefusalLog::new(RefusalCounts::default()),
+            accepted_log: RefusalLog::new(RefusalCounts::default()),
             decisions: vec![String::new(); settings.lanes.len()],
             next_probe_at: now,
             next_evaluation_at: now,
@@ -202,8 +203,8 @@ impl Control {
                 match self.subscribers.on_response(number, link, &response, &self.settings) {
                     Ok(()) => accepted += 1,
                     // Expected on a bad link and already counted as loss: not logged.
-                    Err(ProbeRefusal::Late) => late.add(ProbeRefusal::Late),
-                    Err(reason) => invalid.refused.add(reason),
+                    Err(ProbeRefusal::Late) => late.add(ProbeRefusal::Late, 1),
+                    Err(reason) => invalid.refused.add(reason, 1),
                 }
             }
         }
@@ -316,8 +317,8 @@ impl Control {
             self.decide(now);
         }
         self.endpoints.housekeeping(&mut self.participants, &self.settings, now);
-        self.refused_log.log_new(&self.invalid_responses.refused, now);
-        self.accepted_log.log_new(&self.invalid_responses.accepted, now);
+        self.refused_log.log_refused(&self.invalid_responses.refused, now);
+        self.accepted_log.log_accepted(&self.invalid_responses.accepted, now);
         self.write_record();
         // Every participant is asked, so that each one's threads are woken.
         let stuck = self.participants.iter_mut().filter_map(|one| (!one.have_threads_turned()).then_some(()));

@@ -6,8 +6,8 @@ use bytes::Bytes;
 use tracing::{error, info, warn};
 
 use super::super::arena::CopyArena;
+use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
-use super::super::watch::DropWatch;
 use super::late_joiners::{KeptSample, LateJoiners};
 use super::unsent::{Unsent, UnsentSamples};
 use crate::clock;
@@ -54,8 +54,6 @@ pub(super) struct Output {
     /// The drop reason of a gap in the current mode.
     gap_reason: DropReason,
     mode: LaneMode,
-    /// Drop reasons that are normal operation of the lane and are not logged.
-    expected_drops: &'static [DropReason],
     subscriber: SampleSubscriber,
     writer: Option<RawWriter>,
     unsent: UnsentSamples<Forwarded>,
@@ -77,7 +75,7 @@ pub(super) struct Output {
     shm: HistogramWriter,
     dds_out: HistogramWriter,
     age: HistogramWriter,
-    drop_watch: DropWatch,
+    drop_log: DropLog,
     boards: Boards,
 }
 
@@ -125,14 +123,13 @@ impl Output {
             overwrite_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
             gap_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
             mode: LaneMode::Normal,
-            expected_drops: expected_drops(lane.class),
             subscriber,
             writer: None,
             unsent: UnsentSamples::new(lane.window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
             queued: 0,
             late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
-            drop_watch: DropWatch::new(former.drops),
+            drop_log: DropLog::new(former.drops),
             counters,
             readers,
             former_readers,
@@ -357,7 +354,9 @@ impl Output {
         self.follow_matching(now);
         self.record_readers(now);
         self.serve_late_joiners(now);
-        self.drop_watch.log_new(&self.counters.get().drops, &self.id, &self.lane, self.expected_drops, now);
+        let class = self.class;
+        let is_expected = |reason: DropReason| reason.is_expected(class);
+        self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
     }
 
     /// Waits until all RELIABLE readers have acknowledged all samples, at most for `timeout`. Returns whether
@@ -552,19 +551,5 @@ const fn overwrite_reason(class: TrafficClass, policy: DropPolicy) -> DropReason
         (TrafficClass::Critical, _) => DropReason::QueueOverflow,
         (TrafficClass::Noncritical, DropPolicy::DropOldest) => DropReason::Superseded,
         (TrafficClass::Noncritical, _) => DropReason::QueueFull,
-    }
-}
-
-/// The drop reasons that are normal operation of a lane of this class.
-const fn expected_drops(class: TrafficClass) -> &'static [DropReason] {
-    match class {
-        TrafficClass::Critical => &[DropReason::NoReader],
-        TrafficClass::Noncritical => &[
-            DropReason::Superseded,
-            DropReason::QueueFull,
-            DropReason::Suspended,
-            DropReason::Stopped,
-            DropReason::NoReader,
-        ],
     }
 }

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use tracing::{error, info, warn};
 
+use super::super::count_log::DropLog;
 use super::super::inbox::{ArrivalFlag, Inbox};
 use super::super::role::{Role, RoleError};
-use super::super::watch::DropWatch;
 use super::clocks::Clocks;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};
@@ -46,7 +46,7 @@ pub(super) struct Input {
     dds_in: HistogramWriter,
     clocks: Clocks,
     publishers: Publishers,
-    drop_watch: DropWatch,
+    drop_log: DropLog,
     remind_at: MonotonicNs,
     /// The type conflict that was logged last.
     conflict: Option<(String, String)>,
@@ -84,7 +84,7 @@ impl Input {
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
-            drop_watch: DropWatch::new(counters.get().drops),
+            drop_log: DropLog::new(counters.get().drops),
             counters,
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
@@ -271,7 +271,7 @@ impl Input {
         if counters != *self.counters.get() {
             self.counters.update(|current| *current = counters);
         }
-        self.drop_watch.log_new(&self.counters.get().drops, &self.id, "ingress", &[], now);
+        self.drop_log.log_drops(&self.counters.get().drops, &self.id, "ingress", |_| false, now);
         Ok(())
     }
 

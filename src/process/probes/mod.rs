@@ -4,7 +4,6 @@ mod message;
 mod request_handler;
 mod secret;
 mod trust;
-mod watch;
 
 use crate::dds::ReaderQos;
 use crate::model::{Durability, History, QosProfile, Reliability};
@@ -13,7 +12,6 @@ pub use message::{MAX_MESSAGE_BYTES, PROBE_TYPE, ProbeId, ProbeRequest, ProbeRes
 pub use request_handler::RequestHandler;
 pub use secret::{Secret, SecretError};
 pub use trust::{Signed, Trust};
-pub use watch::RefusalLog;
 
 /// History depth of the readers: one message each of 64 senders that send at the same time.
 const PROBE_DEPTH: u32 = 64;

@@ -44,7 +44,7 @@ impl RequestHandler {
     pub fn is_within_rate(&mut self, writer: Guid, now: MonotonicNs) -> bool {
         let allowed = self.limits.allow(writer, now);
         if !allowed {
-            self.refused.add(ProbeRefusal::RateLimited);
+            self.refused.add(ProbeRefusal::RateLimited, 1);
         }
         allowed
     }
@@ -62,12 +62,12 @@ impl RequestHandler {
         match checked {
             Ok((request, tolerated)) => {
                 if let Some(reason) = tolerated {
-                    self.accepted_anyway.add(reason);
+                    self.accepted_anyway.add(reason, 1);
                 }
                 Some(request)
             }
             Err(reason) => {
-                self.refused.add(reason);
+                self.refused.add(reason, 1);
                 None
             }
         }
@@ -75,7 +75,7 @@ impl RequestHandler {
 
     /// Counts a sample that the DDS library could not read.
     pub fn count_malformed(&mut self) {
-        self.refused.add(ProbeRefusal::Malformed);
+        self.refused.add(ProbeRefusal::Malformed, 1);
     }
 
     /// Makes the response to a request that was received at `received`. `begun` and `sent` are the times at

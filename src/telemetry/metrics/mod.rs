@@ -147,7 +147,7 @@ fn routes(page: &mut Page, report: &Report) {
     for route in &report.routes {
         for reason in DropReason::ALL {
             let labels = [("route", route.id.as_str()), ("reason", reason.label())];
-            page.sample(&labels, Some(route.drops.0.get(*reason)));
+            page.sample(&labels, Some(route.drops.get(*reason)));
         }
     }
     page.family(
@@ -206,7 +206,7 @@ fn outputs(page: &mut Page, report: &Report) {
     for (route, output) in all() {
         for reason in DropReason::ALL {
             let labels = [("lane", output.lane.as_str()), ("route", &route.id), ("reason", reason.label())];
-            page.sample(&labels, Some(output.drops.0.get(*reason)));
+            page.sample(&labels, Some(output.drops.get(*reason)));
         }
     }
     let mut each = |name, help: &str, stage: fn(&OutputReport) -> &Latency| {
@@ -256,7 +256,7 @@ fn control(page: &mut Page, report: &Report) {
     one("adaptive_bridge_absences", Gauge, "Network interfaces and peers that are away at present.", away);
     page.family("adaptive_bridge_probe_refusals_total", Counter, "Probe messages refused, by reason.");
     for reason in ProbeRefusal::ALL {
-        page.sample(&[("reason", reason.label())], Some(probes.refused.0.get(*reason)));
+        page.sample(&[("reason", reason.label())], Some(probes.refused.get(*reason)));
     }
 }
 

@@ -376,7 +376,7 @@ mod tests {
     fn refused_probe_messages_are_problems_except_late_ones() {
         let found = problems_after(|now| {
             for refusal in [ProbeRefusal::Late, ProbeRefusal::Replayed, ProbeRefusal::Replayed] {
-                now.control.refused.add(refusal);
+                now.control.refused.add(refusal, 1);
             }
         });
         let replayed = ProbeRefusal::Replayed.meaning();

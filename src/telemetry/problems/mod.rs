@@ -5,7 +5,6 @@ mod processes;
 mod publishers;
 
 use super::liveness::ProcessState;
-use super::report::drops_since;
 use super::snapshot::{LaneReading, OutputReading, RouteReading, Snapshot};
 use super::text::counted;
 use crate::model::{DropReason, LaneCounters, LaneMode, TrafficClass};
@@ -222,7 +221,7 @@ fn dropped(route: &RouteReading, now: &Snapshot, before: &Snapshot, problems: &m
     let window = window_text(now, before);
     let former = before.route(route);
     let about = format!("route {}", route.id);
-    let dropped = drops_since(&route.counters.drops, former.map(|former| former.counters.drops));
+    let dropped = route.counters.drops.since_reading(former.map(|former| former.counters.drops));
     for (reason, count) in dropped.iter() {
         let text = format!(
             "ingress, route {}: dropped {} in the last {window}: {} ({reason})",
@@ -235,8 +234,8 @@ fn dropped(route: &RouteReading, now: &Snapshot, before: &Snapshot, problems: &m
     for output in &route.outputs {
         let lane = &now.lanes[output.lane];
         let former = former.and_then(|former| former.output(output));
-        let dropped = drops_since(&output.counters.drops, former.map(|former| former.counters.drops));
-        for (reason, count) in dropped.iter().filter(|(reason, _)| !is_expected(*reason, lane.class)) {
+        let dropped = output.counters.drops.since_reading(former.map(|former| former.counters.drops));
+        for (reason, count) in dropped.iter().filter(|(reason, _)| !reason.is_expected(lane.class)) {
             let level = match lane.class {
                 TrafficClass::Critical => Level::Error,
                 TrafficClass::Noncritical => Level::Warn,
@@ -318,18 +317,6 @@ fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
     }
     let readers = counted(output.counters.readers, "subscriber");
     format!("; {readers} matched, see matched_readers in `adaptive-bridge status --json`")
-}
-
-/// Drops that are part of a noncritical lane's normal work. A critical lane has none of these.
-const fn is_expected(reason: DropReason, class: TrafficClass) -> bool {
-    match reason {
-        DropReason::Superseded | DropReason::QueueFull | DropReason::Suspended => {
-            matches!(class, TrafficClass::Noncritical)
-        }
-        // The report shows the cause elsewhere: the lane's mode, the number of its readers, or its restart.
-        DropReason::Stopped | DropReason::NoReader => true,
-        _ => false,
-    }
 }
 
 #[cfg(test)]

@@ -1,11 +1,9 @@
 //! The parts of the report that come from control: safety, probes, subscribers, intruders, absences.
 
-use serde::ser::{Serialize, SerializeMap, Serializer};
-
 use super::age_ms;
 use crate::model::{
-    AbsenceRecord, IntruderRecord, LaneMode, MonotonicNs, ProbeRefusal, RefusalCounts, SubscriberState,
-    SubscriberWarning, TrafficClass,
+    AbsenceRecord, IntruderRecord, LaneMode, MonotonicNs, RefusalCounts, SubscriberState, SubscriberWarning,
+    TrafficClass,
 };
 use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
@@ -31,23 +29,9 @@ pub struct ProbesReport {
     /// Probe responses accepted.
     pub accepted: u64,
     /// Refused messages, by reason.
-    pub refused: Refusals,
+    pub refused: RefusalCounts,
     /// Refused messages within the window, by reason.
-    pub refused_in_window: Refusals,
-}
-
-/// Refusal counts by reason. The JSON has every reason as a key.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Refusals(pub RefusalCounts);
-
-impl Serialize for Refusals {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(ProbeRefusal::COUNT))?;
-        for reason in ProbeRefusal::ALL {
-            map.serialize_entry(reason.label(), &self.0.get(*reason))?;
-        }
-        map.end()
-    }
+    pub refused_in_window: RefusalCounts,
 }
 
 /// The state and the link figures of one subscriber.
@@ -146,8 +130,8 @@ impl Snapshot {
         ProbesReport {
             sent: self.control.probes_sent,
             accepted: self.control.responses_accepted,
-            refused: Refusals(*now),
-            refused_in_window: Refusals(now.since(before)),
+            refused: *now,
+            refused_in_window: now.since(before),
         }
     }
 

@@ -5,9 +5,7 @@
 mod control;
 mod latency;
 
-use serde::ser::{Serialize, SerializeMap, Serializer};
-
-pub use control::{AbsenceReport, IntruderReport, ProbesReport, Refusals, SafetyReport, SubscriberReport};
+pub use control::{AbsenceReport, IntruderReport, ProbesReport, SafetyReport, SubscriberReport};
 pub use latency::{Latency, LatencyTotal};
 
 use super::liveness::ProcessState;
@@ -15,8 +13,7 @@ use super::problems::{self, Problem};
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
 use crate::model::{
-    DropCounts, DropReason, FixedText, Guid, IngressCounters, LaneMode, MonotonicNs, PublisherAccount,
-    ReaderRecord,
+    DropCounts, FixedText, Guid, IngressCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
@@ -127,9 +124,9 @@ pub struct RouteReport {
     /// The publishers that have sent samples.
     pub publishers: Vec<PublisherReport>,
     /// Samples received but not published, by reason.
-    pub drops: Drops,
+    pub drops: DropCounts,
     /// Drops within the window, by reason.
-    pub drops_in_window: Drops,
+    pub drops_in_window: DropCounts,
     /// Whether `received = published + drops`.
     pub whole: bool,
     /// Samples received per second.
@@ -200,9 +197,9 @@ pub struct OutputReport {
     /// Samples waiting in the lane.
     pub waiting: u64,
     /// Samples not forwarded, by reason.
-    pub drops: Drops,
+    pub drops: DropCounts,
     /// Drops within the window, by reason.
-    pub drops_in_window: Drops,
+    pub drops_in_window: DropCounts,
     /// Whether `received = forwarded + waiting + drops`.
     pub whole: bool,
     /// Samples offered per second.
@@ -238,20 +235,6 @@ pub struct ReaderReport {
     pub unacknowledged: u64,
     /// Offered samples that left the lane's history before the reader acknowledged them.
     pub overrun: u64,
-}
-
-/// Drop counts by reason. The JSON has every reason as a key, so that a missing key means a misspelt name.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Drops(pub DropCounts);
-
-impl Serialize for Drops {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(DropReason::COUNT))?;
-        for reason in DropReason::ALL {
-            map.serialize_entry(reason.label(), &self.0.get(*reason))?;
-        }
-        map.end()
-    }
 }
 
 impl Snapshot {
@@ -321,8 +304,8 @@ impl Snapshot {
             repeated: counters.repeated,
             unmarked: counters.unmarked,
             publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
-            drops: Drops(counters.drops),
-            drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
+            drops: counters.drops,
+            drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
             whole: now.is_accounted_for(),
             rate_hz: per_s(counters.received, former.map(|former| former.received), window_ms),
             bytes_per_s: per_s(
@@ -385,8 +368,8 @@ impl Snapshot {
             by_reference: counters.by_reference,
             caught_up: counters.caught_up,
             waiting: counters.waiting,
-            drops: Drops(counters.drops),
-            drops_in_window: Drops(drops_since(&counters.drops, former.map(|former| former.drops))),
+            drops: counters.drops,
+            drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
             whole: counters.is_accounted_for(),
             received_hz: rate(counters.received(), former.map(|former| former.received())),
             rate_hz: rate(counters.forwarded, former.map(|former| former.forwarded)),
@@ -452,17 +435,6 @@ impl RouteReading {
     }
 }
 
-/// Drops since an earlier reading; none without an earlier reading or after the bridge was restarted.
-pub(super) fn drops_since(now: &DropCounts, before: Option<DropCounts>) -> DropCounts {
-    let mut drops = DropCounts::default();
-    if let Some(before) = before {
-        for &reason in DropReason::ALL {
-            drops.add(reason, now.get(reason).saturating_sub(before.get(reason)));
-        }
-    }
-    drops
-}
-
 fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
     let health = &process.health;
     ProcessReport {
@@ -512,18 +484,6 @@ mod tests {
         assert_eq!(per_s(150, None, 500.0), None);
         assert_eq!(per_s(99, Some(100), 500.0), None);
         assert_eq!(per_s(150, Some(100), 0.0), None);
-    }
-
-    #[test]
-    fn drops_before_the_window_are_not_counted() {
-        let mut now = DropCounts::default();
-        now.add(DropReason::Stale, 3);
-        assert_eq!(drops_since(&now, None).total(), 0);
-        let mut before = DropCounts::default();
-        before.add(DropReason::Stale, 1);
-        before.add(DropReason::NoReader, 9);
-        let since: Vec<_> = drops_since(&now, Some(before)).iter().collect();
-        assert_eq!(since, [(DropReason::Stale, 2)]);
     }
 
     /// tests/cli.rs compares the other keys with the output of a running bridge.

@@ -4,6 +4,7 @@
 //! teletraffic engineering; each is defined at the type of that name.
 
 mod control;
+mod counts;
 mod drops;
 mod hash;
 mod health;
@@ -20,6 +21,7 @@ pub use control::{
     AbsenceKind, AbsenceRecord, ControlRecord, IntruderRecord, MAX_ABSENCES, MAX_INTRUDERS,
     MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint, SubscriberRecord, SubscriberWarning,
 };
+pub use counts::{Counts, Reason};
 pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
