@@ -27,7 +27,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::clock;
 use crate::config::{self, ConfigError, Configuration, Settings};
 use crate::process::{InForce, Stop};
-use crate::shm::{self, ShmError};
+use crate::shm::ShmError;
 use crate::telemetry::{self, Snapshot};
 
 /// Exit code of `reload` when some changes of the file wait for a restart of the whole bridge.
@@ -216,11 +216,6 @@ fn output_ended(error: &io::Error) -> ExitCode {
         ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         _ => failed(&format!("stdout: {error}")),
     }
-}
-
-/// The root folder of the bridge's shared-memory files, from these settings and the environment.
-fn root(settings: &Settings) -> PathBuf {
-    shm::default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
 }
 
 /// Sleeps for `ms` and returns `true`; returns `false` as soon as a stop is requested.

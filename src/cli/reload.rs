@@ -4,9 +4,10 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, output_ended, root};
+use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, output_ended};
 use crate::config::Reload;
 use crate::process::{InForce, ReloadAnswer, ReloadResult, reload_all};
+use crate::shm::root_of;
 
 pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
     // A bad file is refused here with all its problems, before any process of the bridge reads it.
@@ -16,7 +17,7 @@ pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
     };
     // The file may have a new instance name since the bridge was started with it.
     let settings = InForce::find(&arguments.file(), Some(&file)).unwrap_or_else(|| file.clone());
-    let root = root(&settings);
+    let root = root_of(&settings);
     let answers = match reload_all(&root, &settings.instance) {
         Ok(answers) if answers.is_empty() => return no_bridge(&settings, &root),
         Ok(answers) => answers,

@@ -7,10 +7,10 @@ use std::process::ExitCode;
 
 use clap::{Args, value_parser};
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge, root};
+use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge};
 use crate::config::Settings;
 use crate::process::Stop;
-use crate::shm::ShmError;
+use crate::shm::{ShmError, root_of};
 use crate::telemetry::{ProcessState, Report, Snapshot};
 
 /// Allowed values of `--interval-ms`: from 10 ms, one period of 100 Hz, to an hour.
@@ -42,7 +42,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Ok(settings) => settings,
         Err(code) => return code,
     };
-    let root = root(&settings);
+    let root = root_of(&settings);
     let first = match read_bridge(&root, &settings) {
         Ok(Some(snapshot)) => snapshot,
         Ok(None) => return no_bridge(&settings, &root),
@@ -92,7 +92,7 @@ fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first
             && let Some(restarted) = arguments.config.running()
         {
             settings = restarted;
-            root = super::root(&settings);
+            root = root_of(&settings);
         }
         // A bridge that was restarted as a whole since the last snapshot may have other lanes or routes.
         let next = match Snapshot::take(&root, &settings) {

@@ -11,13 +11,13 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge, root};
+use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{Encapsulation, MonotonicNs};
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::process::Stop;
-use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError};
+use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError, root_of};
 use crate::telemetry::Intervals;
 
 /// The period of the lines of `--hz`.
@@ -57,7 +57,7 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         return failed(&unknown_topic(&settings, &arguments.topic));
     };
     // Checked first, because opening a node would create the shared memory of a bridge that does not run.
-    let root = root(&settings);
+    let root = root_of(&settings);
     match read_bridge(&root, &settings) {
         Ok(Some(_)) => {}
         Ok(None) => return no_bridge(&settings, &root),

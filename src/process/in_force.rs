@@ -6,10 +6,9 @@ use std::path::{Path, PathBuf};
 
 use tracing::{info, warn};
 
-use super::role::root;
 use crate::config::{ConfigError, Configuration, Settings};
 use crate::model::InstanceName;
-use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root};
+use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root, root_of};
 use crate::telemetry::Snapshot;
 
 /// Environment variable that `up` sets for its children, to the folder of their instance.
@@ -71,7 +70,7 @@ impl InForce {
             return Self::of_running_bridge(share, &bytes, loaded);
         }
         let configuration = loaded?;
-        let (root, instance) = (root(&configuration.settings), configuration.settings.instance.clone());
+        let (root, instance) = (root_of(&configuration.settings), configuration.settings.instance.clone());
         let own = encode(&configuration)?;
         let (share, bytes) = InForceShare::join(&root, &instance, &own)?;
         if bytes != own {
@@ -86,7 +85,7 @@ impl InForce {
     /// # Errors
     /// The bridge runs already, or the folder of the instance cannot be used.
     pub fn begin(file: &Path, configuration: Configuration) -> Result<Self, ShmError> {
-        let (root, instance) = (root(&configuration.settings), configuration.settings.instance.clone());
+        let (root, instance) = (root_of(&configuration.settings), configuration.settings.instance.clone());
         let share = InForceShare::begin(&root, &instance, &encode(&configuration)?)?;
         write_address(file, &root, &instance);
         Ok(Self { configuration, share })
@@ -140,7 +139,7 @@ impl InForce {
             .and_then(|address| settings_of_running(address.root(), address.instance()));
         by_file.or_else(|| {
             let named = loaded?;
-            settings_of_running(&root(named), &named.instance)
+            settings_of_running(&root_of(named), &named.instance)
         })
     }
 }
@@ -155,7 +154,7 @@ fn settings_of_running(root: &Path, instance: &InstanceName) -> Option<Settings>
 fn encode(configuration: &Configuration) -> Result<Vec<u8>, ShmError> {
     configuration.encode().map_err(|error| ShmError::Failed {
         what: "to encode the configuration".to_owned(),
-        path: root(&configuration.settings),
+        path: root_of(&configuration.settings),
         reason: error.to_string(),
     })
 }

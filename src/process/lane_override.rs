@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use super::role::{RoleError, lane_index, root};
+use super::role::{RoleError, lane_index};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{LaneMode, LanePolicy, MonotonicNs};
-use crate::shm::{BridgeShape, ProcessRole, ShmNode};
+use crate::shm::{BridgeShape, ProcessRole, ShmNode, root_of};
 
 /// Overrides the mode of a lane and returns the epoch of the new policy. The override ends after `duration`,
 /// or at the next call if that is `None`; a `mode` of `None` ends an override. The lane applies the policy
@@ -21,7 +21,7 @@ pub fn set_mode(
     duration: Option<Duration>,
 ) -> Result<u64, RoleError> {
     let index = lane_index(settings, lane)?;
-    let node = ShmNode::open(&root(settings), &settings.instance, "mode")?;
+    let node = ShmNode::open(&root_of(settings), &settings.instance, "mode")?;
     let boards = node.boards(&BridgeShape::of(settings))?;
     let serves = boards.health(ProcessRole::Egress(index)).is_some_and(|health| health.pid != 0);
     if !serves {

@@ -2,7 +2,6 @@
 //! health, DDS participant.
 
 use std::fmt;
-use std::path::PathBuf;
 
 use tracing::info;
 
@@ -13,7 +12,7 @@ use crate::clock;
 use crate::config::{Configuration, Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
 use crate::model::{Guid, MonotonicNs, ProcessHealth};
-use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, default_root};
+use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
 use crate::telemetry;
 
 /// Interval at which the process logs how many log lines were left out.
@@ -90,11 +89,6 @@ pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleE
     })
 }
 
-/// The folder of the bridge's shared files, for these settings and this environment.
-pub(super) fn root(settings: &Settings) -> PathBuf {
-    default_root(settings.shared_memory.root_path.as_deref(), |name| std::env::var_os(name))
-}
-
 /// A process that is up: it holds the lock of its role, has shared memory attached and writes its health.
 pub(super) struct Role {
     pub node: ShmNode,
@@ -119,7 +113,7 @@ impl Role {
         name: &str,
         scheduling: &Scheduling,
     ) -> Result<Self, RoleError> {
-        let root = root(settings);
+        let root = root_of(settings);
         let lock = RoleLock::acquire(&root, &settings.instance, name)?;
         // Before the scheduling, which is for the data path: the reload thread runs without it.
         let reloads = Reloads::start(requests, settings, lock.note_path())?;

@@ -20,13 +20,12 @@ use tracing::{error, info, warn};
 use super::in_force::{FOLDER_VARIABLE, InForce};
 use super::notify::{Notifier, write_list};
 use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
-use super::role::root;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Settings};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
-use crate::shm::{RoleLock, ShmError};
+use crate::shm::{RoleLock, ShmError, root_of};
 use crate::telemetry::Snapshot;
 
 /// Interval at which the supervisor checks its children.
@@ -122,7 +121,7 @@ pub fn up(
 ) -> Result<(), SupervisorError> {
     let in_force = InForce::begin(file, configuration)?;
     let settings = &in_force.configuration().settings;
-    let root = root(settings);
+    let root = root_of(settings);
     // The lock file tells another `up` the process id of this one.
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
@@ -193,7 +192,7 @@ impl<'a> ManagerReport<'a> {
             return;
         }
         self.read_at = now.plus_ms(READ_BOARDS_MS);
-        let next = match Snapshot::take(&root(self.settings), self.settings) {
+        let next = match Snapshot::take(&root_of(self.settings), self.settings) {
             Ok(Some(next)) => next,
             // The children have not created the boards yet, or the boards are of another configuration.
             Ok(None) | Err(ShmError::Incompatible { .. }) => return,

@@ -14,7 +14,8 @@ use nix::fcntl::FlockArg;
 
 use super::cell::{Cell, LINE, Plain, load};
 use super::error::ShmError;
-use super::root::{FileLock, InstanceDir, SHM_DIR};
+use super::lock::FileLock;
+use super::root::{InstanceDir, SHM_DIR};
 use super::segment::Segment;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;

@@ -22,7 +22,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use super::error::ShmError;
 use super::header::{self, HeaderError, WireHeader};
 use super::node::{NodeShared, ShmNode, StartLock, failed};
-use super::root::RoleLock;
+use super::roles::RoleLock;
 use super::sample_error::{LoanError, TakeError};
 use super::service::Service;
 use super::slot::{LENT_SLOTS, LentPermit, LentSlot, Slot};

@@ -15,8 +15,9 @@ use nix::fcntl::FlockArg;
 use serde::{Deserialize, Serialize};
 
 use super::error::ShmError;
-use super::holders::RoleHolder;
-use super::root::{FileLock, InstanceDir, RoleLock, lock_is_current, make_private, read_pid};
+use super::lock::{FileLock, lock_is_current, read_pid};
+use super::roles::{RoleHolder, RoleLock};
+use super::root::{InstanceDir, make_private};
 use crate::clock;
 use crate::model::{InstanceName, fnv1a};
 

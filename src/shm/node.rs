@@ -15,7 +15,9 @@ use nix::fcntl::FlockArg;
 
 use super::board::{Boards, BridgeShape};
 use super::error::ShmError;
-use super::root::{FileLock, InstanceDir, Membership};
+use super::lock::FileLock;
+use super::membership::Membership;
+use super::root::InstanceDir;
 use super::segment::{commit_files, require_free};
 use super::service::Service;
 use crate::model::InstanceName;

@@ -7,9 +7,8 @@ use nix::sys::statvfs::statvfs;
 use nix::unistd::geteuid;
 
 use super::{Finding, Severity};
-use crate::cli::root;
 use crate::config::Settings;
-use crate::shm::{RoleHolder, RouteChannel, instance_files};
+use crate::shm::{RoleHolder, RouteChannel, instance_files, root_of};
 
 const SHM: &str = "/dev/shm";
 
@@ -22,7 +21,7 @@ const SYSTEM_UID_MAX: u32 = 999;
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
     let needed = pools.sum::<u64>() + OTHER_BYTES;
-    let root = root(settings);
+    let root = root_of(settings);
     let holders = RoleHolder::all(&root, &settings.instance).unwrap_or_default();
     let mut findings = Vec::new();
     match statvfs(SHM) {

@@ -5,9 +5,8 @@ use std::path::Path;
 
 use super::super::units::{self, DropIns};
 use super::{Finding, Severity, list, output};
-use crate::cli::root;
 use crate::config::Settings;
-use crate::shm::RoleHolder;
+use crate::shm::{RoleHolder, root_of};
 
 const TARGET: &str = "adaptive-bridge.target";
 
@@ -33,7 +32,7 @@ fn kernel_version(release: &str, found: String) -> Finding {
 }
 
 pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
-    let holders = RoleHolder::all(&root(settings), &settings.instance).unwrap_or_default();
+    let holders = RoleHolder::all(&root_of(settings), &settings.instance).unwrap_or_default();
     let mut findings = vec![executables(&holders)];
     if !Path::new("/run/systemd/system").exists() {
         let text = "systemd does not run here; `adaptive-bridge up` supervises the processes";

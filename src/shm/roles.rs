@@ -1,16 +1,100 @@
-//! Finds the processes that serve the roles of an instance, and the files of an instance.
+//! The roles of an instance: the lock of each, and the processes that serve them.
 
 use std::fs;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use nix::fcntl::FlockArg;
+
 use super::error::ShmError;
-use super::root::{InstanceDir, LOCK_SUFFIX, ROLE_PREFIX, read_pid};
+use super::lock::{FileLock, LOCK_SUFFIX, lock_failed, read_pid};
+use super::root::InstanceDir;
 use crate::model::InstanceName;
 
 /// The file in which Linux lists held locks (proc_locks(5)).
 const LOCKS: &str = "/proc/locks";
+
+const ROLE_PREFIX: &str = "role-";
+
+/// The right to serve a role of an instance, such as `ingress` or `egress-critical`. Held until it is
+/// dropped; the kernel releases it when the process ends, in any way.
+#[derive(Debug)]
+pub struct RoleLock {
+    lock: Option<FileLock>,
+}
+
+impl RoleLock {
+    /// Takes the role; if another process has it, the error names that process.
+    pub fn acquire(root: &Path, instance: &InstanceName, role: &str) -> Result<Self, ShmError> {
+        for _ in 0..100 {
+            let dir = InstanceDir::prepare(root, instance)?;
+            match Self::try_acquire(&dir, role) {
+                Ok(Some(lock)) => return Ok(lock),
+                Ok(None) => {
+                    let pid = read_pid(&Self::path(&dir, role));
+                    return Err(ShmError::AlreadyServed { role: role.to_owned(), pid });
+                }
+                Err(error) if error.kind() == ErrorKind::NotFound => continue,
+                Err(error) => return Err(lock_failed(&Self::path(&dir, role), &error)),
+            }
+        }
+        Err(ShmError::Failed {
+            what: format!("to lock the role {role}"),
+            path: root.to_owned(),
+            reason: "other processes removed the folder in 100 attempts".to_owned(),
+        })
+    }
+
+    /// The path of a file beside the lock, in which the holder reports the result of its last reload
+    /// ([`RoleHolder`]). The file is removed with the instance.
+    pub fn note_path(&self) -> Option<PathBuf> {
+        self.lock.as_ref().map(|lock| note_path(lock.path()))
+    }
+
+    /// The id of the process that holds the role; `None` when no process does. Takes no lock.
+    pub(super) fn holder(root: &Path, instance: &InstanceName, role: &str) -> Option<u32> {
+        let path = Self::path(&InstanceDir::find(root, instance).ok()??, role);
+        let inode = fs::metadata(&path).ok()?.ino();
+        let pid = read_pid(&path);
+        is_locked_by(pid, inode).then_some(pid)
+    }
+
+    /// Takes the role; `None` when another process has it.
+    pub(super) fn try_acquire(dir: &InstanceDir, role: &str) -> io::Result<Option<Self>> {
+        let taken = FileLock::take(&Self::path(dir, role), FlockArg::LockExclusiveNonblock)?;
+        taken
+            .map(|mut lock| {
+                lock.write_pid()?;
+                Ok(Self { lock: Some(lock) })
+            })
+            .transpose()
+    }
+
+    fn path(dir: &InstanceDir, role: &str) -> PathBuf {
+        let safe = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+        let name: String = role.chars().map(|c| if safe(c) { c } else { '_' }).collect();
+        dir.path.join(format!("{ROLE_PREFIX}{name}{LOCK_SUFFIX}"))
+    }
+}
+
+/// The path of the reload note beside the lock of a role.
+fn note_path(lock: &Path) -> PathBuf {
+    lock.with_extension("reload")
+}
+
+impl Drop for RoleLock {
+    fn drop(&mut self) {
+        if let Some(lock) = self.lock.take() {
+            let folder = lock.path().parent().map(Path::to_owned);
+            lock.remove();
+            if let Some(folder) = folder {
+                // Succeeds only for the last process of the instance.
+                let _ = fs::remove_dir(folder);
+            }
+        }
+    }
+}
 
 /// A process that serves a role of an instance.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -51,7 +135,7 @@ impl RoleHolder {
                 (is_process && holds(&locks, pid, inode)).then(|| Self {
                     role: role.to_owned(),
                     pid,
-                    note: super::root::note_path(&path),
+                    note: note_path(&path),
                 })
             })
             .collect();
@@ -61,7 +145,7 @@ impl RoleHolder {
 }
 
 /// Whether the process holds a lock on the file with that inode number.
-pub(super) fn is_locked_by(pid: u32, inode: u64) -> bool {
+fn is_locked_by(pid: u32, inode: u64) -> bool {
     fs::read_to_string(LOCKS).is_ok_and(|locks| holds(&locks, pid, inode))
 }
 
