@@ -5,32 +5,13 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use super::choices::{STATES, TRUST_MODES, VERBOSITIES};
 use super::field::Field;
 use super::settings::{
     Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
-    SecretSource, Security, TrustMode, Verbosity,
+    SecretSource, Security,
 };
 use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
-
-pub(super) const TRUST_MODES: &[(&str, TrustMode)] = &[
-    ("default_deny", TrustMode::DefaultDeny),
-    ("permissive", TrustMode::Permissive),
-    ("off", TrustMode::Off),
-];
-
-pub(super) const VERBOSITIES: &[(&str, Verbosity)] = &[
-    ("error", Verbosity::Error),
-    ("warn", Verbosity::Warn),
-    ("info", Verbosity::Info),
-    ("debug", Verbosity::Debug),
-    ("trace", Verbosity::Trace),
-];
-
-pub(super) const STATES: &[(&str, SubscriberState)] = &[
-    ("UNKNOWN", SubscriberState::Unknown),
-    ("CRITICAL", SubscriberState::Critical),
-    ("NONCRITICAL", SubscriberState::Noncritical),
-];
 
 /// Reads `classifier`.
 pub(super) fn classifier(root: &Field<'_>) -> Classifier {

@@ -1,5 +1,6 @@
 //! Reads the lanes: their networks, queues, rates and scheduling.
 
+use super::choices::SCHEDULING_POLICIES;
 use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
@@ -38,12 +39,6 @@ pub(super) fn default_scheduling(class: Option<TrafficClass>) -> Scheduling {
         None => Scheduling::default(),
     }
 }
-
-pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
-    ("other", SchedulingPolicy::Other),
-    ("fifo", SchedulingPolicy::Fifo),
-    ("rr", SchedulingPolicy::RoundRobin),
-];
 
 /// A lane without its outputs, and the default QoS of its outputs.
 pub(super) struct LaneDraft {

@@ -4,6 +4,7 @@
 //! unknown ones; `field` reads and checks one value as its row declares; the other modules build the
 //! settings, with one file for each part.
 
+mod choices;
 mod control;
 mod environment;
 mod field;

@@ -2,25 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use super::choices::{DURABILITIES, HISTORIES, HistoryKind, RELIABILITIES};
 use super::field::Field;
 use super::settings::InputQos;
 use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 
 /// The depth of KEEP_LAST without a depth in the file: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
-
-pub(super) const RELIABILITIES: &[(&str, Reliability)] =
-    &[("RELIABLE", Reliability::Reliable), ("BEST_EFFORT", Reliability::BestEffort)];
-pub(super) const DURABILITIES: &[(&str, Durability)] =
-    &[("VOLATILE", Durability::Volatile), ("TRANSIENT_LOCAL", Durability::TransientLocal)];
-pub(super) const HISTORIES: &[(&str, HistoryKind)] =
-    &[("KEEP_LAST", HistoryKind::KeepLast), ("KEEP_ALL", HistoryKind::KeepAll)];
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum HistoryKind {
-    KeepLast,
-    KeepAll,
-}
 
 /// QoS policies, each of which may be missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -1,6 +1,7 @@
 //! Reads the rates, stale thresholds and queues of noncritical lanes, from `routing_policy` and from each
 //! lane.
 
+use super::choices::DROP_POLICIES;
 use super::field::Field;
 use super::settings::{DropPolicy, LaneRates, RatePolicy};
 
@@ -10,12 +11,6 @@ const DEGRADED_RATE_HZ: f64 = 3.0;
 /// The default queue of a noncritical lane: the depth of the paper's writer, and fewer samples in DEGRADED.
 const NORMAL_DEPTH: u64 = 5;
 const DEGRADED_DEPTH: u64 = 2;
-
-pub(super) const DROP_POLICIES: &[(&str, DropPolicy)] = &[
-    ("drop_oldest", DropPolicy::DropOldest),
-    ("drop_latest", DropPolicy::DropLatest),
-    ("drop_stale", DropPolicy::DropStale),
-];
 
 const MODES: &[&str] = &["normal", "degraded", "disabled", "emergency", "failure"];
 

@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use super::control::{TRUST_MODES, VERBOSITIES};
-use super::lanes::SCHEDULING_POLICIES;
-use super::qos::{DURABILITIES, RELIABILITIES};
-use super::rates::DROP_POLICIES;
+use super::choices::{
+    DROP_POLICIES, DURABILITIES, RELIABILITIES, SCHEDULING_POLICIES, TRUST_MODES, VERBOSITIES,
+};
 use super::settings::{
     MetricsListener, NetworkSelector, SchedulingPolicy, SecretSource, TrustMode, Verbosity,
 };

@@ -2,8 +2,7 @@
 
 use super::row::Kind::{Choice, Decimal, Flag, Other, Whole};
 use super::row::{Row, names};
-use crate::config::control::{STATES, TRUST_MODES, VERBOSITIES};
-use crate::config::rates::DROP_POLICIES;
+use crate::config::choices::{DROP_POLICIES, STATES, TRUST_MODES, VERBOSITIES};
 
 pub(super) const ROWS: &[Row] = &[
     Row::new(

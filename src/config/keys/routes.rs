@@ -2,9 +2,7 @@
 
 use super::row::Kind::{Choice, Decimal, Flag, Other, Whole};
 use super::row::{Row, names};
-use crate::config::lanes::SCHEDULING_POLICIES;
-use crate::config::qos::{DURABILITIES, HISTORIES, RELIABILITIES};
-use crate::config::rates::DROP_POLICIES;
+use crate::config::choices::{DROP_POLICIES, DURABILITIES, HISTORIES, RELIABILITIES, SCHEDULING_POLICIES};
 
 pub(super) const ROWS: &[Row] = &[
     Row::new(
