@@ -30,7 +30,6 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::model::MonotonicNs;
 use crate::shm::ShmError;
 use outcome::{Outcome, wrapped};
-use phase::Setup;
 use sandbox::Sandbox;
 use screen::Screen;
 
@@ -52,6 +51,15 @@ const STALL_AFTER_MS: u64 = 2_000;
 const STALL_MS: u64 = 3_000;
 /// The laser's topic, in the demo's own DDS domain.
 const INPUT_TOPIC: &str = "/scan";
+
+/// How the subscribers receive the scans.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Setup {
+    /// Both directly from the publisher's writer.
+    Direct,
+    /// Each from a lane of the bridge.
+    Bridge,
+}
 
 /// The arguments of `demo`.
 #[derive(Args, Debug)]

@@ -7,20 +7,11 @@ use super::children::{Children, Role};
 use super::sandbox::Sandbox;
 use super::screen::Screen;
 use super::tally::{BridgeDrops, Figures, Stalls, Tally, Window, drops_between, scans_in_s};
-use super::{DemoError, INPUT_TOPIC, Interrupt, STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, first_due_after};
+use super::{DemoError, INPUT_TOPIC, Interrupt, Setup, first_due_after};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{DropCounts, LaneName, MonotonicNs};
 use crate::shm::{Boards, BridgeShape};
-
-/// How the subscribers receive the scans.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Setup {
-    /// Both directly from the publisher's writer.
-    Direct,
-    /// Each from a lane of the bridge.
-    Bridge,
-}
 
 /// How long to wait for the first scans. Discovery takes a second or two, more on a slow machine.
 const READY_TIMEOUT_MS: u64 = 20_000;
@@ -133,7 +124,7 @@ impl Phase<'_> {
             if now >= window.end() {
                 break;
             }
-            self.set_stalled(is_stalled(window, now), now);
+            self.set_stalled(window.is_stalled(now), now);
             if now >= draw_at {
                 draw_at = now.plus_ms(DRAW_EVERY_MS);
                 screen.draw(setup, &self.tally, window, self.stalls_until(now), self.stalled_since, now);
@@ -186,12 +177,6 @@ impl Phase<'_> {
         let current_ns = self.stalled_since.map_or(0, |since| now.since(since));
         Stalls { ns: self.stalls.ns + current_ns, ..self.stalls }
     }
-}
-
-/// Whether an instant of the window is within a stall of the remote subscriber.
-pub(super) fn is_stalled(window: &Window, instant: MonotonicNs) -> bool {
-    let in_cycle_ms = instant.since(window.start()) / 1_000_000 % STALL_EVERY_MS;
-    (STALL_AFTER_MS..STALL_AFTER_MS + STALL_MS).contains(&in_cycle_ms)
 }
 
 /// The output topics of the critical and the noncritical lane.

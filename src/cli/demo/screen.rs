@@ -3,10 +3,9 @@
 
 use std::io::{self, IsTerminal, Write};
 
-use super::RATE_HZ;
 use super::children::Role;
-use super::phase::{Setup, is_stalled};
 use super::tally::{Stalls, Tally, Window};
+use super::{RATE_HZ, Setup};
 use crate::model::MonotonicNs;
 
 /// The period of lines when stdout is no terminal.
@@ -235,7 +234,7 @@ fn timelines(tally: &Tally, window: &Window, now: MonotonicNs) -> [String; 3] {
         }
         // Stalls begin and end at multiples of half a second.
         let halves = (0..cell_ms / CELL_MIN_MS).map(|half| from.plus_ms(half * CELL_MIN_MS));
-        let up = halves.filter(|half| !is_stalled(window, *half)).count();
+        let up = halves.filter(|half| !window.is_stalled(*half)).count();
         link.push(shade(up, (cell_ms / CELL_MIN_MS) as usize));
         publisher.push(shade(tally.written_in(window, from..to), in_cell));
         critical.push(shade(tally.arrived_in(Role::Critical, window, from..to), in_cell));

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::children::Role;
 use super::picture::{BIN_MS, Timeline};
 use super::report::Report;
-use super::{RATE_HZ, due_at};
+use super::{RATE_HZ, STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, due_at};
 use crate::model::{DropCounts, MonotonicNs};
 
 /// The arrival of a scan at a subscriber.
@@ -167,6 +167,12 @@ impl Window {
         due_at(self.began_at, self.numbers.end)
     }
 
+    /// Whether an instant of the window is within a stall of the remote subscriber.
+    pub fn is_stalled(&self, instant: MonotonicNs) -> bool {
+        let in_cycle_ms = instant.since(self.start()) / 1_000_000 % STALL_EVERY_MS;
+        (STALL_AFTER_MS..STALL_AFTER_MS + STALL_MS).contains(&in_cycle_ms)
+    }
+
     /// The end of the range of scans of the window that are due before an instant.
     fn numbers_before(&self, instant: MonotonicNs) -> u64 {
         if instant >= self.end() {
@@ -264,11 +270,7 @@ pub(super) struct BridgeDrops {
 
 /// The samples dropped between two readings of a board, by drop reason.
 pub(super) fn drops_between(before: &DropCounts, after: &DropCounts) -> BTreeMap<&'static str, u64> {
-    after
-        .iter()
-        .map(|(reason, count)| (reason.label(), count.saturating_sub(before.get(reason))))
-        .filter(|(_, count)| *count > 0)
-        .collect()
+    after.since(before).iter().map(|(reason, count)| (reason.label(), count)).collect()
 }
 
 fn ms(ns: u64) -> f64 {
