@@ -10,6 +10,7 @@ mod liveness;
 mod log_limit;
 mod logs;
 mod metrics;
+mod problem;
 mod problems;
 mod report;
 mod snapshot;
@@ -26,7 +27,7 @@ pub use liveness::ProcessState;
 pub use log_limit::log_left_out;
 pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
-pub use problems::{Level, Problem};
+pub use problem::{Level, Problem};
 pub use report::{
     IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
     PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
@@ -34,3 +35,11 @@ pub use report::{
 pub use snapshot::{
     LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
 };
+
+impl Snapshot {
+    /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in
+    /// between has no rates yet.
+    pub fn report_since(&self, earlier: &Self) -> Report {
+        self.report_with(earlier, problems::of(self, earlier))
+    }
+}

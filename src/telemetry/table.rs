@@ -362,7 +362,7 @@ fn duration_text(seconds: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::problems::{Level, Problem};
+    use super::super::problem::{Level, Problem};
     use super::super::test_report::wide_report;
     use super::*;
     use crate::model::DropReason;

@@ -1,7 +1,7 @@
 //! A report for the tests of its output formats.
 
 use super::liveness::ProcessState;
-use super::problems::{Level, Problem};
+use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
     ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,

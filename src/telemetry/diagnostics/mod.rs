@@ -10,7 +10,7 @@ use bytes::Bytes;
 use serde::Serialize;
 
 use super::json::cdr;
-use super::problems::Level;
+use super::problem::Level;
 use super::report::Report;
 use super::text::{printable, shortened};
 use parts::Part;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::super::problems::Problem;
+use super::super::problem::Problem;
 use super::super::test_report::wide_report;
 use super::*;
 

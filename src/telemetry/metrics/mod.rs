@@ -10,7 +10,7 @@ pub use page::CONTENT_TYPE;
 pub use server::{MetricsError, MetricsServer};
 
 use super::liveness::ProcessState;
-use super::problems::Level;
+use super::problem::Level;
 use super::report::{Latency, OutputReport, ProcessReport, Report, RouteReport, SubscriberReport};
 use crate::model::{DropReason, LaneMode, ProbeRefusal, SafetyMode, SubscriberState};
 use page::Kind::{Counter, Gauge, Histogram};

@@ -5,6 +5,7 @@ mod processes;
 mod publishers;
 
 use super::liveness::ProcessState;
+use super::problem::{Level, Problem};
 use super::snapshot::{LaneReading, OutputReading, RouteReading, Snapshot};
 use super::text::counted;
 use crate::model::{DropReason, LaneCounters, LaneMode, TrafficClass};
@@ -21,69 +22,6 @@ const SILENT_LANE_SAMPLES: u64 = 5;
 /// A reader that acknowledged none of this many offered samples is silent. Fewer may be in transit, because a
 /// reader acknowledges at each HEARTBEAT.
 const SILENT_READER_SAMPLES: u64 = 5;
-
-/// The severity of a problem: the levels of `diagnostic_msgs/DiagnosticStatus`, with their numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Level {
-    /// Nothing is wrong.
-    Ok = 0,
-    /// Something is wrong, but the bridge forwards samples.
-    Warn = 1,
-    /// A part of the bridge does not work.
-    Error = 2,
-    /// A part of the bridge, or a peer, sends no data.
-    Stale = 3,
-}
-
-impl Level {
-    /// `ok`, `warn`, `error` or `stale`.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Warn => "warn",
-            Self::Error => "error",
-            Self::Stale => "stale",
-        }
-    }
-
-    /// The more severe of two levels. `Error` is above `Stale`, because missing data only suggests a fault.
-    pub const fn worse(self, other: Self) -> Self {
-        const fn rank(level: Level) -> u8 {
-            match level {
-                Level::Ok => 0,
-                Level::Warn => 1,
-                Level::Stale => 2,
-                Level::Error => 3,
-            }
-        }
-        if rank(other) > rank(self) { other } else { self }
-    }
-}
-
-/// An entry of `problems` in the report. Its JSON is the text alone.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Problem {
-    /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `network`, `intruders`,
-    /// `lane NAME`, `route ID` or `subscriber ID`.
-    pub about: String,
-    /// The severity.
-    pub level: Level,
-    /// A sentence for users: what is wrong, with which part or peer, and what to do next.
-    pub text: String,
-}
-
-impl Problem {
-    fn new(about: impl Into<String>, level: Level, text: String) -> Self {
-        Self { about: about.into(), level, text }
-    }
-}
-
-impl serde::Serialize for Problem {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(&self.text)
-    }
-}
 
 /// All problems, the most severe first: processes, counts that do not add up, the safety mode, lanes that
 /// forward nothing, drops, absences, subscribers, intruders, publishers.

@@ -1,6 +1,5 @@
 //! Problems of a route's publishers.
 
-use super::super::report::clock_offset_s;
 use super::super::snapshot::{RouteReading, Snapshot};
 use super::{Level, Problem};
 use crate::model::PublisherAccount;
@@ -33,7 +32,7 @@ pub(super) fn lost_by_publisher(now: &Snapshot, route: &RouteReading, former: &R
 
 /// A publisher whose clock does not agree with this computer's.
 pub(super) fn clock_offset(now: &Snapshot, route: &RouteReading) -> Option<Problem> {
-    let offset_s = clock_offset_s(&route.counters)?;
+    let offset_s = route.counters.clock_offset_s()?;
     let side = if offset_s < 0.0 { "behind" } else { "ahead of" };
     let text = format!(
         "route {}: the clock of {} is {:.1} s {side} this computer's clock, so the bridge measures the age of its \

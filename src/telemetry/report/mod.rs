@@ -9,12 +9,10 @@ pub use control::{AbsenceReport, IntruderReport, ProbesReport, SafetyReport, Sub
 pub use latency::{Latency, LatencyTotal};
 
 use super::liveness::ProcessState;
-use super::problems::{self, Problem};
+use super::problem::Problem;
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
-use crate::model::{
-    DropCounts, FixedText, Guid, IngressCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
-};
+use crate::model::{DropCounts, FixedText, Guid, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord};
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -238,15 +236,14 @@ pub struct ReaderReport {
 }
 
 impl Snapshot {
-    /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in
-    /// between has no rates yet.
-    pub fn report_since(&self, earlier: &Self) -> Report {
+    /// As [`Snapshot::report_since`], with these problems.
+    pub(super) fn report_with(&self, earlier: &Self, problems: Vec<Problem>) -> Report {
         let window_ms = self.at.since(earlier.at) as f64 / 1e6;
         Report {
             instance: self.instance.to_string(),
             time_unix_ms: self.at_wall.0 / 1_000_000,
             window_ms,
-            problems: problems::of(self, earlier),
+            problems,
             processes: self.processes.iter().map(|process| process_report(process, self.at)).collect(),
             safety: self.safety_report(),
             lanes: self
@@ -314,8 +311,8 @@ impl Snapshot {
                 window_ms,
             ),
             last_received_age_ms: age_ms(counters.last_received_at, self.at),
-            clock_offset_s: clock_offset_s(counters),
-            clock_offset_writer: clock_offset_s(counters).map(|_| counters.clock_writer.to_string()),
+            clock_offset_s: counters.clock_offset_s(),
+            clock_offset_writer: counters.clock_offset_s().map(|_| counters.clock_writer.to_string()),
             dds_in: Latency::of(&now.dds_in, before.map(|before| &before.dds_in)),
             lanes: now
                 .outputs
@@ -450,11 +447,6 @@ fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
         settings_fingerprint: (health.settings_fingerprint != 0)
             .then(|| format!("{:016x}", health.settings_fingerprint)),
     }
-}
-
-/// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all agree.
-pub(super) fn clock_offset_s(counters: &IngressCounters) -> Option<f64> {
-    (counters.clock_offset_ns != 0).then(|| -(counters.clock_offset_ns as f64) / 1e9)
 }
 
 /// The time since `at`; `None` for 0, which means that the event never happened.

@@ -116,6 +116,13 @@ pub struct IngressCounters {
     pub clock_writer: Guid,
 }
 
+impl IngressCounters {
+    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all agree.
+    pub fn clock_offset_s(&self) -> Option<f64> {
+        (self.clock_offset_ns != 0).then(|| -(self.clock_offset_ns as f64) / 1e9)
+    }
+}
+
 /// The counters of one lane for one route.
 ///
 /// `last_sequence - first_sequence = forwarded + drops + waiting`, always.
