@@ -3,13 +3,13 @@
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
-use std::task::{Wake, Waker};
+use std::task::Waker;
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Arrival, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter,
-    ReaderEvent, ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
+    Arrival, ArrivalFlag, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader,
+    RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
     Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
@@ -31,17 +31,9 @@ fn reader_qos(reliability: Reliability, durability: Durability) -> ReaderQos {
     ReaderQos { reliability, durability, depth: 64, deadline_ms: None }
 }
 
-struct Flag(AtomicBool);
-
-impl Wake for Flag {
-    fn wake(self: Arc<Self>) {
-        self.0.store(true, Ordering::Release);
-    }
-}
-
 /// Takes one sample, patiently; the waker must have announced it.
 fn take_one(reader: &RawReader) -> Option<(Vec<u8>, Encapsulation, SourceTimestamp)> {
-    let flag = Arc::new(Flag(AtomicBool::new(false)));
+    let flag = ArrivalFlag::passive();
     let waker = Waker::from(Arc::clone(&flag));
     let give_up = Instant::now() + Duration::from_secs(20);
     loop {
@@ -55,7 +47,7 @@ fn take_one(reader: &RawReader) -> Option<(Vec<u8>, Encapsulation, SourceTimesta
             Take::Malformed => panic!("malformed"),
             Take::Empty => {}
         }
-        while !flag.0.swap(false, Ordering::AcqRel) {
+        while !flag.clear() {
             if Instant::now() > give_up {
                 return None;
             }

@@ -4,6 +4,7 @@
 //! decoded; so the bridge forwards any message type. The public interface has no RustDDS types, so that
 //! another DDS library could replace RustDDS.
 
+mod arrival_flag;
 mod arrivals;
 mod discovery;
 mod error;
@@ -17,6 +18,7 @@ mod qos;
 mod reader;
 mod writer;
 
+pub use arrival_flag::ArrivalFlag;
 pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;

@@ -2,51 +2,10 @@
 
 use std::cell::Cell;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::task::{Wake, Waker};
-use std::thread::Thread;
+use std::task::Waker;
 
-use crate::dds::{Payload, RawReader, Take};
+use crate::dds::{ArrivalFlag, Payload, RawReader, Take};
 use crate::model::{Encapsulation, Guid};
-
-/// A flag that the DDS library raises when a sample has arrived, and the thread to wake then.
-pub(super) struct ArrivalFlag {
-    raised: AtomicBool,
-    /// The thread to unpark; `None` where the DDS library's own thread checks the flag.
-    thread: Option<Thread>,
-}
-
-impl ArrivalFlag {
-    /// Creates a flag that wakes no thread.
-    pub fn passive() -> Self {
-        Self { raised: AtomicBool::new(false), thread: None }
-    }
-
-    pub fn raise(&self) {
-        self.raised.store(true, Ordering::Release);
-        if let Some(thread) = &self.thread {
-            thread.unpark();
-        }
-    }
-
-    pub fn clear(&self) {
-        self.raised.store(false, Ordering::Release);
-    }
-
-    pub fn is_raised(&self) -> bool {
-        self.raised.load(Ordering::Acquire)
-    }
-}
-
-impl Wake for ArrivalFlag {
-    fn wake(self: Arc<Self>) {
-        self.raise();
-    }
-
-    fn wake_by_ref(self: &Arc<Self>) {
-        self.raise();
-    }
-}
 
 /// One take in so many tries the last reader first, so that a flood of samples at the first reader cannot
 /// block it.
@@ -65,8 +24,7 @@ pub(super) struct Inbox {
 impl Inbox {
     /// Creates an inbox with one reader; arrivals wake the calling thread.
     pub fn new(reader: RawReader) -> Self {
-        let thread = Some(std::thread::current());
-        let mut inbox = Self::with_flag(Arc::new(ArrivalFlag { raised: AtomicBool::new(false), thread }));
+        let mut inbox = Self::with_flag(ArrivalFlag::of_this_thread());
         inbox.add(reader);
         inbox
     }
@@ -120,7 +78,7 @@ impl Inbox {
         }
         let take = self.take_first(&mut take_one);
         if take != Take::Empty {
-            self.flag.raised.store(true, Ordering::Release);
+            self.flag.raise_quietly();
         }
         take
     }

@@ -5,9 +5,8 @@ use std::io::{self, Write};
 use std::net::Ipv4Addr;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::task::{Wake, Waker};
-use std::thread::{self, Thread};
+use std::task::Waker;
+use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -19,7 +18,7 @@ use super::{HISTORY_SCANS, MAX_BLOCKING_MS, due_at, first_due_after};
 use crate::cli::failed;
 use crate::clock;
 use crate::config::{DdsNetwork, NetworkSelector};
-use crate::dds::{DdsError, Participant, ParticipantOptions, ReaderQos, Take};
+use crate::dds::{ArrivalFlag, DdsError, Participant, ParticipantOptions, ReaderQos, Take};
 use crate::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp, TopicName};
 
 /// History depth of the subscribers' readers: more than two seconds of scans, so that none is lost there.
@@ -153,8 +152,8 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible
         deadline_ms: None,
     };
     let reader = participant.create_reader(&arguments.topic.to_dds(), DDS_TYPE, &qos)?;
-    let wake_flag = Arc::new(WakeFlag { is_set: AtomicBool::new(false), thread: thread::current() });
-    let waker = Waker::from(Arc::clone(&wake_flag));
+    let flag = ArrivalFlag::of_this_thread();
+    let waker = Waker::from(Arc::clone(&flag));
     loop {
         reader.arm(&waker);
         loop {
@@ -168,22 +167,9 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible
                 break;
             }
         }
-        while !wake_flag.is_set.swap(false, Ordering::AcqRel) {
+        while !flag.clear() {
             thread::park();
         }
-    }
-}
-
-/// The waker of a subscriber's reader: the DDS library wakes it when a sample arrives.
-struct WakeFlag {
-    is_set: AtomicBool,
-    thread: Thread,
-}
-
-impl Wake for WakeFlag {
-    fn wake(self: Arc<Self>) {
-        self.is_set.store(true, Ordering::Release);
-        self.thread.unpark();
     }
 }
 

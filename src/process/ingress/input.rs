@@ -5,7 +5,7 @@ use std::sync::Arc;
 use tracing::{error, info, warn};
 
 use super::super::count_log::DropLog;
-use super::super::inbox::{ArrivalFlag, Inbox};
+use super::super::inbox::Inbox;
 use super::super::role::{Role, RoleError};
 use super::clocks::Clocks;
 use super::pool::{Filled, PoolOwner};
@@ -14,7 +14,7 @@ use super::source::{ReaderPlan, Source, label};
 use super::writer_sequences::WriterSequences;
 use crate::clock;
 use crate::config::{Route, Settings};
-use crate::dds::{Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
+use crate::dds::{ArrivalFlag, Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability, RouteInfo,
     SampleHeader, TopicName,

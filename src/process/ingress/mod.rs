@@ -21,14 +21,13 @@ use std::time::Duration;
 use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
-use super::inbox::ArrivalFlag;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, namespace};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
-use crate::dds::{Discovery, Participant, ParticipantOptions};
+use crate::dds::{ArrivalFlag, Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::{ProcessRole, this_cpu};
 use early_waker::EarlyWaker;
@@ -103,7 +102,7 @@ impl Ingress {
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
-            let flag = Arc::new(ArrivalFlag::passive());
+            let flag = ArrivalFlag::passive();
             inputs.push((Input::open(&role, settings, route, &flag)?, flag));
         }
         let mut lanes = Vec::with_capacity(settings.lanes.len());

@@ -8,10 +8,10 @@
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
-use super::super::inbox::ArrivalFlag;
 use super::input::Input;
 use super::pending_wake::PendingWake;
 use super::writer_sequences::WriterSequences;
+use crate::dds::ArrivalFlag;
 use crate::model::{Guid, TrafficClass};
 use crate::shm::{LaneWaker, this_cpu};
 

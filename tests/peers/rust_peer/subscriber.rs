@@ -2,13 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::task::{Wake, Waker};
-use std::thread::Thread;
+use std::task::Waker;
 use std::time::Duration;
 
 use adaptive_bridge::clock;
-use adaptive_bridge::dds::{RawReader, ReaderEvent, ReaderQos, Take};
+use adaptive_bridge::dds::{ArrivalFlag, RawReader, ReaderEvent, ReaderQos, Take};
 use adaptive_bridge::model::SourceTimestamp;
 use serde_json::{Value, json};
 
@@ -40,12 +38,12 @@ pub fn subscribe(options: &Options, signals: &Signals) -> Result<(), String> {
         .map_err(|error| error.to_string())?;
     let record = Record::create(options.record.as_deref(), "seq,time_ns,latency_ns")?;
     emit_ready();
-    let bell = Arc::new(Bell { rung: AtomicBool::new(false), thread: std::thread::current() });
-    let waker = Waker::from(Arc::clone(&bell));
+    let flag = ArrivalFlag::of_this_thread();
+    let waker = Waker::from(Arc::clone(&flag));
     let mut subscriber = Subscriber::new(options, signals, reader, record);
     while !subscriber.done() {
         subscriber.reader.arm(&waker);
-        if subscriber.take_batch() < BATCH && !bell.rung.swap(false, Ordering::Acquire) {
+        if subscriber.take_batch() < BATCH && !flag.clear() {
             std::thread::park_timeout(SLICE);
         }
         subscriber.tell_matches();
@@ -53,19 +51,6 @@ pub fn subscribe(options: &Options, signals: &Signals) -> Result<(), String> {
     }
     subscriber.emit_summary();
     Ok(())
-}
-
-/// Rung by the library when a sample arrives.
-struct Bell {
-    rung: AtomicBool,
-    thread: Thread,
-}
-
-impl Wake for Bell {
-    fn wake(self: Arc<Self>) {
-        self.rung.store(true, Ordering::Release);
-        self.thread.unpark();
-    }
 }
 
 struct Subscriber<'s> {
