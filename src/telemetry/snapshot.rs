@@ -13,7 +13,7 @@ use crate::model::{
     MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
     PublisherAccount, RouteId, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
 };
-use crate::policy::effective_mode;
+use crate::policy::{ModeSource, mode_and_source};
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 
 /// Attempts to read counts of a lane that add up. In the middle of a turn, a lane has updated only some of
@@ -193,12 +193,12 @@ impl Snapshot {
             let egress = process(boards, format!("egress-{}", lane.name), ProcessRole::Egress(index), now)?;
             let policy = consistent(boards.policy(index))?;
             let hold_ms = settings.policy_hold_ms;
-            let (reason, ends_at) = reason(&policy, control_runs, now, hold_ms);
+            let (mode, reason, ends_at) = mode_of(&policy, lane.class, control_runs, now, hold_ms);
             lanes.push(LaneReading {
                 name: lane.name.clone(),
                 class: lane.class,
                 policy,
-                mode: effective_mode(&policy, lane.class, now, hold_ms),
+                mode,
                 reason,
                 ends_at,
                 health: egress.health,
@@ -296,29 +296,25 @@ fn process(
     Ok(ProcessReading { name, role, health, state: ProcessState::read(&health, now) })
 }
 
-/// The reason of the mode that `effective_mode` returns, and the time at which the policy ends.
-fn reason(
+/// The mode of a lane, its reason, and the time at which the policy ends.
+fn mode_of(
     policy: &LanePolicy,
+    class: TrafficClass,
     control_runs: bool,
     now: MonotonicNs,
     policy_hold_ms: u64,
-) -> (ModeReason, Option<MonotonicNs>) {
-    let confirmed = policy.is_confirmed(now, policy_hold_ms);
-    let holds_until = policy.written_at.plus_ms(policy_hold_ms);
-    let below_floor = if policy.is_overridden(now) { policy.mode_by_hand } else { policy.mode };
-    if confirmed && policy.safety_floor > below_floor {
-        (ModeReason::Safety, Some(holds_until))
-    } else if policy.is_overridden(now) {
-        (ModeReason::ByHand, Some(policy.expires_at).filter(|at| at.0 != 0))
-    } else if policy.written_at.0 == 0 {
-        (ModeReason::Default, None)
-    } else if !confirmed {
-        (ModeReason::Expired, None)
-    } else if control_runs {
-        (ModeReason::Control, Some(holds_until))
-    } else {
-        (ModeReason::Held, Some(holds_until))
-    }
+) -> (LaneMode, ModeReason, Option<MonotonicNs>) {
+    let (mode, source) = mode_and_source(policy, class, now, policy_hold_ms);
+    let holds_until = Some(policy.written_at.plus_ms(policy_hold_ms));
+    let (reason, ends_at) = match source {
+        ModeSource::Default => (ModeReason::Default, None),
+        ModeSource::ByHand => (ModeReason::ByHand, Some(policy.expires_at).filter(|at| at.0 != 0)),
+        ModeSource::Safety => (ModeReason::Safety, holds_until),
+        ModeSource::Control if control_runs => (ModeReason::Control, holds_until),
+        ModeSource::Control => (ModeReason::Held, holds_until),
+        ModeSource::Expired => (ModeReason::Expired, None),
+    };
+    (mode, reason, ends_at)
 }
 
 fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<RouteReading, ShmError> {
@@ -409,7 +405,11 @@ mod tests {
     #[test]
     fn the_reason_follows_from_the_policy() {
         let mut policy = LanePolicy::default();
-        let of = |policy: &LanePolicy, control_runs, ms| reason(policy, control_runs, at(ms), 5_000);
+        let of = |policy: &LanePolicy, control_runs, ms| {
+            let (_, reason, ends_at) =
+                mode_of(policy, TrafficClass::Noncritical, control_runs, at(ms), 5_000);
+            (reason, ends_at)
+        };
         assert_eq!(of(&policy, true, 1), (ModeReason::Default, None));
         policy.written_at = at(1_000);
         assert_eq!(of(&policy, true, 6_000), (ModeReason::Control, Some(at(6_000))));
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reason_agrees_with_the_effective_mode() {
+    fn the_reason_agrees_with_the_mode() {
         let modes = LaneMode::ALL.map(|mode| mode as u8);
         for (mode, safety_floor, mode_by_hand, by_hand, at_ms) in modes
             .iter()
@@ -447,8 +447,8 @@ mod tests {
                 mode_by_hand,
                 ..LanePolicy::default()
             };
-            let effective = effective_mode(&policy, TrafficClass::Noncritical, at(at_ms), 5_000);
-            let expected = match reason(&policy, true, at(at_ms), 5_000).0 {
+            let (effective, reason, _) = mode_of(&policy, TrafficClass::Noncritical, true, at(at_ms), 5_000);
+            let expected = match reason {
                 ModeReason::Safety => safety_floor,
                 ModeReason::ByHand => mode_by_hand,
                 ModeReason::Control => mode,

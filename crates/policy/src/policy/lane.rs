@@ -193,7 +193,22 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
     }
 }
 
-/// The mode that a lane applies, from its policy on the policy board:
+/// What sets the mode of a lane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ModeSource {
+    /// No mode was ever set.
+    Default,
+    /// An operator has set it.
+    ByHand,
+    /// Control has set it, and its confirmation has not expired.
+    Control,
+    /// The safety supervisor requires this mode at least.
+    Safety,
+    /// Control no longer confirms its policy: the safe default.
+    Expired,
+}
+
+/// The mode that a lane applies, from its policy on the policy board, and what sets it:
 ///
 /// - the override by hand, until it expires;
 /// - else control's mode, while control confirms it at least every `policy_hold_ms`;
@@ -203,27 +218,38 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
 ///
 /// A stop by control therefore ends when control dies, and an override cannot lift an emergency.
 #[inline]
+pub const fn mode_and_source(
+    policy: &LanePolicy,
+    class: TrafficClass,
+    now: MonotonicNs,
+    policy_hold_ms: u64,
+) -> (LaneMode, ModeSource) {
+    let confirmed = policy.is_confirmed(now, policy_hold_ms);
+    let (mode, source) = if policy.is_overridden(now) {
+        (mode_of(policy.mode_by_hand), ModeSource::ByHand)
+    } else if policy.written_at.0 == 0 {
+        (LaneMode::Normal, ModeSource::Default)
+    } else if confirmed {
+        (mode_of(policy.mode), ModeSource::Control)
+    } else {
+        match class {
+            TrafficClass::Critical => (LaneMode::Normal, ModeSource::Expired),
+            TrafficClass::Noncritical => (LaneMode::Degraded, ModeSource::Expired),
+        }
+    };
+    let floor = mode_of(policy.safety_floor);
+    if confirmed && floor as u8 > mode as u8 { (floor, ModeSource::Safety) } else { (mode, source) }
+}
+
+/// The mode of [`mode_and_source`].
+#[inline]
 pub const fn effective_mode(
     policy: &LanePolicy,
     class: TrafficClass,
     now: MonotonicNs,
     policy_hold_ms: u64,
 ) -> LaneMode {
-    let confirmed = policy.is_confirmed(now, policy_hold_ms);
-    let mode = if policy.is_overridden(now) {
-        mode_of(policy.mode_by_hand)
-    } else if confirmed {
-        mode_of(policy.mode)
-    } else if policy.written_at.0 == 0 {
-        LaneMode::Normal
-    } else {
-        match class {
-            TrafficClass::Critical => LaneMode::Normal,
-            TrafficClass::Noncritical => LaneMode::Degraded,
-        }
-    };
-    let floor = mode_of(policy.safety_floor);
-    if confirmed && floor as u8 > mode as u8 { floor } else { mode }
+    mode_and_source(policy, class, now, policy_hold_ms).0
 }
 
 /// The mode with that number; an undefined number, which only a foreign process can write, counts as normal.

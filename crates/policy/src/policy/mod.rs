@@ -51,7 +51,9 @@ pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
     NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
-pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, effective_mode};
+pub use lane::{
+    Decision, ModeSource, PollOrder, RouteShaper, critical_drop, effective_mode, mode_and_source,
+};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
 pub use locality::{Locality, Location};
