@@ -15,6 +15,7 @@ use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, output_ended};
 use crate::config::{self, ConfigError, Place, Row, Settings};
 use crate::process::InForce;
 use crate::shm::RouteChannel;
+use crate::telemetry::bytes_text;
 
 /// The arguments of `check`.
 #[derive(Args, Debug)]
@@ -192,11 +193,11 @@ impl fmt::Display for Summary {
                 f,
                 "  shared memory: {} slots for samples of up to {}: {}",
                 route.slots,
-                bytes(route.max_sample_bytes),
-                bytes(route.shared_memory_bytes)
+                bytes_text(route.max_sample_bytes as f64),
+                bytes_text(route.shared_memory_bytes as f64)
             )?;
         }
-        writeln!(f, "\ntotal shared memory: {}", bytes(self.shared_memory_bytes))
+        writeln!(f, "\ntotal shared memory: {}", bytes_text(self.shared_memory_bytes as f64))
     }
 }
 
@@ -240,17 +241,4 @@ fn problems(error: &ConfigError) -> serde_json::Value {
         })
         .collect();
     json!({ "file": error.file(), "problems": problems })
-}
-
-/// A size with a unit, such as `12.0 KiB`.
-fn bytes(count: u64) -> String {
-    const KIB: f64 = 1024.0;
-    let size = count as f64;
-    if size < KIB {
-        format!("{count} B")
-    } else if size < KIB * KIB {
-        format!("{:.1} KiB", size / KIB)
-    } else {
-        format!("{:.1} MiB", size / KIB / KIB)
-    }
 }

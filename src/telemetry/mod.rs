@@ -35,6 +35,7 @@ pub use report::{
 pub use snapshot::{
     LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
 };
+pub use text::bytes_text;
 
 impl Snapshot {
     /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in

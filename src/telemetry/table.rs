@@ -9,7 +9,7 @@ use super::report::{
     AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
     PublisherReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
-use super::text::counted;
+use super::text::{bytes_text, counted};
 use crate::model::DropCounts;
 
 /// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
@@ -337,15 +337,6 @@ fn latency_text(us: f64) -> String {
         ..999_500.0 => format!("{:.0}ms", us / 1e3),
         ..99_950_000.0 => format!("{:.1}s", us / 1e6),
         _ => format!("{:.0}s", us / 1e6),
-    }
-}
-
-fn bytes_text(bytes: f64) -> String {
-    const KIB: f64 = 1024.0;
-    match bytes {
-        ..KIB => format!("{bytes:.0} B"),
-        ..1_048_576.0 => format!("{:.1} KiB", bytes / KIB),
-        _ => format!("{:.1} MiB", bytes / KIB / KIB),
     }
 }
 

@@ -24,6 +24,16 @@ pub(super) fn counted(count: u64, noun: &str) -> String {
     if count == 1 { format!("1 {noun}") } else { format!("{count} {noun}s") }
 }
 
+/// A number of bytes with a unit, such as `12.0 KiB`.
+pub fn bytes_text(bytes: f64) -> String {
+    const KIB: f64 = 1024.0;
+    match bytes {
+        ..KIB => format!("{bytes:.0} B"),
+        ..1_048_576.0 => format!("{:.1} KiB", bytes / KIB),
+        _ => format!("{:.1} MiB", bytes / KIB / KIB),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
