@@ -120,7 +120,7 @@ pub(super) fn wide_report() -> Report {
         probes: ProbesReport {
             sent: u64::MAX,
             accepted: u64::MAX,
-            refused: counts(99_999_999),
+            refused: counts(3),
             refused_in_window: counts(1),
         },
         subscribers: vec![SubscriberReport {

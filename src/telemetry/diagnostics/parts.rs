@@ -5,6 +5,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::Level;
+use crate::model::{Counts, Reason};
 use crate::telemetry::liveness::ProcessState;
 use crate::telemetry::report::{LaneReport, ProcessReport, Report, RouteReport, SubscriberReport};
 
@@ -63,7 +64,7 @@ fn lane(lane: &LaneReport, report: &Report) -> Part {
     let process = report.processes.iter().find(|process| process.name == format!("egress-{}", lane.name));
     let is_up = process.is_some_and(|process| process.state == ProcessState::Running);
     if let Some(process) = process {
-        put(&mut values, "process", process);
+        put(&mut values, "process", process, &[]);
     }
     let message = format!("{} ({}): {}", lane.mode, lane.mode_reason, lane.mode_detail);
     let level = if is_up { Level::Ok } else { Level::Stale };
@@ -72,12 +73,11 @@ fn lane(lane: &LaneReport, report: &Report) -> Part {
 
 fn route(route: &RouteReport) -> Part {
     let mut values = Vec::new();
-    if let Ok(Value::Object(mut fields)) = serde_json::to_value(route) {
-        fields.remove("lanes");
-        flatten("", &Value::Object(fields), &mut values);
-    }
+    put(&mut values, "", route, &["lanes", "drops", "drops_in_window"]);
+    put_counts(&mut values, "drops", &route.drops);
     for output in &route.lanes {
-        put(&mut values, &output.lane, output);
+        put(&mut values, &output.lane, output, &["drops", "drops_in_window"]);
+        put_counts(&mut values, &format!("{}.drops", output.lane), &output.drops);
     }
     let message = match route.rate_hz {
         Some(rate_hz) => format!("{} Hz from {} publishers", number(rate_hz), route.writers),
@@ -88,7 +88,10 @@ fn route(route: &RouteReport) -> Part {
 
 fn probes(report: &Report) -> Part {
     let message = format!("{} sent, {} answered", report.probes.sent, report.probes.accepted);
-    part("probes", message, flat(&report.probes))
+    let mut values = Vec::new();
+    put(&mut values, "", &report.probes, &["refused", "refused_in_window"]);
+    put_counts(&mut values, "refused", &report.probes.refused);
+    part("probes", message, values)
 }
 
 fn subscriber(subscriber: &SubscriberReport) -> Part {
@@ -120,27 +123,36 @@ fn intruders(report: &Report) -> Part {
 
 fn flat(value: &impl Serialize) -> Vec<(String, String)> {
     let mut values = Vec::new();
-    put(&mut values, "", value);
+    put(&mut values, "", value, &[]);
     values
 }
 
-fn put(values: &mut Vec<(String, String)>, path: &str, value: &impl Serialize) {
+/// Adds the leaves of a value by their paths, without the fields `omitted`.
+fn put(values: &mut Vec<(String, String)>, path: &str, value: &impl Serialize, omitted: &[&str]) {
     // Serializing the types of the report does not fail.
-    if let Ok(value) = serde_json::to_value(value) {
+    if let Ok(mut value) = serde_json::to_value(value) {
+        if let Value::Object(fields) = &mut value {
+            fields.retain(|name, _| !omitted.contains(&name.as_str()));
+        }
         flatten(path, &value, values);
     }
 }
 
-/// Collects the leaves of a JSON value by their paths. It omits drop and refusal counts of 0, and the counts
-/// of the window, because a monitor sees the change from one message to the next.
+/// Adds the counts other than 0. Those of the window are left out, because a monitor sees the change from one
+/// message to the next.
+fn put_counts<R: Reason, const N: usize>(
+    values: &mut Vec<(String, String)>,
+    path: &str,
+    counts: &Counts<R, N>,
+) {
+    values.extend(counts.iter().map(|(reason, count)| (format!("{path}.{reason}"), count.to_string())));
+}
+
+/// Collects the leaves of a JSON value by their paths.
 fn flatten(path: &str, value: &Value, values: &mut Vec<(String, String)>) {
     let text = match value {
         Value::Object(fields) => {
-            let named_counts = ["drops", "refused"].iter().any(|name| path.ends_with(name));
             for (key, field) in fields {
-                if key.ends_with("_in_window") || (named_counts && field.as_u64() == Some(0)) {
-                    continue;
-                }
                 let below = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
                 flatten(&below, field, values);
             }
@@ -165,6 +177,7 @@ fn number(value: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::{DropCounts, DropReason};
 
     #[test]
     fn numbers_are_short() {
@@ -179,8 +192,11 @@ mod tests {
             "drops": {"stale": 3, "stopped": 0}, "drops_in_window": {"stale": 1}, "rtt": null, "up": true,
             "dds_in": {"p50_us": 12.5}, "warnings": ["rtt", "loss"], "count": 0
         });
+        let mut drops = DropCounts::default();
+        drops.add(DropReason::Stale, 3);
         let mut found = Vec::new();
-        flatten("", &json, &mut found);
+        put(&mut found, "", &json, &["drops", "drops_in_window"]);
+        put_counts(&mut found, "drops", &drops);
         found.sort();
         let expected = [
             ("count", "0"),
