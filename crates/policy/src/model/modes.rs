@@ -29,138 +29,83 @@ impl fmt::Display for TrafficClass {
     }
 }
 
-/// The mode of a lane: how much it forwards.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-#[repr(u8)]
-pub enum LaneMode {
+/// Declares an enum whose values are numbers in shared memory and have labels.
+macro_rules! numbered {
+    ($(#[$attribute:meta])* $name:ident:
+     $($(#[$of_variant:meta])+ $variant:ident = $number:literal, $label:literal,)+) => {
+        $(#[$attribute])*
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+        #[repr(u8)]
+        pub enum $name {
+            $($(#[$of_variant])+ $variant = $number,)+
+        }
+
+        impl $name {
+            /// Every value, in the order of the numbers.
+            pub const ALL: [Self; [$($number,)+].len()] = [$(Self::$variant,)+];
+
+            /// The label on the command line, in the configuration, `status` and diagnostics.
+            pub const fn label(self) -> &'static str {
+                match self {
+                    $(Self::$variant => $label,)+
+                }
+            }
+
+            /// The value with that number in shared memory; `None` for an undefined number.
+            #[inline]
+            pub const fn from_u8(number: u8) -> Option<Self> {
+                match number {
+                    $($number => Some(Self::$variant),)+
+                    _ => None,
+                }
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.label())
+            }
+        }
+    };
+}
+
+numbered! {
+    /// The mode of a lane: how much it forwards.
+    LaneMode:
     /// The configured rate; 10 Hz by default on a noncritical lane.
     #[default]
-    Normal = 0,
+    Normal = 0, "normal",
     /// The reduced rate; 3 Hz by default. A critical lane behaves as in normal mode.
-    Degraded = 1,
+    Degraded = 1, "degraded",
     /// A noncritical lane forwards nothing; a critical one behaves as in normal mode.
-    Suspended = 2,
+    Suspended = 2, "suspended",
     /// Nothing is forwarded on any lane (emergency).
-    Stopped = 3,
+    Stopped = 3, "stopped",
 }
 
-impl LaneMode {
-    /// Every mode, mildest first.
-    pub const ALL: [Self; 4] = [Self::Normal, Self::Degraded, Self::Suspended, Self::Stopped];
-
-    /// The name that the command line and the configuration use.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Normal => "normal",
-            Self::Degraded => "degraded",
-            Self::Suspended => "suspended",
-            Self::Stopped => "stopped",
-        }
-    }
-
-    /// The mode with that number in shared memory; `None` for an undefined number.
-    #[inline]
-    pub const fn from_u8(value: u8) -> Option<Self> {
-        match value {
-            0 => Some(Self::Normal),
-            1 => Some(Self::Degraded),
-            2 => Some(Self::Suspended),
-            3 => Some(Self::Stopped),
-            _ => None,
-        }
-    }
-}
-
-impl fmt::Display for LaneMode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.label())
-    }
-}
-
-/// The classifier's state of one subscriber.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[repr(u8)]
-pub enum SubscriberState {
+numbered! {
+    /// The classifier's state of one subscriber.
+    #[derive(Serialize, Deserialize)]
+    SubscriberState:
     /// Not enough probe data yet.
     #[default]
-    Unknown = 0,
+    Unknown = 0, "UNKNOWN",
     /// Healthy.
-    Critical = 1,
+    Critical = 1, "CRITICAL",
     /// Degraded.
-    Noncritical = 2,
+    Noncritical = 2, "NONCRITICAL",
 }
 
-impl SubscriberState {
-    /// `UNKNOWN`, `CRITICAL` or `NONCRITICAL`, as configuration files and diagnostics spell it.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Unknown => "UNKNOWN",
-            Self::Critical => "CRITICAL",
-            Self::Noncritical => "NONCRITICAL",
-        }
-    }
-}
-
-impl SubscriberState {
-    /// The state with that number in shared memory; `None` for an undefined number.
-    #[inline]
-    pub const fn from_u8(value: u8) -> Option<Self> {
-        match value {
-            0 => Some(Self::Unknown),
-            1 => Some(Self::Critical),
-            2 => Some(Self::Noncritical),
-            _ => None,
-        }
-    }
-}
-
-impl fmt::Display for SubscriberState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.label())
-    }
-}
-
-/// The safety supervisor's mode of the whole bridge.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-#[repr(u8)]
-pub enum SafetyMode {
+numbered! {
+    /// The safety supervisor's mode of the whole bridge.
+    SafetyMode:
     /// No overload.
     #[default]
-    Normal = 0,
+    Normal = 0, "normal",
     /// Overload is near: the noncritical lanes are suspended.
-    Degraded = 1,
+    Degraded = 1, "degraded",
     /// Extreme failure: all forwarding is stopped and diagnostics are published.
-    Emergency = 2,
-}
-
-impl SafetyMode {
-    /// `normal`, `degraded` or `emergency`.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Normal => "normal",
-            Self::Degraded => "degraded",
-            Self::Emergency => "emergency",
-        }
-    }
-}
-
-impl SafetyMode {
-    /// The mode with that number in shared memory; `None` for an undefined number.
-    #[inline]
-    pub const fn from_u8(value: u8) -> Option<Self> {
-        match value {
-            0 => Some(Self::Normal),
-            1 => Some(Self::Degraded),
-            2 => Some(Self::Emergency),
-            _ => None,
-        }
-    }
-}
-
-impl fmt::Display for SafetyMode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.label())
-    }
+    Emergency = 2, "emergency",
 }
 
 #[cfg(test)]
