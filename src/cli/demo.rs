@@ -17,7 +17,6 @@ mod scan;
 mod screen;
 mod tally;
 
-use std::fmt;
 use std::io;
 use std::path::PathBuf;
 use std::process::{ExitCode, ExitStatus};
@@ -91,57 +90,35 @@ fn first_due_after(began_at: MonotonicNs, instant: MonotonicNs) -> u64 {
 }
 
 /// Why a demo ended early.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 enum DemoError {
     /// The user stopped it.
+    #[error("stopped")]
     Interrupted,
-    /// No DDS domain is free.
+    #[error("the DDS domains {from} to {to} are all in use, perhaps by other demos")]
     NoDomain { from: u16, to: u16 },
-    /// A process could not be started.
+    #[error("cannot start the {name}: {error}")]
     Start { name: &'static str, error: io::Error },
-    /// A process exited during the demo.
+    #[error("the {name} exited unexpectedly ({status})")]
     Ended { name: &'static str, status: ExitStatus },
     /// A subscriber receives no scans, or the publisher publishes none.
+    #[error(
+        "the {name} exchanged no scans for {} s; if the logs above show no cause, check that no firewall blocks UDP \
+         multicast on the loopback interface, which DDS discovery needs",
+        .timeout_ms / 1_000
+    )]
     NothingArrives { name: &'static str, timeout_ms: u64 },
-    /// The bridge refused the demo's configuration.
+    #[error("the demo's configuration: {0}")]
     Config(String),
-    /// An access to shared memory failed.
-    Shm(ShmError),
-    /// Another system call failed.
+    #[error(transparent)]
+    Shm(#[from] ShmError),
+    #[error("{action}: {error}")]
     Os { action: &'static str, error: io::Error },
 }
 
 impl DemoError {
     fn os(action: &'static str, error: io::Error) -> Self {
         Self::Os { action, error }
-    }
-}
-
-impl From<ShmError> for DemoError {
-    fn from(error: ShmError) -> Self {
-        Self::Shm(error)
-    }
-}
-
-impl fmt::Display for DemoError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Interrupted => f.write_str("stopped"),
-            Self::NoDomain { from, to } => {
-                write!(f, "the DDS domains {from} to {to} are all in use, perhaps by other demos")
-            }
-            Self::Start { name, error } => write!(f, "cannot start the {name}: {error}"),
-            Self::Ended { name, status } => write!(f, "the {name} exited unexpectedly ({status})"),
-            Self::NothingArrives { name, timeout_ms } => write!(
-                f,
-                "the {name} exchanged no scans for {} s; if the logs above show no cause, check that no firewall \
-                 blocks UDP multicast on the loopback interface, which DDS discovery needs",
-                timeout_ms / 1_000
-            ),
-            Self::Config(problem) => write!(f, "the demo's configuration: {problem}"),
-            Self::Shm(error) => error.fmt(f),
-            Self::Os { action, error } => write!(f, "{action}: {error}"),
-        }
     }
 }
 

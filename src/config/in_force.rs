@@ -55,16 +55,9 @@ struct Encoded {
 }
 
 /// The error for a stored configuration that another version of the program wrote, or that is damaged.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
 pub struct DecodeError(String);
-
-impl fmt::Display for DecodeError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for DecodeError {}
 
 impl Configuration {
     /// As [`Settings::reloaded`]: this configuration with all changes in `new` that a running bridge can

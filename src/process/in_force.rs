@@ -1,7 +1,6 @@
 //! The configuration in force. The first process of a bridge writes it beside the boards; each process that
 //! starts while the bridge runs uses it, even if the configuration file has changed since.
 
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use tracing::{info, warn};
@@ -22,35 +21,14 @@ pub struct InForce {
 }
 
 /// Why a process cannot get a configuration.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum InForceError {
     /// The bridge does not run, and the file is bad.
-    Config(ConfigError),
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     /// The folder of the instance cannot be used.
-    Shm(ShmError),
-}
-
-impl fmt::Display for InForceError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Config(error) => error.fmt(f),
-            Self::Shm(error) => error.fmt(f),
-        }
-    }
-}
-
-impl std::error::Error for InForceError {}
-
-impl From<ConfigError> for InForceError {
-    fn from(error: ConfigError) -> Self {
-        Self::Config(error)
-    }
-}
-
-impl From<ShmError> for InForceError {
-    fn from(error: ShmError) -> Self {
-        Self::Shm(error)
-    }
+    #[error(transparent)]
+    Shm(#[from] ShmError),
 }
 
 impl InForce {

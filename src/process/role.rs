@@ -1,8 +1,6 @@
 //! Start-up and shutdown that ingress, egress and control share: lock, reloads, scheduling, shared memory,
 //! health, DDS participant.
 
-use std::fmt;
-
 use tracing::info;
 
 use super::notify::Notifier;
@@ -19,9 +17,10 @@ use crate::telemetry;
 const LEFT_OUT_MS: u64 = 1_000;
 
 /// Why a process could not start, or had to end.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum RoleError {
     /// The configuration has no lane of that name.
+    #[error("there is no lane {name}; the configuration has: {}", .lanes.join(", "))]
     NoSuchLane {
         /// The name.
         name: String,
@@ -29,6 +28,10 @@ pub enum RoleError {
         lanes: Vec<String>,
     },
     /// No process serves the lane.
+    #[error(
+        "no process serves lane {lane} of instance {instance}; start it with \
+         `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
+    )]
     NotRunning {
         /// The instance.
         instance: String,
@@ -36,49 +39,14 @@ pub enum RoleError {
         lane: String,
     },
     /// Shared memory failed.
-    Shm(ShmError),
+    #[error(transparent)]
+    Shm(#[from] ShmError),
     /// DDS failed.
-    Dds(DdsError),
+    #[error(transparent)]
+    Dds(#[from] DdsError),
     /// Another operating system call failed.
-    Os(std::io::Error),
-}
-
-impl fmt::Display for RoleError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::NoSuchLane { name, lanes } => {
-                write!(f, "there is no lane {name}; the configuration has: {}", lanes.join(", "))
-            }
-            Self::NotRunning { instance, lane } => write!(
-                f,
-                "no process serves lane {lane} of instance {instance}; start it with \
-                 `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
-            ),
-            Self::Shm(error) => error.fmt(f),
-            Self::Dds(error) => error.fmt(f),
-            Self::Os(error) => error.fmt(f),
-        }
-    }
-}
-
-impl std::error::Error for RoleError {}
-
-impl From<ShmError> for RoleError {
-    fn from(error: ShmError) -> Self {
-        Self::Shm(error)
-    }
-}
-
-impl From<DdsError> for RoleError {
-    fn from(error: DdsError) -> Self {
-        Self::Dds(error)
-    }
-}
-
-impl From<std::io::Error> for RoleError {
-    fn from(error: std::io::Error) -> Self {
-        Self::Os(error)
-    }
+    #[error(transparent)]
+    Os(#[from] std::io::Error),
 }
 
 /// The index of the lane called `name`.

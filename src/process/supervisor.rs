@@ -5,7 +5,7 @@
 //! supervisor: each asks the kernel for SIGTERM when its parent dies, whatever the parent dies of.
 
 use std::ffi::OsString;
-use std::fmt::{self, Write as _};
+use std::fmt::Write as _;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
@@ -49,9 +49,10 @@ const GRACE_MS: u64 = 4_500;
 const SUPERVISOR_VARIABLE: &str = "ADAPTIVE_BRIDGE_SUPERVISOR";
 
 /// Why `up` had to end.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum SupervisorError {
     /// A child could not be started.
+    #[error("cannot start {name}: {error}")]
     Start {
         /// Its name.
         name: String,
@@ -59,35 +60,17 @@ pub enum SupervisorError {
         error: io::Error,
     },
     /// Every child has failed in a way that a restart does not cure.
+    #[error("every process of the bridge has given up; see the log above")]
     AllGaveUp,
     /// Children did not end in time after SIGTERM and were killed.
+    #[error("killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))]
     Killed {
         /// Their names.
         names: Vec<String>,
     },
     /// The bridge runs already, or the folder of the instance cannot be used.
-    Shm(ShmError),
-}
-
-impl fmt::Display for SupervisorError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Start { name, error } => write!(f, "cannot start {name}: {error}"),
-            Self::AllGaveUp => f.write_str("every process of the bridge has given up; see the log above"),
-            Self::Killed { names } => {
-                write!(f, "killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))
-            }
-            Self::Shm(error) => error.fmt(f),
-        }
-    }
-}
-
-impl std::error::Error for SupervisorError {}
-
-impl From<ShmError> for SupervisorError {
-    fn from(error: ShmError) -> Self {
-        Self::Shm(error)
-    }
+    #[error(transparent)]
+    Shm(#[from] ShmError),
 }
 
 /// Makes this process end when `up` ends, if `up` started it. To be called before anything else.

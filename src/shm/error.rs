@@ -1,14 +1,14 @@
 //! Errors when shared memory is set up.
 
-use std::fmt;
 use std::path::PathBuf;
 
 use crate::model::{InstanceName, RouteId};
 
 /// Why shared memory could not be set up. `Display` names what failed, where, and what to do next.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum ShmError {
     /// The folder could not be created or made private.
+    #[error("cannot create the folder {path}: {source}; choose another with shared_memory.root_path")]
     CannotCreateRoot {
         /// The folder.
         path: PathBuf,
@@ -16,6 +16,10 @@ pub enum ShmError {
         source: std::io::Error,
     },
     /// The folder belongs to another user, or other users may write to it.
+    #[error(
+        "the folder {path} is not safe to use: {reason}; run as its owner, or choose another with \
+         shared_memory.root_path"
+    )]
     RootNotOurs {
         /// The folder.
         path: PathBuf,
@@ -23,6 +27,10 @@ pub enum ShmError {
         reason: String,
     },
     /// The folder's path is too long for the files below it.
+    #[error(
+        "the path {path} has {length} bytes, at most {max} are allowed; choose a shorter \
+         shared_memory.root_path"
+    )]
     PathTooLong {
         /// The folder.
         path: PathBuf,
@@ -32,6 +40,7 @@ pub enum ShmError {
         max: usize,
     },
     /// Another process already serves the role.
+    #[error("{role} is served already, by process {pid}; stop it first")]
     AlreadyServed {
         /// The role.
         role: String,
@@ -39,6 +48,7 @@ pub enum ShmError {
         pid: u32,
     },
     /// The whole bridge is to be started, but processes of its instance are running.
+    #[error("the bridge runs already as instance {instance}, process {pid}; stop it first")]
     AlreadyRuns {
         /// The instance.
         instance: InstanceName,
@@ -46,6 +56,11 @@ pub enum ShmError {
         pid: u32,
     },
     /// Shared memory has less free space than the bridge needs.
+    #[error(
+        "{what} needs {needed_bytes} bytes of shared memory, but {path} has {free_bytes} free; enlarge \
+         it (mount -o remount,size=… {path}; docker run --shm-size=…), or lower max_sample_bytes, \
+         queue_depth or max_taps"
+    )]
     NoRoom {
         /// What the memory is for.
         what: String,
@@ -57,6 +72,7 @@ pub enum ShmError {
         path: PathBuf,
     },
     /// The operating system refused access.
+    #[error("not permitted {what} ({path}); all processes of a bridge must run as the same user")]
     Permission {
         /// The operation, as `to` and a verb.
         what: String,
@@ -64,6 +80,7 @@ pub enum ShmError {
         path: PathBuf,
     },
     /// Running processes of this instance use another version or another configuration.
+    #[error("{what} ({path}); stop all processes of this instance, then start them again")]
     Incompatible {
         /// What does not match.
         what: String,
@@ -71,6 +88,7 @@ pub enum ShmError {
         path: PathBuf,
     },
     /// A route has as many taps or lanes as it allows.
+    #[error("all {max} places on route {route} are taken; raise shared_memory.max_taps, or stop a tap")]
     TooManySubscribers {
         /// The route.
         route: RouteId,
@@ -78,6 +96,10 @@ pub enum ShmError {
         max: usize,
     },
     /// Another process has held a lock for longer than a start takes; it may be stopped.
+    #[error(
+        "process {pid} has held the lock {path} for longer than a start takes; if that process is \
+         stopped, continue or kill it"
+    )]
     Busy {
         /// The lock file.
         path: PathBuf,
@@ -85,6 +107,7 @@ pub enum ShmError {
         pid: u32,
     },
     /// An operation of iceoryx2 or of the operating system failed for another reason.
+    #[error("failed {what} ({path}): {reason}")]
     Failed {
         /// The operation, as `to` and a verb.
         what: String,
@@ -93,71 +116,4 @@ pub enum ShmError {
         /// The error that was reported.
         reason: String,
     },
-}
-
-impl fmt::Display for ShmError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::CannotCreateRoot { path, source } => write!(
-                f,
-                "cannot create the folder {}: {source}; choose another with shared_memory.root_path",
-                path.display()
-            ),
-            Self::RootNotOurs { path, reason } => write!(
-                f,
-                "the folder {} is not safe to use: {reason}; run as its owner, or choose another with \
-                 shared_memory.root_path",
-                path.display()
-            ),
-            Self::PathTooLong { path, length, max } => write!(
-                f,
-                "the path {} has {length} bytes, at most {max} are allowed; choose a shorter \
-                 shared_memory.root_path",
-                path.display()
-            ),
-            Self::AlreadyServed { role, pid } => {
-                write!(f, "{role} is served already, by process {pid}; stop it first")
-            }
-            Self::AlreadyRuns { instance, pid } => {
-                write!(f, "the bridge runs already as instance {instance}, process {pid}; stop it first")
-            }
-            Self::NoRoom { what, needed_bytes, free_bytes, path } => write!(
-                f,
-                "{what} needs {needed_bytes} bytes of shared memory, but {} has {free_bytes} free; enlarge \
-                 it (mount -o remount,size=… {0}; docker run --shm-size=…), or lower max_sample_bytes, \
-                 queue_depth or max_taps",
-                path.display()
-            ),
-            Self::Permission { what, path } => write!(
-                f,
-                "not permitted {what} ({}); all processes of a bridge must run as the same user",
-                path.display()
-            ),
-            Self::Incompatible { what, path } => write!(
-                f,
-                "{what} ({}); stop all processes of this instance, then start them again",
-                path.display()
-            ),
-            Self::TooManySubscribers { route, max } => write!(
-                f,
-                "all {max} places on route {route} are taken; raise shared_memory.max_taps, or stop a tap"
-            ),
-            Self::Busy { path, pid } => write!(
-                f,
-                "process {pid} has held the lock {} for longer than a start takes; if that process is \
-                 stopped, continue or kill it",
-                path.display()
-            ),
-            Self::Failed { what, path, reason } => write!(f, "failed {what} ({}): {reason}", path.display()),
-        }
-    }
-}
-
-impl std::error::Error for ShmError {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        match self {
-            Self::CannotCreateRoot { source, .. } => Some(source),
-            _ => None,
-        }
-    }
 }

@@ -1,7 +1,5 @@
 //! The sample header in shared memory, and its validation after reading.
 
-use std::fmt;
-
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::model::{AgeBasis, Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
@@ -10,27 +8,18 @@ use crate::model::{AgeBasis, Encapsulation, Guid, MonotonicNs, SampleHeader, Sou
 pub const HEADER_BYTES: usize = size_of::<SampleHeader>();
 
 /// Why a sample header that was read from shared memory is invalid.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum HeaderError {
     /// The header is not [`HEADER_BYTES`] long.
+    #[error("a sample header of the wrong length")]
     WrongLength,
     /// The sequence number is 0; sequence numbers begin at 1.
+    #[error("a sample header with sequence number 0")]
     SequenceZero,
     /// The payload is longer than the route allows.
+    #[error("a sample larger than its route allows")]
     PayloadTooLong,
 }
-
-impl fmt::Display for HeaderError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::WrongLength => "a sample header of the wrong length",
-            Self::SequenceZero => "a sample header with sequence number 0",
-            Self::PayloadTooLong => "a sample larger than its route allows",
-        })
-    }
-}
-
-impl std::error::Error for HeaderError {}
 
 /// Decodes and validates a header from bytes that any process may have written. Every encapsulation and
 /// timestamp is accepted, because they are forwarded unchanged, and every age basis, because all its values

@@ -72,41 +72,25 @@ fn topic(text: &str) -> Result<TopicName, String> {
 }
 
 /// Why a publisher or subscriber ended.
+#[derive(Debug, thiserror::Error)]
 enum PeerError {
-    Dds(DdsError),
+    #[error(transparent)]
+    Dds(#[from] DdsError),
     /// The demo no longer reads the reports on stdout.
-    PipeClosed(io::Error),
-}
-
-impl From<DdsError> for PeerError {
-    fn from(error: DdsError) -> Self {
-        Self::Dds(error)
-    }
-}
-
-impl From<io::Error> for PeerError {
-    fn from(error: io::Error) -> Self {
-        Self::PipeClosed(error)
-    }
-}
-
-fn exit(error: &PeerError) -> ExitCode {
-    match error {
-        PeerError::Dds(error) => failed(error),
-        PeerError::PipeClosed(error) => failed(error),
-    }
+    #[error(transparent)]
+    PipeClosed(#[from] io::Error),
 }
 
 /// Publishes until it is killed.
 pub(in crate::cli) fn publisher(arguments: &PublisherArguments) -> ExitCode {
     let Err(error) = publish(arguments);
-    exit(&error)
+    failed(&error)
 }
 
 /// Subscribes until it is killed.
 pub(in crate::cli) fn subscriber(arguments: &SubscriberArguments) -> ExitCode {
     let Err(error) = subscribe(arguments);
-    exit(&error)
+    failed(&error)
 }
 
 /// Publishes scans like a timer of rclcpp: scans that become due during a publish call are skipped.

@@ -19,11 +19,19 @@ const MAX_FILE_BYTES: u64 = 4096;
 const STRONG_BYTES: usize = 16;
 
 /// Why the secret could not be loaded. No variant contains any part of a secret.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum SecretError {
     /// A secret is required and none is configured.
+    #[error(
+        "security.enable_probe_hmac is true, but no secret is configured: set \
+         security.hmac_secret_file to a file with the secret, or set enable_probe_hmac to false"
+    )]
     NotConfigured,
     /// The file cannot be read.
+    #[error(
+        "the secret file {path} {problem}; security.hmac_secret_file must name a file whose first line is the \
+         secret"
+    )]
     Unreadable {
         /// The path of the file.
         path: PathBuf,
@@ -31,52 +39,30 @@ pub enum SecretError {
         problem: String,
     },
     /// The file's first line is empty.
+    #[error(
+        "the first line of the secret file {path} is empty; create a secret with `openssl rand -hex 32 \
+         > {path}`, and give the bridge and its responders the same file"
+    )]
     EmptyFile {
         /// The path of the file.
         path: PathBuf,
     },
     /// The environment variable is not set or is empty.
+    #[error(
+        "the environment variable {name}, which security.hmac_secret_env names, is not set or is \
+         empty; set it to the secret"
+    )]
     EmptyVariable {
         /// The name of the variable.
         name: String,
     },
     /// `security.hmac_secret` of the configuration file is empty.
+    #[error("security.hmac_secret in the configuration file is empty")]
     EmptyInline,
     /// The operating system provides no random numbers for nonces.
+    #[error("cannot get random numbers for signatures: {0}")]
     NoRandomness(getrandom::Error),
 }
-
-impl fmt::Display for SecretError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::NotConfigured => f.write_str(
-                "security.enable_probe_hmac is true, but no secret is configured: set \
-                 security.hmac_secret_file to a file with the secret, or set enable_probe_hmac to false",
-            ),
-            Self::Unreadable { path, problem } => write!(
-                f,
-                "the secret file {} {problem}; security.hmac_secret_file must name a file whose first line is the \
-                 secret",
-                path.display()
-            ),
-            Self::EmptyFile { path } => write!(
-                f,
-                "the first line of the secret file {0} is empty; create a secret with `openssl rand -hex 32 \
-                 > {0}`, and give the bridge and its responders the same file",
-                path.display()
-            ),
-            Self::EmptyVariable { name } => write!(
-                f,
-                "the environment variable {name}, which security.hmac_secret_env names, is not set or is \
-                 empty; set it to the secret"
-            ),
-            Self::EmptyInline => f.write_str("security.hmac_secret in the configuration file is empty"),
-            Self::NoRandomness(error) => write!(f, "cannot get random numbers for signatures: {error}"),
-        }
-    }
-}
-
-impl std::error::Error for SecretError {}
 
 /// A shared secret, ready for signing. It cannot be printed; only the resulting state of the hash function is
 /// kept, not the secret itself.

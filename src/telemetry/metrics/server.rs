@@ -6,7 +6,6 @@
 //! requests it.
 
 use std::convert::Infallible;
-use std::fmt;
 use std::fs;
 use std::future::{poll_fn, ready};
 use std::io::{self, ErrorKind};
@@ -50,22 +49,11 @@ const RETRY_PAUSE: Duration = Duration::from_millis(100);
 type Latest = Arc<Mutex<Option<Arc<Report>>>>;
 
 /// The reason why the metrics page cannot be served.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
+#[error("cannot serve the metrics page on {address} (diagnostics.metrics): {source}")]
 pub struct MetricsError {
     address: String,
-    cause: io::Error,
-}
-
-impl fmt::Display for MetricsError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "cannot serve the metrics page on {} (diagnostics.metrics): {}", self.address, self.cause)
-    }
-}
-
-impl std::error::Error for MetricsError {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        Some(&self.cause)
-    }
+    source: io::Error,
 }
 
 /// The HTTP server of the metrics page. Dropping it stops the thread and removes the file of a unix socket.
@@ -88,7 +76,7 @@ impl MetricsServer {
             MetricsListener::Tcp(ip, port) => std::net::SocketAddr::new(*ip, *port).to_string(),
             MetricsListener::Unix(path) => path.display().to_string(),
         };
-        Self::try_start(listener).map_err(|cause| MetricsError { address, cause })
+        Self::try_start(listener).map_err(|source| MetricsError { address, source })
     }
 
     fn try_start(listener: &MetricsListener) -> io::Result<Self> {
