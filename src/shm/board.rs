@@ -96,13 +96,13 @@ struct Layout {
     health: usize,
     policy: usize,
     control: usize,
-    subscribers: usize,
-    intruders: usize,
-    named_endpoints: usize,
-    absences: usize,
+    subscriber: usize,
+    intruder: usize,
+    named_endpoint: usize,
+    absence: usize,
     route_info: usize,
     ingress: usize,
-    publishers: usize,
+    publisher: usize,
     lane: usize,
     output_readers: usize,
     histograms: usize,
@@ -116,14 +116,14 @@ impl Layout {
         let health = wake + lanes * LINE;
         let policy = health + (2 + lanes) * Cell::<ProcessHealth>::WORDS;
         let control = policy + lanes * Cell::<LanePolicy>::WORDS;
-        let subscribers = control + Cell::<ControlRecord>::WORDS;
-        let intruders = subscribers + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
-        let named_endpoints = intruders + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
-        let absences = named_endpoints + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
-        let route_info = absences + MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS;
+        let subscriber = control + Cell::<ControlRecord>::WORDS;
+        let intruder = subscriber + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
+        let named_endpoint = intruder + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
+        let absence = named_endpoint + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
+        let route_info = absence + MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS;
         let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
-        let publishers = ingress + routes * Cell::<IngressCounters>::WORDS;
-        let lane = publishers + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
+        let publisher = ingress + routes * Cell::<IngressCounters>::WORDS;
+        let lane = publisher + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
         let output_readers = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
         let histograms = output_readers + lanes * routes * Cell::<OutputReaders>::WORDS;
         let words = histograms + routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE);
@@ -134,13 +134,13 @@ impl Layout {
             health,
             policy,
             control,
-            subscribers,
-            intruders,
-            named_endpoints,
-            absences,
+            subscriber,
+            intruder,
+            named_endpoint,
+            absence,
             route_info,
             ingress,
-            publishers,
+            publisher,
             lane,
             output_readers,
             histograms,
@@ -148,65 +148,8 @@ impl Layout {
         }
     }
 
-    fn health(&self, role: ProcessRole) -> Cell<ProcessHealth> {
-        let index = match role {
-            ProcessRole::Ingress => 0,
-            ProcessRole::Control => 1,
-            ProcessRole::Egress(lane) => 2 + self.check_lane(lane),
-        };
-        Cell::at(self.health + index * Cell::<ProcessHealth>::WORDS)
-    }
-
     fn policy(&self, lane: usize) -> Cell<LanePolicy> {
         Cell::at(self.policy + self.check_lane(lane) * Cell::<LanePolicy>::WORDS)
-    }
-
-    fn control(&self) -> Cell<ControlRecord> {
-        Cell::at(self.control)
-    }
-
-    fn subscriber(&self, index: usize) -> Cell<SubscriberRecord> {
-        assert!(index < MAX_SUBSCRIBERS, "subscriber {index} of {MAX_SUBSCRIBERS}");
-        Cell::at(self.subscribers + index * Cell::<SubscriberRecord>::WORDS)
-    }
-
-    fn intruder(&self, index: usize) -> Cell<IntruderRecord> {
-        assert!(index < MAX_INTRUDERS, "intruder {index} of {MAX_INTRUDERS}");
-        Cell::at(self.intruders + index * Cell::<IntruderRecord>::WORDS)
-    }
-
-    fn named_endpoint(&self, index: usize) -> Cell<NamedEndpoint> {
-        assert!(index < MAX_NAMED_ENDPOINTS, "named endpoint {index} of {MAX_NAMED_ENDPOINTS}");
-        Cell::at(self.named_endpoints + index * Cell::<NamedEndpoint>::WORDS)
-    }
-
-    fn absence(&self, index: usize) -> Cell<AbsenceRecord> {
-        assert!(index < MAX_ABSENCES, "absence {index} of {MAX_ABSENCES}");
-        Cell::at(self.absences + index * Cell::<AbsenceRecord>::WORDS)
-    }
-
-    fn output_readers(&self, lane: usize, route: usize) -> Cell<OutputReaders> {
-        let index = self.check_lane(lane) * self.routes + self.check_route(route);
-        Cell::at(self.output_readers + index * Cell::<OutputReaders>::WORDS)
-    }
-
-    fn route_info(&self, route: usize) -> Cell<RouteInfo> {
-        Cell::at(self.route_info + self.check_route(route) * Cell::<RouteInfo>::WORDS)
-    }
-
-    fn ingress(&self, route: usize) -> Cell<IngressCounters> {
-        Cell::at(self.ingress + self.check_route(route) * Cell::<IngressCounters>::WORDS)
-    }
-
-    fn publisher(&self, route: usize, index: usize) -> Cell<PublisherAccount> {
-        assert!(index < MAX_PUBLISHERS, "publisher {index} of {MAX_PUBLISHERS}");
-        let cell = self.check_route(route) * MAX_PUBLISHERS + index;
-        Cell::at(self.publishers + cell * Cell::<PublisherAccount>::WORDS)
-    }
-
-    fn lane(&self, lane: usize, route: usize) -> Cell<LaneCounters> {
-        let index = self.check_lane(lane) * self.routes + self.check_route(route);
-        Cell::at(self.lane + index * Cell::<LaneCounters>::WORDS)
     }
 
     fn histogram(&self, stage: Stage, route: usize) -> usize {
@@ -225,6 +168,10 @@ impl Layout {
         self.wake + self.check_lane(lane) * LINE
     }
 
+    fn output(&self, lane: usize, route: usize) -> usize {
+        self.check_lane(lane) * self.routes + self.check_route(route)
+    }
+
     /// Panics for a number that the shape does not have: a defect of the caller, because numbers come from
     /// the configuration that the shape was made from.
     fn check_lane(&self, lane: usize) -> usize {
@@ -236,6 +183,74 @@ impl Layout {
         assert!(route < self.routes, "route {route} of {}", self.routes);
         route
     }
+}
+
+/// The index in a table of this size, which contains it.
+fn within(index: usize, size: usize) -> usize {
+    assert!(index < size, "record {index} of {size}");
+    index
+}
+
+/// Declares the boards: how each is read, how its only writer gets it, the type of its value, and which of the
+/// cells of the layout it is.
+macro_rules! boards {
+    ($($(#[doc = $doc:literal])+
+       $name:ident, $writer:ident($($arg:ident: $of:ty),*): $value:ty = |$layout:ident| $index:expr;)+) => {
+        impl Layout {
+            $(fn $name(&self, $($arg: $of),*) -> Cell<$value> {
+                let $layout = self;
+                Cell::at($layout.$name + ($index) * Cell::<$value>::WORDS)
+            })+
+        }
+
+        impl Boards {
+            $($(#[doc = $doc])+
+            ///
+            /// `None` when the writer changes the value faster than it can be read, which only a runaway writer
+            /// does; zeroes when it has never been written.
+            pub fn $name(&self, $($arg: $of),*) -> Option<$value> {
+                self.layout.$name($($arg),*).read(&self.segment)
+            }
+
+            #[doc = concat!("Writes the value of [`", stringify!($name), "`](Self::", stringify!($name), "), beginning")]
+            /// with what its predecessor wrote. One writer at a time: the holder of the role's lock.
+            pub fn $writer(&self, $($arg: $of),*) -> BoardWriter<$value> {
+                self.writer(self.layout.$name($($arg),*))
+            })+
+        }
+    };
+}
+
+boards! {
+    /// The health of a process.
+    health, health_writer(role: ProcessRole): ProcessHealth = |layout| match role {
+        ProcessRole::Ingress => 0,
+        ProcessRole::Control => 1,
+        ProcessRole::Egress(lane) => 2 + layout.check_lane(lane),
+    };
+    /// The state and decisions of control that concern the whole bridge.
+    control, control_writer(): ControlRecord = |layout| 0;
+    /// The record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
+    subscriber, subscriber_writer(index: usize): SubscriberRecord = |layout| within(index, MAX_SUBSCRIBERS);
+    /// The intruder at an index below [`MAX_INTRUDERS`].
+    intruder, intruder_writer(index: usize): IntruderRecord = |layout| within(index, MAX_INTRUDERS);
+    /// The named endpoint at an index below [`MAX_NAMED_ENDPOINTS`]: a GUID and its ROS 2 node.
+    named_endpoint, named_endpoint_writer(index: usize): NamedEndpoint =
+        |layout| within(index, MAX_NAMED_ENDPOINTS);
+    /// The absence (of an interface or peer) at an index below [`MAX_ABSENCES`].
+    absence, absence_writer(index: usize): AbsenceRecord = |layout| within(index, MAX_ABSENCES);
+    /// What ingress has discovered about a route.
+    route_info, route_info_writer(route: usize): RouteInfo = |layout| layout.check_route(route);
+    /// The counters of ingress for a route.
+    ingress, ingress_writer(route: usize): IngressCounters = |layout| layout.check_route(route);
+    /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
+    publisher, publisher_writer(route: usize, index: usize): PublisherAccount =
+        |layout| layout.check_route(route) * MAX_PUBLISHERS + within(index, MAX_PUBLISHERS);
+    /// The counters of a lane for a route.
+    lane, lane_writer(lane: usize, route: usize): LaneCounters = |layout| layout.output(lane, route);
+    /// The readers that are matched with a lane's output of a route.
+    output_readers, output_readers_writer(lane: usize, route: usize): OutputReaders =
+        |layout| layout.output(lane, route);
 }
 
 /// All boards of an instance.
@@ -288,119 +303,6 @@ impl Boards {
             });
         }
         Ok(Self { segment: Arc::new(segment), layout, policy_lock: dir.path.join("policy.lock") })
-    }
-
-    /// The health of a process; zeroes if it has never run. As for all boards, `None` when the writer changes
-    /// the value faster than it can be read, which only a runaway writer does.
-    pub fn health(&self, role: ProcessRole) -> Option<ProcessHealth> {
-        self.layout.health(role).read(&self.segment)
-    }
-
-    /// Writes the health of a process, beginning with what its predecessor wrote. One writer at a time: the
-    /// holder of the role's lock.
-    pub fn health_writer(&self, role: ProcessRole) -> BoardWriter<ProcessHealth> {
-        self.writer(self.layout.health(role))
-    }
-
-    /// The counters of ingress for a route.
-    pub fn ingress(&self, route: usize) -> Option<IngressCounters> {
-        self.layout.ingress(route).read(&self.segment)
-    }
-
-    /// Writes the counters of ingress for a route, beginning with those of its predecessor.
-    pub fn ingress_writer(&self, route: usize) -> BoardWriter<IngressCounters> {
-        self.writer(self.layout.ingress(route))
-    }
-
-    /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
-    pub fn publisher(&self, route: usize, index: usize) -> Option<PublisherAccount> {
-        self.layout.publisher(route, index).read(&self.segment)
-    }
-
-    /// Writes the account of the publisher of a route at an index below [`MAX_PUBLISHERS`], beginning with
-    /// what its predecessor wrote.
-    pub fn publisher_writer(&self, route: usize, index: usize) -> BoardWriter<PublisherAccount> {
-        self.writer(self.layout.publisher(route, index))
-    }
-
-    /// The counters of a lane for a route.
-    pub fn lane(&self, lane: usize, route: usize) -> Option<LaneCounters> {
-        self.layout.lane(lane, route).read(&self.segment)
-    }
-
-    /// Writes the counters of a lane for a route, beginning with those of its predecessor.
-    pub fn lane_writer(&self, lane: usize, route: usize) -> BoardWriter<LaneCounters> {
-        self.writer(self.layout.lane(lane, route))
-    }
-
-    /// The state and decisions of control that concern the whole bridge.
-    pub fn control(&self) -> Option<ControlRecord> {
-        self.layout.control().read(&self.segment)
-    }
-
-    /// Writes the record of control. One writer at a time, as for the health.
-    pub fn control_writer(&self) -> BoardWriter<ControlRecord> {
-        self.writer(self.layout.control())
-    }
-
-    /// The record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
-    pub fn subscriber(&self, index: usize) -> Option<SubscriberRecord> {
-        self.layout.subscriber(index).read(&self.segment)
-    }
-
-    /// Writes the record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
-    pub fn subscriber_writer(&self, index: usize) -> BoardWriter<SubscriberRecord> {
-        self.writer(self.layout.subscriber(index))
-    }
-
-    /// The intruder at an index below [`MAX_INTRUDERS`].
-    pub fn intruder(&self, index: usize) -> Option<IntruderRecord> {
-        self.layout.intruder(index).read(&self.segment)
-    }
-
-    /// Writes the intruder at an index below [`MAX_INTRUDERS`].
-    pub fn intruder_writer(&self, index: usize) -> BoardWriter<IntruderRecord> {
-        self.writer(self.layout.intruder(index))
-    }
-
-    /// The named endpoint at an index below [`MAX_NAMED_ENDPOINTS`]: a GUID and its ROS 2 node.
-    pub fn named_endpoint(&self, index: usize) -> Option<NamedEndpoint> {
-        self.layout.named_endpoint(index).read(&self.segment)
-    }
-
-    /// Writes the named endpoint at an index below [`MAX_NAMED_ENDPOINTS`].
-    pub fn named_endpoint_writer(&self, index: usize) -> BoardWriter<NamedEndpoint> {
-        self.writer(self.layout.named_endpoint(index))
-    }
-
-    /// The absence (of an interface or peer) at an index below [`MAX_ABSENCES`].
-    pub fn absence(&self, index: usize) -> Option<AbsenceRecord> {
-        self.layout.absence(index).read(&self.segment)
-    }
-
-    /// Writes the absence at an index below [`MAX_ABSENCES`].
-    pub fn absence_writer(&self, index: usize) -> BoardWriter<AbsenceRecord> {
-        self.writer(self.layout.absence(index))
-    }
-
-    /// The readers that are matched with a lane's output of a route.
-    pub fn output_readers(&self, lane: usize, route: usize) -> Option<OutputReaders> {
-        self.layout.output_readers(lane, route).read(&self.segment)
-    }
-
-    /// Writes the readers of a lane's output of a route, beginning with what its predecessor wrote.
-    pub fn output_readers_writer(&self, lane: usize, route: usize) -> BoardWriter<OutputReaders> {
-        self.writer(self.layout.output_readers(lane, route))
-    }
-
-    /// What ingress has discovered about a route.
-    pub fn route_info(&self, route: usize) -> Option<RouteInfo> {
-        self.layout.route_info(route).read(&self.segment)
-    }
-
-    /// Writes what ingress has discovered about a route.
-    pub fn route_info_writer(&self, route: usize) -> BoardWriter<RouteInfo> {
-        self.writer(self.layout.route_info(route))
     }
 
     /// The latencies of a stage on a route. Latencies that are recorded during the call may be missing.
