@@ -135,9 +135,7 @@ impl Meter {
 /// Appends `; dropped` and the sum of the counts of each reason; nothing without drops.
 pub(super) fn write_drops<'a>(line: &mut String, counts: impl Iterator<Item = &'a DropCounts>) {
     let mut drops = DropCounts::default();
-    for (reason, dropped) in counts.flat_map(DropCounts::iter) {
-        drops.add(reason, dropped);
-    }
+    counts.for_each(|one| drops.merge(one));
     let dropped = drops.iter().map(|(reason, dropped)| format!("{dropped} {reason}"));
     write_list(line, "; dropped", dropped);
 }

@@ -1,5 +1,6 @@
 //! Snapshot: one reading of all boards of a bridge.
 
+use std::ops::Range;
 use std::path::Path;
 use std::thread;
 use std::time::Duration;
@@ -218,9 +219,21 @@ impl Snapshot {
             routes,
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
-            intruders: read_intruders(boards, &control)?,
-            absences: read_absences(boards)?,
-            named_endpoints: read_named_endpoints(boards)?,
+            intruders: records(
+                places(control.intruders, MAX_INTRUDERS),
+                |place| boards.intruder(place),
+                |one| !one.topic.as_str().is_empty(),
+            )?,
+            absences: records(
+                0..MAX_ABSENCES,
+                |place| boards.absence(place),
+                |one| one.since != MonotonicNs::default(),
+            )?,
+            named_endpoints: records(
+                0..MAX_NAMED_ENDPOINTS,
+                |place| boards.named_endpoint(place),
+                |one| one.endpoint != Guid::default(),
+            )?,
             control,
             lanes,
         })
@@ -237,52 +250,27 @@ fn read_subscribers(
     control: &ControlRecord,
     lanes: usize,
 ) -> Result<Vec<SubscriberReading>, ShmError> {
-    let mut subscribers = Vec::new();
-    for place in places(control.subscribers, MAX_SUBSCRIBERS) {
-        let record = consistent(boards.subscriber(place))?;
-        if !record.id.as_str().is_empty() {
-            let lane = usize::try_from(record.lane).ok().filter(|lane| *lane < lanes);
-            subscribers.push(SubscriberReading { lane, record });
-        }
-    }
-    Ok(subscribers)
+    let places = places(control.subscribers, MAX_SUBSCRIBERS);
+    let records = records(places, |place| boards.subscriber(place), |one| !one.id.as_str().is_empty())?;
+    let reading = |record: SubscriberRecord| {
+        let lane = usize::try_from(record.lane).ok().filter(|lane| *lane < lanes);
+        SubscriberReading { lane, record }
+    };
+    Ok(records.into_iter().map(reading).collect())
 }
 
-fn read_intruders(boards: &Boards, control: &ControlRecord) -> Result<Vec<IntruderRecord>, ShmError> {
-    let mut intruders = Vec::new();
-    for place in places(control.intruders, MAX_INTRUDERS) {
-        let record = consistent(boards.intruder(place))?;
-        if !record.topic.as_str().is_empty() {
-            intruders.push(record);
-        }
-    }
-    Ok(intruders)
-}
-
-fn read_absences(boards: &Boards) -> Result<Vec<AbsenceRecord>, ShmError> {
-    let mut absences = Vec::new();
-    for place in 0..MAX_ABSENCES {
-        let record = consistent(boards.absence(place))?;
-        if record.since != MonotonicNs::default() {
-            absences.push(record);
-        }
-    }
-    Ok(absences)
-}
-
-fn read_named_endpoints(boards: &Boards) -> Result<Vec<NamedEndpoint>, ShmError> {
-    let mut named = Vec::new();
-    for place in 0..MAX_NAMED_ENDPOINTS {
-        let record = consistent(boards.named_endpoint(place))?;
-        if record.endpoint != Guid::default() {
-            named.push(record);
-        }
-    }
-    Ok(named)
+/// Reads the records in use at these places of a table.
+fn records<T>(
+    places: Range<usize>,
+    read: impl Fn(usize) -> Option<T>,
+    is_used: impl Fn(&T) -> bool,
+) -> Result<Vec<T>, ShmError> {
+    let records = places.map(|place| consistent(read(place)));
+    records.filter(|record| record.as_ref().map_or(true, &is_used)).collect()
 }
 
 /// The places in use of a table with `size` places. The board may contain any number.
-fn places(taken: u64, size: usize) -> std::ops::Range<usize> {
+fn places(taken: u64, size: usize) -> Range<usize> {
     0..usize::try_from(taken).unwrap_or(size).min(size)
 }
 
