@@ -2,7 +2,6 @@
 
 use std::ffi::OsStr;
 use std::fmt::{self, Write as _};
-use std::io::{self, Write as _};
 use std::process::ExitCode;
 use std::sync::LazyLock;
 
@@ -11,7 +10,7 @@ use clap::{Arg, Args, Command};
 use serde::Serialize;
 use serde_json::json;
 
-use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, output_ended};
+use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, print};
 use crate::config::{self, ConfigError, Place, Row, Settings};
 use crate::process::InForce;
 use crate::shm::RouteChannel;
@@ -33,7 +32,7 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     if let Some(path) = &arguments.explain {
         return explain(path);
     }
@@ -43,22 +42,16 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
             Err(error) => (problems(&error).to_string() + "\n", ExitCode::from(EXIT_CONFIG)),
         }
     } else {
-        match arguments.config.load() {
-            Ok(settings) => {
-                let running = InForce::find(&arguments.config.file(), Some(&settings));
-                let text = Summary::of(&settings).to_string();
-                (
-                    text + &running.map_or_else(String::new, |running| differences(&running, settings)),
-                    ExitCode::SUCCESS,
-                )
-            }
-            Err(code) => return code,
-        }
+        let settings = arguments.config.load()?;
+        let running = InForce::find(&arguments.config.file(), Some(&settings));
+        let text = Summary::of(&settings).to_string();
+        (
+            text + &running.map_or_else(String::new, |running| differences(&running, settings)),
+            ExitCode::SUCCESS,
+        )
     };
-    match io::stdout().write_all(text.as_bytes()) {
-        Ok(()) => code,
-        Err(error) => output_ended(&error),
-    }
+    print(&text)?;
+    Ok(code)
 }
 
 /// Reads the path of a key, and offers all paths to the completions of a shell.
@@ -95,18 +88,16 @@ static OFFERED_PATHS: LazyLock<Vec<String>> = LazyLock::new(|| {
 });
 
 /// Prints the declaration of a key, or of all keys of a section.
-fn explain(path: &str) -> ExitCode {
+fn explain(path: &str) -> Result<ExitCode, ExitCode> {
     let keys = config::keys_at(path);
     if keys.is_empty() {
         let hint = config::nearest_key(path).map(|key| format!("; did you mean `{key}`?"));
         failed(&format!("{path} is no key of the configuration{}", hint.unwrap_or_default()));
-        return ExitCode::from(EXIT_USAGE);
+        return Err(ExitCode::from(EXIT_USAGE));
     }
     let explained: Vec<String> = keys.iter().map(|(path, row)| explained(path, row)).collect();
-    match io::stdout().write_all(explained.join("\n").as_bytes()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => output_ended(&error),
-    }
+    print(&explained.join("\n"))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 fn explained(path: &str, row: &Row) -> String {

@@ -1,12 +1,11 @@
 //! `completions`: prints the script with which a shell completes command lines of this program.
 
-use std::io::{self, Write};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory};
 use clap_complete::Shell;
 
-use super::{Cli, output_ended};
+use super::{Cli, print_bytes};
 
 /// The arguments of `completions`.
 #[derive(Args, Debug)]
@@ -15,14 +14,12 @@ pub(super) struct Arguments {
     shell: Shell,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let mut command = Cli::command();
     let name = command.get_name().to_owned();
     // Generated in memory first, because the generator panics when a write fails.
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut command, name, &mut script);
-    match io::stdout().write_all(&script) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => output_ended(&error),
-    }
+    print_bytes(&script)?;
+    Ok(ExitCode::SUCCESS)
 }

@@ -7,14 +7,13 @@ mod services;
 
 use std::fmt::{self, Write};
 use std::fs;
-use std::io::{self, Write as _};
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
 use clap::Args;
 use serde::Serialize;
 
-use super::{ConfigArguments, failed, output_ended};
+use super::{ConfigArguments, failed, print};
 use crate::config::{self, Settings};
 
 /// The arguments of `doctor`.
@@ -85,6 +84,18 @@ impl Finding {
         Self { check, severity, found: found.into(), meaning, command: None }
     }
 
+    fn note(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
+        Self::new(check, Severity::Note, found, meaning)
+    }
+
+    fn warning(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
+        Self::new(check, Severity::Warning, found, meaning)
+    }
+
+    fn error(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
+        Self::new(check, Severity::Error, found, meaning)
+    }
+
     fn with_command(mut self, command: impl Into<String>) -> Self {
         self.command = Some(command.into());
         self
@@ -121,7 +132,7 @@ impl fmt::Display for Diagnosis {
     }
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let file = arguments.config.file();
     let mut findings = Vec::new();
     let settings = match arguments.config.try_load() {
@@ -132,34 +143,26 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         Err(error) => {
             let problems = error.problems().len();
             findings.push(
-                Finding::new(
+                Finding::error(
                     "configuration",
-                    Severity::Error,
                     format!("{}: {problems} problems", file.display()),
                     "No process of the bridge starts. The following checks use the default settings.",
                 )
                 .with_command(format!("adaptive-bridge check --config {}", file.display())),
             );
-            match config::parse("topics: [{id: none, input_topic: /none}]", "the defaults", &|_| None) {
-                Ok(settings) => settings,
-                Err(error) => return failed(&error),
-            }
+            config::parse("topics: [{id: none, input_topic: /none}]", "the defaults", &|_| None)
+                .map_err(|error| failed(&error))?
         }
     };
     findings.extend(check(&settings, &file));
     let diagnosis = Diagnosis::of(findings);
     let text = if arguments.json {
-        match serde_json::to_string_pretty(&diagnosis) {
-            Ok(text) => text + "\n",
-            Err(error) => return failed(&error),
-        }
+        serde_json::to_string_pretty(&diagnosis).map_err(|error| failed(&error))? + "\n"
     } else {
         diagnosis.to_string()
     };
-    match io::stdout().write_all(text.as_bytes()) {
-        Ok(()) => ExitCode::from(diagnosis.severity.exit_code()),
-        Err(error) => output_ended(&error),
-    }
+    print(&text)?;
+    Ok(ExitCode::from(diagnosis.severity.exit_code()))
 }
 
 fn check(settings: &Settings, file: &Path) -> Vec<Finding> {

@@ -17,7 +17,7 @@ mod status;
 mod tap;
 mod units;
 
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -154,7 +154,7 @@ pub fn main() -> ExitCode {
     // clap prints help and errors itself and exits with 0 or 2.
     let cli = Cli::parse();
     telemetry::start_logs();
-    match cli.command {
+    let ended = match cli.command {
         Command::Check(arguments) => check::run(&arguments),
         Command::Ingress(arguments) => roles::ingress(&arguments),
         Command::Egress(arguments) => roles::egress(&arguments),
@@ -168,11 +168,12 @@ pub fn main() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Units(arguments) => units::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
-        Command::Man(arguments) => man::run(&arguments),
-        Command::Demo(arguments) => demo::run(&arguments),
-        Command::DemoPublisher(arguments) => demo::publisher(&arguments),
-        Command::DemoSubscriber(arguments) => demo::subscriber(&arguments),
-    }
+        Command::Man(arguments) => Ok(man::run(&arguments)),
+        Command::Demo(arguments) => Ok(demo::run(&arguments)),
+        Command::DemoPublisher(arguments) => Ok(demo::publisher(&arguments)),
+        Command::DemoSubscriber(arguments) => Ok(demo::subscriber(&arguments)),
+    };
+    ended.unwrap_or_else(|code| code)
 }
 
 /// Prints why a command failed and returns its exit code.
@@ -191,6 +192,12 @@ fn read_bridge(root: &Path, settings: &Settings) -> Result<Option<Snapshot>, Str
         ),
         other => other.to_string(),
     })
+}
+
+/// Takes a snapshot of the bridge, or prints why there is none and returns the exit code.
+fn running_bridge(root: &Path, settings: &Settings) -> Result<Snapshot, ExitCode> {
+    let snapshot = read_bridge(root, settings).map_err(|error| failed(&error))?;
+    snapshot.ok_or_else(|| no_bridge(settings, root))
 }
 
 /// Prints that no bridge runs with these settings and returns the exit code.
@@ -216,6 +223,15 @@ fn output_ended(error: &io::Error) -> ExitCode {
         ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         _ => failed(&format!("stdout: {error}")),
     }
+}
+
+/// Writes the result of a subcommand to stdout.
+fn print(text: &str) -> Result<(), ExitCode> {
+    print_bytes(text.as_bytes())
+}
+
+fn print_bytes(bytes: &[u8]) -> Result<(), ExitCode> {
+    io::stdout().write_all(bytes).map_err(|error| output_ended(&error))
 }
 
 /// Sleeps for `ms` and returns `true`; returns `false` as soon as a stop is requested.

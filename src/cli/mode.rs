@@ -68,27 +68,18 @@ fn override_duration(text: &str) -> Result<OverrideDuration, String> {
     }
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.in_force() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
+    let settings = arguments.config.in_force()?;
     let mode = arguments.mode.override_mode();
-    match process::set_mode(&settings, &arguments.lane, mode, arguments.duration.0) {
-        Ok(epoch) => {
-            let lane = &arguments.lane;
-            match (mode, arguments.duration.0) {
-                (None, _) => println!("lane {lane}: no override (epoch {epoch})"),
-                (Some(mode), None) => println!("lane {lane}: {mode} until the next override (epoch {epoch})"),
-                (Some(mode), Some(duration)) => {
-                    println!(
-                        "lane {lane}: {mode} for {} (epoch {epoch})",
-                        humantime::format_duration(duration)
-                    );
-                }
-            }
-            ExitCode::SUCCESS
+    let epoch = process::set_mode(&settings, &arguments.lane, mode, arguments.duration.0)
+        .map_err(|error| failed(&error))?;
+    let lane = &arguments.lane;
+    match (mode, arguments.duration.0) {
+        (None, _) => println!("lane {lane}: no override (epoch {epoch})"),
+        (Some(mode), None) => println!("lane {lane}: {mode} until the next override (epoch {epoch})"),
+        (Some(mode), Some(duration)) => {
+            println!("lane {lane}: {mode} for {} (epoch {epoch})", humantime::format_duration(duration));
         }
-        Err(error) => failed(&error),
     }
+    Ok(ExitCode::SUCCESS)
 }

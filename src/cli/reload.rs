@@ -1,33 +1,25 @@
 //! `reload`: applies the changes of the configuration file to the running bridge.
 
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, output_ended};
+use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, print};
 use crate::config::Reload;
 use crate::process::{InForce, ReloadAnswer, ReloadResult, reload_all};
 use crate::shm::root_of;
 
-pub(super) fn run(arguments: &ConfigArguments) -> ExitCode {
+pub(super) fn run(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
     // A bad file is refused here with all its problems, before any process of the bridge reads it.
-    let file = match arguments.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
+    let file = arguments.load()?;
     // The file may have a new instance name since the bridge was started with it.
     let settings = InForce::find(&arguments.file(), Some(&file)).unwrap_or_else(|| file.clone());
     let root = root_of(&settings);
-    let answers = match reload_all(&root, &settings.instance) {
-        Ok(answers) if answers.is_empty() => return no_bridge(&settings, &root),
-        Ok(answers) => answers,
-        Err(error) => return failed(&error),
-    };
-    let text = summary(&answers, file.fingerprint());
-    if let Err(error) = io::stdout().write_all(text.as_bytes()) {
-        return output_ended(&error);
+    let answers = reload_all(&root, &settings.instance).map_err(|error| failed(&error))?;
+    if answers.is_empty() {
+        return Err(no_bridge(&settings, &root));
     }
-    exit_code(&answers)
+    print(&summary(&answers, file.fingerprint()))?;
+    Ok(exit_code(&answers))
 }
 
 fn exit_code(answers: &[ReloadAnswer]) -> ExitCode {

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, EXIT_CONFIG, failed, roles};
+use super::{ConfigArguments, EXIT_CONFIG, bad_configuration, failed, roles};
 use crate::config::{self, Configuration, DdsNetwork, NetworkSelector, SecretSource, Settings};
 use crate::model::{LaneName, TopicName, is_probe_id};
 use crate::process::probes::Trust;
@@ -40,15 +40,9 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let loaded = config::load_or_default(arguments.config.path(), &|name| std::env::var(name).ok());
-    let Configuration { settings, inline_secret } = match loaded {
-        Ok(configuration) => configuration,
-        Err(error) => {
-            eprintln!("{error}");
-            return ExitCode::from(EXIT_CONFIG);
-        }
-    };
+    let Configuration { settings, inline_secret } = loaded.map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(settings.diagnostics.verbosity);
     let request_topic = arguments.request_topic.as_ref().unwrap_or(&settings.probes.request_topic);
     let response_topic = arguments.response_topic.as_ref().unwrap_or(&settings.probes.response_topic);
@@ -56,20 +50,17 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
         failed(&format!(
             "probe requests and responses must be on different topics; both are on {request_topic}"
         ));
-        return ExitCode::from(EXIT_CONFIG);
+        return Err(ExitCode::from(EXIT_CONFIG));
     }
     let mut security = settings.security.clone();
     if let Some(path) = &arguments.secret_file {
         security.enable_probe_hmac = true;
         security.secret = Some(SecretSource::File(path.clone()));
     }
-    let trust = match Trust::load(&security, inline_secret.as_ref()) {
-        Ok(trust) => trust,
-        Err(error) => {
-            failed(&error);
-            return ExitCode::from(EXIT_CONFIG);
-        }
-    };
+    let trust = Trust::load(&security, inline_secret.as_ref()).map_err(|error| {
+        failed(&error);
+        ExitCode::from(EXIT_CONFIG)
+    })?;
     let network = arguments.network(&settings);
     let options = ResponderOptions {
         id: &arguments.id,

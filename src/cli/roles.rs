@@ -24,11 +24,11 @@ pub(super) struct EgressArguments {
     config: ConfigArguments,
 }
 
-pub(super) fn ingress(arguments: &ConfigArguments) -> ExitCode {
+pub(super) fn ingress(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
     role(arguments, |configuration, reloads, stop| process::ingress(&configuration.settings, reloads, stop))
 }
 
-pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
+pub(super) fn egress(arguments: &EgressArguments) -> Result<ExitCode, ExitCode> {
     let mut unused = false;
     let code = role(&arguments.config, |configuration, reloads, stop| {
         let settings = &configuration.settings;
@@ -38,26 +38,20 @@ pub(super) fn egress(arguments: &EgressArguments) -> ExitCode {
             return Ok(());
         }
         process::egress(settings, &arguments.lane, reloads, stop)
-    });
-    if unused { ExitCode::from(EXIT_UNUSED) } else { code }
+    })?;
+    Ok(if unused { ExitCode::from(EXIT_UNUSED) } else { code })
 }
 
-pub(super) fn control(arguments: &ConfigArguments) -> ExitCode {
+pub(super) fn control(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
     role(arguments, |Configuration { settings, inline_secret }, reloads, stop| {
         process::control(settings, inline_secret.as_ref(), reloads, stop)
     })
 }
 
-pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
-    let hang_up = match HangUp::on_signal() {
-        Ok(hang_up) => hang_up,
-        Err(error) => return failed(&error),
-    };
+pub(super) fn up(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
+    let hang_up = HangUp::on_signal().map_err(|error| failed(&error))?;
     // `up` starts the whole bridge, so it reads the file and not the configuration in force.
-    let configuration = match arguments.try_load_configuration() {
-        Ok(configuration) => configuration,
-        Err(error) => return bad_configuration(&error),
-    };
+    let configuration = arguments.try_load_configuration().map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
     let child_arguments: Vec<OsString> = match arguments.path() {
         Some(path) => vec!["--config".into(), path.into()],
@@ -70,16 +64,14 @@ pub(super) fn up(arguments: &ConfigArguments) -> ExitCode {
 fn role(
     arguments: &ConfigArguments,
     role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
-) -> ExitCode {
+) -> Result<ExitCode, ExitCode> {
     let reload_arguments = arguments.clone();
-    let reloads = match ReloadRequests::on_signal(move || reload_arguments.try_load_configuration()) {
-        Ok(reloads) => reloads,
-        Err(error) => return failed(&error),
-    };
+    let reloads = ReloadRequests::on_signal(move || reload_arguments.try_load_configuration())
+        .map_err(|error| failed(&error))?;
     process::end_with_supervisor();
     let in_force = match InForce::join(&arguments.file(), arguments.try_load_configuration()) {
         Ok(in_force) => in_force,
-        Err(InForceError::Config(error)) => return bad_configuration(&error),
+        Err(InForceError::Config(error)) => return Err(bad_configuration(&error)),
         Err(InForceError::Shm(error)) => return run(|_| Err(error)),
     };
     let configuration = in_force.configuration().clone();
@@ -88,20 +80,19 @@ fn role(
 }
 
 /// Runs `role` until it returns or a signal stops it, and returns the exit code of the process.
-pub(super) fn run<E: std::fmt::Display>(role: impl FnOnce(&Stop) -> Result<(), E>) -> ExitCode {
+pub(super) fn run<E: std::fmt::Display>(
+    role: impl FnOnce(&Stop) -> Result<(), E>,
+) -> Result<ExitCode, ExitCode> {
     process::abort_on_panic();
-    let stop = match Stop::on_signals() {
-        Ok(stop) => stop,
-        Err(error) => return failed(&error),
-    };
+    let stop = Stop::on_signals().map_err(|error| failed(&error))?;
     match role(&stop) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) => {
             let code = failed(&error);
             if std::env::var_os("NOTIFY_SOCKET").is_some() {
                 pause(FAILED_START_MS, &stop);
             }
-            code
+            Err(code)
         }
     }
 }

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 use clap::{Args, value_parser};
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, pause, read_bridge};
+use super::{ConfigArguments, failed, no_bridge, output_ended, pause, running_bridge};
 use crate::config::Settings;
 use crate::process::Stop;
 use crate::shm::{ShmError, root_of};
@@ -37,33 +37,21 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.in_force() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
+    let settings = arguments.config.in_force()?;
     let root = root_of(&settings);
-    let first = match read_bridge(&root, &settings) {
-        Ok(Some(snapshot)) => snapshot,
-        Ok(None) => return no_bridge(&settings, &root),
-        Err(error) => return failed(&error),
-    };
+    let first = running_bridge(&root, &settings)?;
     if let Some(process) = &arguments.require {
-        return require(&first, process);
+        return Ok(require(&first, process));
     }
     if arguments.watch {
         return watch(arguments, root, settings, first);
     }
     #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
     std::thread::sleep(std::time::Duration::from_millis(arguments.interval_ms));
-    match read_bridge(&root, &settings) {
-        Ok(Some(second)) => match show(&second.report_since(&first), arguments.json) {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(error) => output_ended(&error),
-        },
-        Ok(None) => no_bridge(&settings, &root),
-        Err(error) => failed(&error),
-    }
+    let second = running_bridge(&root, &settings)?;
+    show(&second.report_since(&first), arguments.json).map_err(|error| output_ended(&error))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Checks that a process runs, for health checks.
@@ -80,11 +68,13 @@ fn require(bridge: &Snapshot, process: &str) -> ExitCode {
 
 /// Shows one report after the other. Waits for a bridge that has ended: it may be restarted, perhaps with
 /// other settings.
-fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first: Snapshot) -> ExitCode {
-    let stop = match Stop::on_signals() {
-        Ok(stop) => stop,
-        Err(error) => return failed(&error),
-    };
+fn watch(
+    arguments: &Arguments,
+    mut root: PathBuf,
+    mut settings: Settings,
+    first: Snapshot,
+) -> Result<ExitCode, ExitCode> {
+    let stop = Stop::on_signals().map_err(|error| failed(&error))?;
     let in_place = !arguments.json && io::stdout().is_terminal();
     let mut last = Some(first);
     while pause(arguments.interval_ms, &stop) {
@@ -98,7 +88,7 @@ fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first
         let next = match Snapshot::take(&root, &settings) {
             Ok(next) => next,
             Err(ShmError::Incompatible { .. }) if arguments.config.running().is_some() => None,
-            Err(error) => return failed(&error),
+            Err(error) => return Err(failed(&error)),
         };
         let shown = match (&next, &last) {
             (Some(next), before) => {
@@ -111,12 +101,10 @@ fn watch(arguments: &Arguments, mut root: PathBuf, mut settings: Settings, first
             }
             (None, None) => Ok(()),
         };
-        if let Err(error) = shown {
-            return output_ended(&error);
-        }
+        shown.map_err(|error| output_ended(&error))?;
         last = next;
     }
-    ExitCode::SUCCESS
+    Ok(ExitCode::SUCCESS)
 }
 
 fn show(report: &Report, json: bool) -> io::Result<()> {

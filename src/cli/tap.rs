@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, no_bridge, output_ended, read_bridge};
+use super::{ConfigArguments, failed, output_ended, read_bridge, running_bridge};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{Encapsulation, MonotonicNs};
@@ -48,38 +48,25 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.in_force() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
+    let settings = arguments.config.in_force()?;
     let Some(route) = find_route(&settings, &arguments.topic) else {
-        return failed(&unknown_topic(&settings, &arguments.topic));
+        return Err(failed(&unknown_topic(&settings, &arguments.topic)));
     };
     // Checked first, because opening a node would create the shared memory of a bridge that does not run.
     let root = root_of(&settings);
-    match read_bridge(&root, &settings) {
-        Ok(Some(_)) => {}
-        Ok(None) => return no_bridge(&settings, &root),
-        Err(error) => return failed(&error),
-    }
-    let stop = match Stop::on_signals() {
-        Ok(stop) => stop,
-        Err(error) => return failed(&error),
-    };
-    let subscriber = ShmNode::open(&root, &settings.instance, "tap").and_then(|node| {
+    running_bridge(&root, &settings)?;
+    let stop = Stop::on_signals().map_err(|error| failed(&error))?;
+    let opened = ShmNode::open(&root, &settings.instance, "tap").and_then(|node| {
         let channel = RouteChannel::of(&settings, route);
         SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, arguments.retained)
     });
-    let subscriber = match subscriber {
-        Ok(subscriber) => subscriber,
-        Err(error) => return failed(&error),
-    };
+    let subscriber = opened.map_err(|error| failed(&error))?;
     let bridge_runs = || matches!(read_bridge(&root, &settings), Ok(Some(_)));
     match Tap::new(arguments).follow(&subscriber, &stop, bridge_runs) {
-        Ok(End::Done) => ExitCode::SUCCESS,
-        Ok(End::BridgeGone) => failed(&"the bridge has ended"),
-        Err(error) => output_ended(&error),
+        Ok(End::Done) => Ok(ExitCode::SUCCESS),
+        Ok(End::BridgeGone) => Err(failed(&"the bridge has ended")),
+        Err(error) => Err(output_ended(&error)),
     }
 }
 

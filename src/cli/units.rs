@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
-use std::io::{self, ErrorKind, Write as _};
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, output_ended};
+use super::{ConfigArguments, failed, print};
 use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
 use crate::model::TrafficClass;
 
@@ -43,24 +43,16 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-pub(super) fn run(arguments: &Arguments) -> ExitCode {
-    let settings = match arguments.config.load() {
-        Ok(settings) => settings,
-        Err(code) => return code,
-    };
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
+    let settings = arguments.config.load()?;
     let wanted = DropIns::of(&settings, &arguments.config.file());
     let text = if arguments.write {
-        match wanted.write(&arguments.folder) {
-            Ok(text) => text,
-            Err(error) => return failed(&error),
-        }
+        wanted.write(&arguments.folder).map_err(|error| failed(&error))?
     } else {
         wanted.print(&arguments.folder)
     };
-    match io::stdout().write_all(text.as_bytes()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => output_ended(&error),
-    }
+    print(&text)?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// The drop-ins that a configuration needs, by unit.
