@@ -76,7 +76,7 @@ fn open_files(limit: u64) -> Finding {
     if limit >= OPEN_FILES {
         return Finding::ok("open files", found);
     }
-    Finding::new("open files", Severity::Warning, found, "Too few for many routes.")
+    Finding::warning("open files", found, "Too few for many routes.")
         .with_command(format!("ulimit -n {OPEN_FILES}"))
 }
 
@@ -100,10 +100,7 @@ fn real_time(configured: &[&Scheduling], rights: &Rights) -> Finding {
         Some(priority) if rights.nice || rights.rtprio >= priority => {
             Finding::ok(check, format!("priority {priority} is allowed"))
         }
-        Some(priority) => Finding::new(
-            check,
-            Severity::Warning,
-            format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
+        Some(priority) => Finding::warning(check, format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
             "Processes that this user starts run without a real-time policy. The installed services are allowed 50.",
         )
         .with_command(limits_line("rtprio", &priority.to_string())),
@@ -119,10 +116,7 @@ fn memory_lock(configured: &[&Scheduling], rights: &Rights) -> Finding {
         return Finding::ok(check, "is allowed");
     }
     let found = format!("lock_memory is configured, and this user may lock {} KiB", rights.memlock / 1024);
-    Finding::new(
-        check,
-        Severity::Warning,
-        found,
+    Finding::warning(check, found,
         "Page faults may delay processes that this user starts. The installed critical services may lock memory.",
     )
     .with_command(limits_line("memlock", "unlimited"))
@@ -145,9 +139,8 @@ fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
     if missing.is_empty() {
         return Finding::ok("CPUs", format!("{online} are online"));
     }
-    Finding::new(
+    Finding::warning(
         "CPUs",
-        Severity::Warning,
         format!("CPUs {} are configured, and only {online} are online", list(missing)),
         "A process whose configured CPUs are all offline runs on every CPU.",
     )
@@ -156,16 +149,14 @@ fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
 fn throttling(runtime_us: i64) -> Finding {
     let check = "real-time runtime";
     match runtime_us {
-        0 => Finding::new(
+        0 => Finding::warning(
             check,
-            Severity::Warning,
             "kernel.sched_rt_runtime_us is 0",
             "No process may have a real-time policy.",
         )
         .with_command("sudo sysctl -w kernel.sched_rt_runtime_us=950000"),
-        runtime_us if runtime_us < 0 => Finding::new(
+        runtime_us if runtime_us < 0 => Finding::note(
             check,
-            Severity::Note,
             "kernel.sched_rt_runtime_us is -1",
             "A real-time process in an endless loop blocks its CPU; LimitRTTIME of the services prevents that.",
         ),
@@ -204,7 +195,7 @@ fn idle_states(cpus: &Path) -> Option<Finding> {
         "At low rates, when CPUs go idle between samples, a sample waits for up to three such wake-ups.";
     let command = "sudo sh -c 'exec 3>/dev/cpu_dma_latency && echo 0 >&3 && exec sleep infinity' \
                    # keeps CPUs awake while it runs; draws more power";
-    Some(Finding::new("idle CPUs", Severity::Note, found, meaning).with_command(command))
+    Some(Finding::note("idle CPUs", found, meaning).with_command(command))
 }
 
 fn clock_source(current: &str, available: &str) -> Finding {

@@ -6,7 +6,7 @@ use std::path::Path;
 use nix::sys::statvfs::statvfs;
 use nix::unistd::geteuid;
 
-use super::{Finding, Severity};
+use super::Finding;
 use crate::config::Settings;
 use crate::shm::{RoleHolder, RouteChannel, instance_files, root_of};
 
@@ -35,13 +35,8 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
             findings.push(free_space(needed, &space));
         }
         Err(error) => findings.push(
-            Finding::new(
-                "shared memory",
-                Severity::Error,
-                format!("{SHM}: {error}"),
-                "The bridge cannot start without it.",
-            )
-            .with_command(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
+            Finding::error("shared memory", format!("{SHM}: {error}"), "The bridge cannot start without it.")
+                .with_command(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
         ),
     }
     let files = instance_files(&root, &settings.instance);
@@ -72,21 +67,15 @@ fn free_space(needed: u64, space: &Space) -> Finding {
     if space.is_allocated {
         Finding::ok(check, format!("{found}; the running bridge has already allocated it"))
     } else if space.free < needed {
-        Finding::new(
+        Finding::error(
             check,
-            Severity::Error,
             found,
             "The bridge does not start, because it allocates all its pools at the start.",
         )
         .with_command(command)
     } else if space.free < needed + needed / 2 {
-        Finding::new(
-            check,
-            Severity::Warning,
-            found,
-            "If another program uses the rest, the bridge cannot be restarted.",
-        )
-        .with_command(command)
+        Finding::warning(check, found, "If another program uses the rest, the bridge cannot be restarted.")
+            .with_command(command)
     } else {
         Finding::ok(check, found)
     }
@@ -96,9 +85,8 @@ fn leftover_files(processes: usize, files: usize, bytes: u64) -> Finding {
     let check = "left behind";
     match (processes, files) {
         (0, 0) => Finding::ok(check, "no files of an earlier bridge"),
-        (0, files) => Finding::new(
+        (0, files) => Finding::note(
             check,
-            Severity::Note,
             format!("{files} files ({} KiB) in {SHM}, and no process of the bridge", bytes.div_ceil(1024)),
             "All processes of a bridge were killed. The next start removes these files.",
         ),
@@ -135,10 +123,7 @@ fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
     if ["no", "false", "off", "0"].contains(&value) {
         return Finding::ok(check, "is off");
     }
-    Finding::new(
-        check,
-        Severity::Warning,
-        "is on, and this is not a system user",
+    Finding::warning(check, "is on, and this is not a system user",
         "When you log out, logind removes your shared memory, also that of a bridge that still runs. The installed \
          services run as a system user.",
     )
@@ -150,6 +135,7 @@ fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Severity;
     use super::*;
 
     #[test]

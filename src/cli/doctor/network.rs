@@ -93,28 +93,22 @@ fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
     };
     let check = "interface";
     match found {
-        None => Finding::new(
+        None => Finding::error(
             check,
-            Severity::Error,
             format!("no interface {name}; this machine has: {}", names(interfaces)),
             "A process that is configured to use it does not start.",
         ),
-        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => Finding::new(
+        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => {
+            Finding::error(check, format!("{name} is down"), "No DDS participants are discovered on it.")
+                .with_command(format!("sudo ip link set {} up", interface.name))
+        }
+        Some(interface) if interface.address.is_none() => Finding::error(
             check,
-            Severity::Error,
-            format!("{name} is down"),
-            "No DDS participants are discovered on it.",
-        )
-        .with_command(format!("sudo ip link set {} up", interface.name)),
-        Some(interface) if interface.address.is_none() => Finding::new(
-            check,
-            Severity::Error,
             format!("{name} has no IPv4 address"),
             "No DDS participants are discovered on it.",
         ),
-        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_MULTICAST) => Finding::new(
+        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_MULTICAST) => Finding::error(
             check,
-            Severity::Error,
             format!("{name} carries no multicast"),
             "DDS participants announce themselves by multicast, so none are discovered there.",
         )
@@ -135,9 +129,8 @@ fn any_multicast(interfaces: &[Interface]) -> Finding {
     let carrying = interfaces.iter().filter(|found| found.carries_multicast() && found.address.is_some());
     let carrying: Vec<Interface> = carrying.cloned().collect();
     if carrying.is_empty() {
-        return Finding::new(
+        return Finding::warning(
             "multicast",
-            Severity::Warning,
             "no interface that is up and has an address carries multicast",
             "DDS participants on other machines are not discovered.",
         )
@@ -153,10 +146,7 @@ fn multicast_route(routed: bool, interfaces: &[Interface]) -> Finding {
     }
     let carrying = interfaces.iter().find(|found| found.carries_multicast() && found.address.is_some());
     let through = carrying.map_or("eth0", |interface| interface.name.as_str());
-    Finding::new(
-        "multicast route",
-        Severity::Warning,
-        format!("there is no route to {}", SPDP.0),
+    Finding::warning("multicast route", format!("there is no route to {}", SPDP.0),
         "Announcements that are not bound to an interface are not sent, so no DDS participants are discovered.",
     )
     .with_command(format!("sudo ip route add 239.0.0.0/8 dev {through}"))

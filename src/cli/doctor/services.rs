@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use super::super::units::{self, DropIns};
-use super::{Finding, Severity, list, output};
+use super::{Finding, list, output};
 use crate::config::Settings;
 use crate::shm::{RoleHolder, root_of};
 
@@ -28,7 +28,7 @@ fn kernel_version(release: &str, found: String) -> Finding {
     if version >= OLDEST_KERNEL {
         return Finding::ok("versions", found);
     }
-    Finding::new("versions", Severity::Warning, found, "The bridge is not tested with a kernel this old.")
+    Finding::warning("versions", found, "The bridge is not tested with a kernel this old.")
 }
 
 pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
@@ -60,9 +60,8 @@ fn executables(holders: &[RoleHolder]) -> Finding {
     if old.is_empty() {
         return Finding::ok("processes", format!("{} processes of the bridge run", holders.len()));
     }
-    Finding::new(
+    Finding::warning(
         "processes",
-        Severity::Warning,
         format!("{} still run an executable that was replaced", list(old)),
         "An upgrade takes effect after a restart.",
     )
@@ -73,15 +72,13 @@ fn executables(holders: &[RoleHolder]) -> Finding {
 fn services(enabled: &str) -> Finding {
     match enabled {
         "enabled" | "enabled-runtime" => Finding::ok("services", format!("{TARGET} is enabled")),
-        "" | "not-found" => Finding::new(
+        "" | "not-found" => Finding::note(
             "services",
-            Severity::Note,
             "the service units are not installed",
             "The bridge does not start when the machine boots.",
         ),
-        state => Finding::new(
+        state => Finding::warning(
             "services",
-            Severity::Warning,
             format!("{TARGET} is {state}"),
             "The bridge does not start when the machine boots.",
         )
@@ -94,9 +91,8 @@ fn drop_ins(match_configuration: bool, file: &Path) -> Finding {
     if match_configuration {
         return Finding::ok("units", "match the configuration");
     }
-    Finding::new(
+    Finding::warning(
         "units",
-        Severity::Warning,
         "do not match the configuration",
         "A lane has no service, or a service lacks a right that the configuration needs.",
     )
@@ -109,9 +105,8 @@ fn failed(units: &str) -> Finding {
     let Some(first) = names.first().copied() else {
         return Finding::ok("failed", "no service has failed");
     };
-    Finding::new(
+    Finding::error(
         "failed",
-        Severity::Error,
         list(&names),
         "systemd no longer restarts them: the configuration is bad, or they exited too often.",
     )
@@ -120,6 +115,7 @@ fn failed(units: &str) -> Finding {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Severity;
     use super::*;
 
     #[test]
