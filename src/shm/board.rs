@@ -191,8 +191,8 @@ fn within(index: usize, size: usize) -> usize {
     index
 }
 
-/// Declares the boards: how each is read, how its only writer gets it, the type of its value, and which of the
-/// cells of the layout it is.
+/// Declares the boards: how each is read, how its only writer gets it, the type of its value, and which of
+/// the cells of the layout it is.
 macro_rules! boards {
     ($($(#[doc = $doc:literal])+
        $name:ident, $writer:ident($($arg:ident: $of:ty),*): $value:ty = |$layout:ident| $index:expr;)+) => {
@@ -206,13 +206,13 @@ macro_rules! boards {
         impl Boards {
             $($(#[doc = $doc])+
             ///
-            /// `None` when the writer changes the value faster than it can be read, which only a runaway writer
-            /// does; zeroes when it has never been written.
+            /// `None` when the writer changes the value faster than it can be read, which only a runaway
+            /// writer does; zeroes when it has never been written.
             pub fn $name(&self, $($arg: $of),*) -> Option<$value> {
                 self.layout.$name($($arg),*).read(&self.segment)
             }
 
-            #[doc = concat!("Writes the value of [`", stringify!($name), "`](Self::", stringify!($name), "), beginning")]
+            #[doc = concat!("The writer of [`Self::", stringify!($name), "`]. It begins")]
             /// with what its predecessor wrote. One writer at a time: the holder of the role's lock.
             pub fn $writer(&self, $($arg: $of),*) -> BoardWriter<$value> {
                 self.writer(self.layout.$name($($arg),*))

@@ -100,7 +100,9 @@ fn real_time(configured: &[&Scheduling], rights: &Rights) -> Finding {
         Some(priority) if rights.nice || rights.rtprio >= priority => {
             Finding::ok(check, format!("priority {priority} is allowed"))
         }
-        Some(priority) => Finding::warning(check, format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
+        Some(priority) => Finding::warning(
+            check,
+            format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
             "Processes that this user starts run without a real-time policy. The installed services are allowed 50.",
         )
         .with_command(limits_line("rtprio", &priority.to_string())),

@@ -41,8 +41,8 @@ reasons! {
 }
 
 impl DropReason {
-    /// Whether a lane of this class drops samples for this reason in normal operation. Such drops are counted,
-    /// but not logged and no problem: the lane's mode and the number of its readers show the cause.
+    /// Whether a lane of this class drops samples for this reason in normal operation. Such drops are
+    /// counted, but not logged and no problem: the lane's mode and the number of its readers show the cause.
     pub const fn is_expected(self, class: TrafficClass) -> bool {
         match self {
             Self::Stopped | Self::NoReader => true,

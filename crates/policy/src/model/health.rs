@@ -117,7 +117,8 @@ pub struct IngressCounters {
 }
 
 impl IngressCounters {
-    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all agree.
+    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all
+    /// agree.
     pub fn clock_offset_s(&self) -> Option<f64> {
         (self.clock_offset_ns != 0).then(|| -(self.clock_offset_ns as f64) / 1e9)
     }
