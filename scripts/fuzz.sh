@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs each fuzz target for a number of seconds, 10 by default: scripts/fuzz.sh [SECONDS [TARGET…]]
 #
-# A run begins with the inputs in fuzz/seeds and fuzz/regressions, which tests/regressions.rs also runs, and with the
+# A run begins with the inputs in fuzz/seeds and fuzz/regressions, which tests/pure/regressions.rs also runs, and with the
 # inputs that earlier runs on this machine found (fuzz/corpus).
 set -eu
 cd "$(dirname "$0")/.."

@@ -478,7 +478,7 @@ mod tests {
         assert_eq!(per_s(150, Some(100), 0.0), None);
     }
 
-    /// tests/cli.rs compares the other keys with the output of a running bridge.
+    /// tests/dds/cli.rs compares the other keys with the output of a running bridge.
     #[test]
     fn every_key_of_a_subscriber_an_intruder_and_a_publisher_is_documented() {
         let report = serde_json::to_value(crate::telemetry::test_report::wide_report()).unwrap();

@@ -213,7 +213,7 @@ fn states_of(text: &str) -> Vec<(u64, SubscriberState)> {
 
 #[test]
 fn the_traces_have_their_expected_transitions() {
-    let toggle = states_of(include_str!("../data/probe_traces/toggle.csv"));
+    let toggle = states_of(include_str!("../../data/probe_traces/toggle.csv"));
     let expected = [
         (3_000, Critical),
         (8_000, Noncritical),
@@ -224,7 +224,7 @@ fn the_traces_have_their_expected_transitions() {
     assert_eq!(toggle, expected);
     // As the running control decided when the link was recorded: after 3.5, 70.0, 108.0, 110.5, 120.5, 187.0
     // and 237.5 s.
-    let recorded = states_of(include_str!("../data/probe_traces/recorded_toggle.csv"));
+    let recorded = states_of(include_str!("../../data/probe_traces/recorded_toggle.csv"));
     let expected = [
         (3_000, Critical),
         (70_000, Noncritical),
@@ -235,8 +235,8 @@ fn the_traces_have_their_expected_transitions() {
         (237_500, Critical),
     ];
     assert_eq!(recorded, expected);
-    let restart = states_of(include_str!("../data/probe_traces/responder_restart.csv"));
+    let restart = states_of(include_str!("../../data/probe_traces/responder_restart.csv"));
     assert_eq!(restart, [(4_500, Critical), (32_000, Noncritical), (53_500, Critical)]);
-    let slow = states_of(include_str!("../data/probe_traces/slow_link.csv"));
+    let slow = states_of(include_str!("../../data/probe_traces/slow_link.csv"));
     assert_eq!(slow, [(3_000, Critical), (37_000, Noncritical), (95_500, Critical)]);
 }

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-#[path = "../fuzz/src/lib.rs"]
+#[path = "../../fuzz/src/lib.rs"]
 mod fuzz;
 
 /// The input files of a target in a folder of `fuzz/`; empty if the folder does not exist.
@@ -31,7 +31,7 @@ fn no_stored_input_fails() {
 
 #[test]
 fn every_fuzz_target_is_tested_here() {
-    let manifest = include_str!("../fuzz/Cargo.toml");
+    let manifest = include_str!("../../fuzz/Cargo.toml");
     let built: Vec<&str> =
         manifest.split("[[bin]]").skip(1).map(|bin| bin.split('"').nth(1).unwrap()).collect();
     let run: Vec<&str> = fuzz::TARGETS.iter().map(|(name, _)| *name).collect();

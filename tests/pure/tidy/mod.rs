@@ -5,13 +5,8 @@
 //! Each rule is a function of a file's path and text that lists what breaks it, so that the tests can also
 //! show that it finds what it is for.
 
-#[path = "tidy/dependencies.rs"]
 mod dependencies;
-#[path = "tidy/docs.rs"]
 mod docs;
-#[path = "tidy/layers.rs"]
 mod layers;
-#[path = "tidy/source.rs"]
 mod source;
-#[path = "tidy/text.rs"]
 mod text;

@@ -14,7 +14,7 @@ use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::unistd::Pid;
 use support::bridge::Bridge;
 use support::process::Process;
-use support::{netns, skip, wait_for};
+use support::{exclusive, netns, skip, wait_for};
 
 const DOMAIN_ID: u16 = 115;
 const TYPE: &str = "std_msgs/msg/String";
@@ -48,6 +48,7 @@ fn the_threads_of_a_data_path_have_one_priority() {
     if let Some(reason) = netns::requires_root() {
         return skip(test, &reason);
     }
+    let _exclusive = exclusive();
     let bridge = Bridge::new(
         "instance: {instance}\nros: {domain_id: 115}\nshared_memory: {root_path: {folder}/root}\n\
          topics: [{id: scan, input_topic: /scan, max_sample_bytes: 1024}]\n\
@@ -107,6 +108,7 @@ fn the_early_waker_runs_on_the_cpus_of_the_critical_lanes() {
     let Some([here, there]) = two_cpus() else {
         return skip("the_early_waker_runs_on_the_cpus_of_the_critical_lanes", "one CPU");
     };
+    let _exclusive = exclusive();
     let (here, there) = (format!("cpus: [{here}]"), format!("cpus: [{there}]"));
     let (_bridge, mut ingress) = pinned(&here, &there);
     // It sets what it runs as by itself.
@@ -137,6 +139,7 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
     if let Some(reason) = netns::requires_root() {
         return skip(test, &reason);
     }
+    let _exclusive = exclusive();
     let (bridge, ingress) = pinned(&format!("cpus: [{here}]"), &format!("cpus: [{there}]"));
     let settings = config::load(Some(&bridge.config()), &|_| None).unwrap();
     let root = settings.shared_memory.root_path.clone().unwrap();

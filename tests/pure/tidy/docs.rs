@@ -194,14 +194,14 @@ fn the_changelog_has_a_section_for_what_is_not_released() {
 
 #[test]
 fn the_documentation_of_the_configuration_keys_is_tested() {
-    let text = std::fs::read_to_string(root().join("tests/config.rs")).unwrap();
+    let text = std::fs::read_to_string(root().join("tests/pure/config.rs")).unwrap();
     for test in [
         "every_key_is_documented_and_every_documented_key_exists",
         "every_key_is_in_the_default_file",
         "the_tables_of_the_documentation_are_made_of_the_rows",
         "the_default_file_has_the_defaults_of_the_rows",
     ] {
-        assert!(text.contains(&format!("#[test]\nfn {test}()")), "tests/config.rs has no test {test}");
+        assert!(text.contains(&format!("#[test]\nfn {test}()")), "tests/pure/config.rs has no test {test}");
     }
 }
 

@@ -1,5 +1,5 @@
 //! The command line from outside, on bridges that really run: the shipped binary as child processes, real
-//! shared memory, and publishers and subscribers of this process on real sockets. Domains 100 to 109.
+//! shared memory, and publishers and subscribers of this process on real sockets. Domains 100 to 109 and 120.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -712,7 +712,7 @@ fn every_subcommand_has_completions_and_a_manual_page() {
 #[test]
 fn a_lane_on_which_no_route_has_an_output_has_no_process() {
     let bridge = Bridge::new(
-        "instance: {instance}\nshared_memory: {root_path: {folder}/root}\nros: {domain_id: 118}\n\
+        "instance: {instance}\nshared_memory: {root_path: {folder}/root}\nros: {domain_id: 120}\n\
          topics: [{id: scan, input_topic: /scan, lanes: [critical]}]\n",
     );
     let mut up = bridge.start("up");

@@ -1,15 +1,10 @@
 //! Tests of control's policy in virtual time: random links, random overload, the paper's toggled impairment,
 //! recorded probe traces, replays and floods. No I/O and no sleeping.
 
-#[path = "control_policy/classifier.rs"]
 mod classifier;
-#[path = "control_policy/safety.rs"]
 mod safety;
-#[path = "control_policy/traces.rs"]
 mod traces;
-#[path = "control_policy/trust.rs"]
 mod trust;
-#[path = "control_policy/window.rs"]
 mod window;
 
 use adaptive_bridge::model::MonotonicNs;

@@ -12,9 +12,9 @@ use adaptive_bridge::config::{
 use adaptive_bridge::model::{QosProfile, TopicName, TypeName};
 use proptest::prelude::*;
 
-const DEFAULT: &str = include_str!("../config/default.yaml");
-const MINIMAL: &str = include_str!("../config/minimal.yaml");
-const README: &str = include_str!("../config/README.md");
+const DEFAULT: &str = include_str!("../../config/default.yaml");
+const MINIMAL: &str = include_str!("../../config/minimal.yaml");
+const README: &str = include_str!("../../config/README.md");
 
 fn no_env(_: &str) -> Option<String> {
     None
@@ -124,7 +124,7 @@ fn original_diagnostics() -> Diagnostics {
 
 #[test]
 fn the_originals_default_file_keeps_its_meaning() {
-    let settings = settings(include_str!("fixtures/config/original_default.yaml"));
+    let settings = settings(include_str!("../fixtures/config/original_default.yaml"));
     check_common_original(&settings);
     let lane = &settings.lanes[1];
     assert_eq!(lane.outputs[0].qos, QosProfile { lifespan_ms: Some(500), ..QosProfile::NONCRITICAL });
@@ -140,7 +140,7 @@ fn the_originals_default_file_keeps_its_meaning() {
 
 #[test]
 fn the_originals_minimal_file_keeps_its_meaning() {
-    let settings = settings(include_str!("fixtures/config/original_minimal.yaml"));
+    let settings = settings(include_str!("../fixtures/config/original_minimal.yaml"));
     check_common_original(&settings);
     let lane = &settings.lanes[1];
     assert_eq!(lane.outputs[0].qos, QosProfile::NONCRITICAL);
@@ -165,7 +165,7 @@ fn the_originals_minimal_file_keeps_its_meaning() {
 
 #[test]
 fn the_originals_stress_file_keeps_its_meaning() {
-    let settings = settings(include_str!("fixtures/config/original_stress.yaml"));
+    let settings = settings(include_str!("../fixtures/config/original_stress.yaml"));
     check_common_original(&settings);
     let lane = &settings.lanes[1];
     assert_eq!(lane.outputs[0].qos, QosProfile { lifespan_ms: Some(500), ..QosProfile::NONCRITICAL });
@@ -208,7 +208,7 @@ fn the_originals_stress_file_keeps_its_meaning() {
 
 #[test]
 fn twelve_mistakes_in_one_file_are_twelve_problems_with_their_lines() {
-    let error = parse(include_str!("fixtures/config/twelve_mistakes.yaml")).unwrap_err();
+    let error = parse(include_str!("../fixtures/config/twelve_mistakes.yaml")).unwrap_err();
     let found: Vec<(Place, &str)> =
         error.problems().iter().map(|problem| (problem.place, problem.key.as_str())).collect();
     let expected = [

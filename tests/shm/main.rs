@@ -1,8 +1,6 @@
 //! The shared-memory edge on real shared memory, with real processes that are killed, stopped and restarted.
 
-#[path = "shm/child.rs"]
 mod child;
-#[path = "shm/support.rs"]
 mod support;
 
 use std::alloc::{GlobalAlloc, Layout, System};

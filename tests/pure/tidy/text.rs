@@ -31,8 +31,8 @@ const UNSAFE: &[&str] = &[
     "tests/support/machine.rs",
     // Scheduling of the benchmark, and an allocator that counts.
     "benches/hop/system.rs",
-    "tests/allocations.rs",
-    "tests/shm.rs",
+    "tests/dds/allocations.rs",
+    "tests/shm/main.rs",
 ];
 
 /// What breaks the rules in a file of Rust.

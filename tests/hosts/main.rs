@@ -1,0 +1,17 @@
+//! Tests with several hosts, which are network namespaces: they need root or a user namespace, and the DDS
+//! peers (`make peers`). One file: `cargo test --test hosts networks::`.
+
+mod control;
+mod control_faults;
+mod crowds;
+mod faults;
+mod hangs;
+mod hostile;
+mod hostile_readers;
+mod interop;
+mod intruders;
+mod networks;
+mod readers;
+mod responder;
+mod restarts;
+mod visits;
