@@ -34,7 +34,8 @@ impl Bridge {
     pub fn new(yaml: &str) -> Bridge {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let instance = format!("test_{}_{number}", std::process::id());
+        // Of equal length, so that no name is the beginning of another one.
+        let instance = format!("test_{}_{number:03}", std::process::id());
         let bridge = Bridge { instance, folder: tempfile::tempdir().unwrap() };
         bridge.write_config(yaml);
         bridge
