@@ -188,7 +188,7 @@ fn quantiles_are_of_the_nearest_rank() {
 }
 
 #[test]
-fn a_tail_of_too_few_samples_is_not_told() {
+fn a_tail_quantile_of_too_few_samples_is_not_printed() {
     let of = |count: u32| Quantiles::of(&(0..count).map(f64::from).collect::<Vec<_>>());
     assert_eq!((of(0).p50_us, of(0).max_us), (None, None));
     assert_eq!((of(99).p99_us, of(99).max_us), (None, Some(98.0)));
@@ -220,7 +220,7 @@ fn growth_is_not_moved_by_outliers() {
 }
 
 #[test]
-fn memory_is_judged_by_its_slope_and_only_when_that_can_be_seen() {
+fn memory_is_judged_by_its_slope_if_the_interval_is_narrow_enough() {
     let judged = |kib_per_second: f64, seconds: f64| {
         let soak = Soak { series: vec![series("ingress", kib_per_second, seconds)], ..Soak::default() };
         let summary = Summary { soak: Some(soak), ..Summary::default() };
@@ -301,7 +301,7 @@ fn a_hop_of_many_repetitions_is_met_or_missed_only_when_that_is_certain() {
 fn cpu_is_judged_by_the_repetitions_of_each_process() {
     let mut summary = made_up();
     for row in &mut summary.resources {
-        // In the fifth repetition somebody else had the machine.
+        // In the fifth repetition another program loaded the machine.
         let each = |usual: f64, disturbed: f64| [&[usual; 4][..], &[disturbed], &[usual; 4]].concat();
         row.repetitions_cpu_us = match row.process.as_str() {
             "relay" => each(100.0, 110.0),
@@ -389,7 +389,7 @@ const PAGE: &str = "# P\n\nWords.\n\n<!-- figures:runs -->\nold\n<!-- end -->\n\
                     <!-- end -->\nMore words.\n";
 
 #[test]
-fn the_page_keeps_its_words_and_gets_the_figures() {
+fn filling_the_page_keeps_its_text_and_replaces_its_figures() {
     let run = ("2026-01-02T03-04-05Z".to_owned(), made_up());
     let filled = fill(PAGE, std::slice::from_ref(&run)).unwrap();
     assert!(filled.starts_with("# P\n\nWords.\n\n<!-- figures:runs -->\n"), "{filled}");

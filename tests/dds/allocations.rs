@@ -110,7 +110,7 @@ fn count(bytes: usize) {
     ];
     let owner =
         owners.iter().filter(|(position, _)| position.is_some()).min_by_key(|(position, _)| *position);
-    // What nobody is to be seen behind is ours until the contrary is shown.
+    // An allocation whose backtrace shows no library counts as ours.
     let counts = owner.map_or(&OURS, |(_, counts)| counts);
     counts[role].fetch_add(1, Ordering::Relaxed);
     if std::ptr::eq(counts, &OURS) {

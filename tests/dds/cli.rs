@@ -402,7 +402,7 @@ fn a_mode_set_by_hand_is_shown_and_what_it_drops_is_named() {
 }
 
 #[test]
-fn watch_shows_line_after_line_and_ends_well_on_a_signal_or_when_nobody_reads() {
+fn watch_prints_lines_and_succeeds_at_a_signal_or_a_closed_pipe() {
     let bridge = bridge(105);
     let mut running = up(&bridge);
     let mut json = bridge.start("status --watch --json --interval-ms 50");
@@ -442,7 +442,7 @@ fn watch_shows_line_after_line_and_ends_well_on_a_signal_or_when_nobody_reads() 
             .unwrap();
         let mut line = String::new();
         BufReader::new(unread.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let status = wait_for("the end of a program that nobody reads", || unread.try_wait().unwrap());
+        let status = wait_for("the end of watch after its pipe was closed", || unread.try_wait().unwrap());
         let mut log = String::new();
         unread.stderr.take().unwrap().read_to_string(&mut log).unwrap();
         assert_eq!((status.code(), log.as_str()), (Some(0), ""));
@@ -464,7 +464,7 @@ fn frames(mut bytes: &[u8]) -> Vec<(Encapsulation, Vec<u8>)> {
 }
 
 #[test]
-fn a_tap_sees_the_payloads_bit_for_bit_and_disturbs_nobody() {
+fn a_tap_receives_payloads_bit_for_bit_and_disturbs_no_lane() {
     let bridge = bridge(106);
     let _up = up(&bridge);
     let _publisher = Publisher::new(106).run();

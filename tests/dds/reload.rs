@@ -143,7 +143,7 @@ fn a_bad_file_changes_nothing_and_is_reported() {
     let flow = flow(&bridge, 111);
     bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: -1}}\nclassifyer: {}"));
 
-    // The command asks nobody.
+    // The command contacts no process.
     let (code, said) = reload(&bridge);
     assert_eq!(code, Some(78), "{said}");
     assert_says(&said, &["lanes.noncritical.max_rate_hz = -1: must be", "did you mean `classifier`?"]);
@@ -244,7 +244,7 @@ fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
 }
 
 #[test]
-fn a_process_that_does_not_answer_is_named_and_nobody_else_is_signalled() {
+fn a_process_that_does_not_answer_is_named_and_no_other_is_signalled() {
     let bridge = Bridge::new(&file(114, ""));
     let (code, said) = reload(&bridge);
     assert_eq!(code, Some(1), "{said}");

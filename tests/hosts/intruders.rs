@@ -71,8 +71,8 @@ fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) 
 }
 
 #[test]
-fn readers_of_every_library_are_told_by_their_host() {
-    let test = "readers_of_every_library_are_told_by_their_host";
+fn readers_of_every_library_are_matched_to_their_host() {
+    let test = "readers_of_every_library_are_matched_to_their_host";
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     let bridge = node_on(&robot, "bridge", 16);
     let mut peers = Vec::new();
@@ -116,7 +116,7 @@ fn readers_of_every_library_are_told_by_their_host() {
             assert!([laptop.address().to_string(), "192.168.7.2".to_owned()].contains(&host), "{host}");
         }
     }
-    // One that only listens on loopback may not be heard here at all.
+    // A reader that listens only on loopback may not be discovered here.
     if let Some(reader) = readers.get("rt/loopback") {
         println!("rt/loopback: {:?}", reader.location);
         assert_eq!(reader.location.locality(&own), Locality::Local);
@@ -194,8 +194,8 @@ impl Turn {
 }
 
 #[test]
-fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
-    let test = "an_intruder_is_named_by_host_and_node_and_its_end_is_seen";
+fn an_intruder_is_reported_with_host_and_node_until_it_leaves() {
+    let test = "an_intruder_is_reported_with_host_and_node_until_it_leaves";
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     let mut turn = Turn::new(&robot);
 
@@ -246,8 +246,8 @@ fn an_intruder_is_named_by_host_and_node_and_its_end_is_seen() {
 }
 
 #[test]
-fn one_whose_link_fails_for_a_while_is_warned_of_once() {
-    let test = "one_whose_link_fails_for_a_while_is_warned_of_once";
+fn an_intruder_whose_link_fails_for_a_while_causes_one_warning() {
+    let test = "an_intruder_whose_link_fails_for_a_while_causes_one_warning";
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     laptop.run("ip", &["link", "set", "wlan0", "down"]);
     let mut turn = Turn::new(&robot);
@@ -263,13 +263,13 @@ fn one_whose_link_fails_for_a_while_is_warned_of_once() {
 }
 
 #[test]
-fn a_graph_entry_that_lies_or_is_garbage_is_counted_and_names_nobody() {
-    let test = "a_graph_entry_that_lies_or_is_garbage_is_counted_and_names_nobody";
+fn a_false_or_malformed_graph_entry_is_counted_and_names_no_node() {
+    let test = "a_false_or_malformed_graph_entry_is_counted_and_names_no_node";
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     let mut turn = Turn::new(&robot);
     let mut rviz = node_on(&laptop, "rviz", 16);
     let reader = read(&mut rviz, "rt/scan");
-    // Another participant says that the reader is of its own node, and says so in the name of the first.
+    // Another participant claims the reader for its own node, and does so in the name of the first.
     let lie = encode_graph(rviz.guid(), "/", "innocent", &[reader.guid()], &[], 16);
     let thief = encode_graph(Guid([7; 16]), "/", "thief", &[reader.guid()], &[], 24);
     let folder = tempfile::tempdir().unwrap();

@@ -33,7 +33,7 @@ fn topic(name: &str) -> TopicName {
 }
 
 #[test]
-fn the_default_file_says_what_the_minimal_file_means() {
+fn the_default_file_and_the_minimal_file_give_the_same_settings() {
     assert_eq!(settings(DEFAULT), settings(MINIMAL));
 }
 
@@ -405,7 +405,7 @@ fn a_file_is_found_by_its_path_or_by_the_environment() {
     let named = path.display().to_string();
     let env = |name: &str| (name == "ADAPTIVE_BRIDGE_CONFIG").then(|| named.clone());
     assert_eq!(config::load(None, &env).unwrap(), expected);
-    // The command line goes before the environment.
+    // The command line has priority over the environment.
     let missing = folder.path().join("b.yaml");
     let error = config::load(Some(&missing), &env).unwrap_err();
     assert_eq!(error.file(), missing.display().to_string());
@@ -413,7 +413,7 @@ fn a_file_is_found_by_its_path_or_by_the_environment() {
 }
 
 #[test]
-fn without_any_file_the_error_says_what_to_do() {
+fn without_a_file_the_error_explains_how_to_give_one() {
     let default = Path::new(config::DEFAULT_PATH);
     if default.exists() {
         // A machine that has a configuration of its own reads that one.
@@ -427,7 +427,7 @@ fn without_any_file_the_error_says_what_to_do() {
 }
 
 #[test]
-fn what_is_no_ordinary_file_is_refused_and_never_waited_for() {
+fn anything_but_a_regular_file_is_refused_without_blocking() {
     let folder = tempfile::tempdir().unwrap();
     let pipe = folder.path().join("pipe");
     nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
@@ -534,7 +534,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("diagnostics.metrics", "null", r#""127.0.0.1:9464""#),
 ];
 
-/// The settings in which each key has its first value, or where `second` says so its second.
+/// The settings in which each key has its first value, or its second where `second` is true.
 fn chosen(second: impl Fn(usize) -> bool) -> Settings {
     let mut file = serde_json::json!({"topics": [{"id": "scan"}]});
     for (index, (key, first, other)) in CHOICES.iter().enumerate() {
@@ -565,32 +565,32 @@ fn pattern(key: &str) -> String {
 }
 
 #[test]
-fn what_is_documented_to_change_without_a_restart_does_and_nothing_else() {
+fn exactly_the_keys_documented_as_reloadable_change_without_a_restart() {
     let (_, reload) = chosen(|_| false).reloaded(chosen(|_| true));
     let changed: BTreeSet<String> = reload.changed.iter().map(|change| pattern(&change.key)).collect();
-    // What these set is told under other keys: the lanes' rates, the secret.
-    let told_elsewhere = |key: &&str| {
+    // Changes of these are reported under other keys: the lanes' rates, the secret.
+    let reported_elsewhere = |key: &&str| {
         key.starts_with("routing_policy.")
             || ["subscribers.<subscriber>.lane", "security.hmac_secret_file", "security.hmac_secret_env"]
                 .contains(key)
     };
     let marked: BTreeSet<String> =
-        marked_keys().into_iter().filter(|key| !told_elsewhere(key)).map(str::to_owned).collect();
+        marked_keys().into_iter().filter(|key| !reported_elsewhere(key)).map(str::to_owned).collect();
     assert_eq!(changed, marked);
     for left in &reload.waits {
         assert!(!marked.contains(&pattern(&left.key)), "{left}");
     }
     for (index, (key, ..)) in CHOICES.iter().enumerate() {
         let (_, reload) = chosen(|_| false).reloaded(chosen(|other| other == index));
-        assert_ne!(reload, config::Reload::default(), "{key} is not told of");
+        assert_ne!(reload, config::Reload::default(), "a change of {key} is reported");
     }
 }
 
 #[test]
-fn each_change_is_told_in_the_words_of_the_file() {
+fn each_change_is_reported_with_key_and_values_of_the_file() {
     let (_, reload) = chosen(|_| false).reloaded(chosen(|_| true));
-    let mut told: Vec<String> = reload.changed.iter().map(ToString::to_string).collect();
-    told.extend(reload.waits.iter().map(ToString::to_string));
+    let mut reported: Vec<String> = reload.changed.iter().map(ToString::to_string).collect();
+    reported.extend(reload.waits.iter().map(ToString::to_string));
     for expected in [
         "policy_hold_s: 5 -> 4.5",
         "lanes.noncritical.max_rate_hz: 10 -> 20",
@@ -608,12 +608,16 @@ fn each_change_is_told_in_the_words_of_the_file() {
         "lanes.rviz.domain_id: 0 -> 9",
         "diagnostics.metrics: none -> 127.0.0.1:9464",
     ] {
-        assert!(told.iter().any(|line| line == expected), "{expected} is not in:\n{}", told.join("\n"));
+        assert!(
+            reported.iter().any(|line| line == expected),
+            "{expected} is not in:\n{}",
+            reported.join("\n")
+        );
     }
 }
 
 #[test]
-fn a_lane_that_came_or_went_needs_a_restart_and_so_does_a_subscriber_on_it() {
+fn an_added_or_removed_lane_and_a_subscriber_on_it_need_a_restart() {
     let base = "topics: [{id: scan, input_topic: /scan}]\n";
     let old = settings(&format!("{base}lanes: {{old: {{}}}}\nsubscribers: {{a: old, b: critical}}"));
     let new =
@@ -635,7 +639,7 @@ fn a_lane_that_came_or_went_needs_a_restart_and_so_does_a_subscriber_on_it() {
 }
 
 #[test]
-fn more_samples_may_wait_only_where_shared_memory_has_room_for_them() {
+fn a_longer_queue_is_reloaded_only_if_shared_memory_has_room_for_it() {
     let with = |samples: usize| {
         settings(&format!(
             "topics: [{{id: scan, input_topic: /scan}}]\n\
@@ -732,7 +736,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_reload_takes_over_all_that_it_can_and_leaves_the_rest_as_it_is(
+    fn a_reload_applies_every_reloadable_key_and_keeps_the_others(
         choices in prop::collection::vec(any::<(bool, bool)>(), CHOICES.len()),
     ) {
         let old = chosen(|index| choices[index].0);
@@ -799,7 +803,7 @@ proptest! {
         let whole = config::Configuration::decode(&bytes).unwrap();
         prop_assert!(config::Configuration::decode(&bytes[..at]).is_err());
         bytes[at] = byte;
-        // A damaged secret cannot be told; the settings have their fingerprint.
+        // A damaged secret is not detectable from the settings; they have their fingerprint.
         if let Ok(read) = config::Configuration::decode(&bytes) {
             prop_assert_eq!(read.settings, whole.settings);
         }

@@ -47,7 +47,7 @@ impl Random {
     }
 }
 
-/// A publisher on a timer: sample n comes at n intervals, late by a random part of `jitter_ns`.
+/// A publisher on a timer: sample n is published after n intervals, late by a random part of `jitter_ns`.
 struct Publisher {
     input_hz: f64,
     jitter_ns: u64,
@@ -77,7 +77,7 @@ struct Setup {
     /// Of the input interval, peak to peak.
     jitter: f64,
     target_hz: f64,
-    /// The consumer wakes up to so much after the instant it asked for, and at least 50 µs after it.
+    /// The consumer wakes at most this long after the requested instant, and at least 50 µs after it.
     late_ns_max: u64,
     drop_policy: DropPolicy,
     queue_samples: usize,
@@ -523,7 +523,7 @@ proptest! {
     }
 
     #[test]
-    fn the_freshest_that_tokens_pay_for_are_sent_in_order(
+    fn a_lane_that_keeps_the_freshest_sends_in_order_what_its_tokens_allow(
         ages_ms in prop::collection::vec(0..400_u64, 1..12),
         tokens in 1..6_u64,
     ) {
@@ -543,7 +543,7 @@ proptest! {
     }
 
     #[test]
-    fn first_in_first_out_keeps_order_and_refuses_only_what_has_no_place(
+    fn first_in_first_out_keeps_order_and_drops_only_when_the_queue_is_full(
         ops in prop::collection::vec(any::<bool>(), 1..200),
         capacity in 1..8_usize,
     ) {
@@ -764,7 +764,7 @@ proptest! {
     }
 
     #[test]
-    fn the_mode_is_what_hand_control_and_safety_say_while_they_hold(
+    fn the_lane_mode_follows_override_control_and_safety_until_they_expire(
         written_at in 0..100_000_u64,
         expires_at in 0..100_000_u64,
         mode in 0..6_u8,
@@ -786,24 +786,24 @@ proptest! {
             ..LanePolicy::default()
         };
         let now = MonotonicNs(now * ms / 100);
-        let said = |number| LaneMode::from_u8(number).unwrap_or(LaneMode::Normal);
+        let mode_of = |number| LaneMode::from_u8(number).unwrap_or(LaneMode::Normal);
         let confirmed = written_at != 0 && now <= policy.written_at.plus_ms(hold_ms);
         let cases =
             [(TrafficClass::Critical, LaneMode::Normal), (TrafficClass::Noncritical, LaneMode::Degraded)];
         for (class, safe) in cases {
             let effective = effective_mode(&policy, class, now, hold_ms);
-            let asked = if by_hand == 1 && (expires_at == 0 || now < policy.expires_at) {
-                said(mode_by_hand)
+            let requested = if by_hand == 1 && (expires_at == 0 || now < policy.expires_at) {
+                mode_of(mode_by_hand)
             } else if confirmed {
-                said(mode)
+                mode_of(mode)
             } else if written_at == 0 {
                 LaneMode::Normal
             } else {
                 safe
             };
-            let floor = if confirmed { said(safety_floor) } else { LaneMode::Normal };
-            prop_assert_eq!(effective as u8, (asked as u8).max(floor as u8));
-            // Without control nothing can stop a critical lane for longer than the hold, but a hand.
+            let floor = if confirmed { mode_of(safety_floor) } else { LaneMode::Normal };
+            prop_assert_eq!(effective as u8, (requested as u8).max(floor as u8));
+            // Without control only a manual override stops a critical lane for longer than the hold.
             if by_hand == 0 && !confirmed && class == TrafficClass::Critical {
                 prop_assert_eq!(critical_drop(effective), None);
             }
@@ -811,7 +811,7 @@ proptest! {
     }
 
     #[test]
-    fn the_numbers_of_a_route_add_up_to_those_seen_and_those_missing(
+    fn received_and_missing_samples_of_a_route_add_up_to_its_sequence_numbers(
         jumps in prop::collection::vec(-3..20_i64, 1..200),
         begin in 1..1_000_u64,
         restart_at in 0..200_usize,

@@ -67,7 +67,7 @@ fn the_threads_of_a_data_path_have_one_priority() {
     }
 }
 
-/// Policy, as proc_pid_stat(5) counts, and CPUs of the thread that gets critical lanes up, if there is one.
+/// Policy, as proc_pid_stat(5) counts, and CPUs of the early waker, if it runs.
 fn early_waker(ingress: &Process) -> Option<(u32, String)> {
     let tasks = fs::read_dir(format!("/proc/{}/task", ingress.pid())).unwrap();
     tasks.filter_map(Result::ok).find_map(|task| {
@@ -90,7 +90,7 @@ fn two_cpus() -> Option<[usize; 2]> {
     Some([cpus.next()?, cpus.next()?])
 }
 
-/// Ingress of a bridge with one lane that matters, each pinned as it says.
+/// Ingress of a bridge with one critical lane, with the scheduling settings of each.
 fn pinned(ingress: &str, lane: &str) -> (Bridge, Process) {
     let bridge = Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {DOMAIN_ID}}}\nshared_memory: {{root_path: {{folder}}/root}}\n\
@@ -102,7 +102,7 @@ fn pinned(ingress: &str, lane: &str) -> (Bridge, Process) {
     (bridge, process)
 }
 
-/// Where a lane could get in the way of ingress nobody gets it up: `docs/decisions/0013-early-waker.md`.
+/// Without CPUs of its own for each, ingress starts no early waker: `docs/decisions/0013-early-waker.md`.
 #[test]
 fn the_early_waker_runs_on_the_cpus_of_the_critical_lanes() {
     let Some([here, there]) = two_cpus() else {
@@ -111,8 +111,8 @@ fn the_early_waker_runs_on_the_cpus_of_the_critical_lanes() {
     let _exclusive = exclusive();
     let (here, there) = (format!("cpus: [{here}]"), format!("cpus: [{there}]"));
     let (_bridge, mut ingress) = pinned(&here, &there);
-    // It sets what it runs as by itself.
-    wait_for("an early waker that runs where the lane does when nothing else does", || {
+    // The early waker sets its own policy and CPUs.
+    wait_for("an early waker on the CPU of the lane with SCHED_BATCH", || {
         let (policy, cpus) = early_waker(&ingress)?;
         (policy == libc::SCHED_BATCH as u32 && there == format!("cpus: [{cpus}]")).then_some(())
     });
@@ -121,15 +121,15 @@ fn the_early_waker_runs_on_the_cpus_of_the_critical_lanes() {
         let (_bridge, ingress) = pinned(of_ingress, of_lane);
         assert_eq!(early_waker(&ingress), None, "ingress {of_ingress:?}, lane {of_lane:?}");
     }
-    // A CPU that is not there.
+    // A CPU that does not exist.
     let (_bridge, mut ingress) = pinned(&here, "cpus: [1023]");
     ingress.wait_for_log("no early waker");
     wait_for("an end of the early waker", || early_waker(&ingress).is_none().then_some(()));
     assert!(ingress.terminate().success());
 }
 
-/// While a program of higher priority keeps ingress from receiving, a lane can have heard of a sample from
-/// nobody but the early waker.
+/// While a program of higher priority keeps ingress from receiving, only the early waker can wake a lane for
+/// a sample.
 #[test]
 fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
     let test = "the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample";
@@ -179,7 +179,7 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
             "echo up; while :; do :; done",
         ]);
         let mut burner = Process::spawn("burner", command);
-        burner.wait_for_line("a program that burns", 0, |line| (line == "up").then_some(()));
+        burner.wait_for_line("a program that loads its CPU", 0, |line| (line == "up").then_some(()));
         write();
         let woken = lane.sleep(Duration::from_millis(200));
         let received = published() - before;
@@ -187,6 +187,6 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
         wait_for("the sample", || (published() > before).then_some(()));
         woken == Woken::Announced && received == 0
     });
-    // A datagram that is not a sample may have come just before it.
+    // A datagram that is not a sample may have arrived just before it.
     assert!(times.count() > 5, "{}", ingress.log());
 }

@@ -161,8 +161,8 @@ fn the_units_are_sound_and_hardened() {
 }
 
 #[test]
-fn a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody() {
-    let test = "a_unit_that_is_killed_or_stopped_comes_back_and_holds_up_nobody";
+fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
+    let test = "a_killed_or_stopped_unit_is_restarted_and_delays_no_other";
     let Some(bed) = Bed::boot(test, SCAN) else { return };
     bed.start();
     bed.machine.run(&["systemctl", "start", RESPONDER]);

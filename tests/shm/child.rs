@@ -206,8 +206,7 @@ impl Child {
         }
     }
 
-    /// Answers every wake of lane 0 by one of lane 1. It never looks by itself: a wake that is missed is not
-    /// made up for.
+    /// Answers every wake of lane 0 by one of lane 1. It does not poll, so a missed wake stays unanswered.
     fn pong(&self) {
         let node = self.node("pong");
         let boards = node.boards(&shape()).unwrap();
@@ -231,8 +230,8 @@ impl Child {
         }
     }
 
-    /// In a small /dev/shm of its own: says what a pool that does not fit leads to, then fills the rest and
-    /// goes on.
+    /// In a small /dev/shm of its own: prints the error of a pool that does not fit, then fills the rest and
+    /// continues.
     fn full(&self) {
         let node = self.node("ingress");
         let boards = node.boards(&shape()).unwrap();
@@ -242,7 +241,7 @@ impl Child {
         let publisher = SamplePublisher::create(&node, &channel).unwrap();
         let subscriber = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(LANE), false).unwrap();
         let mut counters = boards.ingress_writer(0);
-        // Not a byte is left for anybody now.
+        // /dev/shm is full now.
         use std::io::Write;
         let mut filler = std::fs::File::create("/dev/shm/filler").unwrap();
         while filler.write_all(&[1; 4096]).is_ok() {}
@@ -277,8 +276,8 @@ impl Child {
         }
     }
 
-    /// Says how many allocations this thread made in 10,000 samples, and where a queue overflows and samples
-    /// are refused.
+    /// Prints how many allocations this thread made in 10,000 samples, also with a queue that overflows and
+    /// with refused samples.
     fn allocations(&self) {
         let node = self.node("ingress");
         let channel = RouteChannel { retained_samples: 2, ..channel(3_000) };

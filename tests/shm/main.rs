@@ -102,11 +102,11 @@ fn a_slot_that_is_not_published_is_free_again() {
     for _ in 0..10_000 {
         drop(publisher.copy_in(&[1; 64]).unwrap());
     }
-    assert_eq!(publish(&publisher, 1, 64), 0, "nobody is there");
+    assert_eq!(publish(&publisher, 1, 64), 0, "no subscriber has joined");
 }
 
 #[test]
-fn the_pool_is_as_large_as_computed_and_all_of_it_is_there() {
+fn the_pool_has_the_computed_size_and_is_allocated_completely() {
     for (bytes, retained_samples, max_taps) in [(2_948, 0, 0), (100, 3, 2), (1 << 20, 1, 1)] {
         let place = Place::new();
         let node = place.node();
@@ -131,16 +131,16 @@ fn the_pool_is_as_large_as_computed_and_all_of_it_is_there() {
 }
 
 #[test]
-fn a_payload_written_into_a_lent_slot_arrives_and_copies_go_on_meanwhile() {
+fn a_payload_written_into_a_lent_slot_arrives_beside_copied_ones() {
     let place = Place::new();
     let node = place.node();
     let channel = channel(1_000);
     let publisher = SamplePublisher::create(&node, &channel).unwrap();
     let lane = lane(&node, &channel);
-    assert!(publisher.lend(1_001).is_none(), "longer than the route allows");
+    assert!(publisher.lend(1_001).is_none(), "a sample longer than the route allows gets no slot");
     let mut first = publisher.lend(1_000).unwrap();
     let mut second = publisher.lend(10).unwrap();
-    assert!(publisher.lend(10).is_none(), "two at once");
+    assert!(publisher.lend(10).is_none(), "a publisher lends at most two slots at a time");
     for sequence in 1..=50 {
         publish(&publisher, sequence, 1_000);
         assert_eq!(sequences(&lane), [sequence]);
@@ -164,7 +164,7 @@ fn a_payload_written_into_a_lent_slot_arrives_and_copies_go_on_meanwhile() {
 }
 
 #[test]
-fn the_pool_suffices_when_everybody_holds_all_it_may() {
+fn the_pool_suffices_when_each_subscriber_holds_its_maximum() {
     let place = Place::new();
     let node = place.node();
     let shares =
@@ -204,7 +204,7 @@ fn the_pool_suffices_when_everybody_holds_all_it_may() {
 }
 
 #[test]
-fn the_borrow_limit_loses_nothing_and_samples_go_back_from_any_thread() {
+fn the_borrow_limit_loses_no_sample_and_any_thread_may_return_one() {
     let place = Place::new();
     let node = place.node();
     let channel = channel(100);
@@ -222,7 +222,7 @@ fn the_borrow_limit_loses_nothing_and_samples_go_back_from_any_thread() {
     assert_eq!(lane.borrowed(), 7);
     let ninth = lane.take().unwrap().unwrap();
     assert_eq!(ninth.header().sequence, 9);
-    // What `Bytes::from_owner` asks for.
+    // What `Bytes::from_owner` requires.
     let bytes = bytes::Bytes::from_owner(ninth);
     assert_eq!(bytes, payload(9, 100));
     assert_eq!(lane.borrowed(), 8);
@@ -232,7 +232,7 @@ fn the_borrow_limit_loses_nothing_and_samples_go_back_from_any_thread() {
 }
 
 #[test]
-fn a_full_queue_gives_up_its_oldest_sample() {
+fn a_full_queue_discards_its_oldest_sample() {
     let place = Place::new();
     let node = place.node();
     let channel = channel(100);
@@ -245,7 +245,7 @@ fn a_full_queue_gives_up_its_oldest_sample() {
 }
 
 #[test]
-fn publisher_and_subscribers_may_come_in_any_order() {
+fn publisher_and_subscribers_may_start_in_any_order() {
     let place = Place::new();
     let channel = channel(100);
     let (lane_node, tap_node) = (place.node(), place.node());
@@ -266,7 +266,7 @@ fn publisher_and_subscribers_may_come_in_any_order() {
 }
 
 #[test]
-fn what_is_borrowed_outlives_publisher_and_subscriber() {
+fn a_borrowed_sample_outlives_publisher_and_subscriber() {
     let place = Place::new();
     let channel = channel(100);
     let (one, other) = (place.node(), place.node());
@@ -280,7 +280,7 @@ fn what_is_borrowed_outlives_publisher_and_subscriber() {
     drop((lane, other));
     assert_eq!(first.payload(), payload(1, 100));
     assert_eq!(second.payload(), payload(2, 100));
-    assert!(!place.root_files().is_empty(), "a sample keeps the membership");
+    assert!(!place.root_files().is_empty(), "a borrowed sample keeps its subscriber's files");
     drop((first, second));
     place.assert_nothing_left();
 }
@@ -307,7 +307,7 @@ fn a_lane_outlives_more_publishers_than_it_holds_samples_of() {
 }
 
 #[test]
-fn retained_samples_come_to_those_who_ask_also_without_new_ones() {
+fn subscribers_that_request_retained_samples_receive_them_without_a_new_one() {
     let place = Place::new();
     let node = place.node();
     let shallow = QueueLimits { queue_depth: 1, max_borrowed: 2 };
@@ -316,19 +316,19 @@ fn retained_samples_come_to_those_who_ask_also_without_new_ones() {
     for sequence in 1..=10 {
         publish(&publisher, sequence, 100);
     }
-    let asks = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), true).unwrap();
+    let requesting = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), true).unwrap();
     let does_not = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(shallow), false).unwrap();
-    assert_eq!(sequences(&asks), [0u64; 0]);
+    assert_eq!(sequences(&requesting), [0u64; 0]);
     publisher.connect_subscribers();
-    assert_eq!(sequences(&asks), [8, 9, 10]);
+    assert_eq!(sequences(&requesting), [8, 9, 10]);
     assert_eq!(sequences(&does_not), [0u64; 0]);
     publish(&publisher, 11, 100);
-    assert_eq!(sequences(&asks), [11]);
+    assert_eq!(sequences(&requesting), [11]);
     assert_eq!(sequences(&does_not), [11]);
 }
 
 #[test]
-fn a_header_that_makes_no_sense_is_an_error_and_the_next_sample_comes() {
+fn an_invalid_header_is_an_error_and_the_next_sample_is_received() {
     let place = Place::new();
     let node = place.node();
     let channel = channel(100);
@@ -351,7 +351,7 @@ fn a_sample_costs_no_allocation() {
 }
 
 #[test]
-fn nobody_else_may_read_what_is_shared() {
+fn other_users_cannot_read_shared_memory() {
     let place = Place::new();
     let node = place.node();
     let channel = RouteChannel { retained_samples: 1, ..channel(100) };
@@ -376,7 +376,7 @@ fn nobody_else_may_read_what_is_shared() {
 }
 
 #[test]
-fn nothing_is_left_when_the_last_one_has_gone() {
+fn the_last_process_that_ends_leaves_no_files() {
     let place = Place::new();
     let role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
     let (first, second) = (place.node(), place.node());
@@ -395,7 +395,7 @@ fn nothing_is_left_when_the_last_one_has_gone() {
 }
 
 #[test]
-fn two_instances_and_two_roots_do_not_meet() {
+fn instances_and_roots_are_separate() {
     let (here, mut there) = (Place::new(), Place::new());
     let channel = channel(100);
     let other_name = InstanceName::try_from("other").unwrap();
@@ -435,7 +435,7 @@ fn two_instances_and_two_roots_do_not_meet() {
 }
 
 #[test]
-fn those_who_disagree_about_sizes_do_not_meet() {
+fn processes_with_different_sizes_do_not_share_a_channel() {
     let place = Place::new();
     let node = place.node();
     let _lane = lane(&node, &channel(100));
@@ -458,7 +458,7 @@ fn those_who_disagree_about_sizes_do_not_meet() {
 }
 
 #[test]
-fn taps_beyond_the_limit_are_refused_and_take_no_lanes_place() {
+fn taps_beyond_the_limit_are_refused_and_leave_the_lanes_their_places() {
     let place = Place::new();
     let node = place.node();
     let channel = channel(100);
@@ -531,10 +531,10 @@ fn a_folder_that_others_could_tamper_with_is_refused() {
 fn a_configuration_file_in_the_working_folder_changes_nothing() {
     let place = Place::new();
     let elsewhere = tempfile::tempdir().unwrap();
-    let stranger = "[global]\nroot-path = \"/nonexistent\"\nprefix = \"stranger_\"\n";
-    fs::write(elsewhere.path().join("iceoryx2.toml"), stranger).unwrap();
+    let foreign = "[global]\nroot-path = \"/nonexistent\"\nprefix = \"foreign_\"\n";
+    fs::write(elsewhere.path().join("iceoryx2.toml"), foreign).unwrap();
     fs::create_dir(elsewhere.path().join("config")).unwrap();
-    fs::write(elsewhere.path().join("config/iceoryx2.toml"), stranger).unwrap();
+    fs::write(elsewhere.path().join("config/iceoryx2.toml"), foreign).unwrap();
     let mut command = Command::new(std::env::current_exe().unwrap());
     command.current_dir(elsewhere.path());
     let mut child = Process::start_with(command, "open", &place, "");
@@ -548,7 +548,7 @@ fn a_configuration_file_in_the_working_folder_changes_nothing() {
 }
 
 #[test]
-fn a_role_has_one_process_at_a_time() {
+fn a_role_is_held_by_one_process_at_a_time() {
     let place = Place::new();
     let mut holder = Process::start("role", &place, "");
     holder.expect("served");
@@ -562,10 +562,10 @@ fn a_role_has_one_process_at_a_time() {
     holder.kill();
     let role = RoleLock::acquire(place.root(), &place.instance, "ingress").unwrap();
     let refused = Process::start("role", &place, "");
-    let said = refused.hear();
+    let message = refused.next_line();
     assert!(
-        said.contains(&format!("ingress is served already, by process {}", std::process::id())),
-        "{said}"
+        message.contains(&format!("ingress is served already, by process {}", std::process::id())),
+        "{message}"
     );
     refused.finish();
     drop(role);
@@ -577,7 +577,7 @@ fn a_role_has_one_process_at_a_time() {
 }
 
 #[test]
-fn lanes_go_on_when_ingress_is_killed_again_and_again() {
+fn lanes_continue_after_repeated_kills_of_ingress() {
     let place = Place::new();
     let lanes = [0, 1].map(|lane| Process::start("lane", &place, &format!("{lane} 2948 0")));
     lanes.iter().for_each(|lane| lane.expect("ready"));
@@ -586,18 +586,20 @@ fn lanes_go_on_when_ingress_is_killed_again_and_again() {
         let mut ingress = Process::start("publisher", &place, "100 2948");
         ingress.expect("ready");
         let before = boards().lane(0, 0).unwrap().last_sequence;
-        until("samples flow", || boards().lane(0, 0).unwrap().last_sequence > before + 200);
+        until("samples are forwarded", || boards().lane(0, 0).unwrap().last_sequence > before + 200);
         ingress.kill();
         let dead = boards().ingress(0).unwrap();
-        assert_eq!(dead.received, dead.published, "the pool suffices");
+        assert_eq!(dead.received, dead.published, "every received sample found a slot of the pool");
     }
     let last = Process::start("publisher", &place, "100 2948");
     last.expect("ready");
     let before = boards().lane(1, 0).unwrap().last_sequence;
-    until("samples flow", || boards().lane(1, 0).unwrap().last_sequence > before + 200);
+    until("samples are forwarded", || boards().lane(1, 0).unwrap().last_sequence > before + 200);
     let published: u64 = last.finish().parse().unwrap();
     for number in 0..2 {
-        until("the lane has them all", || boards().lane(number, 0).unwrap().last_sequence == published);
+        until("the lane has received every sample", || {
+            boards().lane(number, 0).unwrap().last_sequence == published
+        });
         let counters = boards().lane(number, 0).unwrap();
         assert!(counters.is_accounted_for(), "{counters:?}");
         if number == 0 {
@@ -612,7 +614,7 @@ fn lanes_go_on_when_ingress_is_killed_again_and_again() {
 }
 
 #[test]
-fn ingress_and_the_other_lane_go_on_when_a_lane_is_killed_with_samples_in_its_hands() {
+fn ingress_and_the_other_lane_continue_after_a_lane_is_killed_that_holds_samples() {
     let place = Place::new();
     let ingress = Process::start("publisher", &place, "100 2948");
     ingress.expect("ready");
@@ -629,12 +631,14 @@ fn ingress_and_the_other_lane_go_on_when_a_lane_is_killed_with_samples_in_its_ha
     let fresh = Process::start("lane", &place, "1 2948 0");
     fresh.expect("ready");
     let before = boards.lane(1, 0).unwrap().last_sequence;
-    until("the new lane flows", || boards.lane(1, 0).unwrap().last_sequence > before + 500);
+    until("the new lane forwards samples", || boards.lane(1, 0).unwrap().last_sequence > before + 500);
     assert!(fresh.finish().parse::<u64>().unwrap() > 0);
     let published: u64 = ingress.finish().parse().unwrap();
     let counters = boards.ingress(0).unwrap();
     assert_eq!(counters.received, published, "no sample found the pool empty: {counters:?}");
-    until("the healthy lane has them all", || boards.lane(0, 0).unwrap().last_sequence == published);
+    until("the healthy lane has received every sample", || {
+        boards.lane(0, 0).unwrap().last_sequence == published
+    });
     let counters = boards.lane(0, 0).unwrap();
     assert_eq!(counters.drops.total(), 0, "{counters:?}");
     healthy.finish();
@@ -642,24 +646,24 @@ fn ingress_and_the_other_lane_go_on_when_a_lane_is_killed_with_samples_in_its_ha
 }
 
 #[test]
-fn a_stopped_lane_holds_up_nobody_and_goes_on_after_a_gap() {
+fn a_stopped_lane_delays_no_other_process_and_continues_after_a_gap() {
     let place = Place::new();
     let lanes = [0, 1].map(|lane| Process::start("lane", &place, &format!("{lane} 2948 0")));
     lanes.iter().for_each(|lane| lane.expect("ready"));
     let ingress = Process::start("publisher", &place, "50 2948");
     ingress.expect("ready");
     let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
-    until("both flow", || (0..2).all(|lane| boards.lane(lane, 0).unwrap().forwarded > 100));
+    until("both lanes forward samples", || (0..2).all(|lane| boards.lane(lane, 0).unwrap().forwarded > 100));
     lanes[1].signal(Signal::SIGSTOP);
     let stopped_at = boards.ingress(0).unwrap().published;
     // Far more than a queue of 64, and more wakes than a socket's buffer would take.
-    until("ingress goes on", || boards.ingress(0).unwrap().published > stopped_at + 20_000);
+    until("ingress continues", || boards.ingress(0).unwrap().published > stopped_at + 20_000);
     lanes[1].signal(Signal::SIGCONT);
     let resumed_at = boards.ingress(0).unwrap().published;
-    until("the lane goes on", || boards.lane(1, 0).unwrap().last_sequence > resumed_at + 500);
+    until("the lane continues", || boards.lane(1, 0).unwrap().last_sequence > resumed_at + 500);
     let published: u64 = ingress.finish().parse().unwrap();
     assert_eq!(boards.ingress(0).unwrap().received, published);
-    until("all is accounted for", || {
+    until("every sample is accounted for", || {
         (0..2).all(|lane| boards.lane(lane, 0).unwrap().last_sequence == published)
     });
     let counters = [0, 1].map(|lane| boards.lane(lane, 0).unwrap());
@@ -673,7 +677,7 @@ fn a_stopped_lane_holds_up_nobody_and_goes_on_after_a_gap() {
 }
 
 #[test]
-fn taps_that_come_and_are_killed_disturb_nobody() {
+fn taps_that_start_and_are_killed_disturb_no_lane() {
     let place = Place::new();
     let healthy = Process::start("lane", &place, "0 500 0");
     healthy.expect("ready");
@@ -686,7 +690,7 @@ fn taps_that_come_and_are_killed_disturb_nobody() {
     }
     let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
     let published: u64 = ingress.finish().parse().unwrap();
-    until("all has arrived", || boards.lane(0, 0).unwrap().last_sequence == published);
+    until("every sample has arrived", || boards.lane(0, 0).unwrap().last_sequence == published);
     assert_eq!(boards.lane(0, 0).unwrap().drops.total(), 0);
     healthy.finish();
     place.assert_nothing_left();
@@ -705,7 +709,7 @@ fn processes_killed_while_they_start_leave_nothing() {
     let ingress = Process::start("publisher", &place, "100 1000");
     ingress.expect("ready");
     let boards = Boards::find(place.root(), &place.instance, &shape()).unwrap().unwrap();
-    until("samples flow", || boards.lane(0, 0).unwrap().forwarded > 100);
+    until("samples are forwarded", || boards.lane(0, 0).unwrap().forwarded > 100);
     ingress.finish();
     survivor.finish();
     place.assert_nothing_left();
@@ -719,7 +723,7 @@ fn processes_killed_while_they_start_leave_nothing() {
 }
 
 #[test]
-fn what_a_process_leaves_half_made_is_removed_and_holds_up_nobody() {
+fn incomplete_files_of_a_killed_process_are_removed_and_delay_no_other_process() {
     let place = Place::new();
     let survivor = Process::start("tap", &place, "1000");
     survivor.expect("ready");
@@ -733,7 +737,7 @@ fn what_a_process_leaves_half_made_is_removed_and_holds_up_nobody() {
         let _publisher = SamplePublisher::create(&node, &other).unwrap();
         services().find(|path| !before.contains(path)).unwrap()
     };
-    assert!(!service.exists(), "the service goes with its last user");
+    assert!(!service.exists(), "the service is removed with its last user");
     let count = place.shm_files().into_iter().find(|path| path.to_string_lossy().ends_with("global_mgmt"));
     let count = count.unwrap();
     let connection = std::path::Path::new("/dev/shm")
@@ -763,15 +767,15 @@ fn what_a_process_leaves_half_made_is_removed_and_holds_up_nobody() {
 }
 
 #[test]
-fn counters_survive_their_writer_whole() {
+fn counters_of_a_killed_writer_remain_consistent() {
     let place = Place::new();
     let node = place.node();
     let boards = node.boards(&shape()).unwrap();
     let mut last = 0;
     for round in 1..=30 {
         let mut writer = Process::start("counter", &place, "");
-        let resumed: u64 = writer.hear().parse().unwrap();
-        assert_eq!(resumed, last, "the new writer begins where the dead one ended");
+        let resumed: u64 = writer.next_line().parse().unwrap();
+        assert_eq!(resumed, last, "the new writer continues from the last value of the killed one");
         let mut read = 0;
         while read < 20_000 || boards.ingress(0).unwrap().received < last + 1_000 {
             let counters = boards.ingress(0).unwrap();
@@ -875,14 +879,18 @@ fn a_policy_counts_its_changes_and_is_changed_by_one_process_at_a_time() {
         };
         boards.policies().unwrap().set(0, MonotonicNs(1), change).epoch
     };
-    assert_eq!(set(LaneMode::Normal, 0), 1, "also when it says what nobody had said");
+    assert_eq!(
+        set(LaneMode::Normal, 0),
+        1,
+        "the first policy increments the epoch even if it equals the default"
+    );
     assert_eq!(set(LaneMode::Normal, 7), 1);
     assert_eq!(boards.policy(0).unwrap().written_at, MonotonicNs(7));
     assert_eq!(set(LaneMode::Suspended, 8), 2);
     assert_eq!(boards.policy(0).unwrap().mode, LaneMode::Suspended as u8);
     assert_eq!(boards.policy(1).unwrap().epoch, 0);
-    // Another process confirms and changes meanwhile; no change is lost, and one that is killed blocks
-    // nobody.
+    // Another process confirms and changes the policy meanwhile: no change is lost, and a killed process
+    // blocks no other.
     for _ in 0..5 {
         let mut other = Process::start("policy", &place, "");
         other.expect("ready");
@@ -917,7 +925,7 @@ fn no_wake_is_missed() {
             (0..turn * 6_091 % 400).for_each(|_| std::hint::spin_loop());
         }
         waker.wake();
-        // A wake whose system call comes late looks like an announcement.
+        // A wake whose system call is delayed is reported as an announcement.
         let woken = sleeper.sleep(support::PATIENCE);
         let woken = if woken == Woken::Announced { sleeper.sleep(support::PATIENCE) } else { woken };
         assert_eq!(woken, Woken::Woken, "turn {turn}");
@@ -926,18 +934,18 @@ fn no_wake_is_missed() {
     while sleeper.sleep(Duration::from_millis(20)) != Woken::TimedOut {}
     boards.waker(1).wake();
     boards.waker(1).wake();
-    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "a wake before the sleep counts");
-    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::TimedOut, "and two of them are one");
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "a wake before the sleep ends it");
+    assert_eq!(sleeper.sleep(Duration::ZERO), Woken::TimedOut, "two wakes before the sleep end one sleep");
     let start = std::time::Instant::now();
     assert_eq!(sleeper.sleep(Duration::from_millis(30)), Woken::TimedOut);
-    assert!(start.elapsed() >= Duration::from_millis(30), "the whole time is slept");
+    assert!(start.elapsed() >= Duration::from_millis(30), "the sleep lasts until its timeout");
 }
 
 /// No CPU that a lane sleeps on.
 const ELSEWHERE: u32 = 0;
 
 #[test]
-fn an_announcement_is_no_wake() {
+fn an_announcement_is_distinguished_from_a_wake() {
     let place = Place::new();
     let node = place.node();
     let boards = node.boards(&shape()).unwrap();
@@ -950,22 +958,34 @@ fn an_announcement_is_no_wake() {
                 waker.announce(ELSEWHERE);
             }
         });
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "up for what is to come");
-        // Nothing comes, and no more is believed: it sleeps.
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "an announcement ends the sleep");
+        // No sample follows, so the lane ignores further announcements until its next wake.
         let start = std::time::Instant::now();
         assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
-        assert!(start.elapsed() >= Duration::from_millis(100), "the whole time is slept");
+        assert!(start.elapsed() >= Duration::from_millis(100), "the sleep lasts until its timeout");
         waker.wake();
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "a wake counts among them");
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "and they are believed again");
+        assert_eq!(
+            sleeper.sleep(support::PATIENCE),
+            Woken::Woken,
+            "a wake ends the sleep among ignored announcements"
+        );
+        assert_eq!(
+            sleeper.sleep(support::PATIENCE),
+            Woken::Announced,
+            "announcements end the sleep again after a wake"
+        );
         waker.wake();
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "it comes while the lane is up");
+        assert_eq!(
+            sleeper.sleep(support::PATIENCE),
+            Woken::Woken,
+            "a wake during an announced wake-up is not lost"
+        );
         done.store(true, Ordering::Relaxed);
     });
 }
 
 #[test]
-fn a_lane_is_not_told_by_the_cpu_that_it_sleeps_on() {
+fn an_announcement_from_the_cpu_that_the_lane_sleeps_on_is_ignored() {
     let place = Place::new();
     let node = place.node();
     let boards = node.boards(&shape()).unwrap();
@@ -979,14 +999,18 @@ fn a_lane_is_not_told_by_the_cpu_that_it_sleeps_on() {
                 waker.announce(cpu.load(Ordering::Relaxed));
             }
         });
-        // It stays where it is.
+        // This thread stays on its CPU.
         let mut here = nix::sched::CpuSet::new();
         here.set(nix::sched::sched_getcpu().unwrap()).unwrap();
         nix::sched::sched_setaffinity(nix::unistd::Pid::from_raw(0), &here).unwrap();
         cpu.store(this_cpu(), Ordering::Relaxed);
         while sleeper.sleep(Duration::from_millis(10)) == Woken::Announced {}
         waker.wake();
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "and would believe it");
+        assert_eq!(
+            sleeper.sleep(support::PATIENCE),
+            Woken::Woken,
+            "after a wake announcements are not ignored"
+        );
         assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
         done.store(true, Ordering::Relaxed);
     });
@@ -1006,7 +1030,7 @@ fn waking_a_stopped_lane_never_blocks() {
     }
     assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken);
     lane.signal(Signal::SIGCONT);
-    assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "it goes on");
+    assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "the lane continues");
     lane.kill();
     // The dead one may have been asleep: its flag stays up, and waking it is harmless.
     waker.wake();
@@ -1029,13 +1053,13 @@ fn a_full_shared_memory_is_an_error_at_the_start_and_never_later() {
     let script = "mount -t tmpfs -o size=4m tmpfs /dev/shm && exec \"$0\" \"$@\"";
     command.args(["-m", "sh", "-c", script]).arg(std::env::current_exe().unwrap());
     let child = Process::start_with(command, "full", &place, "");
-    let error = child.hear();
+    let error = child.next_line();
     let needed = channel(1 << 20).pool_size().bytes;
     for part in [&format!("needs {}", needed + 512 * 1024), "/dev/shm", "scan", "remount", "max_sample_bytes"]
     {
         assert!(error.contains(part), "{part} is not in: {error}");
     }
-    let error = child.hear();
+    let error = child.next_line();
     assert!(error.contains("0 free"), "{error}");
     child.expect("done");
     child.finish();

@@ -18,7 +18,7 @@ use nix::unistd::Pid;
 /// Patience of a test with what has to happen at last.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Says loudly that a test was not run; in CI that is a failure.
+/// Reports that a test was not run; panics if `CI` is set.
 pub fn skip(reason: &str) {
     eprintln!("SKIPPED: {reason}");
     assert!(std::env::var_os("CI").is_none(), "skipped in CI: {reason}");
@@ -165,8 +165,8 @@ impl Process {
         std::thread::spawn(move || {
             for line in output.lines().map_while(Result::ok) {
                 // libtest writes the test's name without an end of line before the first of ours.
-                if let Some((_, said)) = line.split_once("@ ")
-                    && sender.send(said.to_owned()).is_err()
+                if let Some((_, message)) = line.split_once("@ ")
+                    && sender.send(message.to_owned()).is_err()
                 {
                     return;
                 }
@@ -176,13 +176,13 @@ impl Process {
         Self { child, lines, input }
     }
 
-    /// The next thing the child says.
-    pub fn hear(&self) -> String {
-        self.lines.recv_timeout(PATIENCE).expect("the child says nothing")
+    /// The next line that the child printed.
+    pub fn next_line(&self) -> String {
+        self.lines.recv_timeout(PATIENCE).expect("a line of the child")
     }
 
     pub fn expect(&self, what: &str) {
-        assert_eq!(self.hear(), what);
+        assert_eq!(self.next_line(), what);
     }
 
     pub fn pid(&self) -> u32 {
@@ -199,7 +199,7 @@ impl Process {
         self.child.wait().unwrap();
     }
 
-    /// Asks the child to end by itself and returns what it said last.
+    /// Requests the child to end by itself and returns its last line.
     pub fn finish(mut self) -> String {
         drop(self.input.take());
         let mut last = String::new();

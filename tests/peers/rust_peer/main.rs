@@ -50,7 +50,7 @@ impl Signals {
 /// One line of JSON to stdout, at once.
 fn emit(event: &Value) {
     let mut out = std::io::stdout().lock();
-    // Without a reader there is nobody to tell.
+    // An error means that the pipe is closed; nothing can be reported then.
     let _ = writeln!(out, "{event}").and_then(|()| out.flush());
 }
 

@@ -103,7 +103,7 @@ fn unknown_is_critical_where_it_is_not_allowed() {
 }
 
 #[test]
-fn an_override_applies_at_once_and_the_classifier_goes_on_from_it() {
+fn an_override_applies_at_once_and_the_classifier_continues_from_it() {
     let thresholds = ClassifierThresholds::default();
     let mut classifier = SubscriberClassifier::new();
     run(&mut classifier, &[full(GOOD); 3]);
@@ -115,7 +115,7 @@ fn an_override_applies_at_once_and_the_classifier_goes_on_from_it() {
 }
 
 #[test]
-fn nothing_found_or_forced_stays_when_nobody_is_classified() {
+fn an_unclassified_subscriber_keeps_no_state_and_no_override() {
     let thresholds = ClassifierThresholds::default();
     let mut classifier = SubscriberClassifier::new();
     assert_eq!(classifier.unclassified(&thresholds), None);

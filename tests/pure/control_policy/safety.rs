@@ -52,7 +52,7 @@ fn bench() -> Bench {
 }
 
 #[test]
-fn the_way_up_and_the_way_back_go_through_degraded() {
+fn escalation_and_recovery_pass_through_degraded() {
     let mut bench = bench();
     assert_eq!(bench.modes(EXTREME, 6), [Normal, Normal, Degraded, Degraded, Degraded, Emergency]);
     assert_eq!(bench.modes(CRITICAL, 10)[8..], [Emergency, Degraded]);
@@ -76,7 +76,7 @@ fn a_reading_that_differs_resets_the_count_either_way() {
 }
 
 #[test]
-fn emergency_ends_once_readings_no_longer_speak_for_it() {
+fn emergency_ends_when_readings_no_longer_indicate_it() {
     let mut bench = bench();
     assert_eq!(bench.last(EXTREME, 6), Emergency);
     assert_eq!(bench.modes(NEAR, 10)[8..], [Emergency, Degraded]);
@@ -91,7 +91,7 @@ fn without_noncritical_first_emergency_comes_at_once() {
 }
 
 #[test]
-fn the_decision_says_who_and_what() {
+fn a_safety_decision_names_the_process_and_the_cause() {
     let mut bench = bench();
     let waiting = ProcessLoad { waiting: 51, ..NONCRITICAL };
     for _ in 0..2 {
@@ -111,7 +111,7 @@ fn the_decision_says_who_and_what() {
 }
 
 #[test]
-fn each_trouble_of_the_critical_path_speaks_for_what_it_should() {
+fn each_fault_of_the_critical_path_indicates_its_mode() {
     let errors = |errors| ProcessLoad { errors, ..CRITICAL };
     let lost = |n| errors(ErrorCounts { queue_overflow: n, ..ErrorCounts::default() });
     let cases = [
@@ -144,7 +144,7 @@ fn each_trouble_of_the_critical_path_speaks_for_what_it_should() {
 }
 
 #[test]
-fn each_trouble_of_a_noncritical_lane_speaks_for_degraded_at_most() {
+fn each_fault_of_a_noncritical_lane_indicates_at_most_degraded() {
     let errors = |errors| ProcessLoad { errors, ..NONCRITICAL };
     let cases = [
         ("samples that wait", ProcessLoad { waiting: 51, ..NONCRITICAL }, Degraded),
@@ -249,7 +249,7 @@ proptest! {
     #![proptest_config(config(256))]
 
     #[test]
-    fn every_step_takes_its_readings_in_a_row(
+    fn every_transition_takes_its_number_of_consecutive_readings(
         hysteresis_count in 0..5_u32,
         recovery_count in 0..8_u32,
         first: bool,
@@ -304,7 +304,7 @@ proptest! {
     }
 
     #[test]
-    fn whatever_the_critical_path_reports_the_way_back_is_open(
+    fn recovery_to_normal_is_possible_after_any_report_of_the_critical_path(
         steps in prop::collection::vec(load(Critical), 1..60),
     ) {
         let mut bench = bench();

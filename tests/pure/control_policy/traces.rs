@@ -69,14 +69,14 @@ impl Channel {
     }
 }
 
-/// A probe: when it was sent, and how long its answer takes, if one comes.
+/// A probe: when it was sent, and how long its answer takes, if it is answered.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Probe {
     sent_ms: u64,
     rtt_ms: Option<f64>,
 }
 
-/// Probes over a link that is impaired at the times that `impaired` says: a channel each way, and 20 ± 10 ms
+/// Probes over a link that is impaired at the times of `impaired`: a channel each way, and 20 ± 10 ms
 /// on the way back. Otherwise 1 ms and no loss.
 fn link(level: Level, length_s: u64, seed: u64, impaired: impl Fn(u64) -> bool) -> Vec<Probe> {
     let mut random = Random(seed);

@@ -39,7 +39,7 @@ fn messages_may_overtake_each_other() {
 }
 
 #[test]
-fn what_is_older_than_the_oldest_kept_is_refused() {
+fn a_message_older_than_the_oldest_kept_one_is_refused() {
     let mut guard = ReplayGuard::new(30_000, 4);
     for number in 0..10 {
         assert_eq!(guard.admit(nonce(number), wall(u64::from(number)), wall(20)), Admission::Fresh);

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::{MS, at_ms, config};
 
-/// A window that has heard its subscriber: probe 0 was sent at 0 and answered after 10 ms.
+/// A window with one answered probe: probe 0 was sent at 0 and answered after 10 ms.
 fn open_window(window_size: usize) -> ProbeWindow {
     let mut window = ProbeWindow::new(window_size, 500);
     window.sent(0, at_ms(0));
@@ -56,7 +56,7 @@ fn rtt_and_jitter_are_those_of_the_window() {
 }
 
 #[test]
-fn a_subscriber_never_heard_has_no_data_and_one_that_falls_silent_has_loss() {
+fn a_subscriber_that_never_answered_has_no_data_and_one_that_stops_answering_has_loss() {
     let mut window = ProbeWindow::new(50, 500);
     for seq in 0..100 {
         window.sent(seq, at_ms(seq * 200));
@@ -92,7 +92,7 @@ fn a_subscriber_whose_answers_are_all_late_has_loss() {
 }
 
 #[test]
-fn what_was_under_way_while_the_control_process_was_stopped_is_excused() {
+fn probes_pending_while_the_control_process_was_stopped_are_excused() {
     let mut window = open_window(50);
     // Lost before the stop, under way at its beginning, and sent at its very end.
     window.sent(1, at_ms(200));
@@ -108,7 +108,7 @@ fn what_was_under_way_while_the_control_process_was_stopped_is_excused() {
 }
 
 #[test]
-fn a_numbering_that_begins_anew_excuses_what_was_under_way() {
+fn a_restarted_numbering_excuses_pending_probes() {
     let mut window = open_window(50);
     window.sent(1_000_000, at_ms(200));
     window.sent(0, at_ms(300));
@@ -119,7 +119,7 @@ fn a_numbering_that_begins_anew_excuses_what_was_under_way() {
 }
 
 #[test]
-fn more_probes_under_way_than_the_window_holds_are_lost_oldest_first() {
+fn pending_probes_beyond_the_window_are_lost_oldest_first() {
     let mut window = ProbeWindow::new(10, 60_000);
     window.sent(0, at_ms(0));
     window.answered(0, at_ms(0));
@@ -132,7 +132,7 @@ fn more_probes_under_way_than_the_window_holds_are_lost_oldest_first() {
 }
 
 #[test]
-fn new_limits_apply_to_what_is_under_way_and_keep_the_newest_fates() {
+fn new_limits_apply_to_pending_probes_and_keep_the_newest_results() {
     let mut window = ProbeWindow::new(50, 500);
     for seq in 0..50 {
         window.sent(seq, at_ms(seq * 100));
@@ -148,14 +148,14 @@ fn new_limits_apply_to_what_is_under_way_and_keep_the_newest_fates() {
 }
 
 #[test]
-fn a_stopped_control_process_demotes_nobody() {
+fn a_stopped_control_process_demotes_no_subscriber() {
     let thresholds = ClassifierThresholds::default();
     let mut window = ProbeWindow::new(50, 500);
     let mut classifier = SubscriberClassifier::new();
     let mut now_ms = 0;
     for seq in 0..2_000 {
         let before_ms = now_ms;
-        // Every 100th turn comes 40 s late.
+        // Every 100th turn is 40 s late.
         now_ms += if seq % 100 == 99 { 40_000 } else { 200 };
         if now_ms - before_ms > 300 {
             window.excuse_pause(at_ms(before_ms + 200), at_ms(now_ms));

@@ -1,6 +1,6 @@
 //! Checks the rules of this source tree that neither compiler, clippy nor cargo-deny knows: layers, purity,
 //! words, sizes, links, dependencies.
-//! Pure: reads files, and asks cargo about the dependencies.
+//! Pure: reads files, and lists the dependencies by cargo.
 //!
 //! Each rule is a function of a file's path and text that lists what breaks it, so that the tests can also
 //! show that it finds what it is for.

@@ -133,7 +133,7 @@ impl Rust {
         })
     }
 
-    /// Reads `a::b::{c, d::e}` from `at` on, and says where it ends.
+    /// Reads `a::b::{c, d::e}` from `at` on, and returns where it ends.
     fn tree(&self, mut at: usize, prefix: &[String], paths: &mut Vec<SourcePath>) -> usize {
         let mut names = prefix.to_vec();
         let line = self.tokens.get(at).map_or(0, |token| token.line);
@@ -278,7 +278,7 @@ fn quoted(text: &[char], quote: char) -> usize {
 }
 
 #[test]
-fn code_comments_and_strings_are_told_apart() {
+fn code_comments_and_strings_are_distinguished() {
     let text = "a::b /* x /* y */ z */ \"c \\\" // d\" r#\"e\" f\"# 'g' '\\'' &'h str // i\n/// j\nb\"k\" 'l";
     let rust = Rust::new(text);
     let tokens: Vec<&str> = rust.tokens.iter().map(|token| token.text.as_str()).collect();
