@@ -1,7 +1,7 @@
 //! Adaptive Bridge: a proxy between a robot's publishers and its subscribers.
 //!
-//! The modules are layers: each may use those listed above it and none of those below. `tests/pure/tidy` checks
-//! this, and the compiler for the first two, which are a crate of their own (`crates/policy`).
+//! The modules are layers: each may use those listed above it and none of those below. `tests/pure/tidy`
+//! checks this, and the compiler for the first two, which are a crate of their own (`crates/policy`).
 //!
 //! - [`model`]: plain data types: time, names, QoS, sample header, modes, drop reasons.
 //! - [`policy`]: decisions without side effects; the time is an argument.

@@ -1,5 +1,6 @@
 //! Everything that reads bytes which somebody else wrote, as functions of those bytes. A function panics when
-//! the bridge breaks a promise, or the bridge does. `tests/pure/regressions.rs` runs the same ones on kept inputs.
+//! the bridge breaks a promise, or the bridge does. `tests/pure/regressions.rs` runs the same ones on kept
+//! inputs.
 
 use std::collections::HashMap;
 use std::fs::DirEntry;
