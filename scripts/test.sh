@@ -35,5 +35,6 @@ step make --no-print-directory lint
 # programs may run their tests in parallel.
 step cargo test --locked --workspace --no-fail-fast
 # The tests of the patched DDS library, a separate package with its own development dependencies.
+export CARGO_PROFILE_DEV_DEBUG=line-tables-only
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds
 step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"
