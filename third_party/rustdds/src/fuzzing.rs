@@ -201,6 +201,8 @@ impl LentMemory for Zeros {
   fn bytes(&mut self) -> &mut [u8] {
     &mut self.0
   }
+
+  fn finish(self: Box<Self>) {}
 }
 
 // A writer that has sent something, and its one reader.

@@ -145,7 +145,7 @@ pub mod no_key {
     /// Like [`from_bytes_with`](Self::from_bytes_with), but the decoder also
     /// sees the two option bytes of the encapsulation header.
     fn from_encapsulated_with<'de, S>(
-      input_bytes: &'de [u8],
+      input_bytes: &'de Bytes,
       encoding: RepresentationIdentifier,
       options: [u8; 2],
       decoder: S,
@@ -226,10 +226,11 @@ pub mod no_key {
     ) -> Result<Decoded, Self::Error>;
 
     /// Like [`decode_bytes`](Self::decode_bytes), with the two option bytes
-    /// of the encapsulation header, which a decoder may ignore.
+    /// of the encapsulation header, which a decoder may ignore. A decoder may
+    /// keep the payload by a clone of `input_bytes`, which copies nothing.
     fn decode_encapsulated(
       self,
-      input_bytes: &'de [u8],
+      input_bytes: &'de Bytes,
       encoding: RepresentationIdentifier,
       _options: [u8; 2],
     ) -> Result<Decoded, Self::Error>
@@ -246,13 +247,13 @@ pub mod no_key {
       self,
       memory: &'de mut Option<Box<dyn LentMemory>>,
       encoding: RepresentationIdentifier,
-      options: [u8; 2],
+      _options: [u8; 2],
     ) -> Result<Decoded, Self::Error>
     where
       Self: Sized,
     {
       let bytes = memory.as_mut().map_or(&mut [][..], |memory| memory.bytes());
-      self.decode_encapsulated(bytes, encoding, options)
+      self.decode_bytes(bytes, encoding)
     }
   }
 

@@ -1,7 +1,6 @@
 //! Samples that are put together in memory of the application.
 
 use std::{
-  any::Any,
   fmt,
   sync::{Arc, Mutex, PoisonError},
 };
@@ -18,9 +17,13 @@ pub trait SampleMemory: Send + Sync {
 
 /// Memory for one sample. The library drops it when the sample never becomes
 /// complete, or when nobody takes it.
-pub trait LentMemory: Any + Send {
+pub trait LentMemory: Send {
   /// The memory, as long as what was asked for. The same bytes at each call.
   fn bytes(&mut self) -> &mut [u8];
+
+  /// Gives the memory, with the whole sample in it, back to the application that
+  /// lent it, and has now taken the sample. The library does not call this.
+  fn finish(self: Box<Self>);
 }
 
 // The payload of a complete sample, until a reader takes it.

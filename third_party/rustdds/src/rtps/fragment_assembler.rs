@@ -490,6 +490,8 @@ mod tests {
     fn bytes(&mut self) -> &mut [u8] {
       &mut self.0
     }
+
+    fn finish(self: Box<Self>) {}
   }
 
   fn lend(len: usize) -> Option<Box<dyn LentMemory>> {

@@ -2299,6 +2299,8 @@ mod tests {
     fn bytes(&mut self) -> &mut [u8] {
       &mut self.0
     }
+
+    fn finish(self: Box<Self>) {}
   }
 
   impl Drop for CountedMemory {

@@ -166,7 +166,7 @@ where
 
   fn decode_encapsulated(
     self,
-    input_bytes: &'de [u8],
+    input_bytes: &'de Bytes,
     encoding: RepresentationIdentifier,
     options: [u8; 2],
   ) -> Result<Decoded, Self::Error> {
