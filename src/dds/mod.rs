@@ -2,7 +2,7 @@
 //!
 //! Payloads are forwarded as the bytes that were on the wire, with their encapsulation header, and are never
 //! decoded; so the bridge forwards any message type. The public interface has no RustDDS types, so that
-//! another DDS library could replace RustDDS.
+//! another DDS library could replace RustDDS, except the two traits by which it borrows memory from the bridge.
 
 mod arrival_flag;
 mod arrivals;
@@ -28,7 +28,7 @@ pub use lent::{LentMemory, Payload, SampleMemory};
 pub use network::{AbsentInterface, absent_interfaces, host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
-pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take};
+pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take, TakePayload};
 pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent, Written};
 
 /// RustDDS in the version that ros2-client uses, so that the program contains one version of it.

@@ -1,12 +1,11 @@
 //! Passes raw payloads through RustDDS' serialization traits without encoding or decoding them.
 
-use std::any::Any;
-use std::cell::RefCell;
 use std::convert::Infallible;
+use std::fmt;
 
 use bytes::Bytes;
 
-use super::lent::{LentMemoryAdapter, Payload};
+use super::lent::Payload;
 use super::rustdds::no_key::{Decode, DeserializerAdapter, SerializerAdapter};
 use super::rustdds::{LentMemory, RepresentationIdentifier};
 use crate::model::Encapsulation;
@@ -16,6 +15,9 @@ pub(super) struct RawPayload {
     pub bytes: Bytes,
     pub encapsulation: Encapsulation,
 }
+
+/// A received payload, with its encapsulation.
+pub(super) type Received = (Payload, Encapsulation);
 
 /// The (de)serializer that RustDDS' readers and writers of raw payloads use.
 pub(super) struct RawAdapter;
@@ -42,30 +44,36 @@ static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::XML,
 ];
 
-/// Receives a payload and its encapsulation.
-pub(super) type PayloadCallback<'a> = dyn FnMut(Payload<'_>, Encapsulation) + 'a;
-
-/// Calls a closure with the payload, either in the receive buffer or in the memory that was lent for it.
+/// Returns the payload, either in the receive buffer or in the memory that was lent for it.
 #[derive(Clone, Copy)]
-pub(super) struct PayloadDecoder<'cell, 'closure>(
-    pub &'cell RefCell<&'closure mut PayloadCallback<'closure>>,
-);
+pub(super) struct PayloadDecoder;
 
-impl Decode<'_, ()> for PayloadDecoder<'_, '_> {
-    type Error = Infallible;
+/// Another reader of the topic has taken the memory in which the sample was.
+#[derive(Debug)]
+pub(super) struct MemoryTaken;
 
-    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> Result<(), Infallible> {
-        self.decode_encapsulated(bytes, encoding, [0, 0])
+impl fmt::Display for MemoryTaken {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("another reader has taken the payload")
+    }
+}
+
+impl std::error::Error for MemoryTaken {}
+
+impl Decode<'_, Received> for PayloadDecoder {
+    type Error = MemoryTaken;
+
+    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> Result<Received, MemoryTaken> {
+        self.decode_encapsulated(&Bytes::copy_from_slice(bytes), encoding, [0, 0])
     }
 
     fn decode_encapsulated(
         self,
-        bytes: &[u8],
+        bytes: &Bytes,
         encoding: RepresentationIdentifier,
         options: [u8; 2],
-    ) -> Result<(), Infallible> {
-        (self.0.borrow_mut())(Payload::Bytes(bytes), encapsulation(encoding, options));
-        Ok(())
+    ) -> Result<Received, MemoryTaken> {
+        Ok((Payload::Bytes(bytes.clone()), encapsulation(encoding, options)))
     }
 
     fn decode_lent(
@@ -73,18 +81,9 @@ impl Decode<'_, ()> for PayloadDecoder<'_, '_> {
         memory: &mut Option<Box<dyn LentMemory>>,
         encoding: RepresentationIdentifier,
         options: [u8; 2],
-    ) -> Result<(), Infallible> {
-        if let Some(memory) = memory.take() {
-            let memory: Box<dyn Any> = memory;
-            match memory.downcast::<LentMemoryAdapter>() {
-                Ok(lent) => {
-                    (self.0.borrow_mut())(Payload::Lent(lent.0), encapsulation(encoding, options));
-                }
-                // `RawReader::lend_memory` lends the library memory of this type only.
-                Err(_) => debug_assert!(false, "the DDS library returned memory that no reader lent"),
-            }
-        }
-        Ok(())
+    ) -> Result<Received, MemoryTaken> {
+        let memory = memory.take().ok_or(MemoryTaken)?;
+        Ok((Payload::Lent(memory), encapsulation(encoding, options)))
     }
 }
 
@@ -93,15 +92,17 @@ fn encapsulation(encoding: RepresentationIdentifier, options: [u8; 2]) -> Encaps
     Encapsulation([high, low, options[0], options[1]])
 }
 
-impl DeserializerAdapter<()> for RawAdapter {
-    type Error = Infallible;
-    type Decoded = ();
+impl DeserializerAdapter<Received> for RawAdapter {
+    type Error = MemoryTaken;
+    type Decoded = Received;
 
     fn supported_encodings() -> &'static [RepresentationIdentifier] {
         &ENCAPSULATIONS
     }
 
-    fn transform_decoded((): ()) {}
+    fn transform_decoded(received: Received) -> Received {
+        received
+    }
 }
 
 impl SerializerAdapter<RawPayload> for RawAdapter {

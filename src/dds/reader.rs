@@ -1,11 +1,10 @@
 //! A DDS reader of raw payloads that gives access to each payload in the receive buffer, without a copy.
 
-use std::cell::RefCell;
 use std::sync::Arc;
 use std::task::Waker;
 
-use super::lent::{Payload, SampleMemory, SampleMemoryAdapter};
-use super::payload::{PayloadDecoder, RawAdapter};
+use super::lent::{Payload, SampleMemory};
+use super::payload::{PayloadDecoder, RawAdapter, Received};
 use super::rustdds::no_key::SimpleDataReader;
 use super::rustdds::{DataReaderStatus, StatusEvented};
 use crate::model::{Encapsulation, Guid, SourceTimestamp};
@@ -32,6 +31,38 @@ pub enum Take {
     Empty,
 }
 
+/// The result of [`RawReader::take_payload`].
+pub enum TakePayload {
+    /// A sample, its payload and the payload's encapsulation.
+    Sample(SampleOrigin, Payload, Encapsulation),
+    /// A sample whose encapsulation DDS does not define; it was discarded.
+    Malformed,
+    /// No sample was waiting.
+    Empty,
+}
+
+impl TakePayload {
+    /// Whether no sample was waiting.
+    pub fn is_empty(&self) -> bool {
+        matches!(self, Self::Empty)
+    }
+
+    /// Calls `read` with the payload, if there is one.
+    pub fn read(self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
+        match self {
+            Self::Sample(origin, payload, encapsulation) => {
+                match payload {
+                    Payload::Bytes(bytes) => read(&bytes, encapsulation),
+                    Payload::Lent(mut memory) => read(memory.bytes(), encapsulation),
+                }
+                Take::Sample(origin)
+            }
+            Self::Malformed => Take::Malformed,
+            Self::Empty => Take::Empty,
+        }
+    }
+}
+
 /// A change of the writers that a reader is matched with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ReaderEvent {
@@ -49,7 +80,7 @@ pub enum ReaderEvent {
 
 /// A DDS reader of raw payloads.
 pub struct RawReader {
-    pub(super) inner: SimpleDataReader<(), RawAdapter>,
+    pub(super) inner: SimpleDataReader<Received, RawAdapter>,
     pub(super) guid: Guid,
 }
 
@@ -77,34 +108,33 @@ impl RawReader {
     /// lends none, the library uses its own. The setting applies to the topic: of two readers of the topic in
     /// one participant, one must [ignore](Self::ignore_reliable_writers) the samples that the other takes.
     pub fn lend_memory(&self, memory: Arc<dyn SampleMemory>) {
-        self.inner.set_sample_memory(Arc::new(SampleMemoryAdapter(memory)));
+        self.inner.set_sample_memory(memory);
     }
 
-    /// Takes the next sample, if one waits, and calls `lend` once with its payload and encapsulation.
+    /// Takes the next sample, if one waits, and calls `read` once with its payload and encapsulation.
     ///
-    /// Samples of one RELIABLE writer are returned in order and once each. The library's lock on the topic is
-    /// held while `lend` runs: it must copy and return.
-    pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
-        self.take_payload(&mut |payload, encapsulation| {
-            payload.with_bytes(|bytes| lend(bytes, encapsulation));
-        })
+    /// Samples of one RELIABLE writer are returned in order and once each.
+    pub fn take(&self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
+        self.take_payload().read(read)
     }
 
-    /// Like [`take`](Self::take), but also returns the [lent memory](Self::lend_memory) that the payload is
-    /// in.
-    pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
-        let lend = RefCell::new(receive);
-        match self.inner.try_take_one_with(PayloadDecoder(&lend)) {
-            Ok(Some(change)) => Take::Sample(SampleOrigin {
-                source_timestamp: change
-                    .write_options
-                    .source_timestamp()
-                    .map_or(SourceTimestamp::NONE, |time| SourceTimestamp(time.to_ticks())),
-                writer: Guid(change.writer_guid.to_bytes()),
-                sequence: i64::from(change.sequence_number),
-            }),
-            Ok(None) => Take::Empty,
-            Err(_) => Take::Malformed,
+    /// Like [`take`](Self::take), but returns the payload, also one in [lent memory](Self::lend_memory).
+    pub fn take_payload(&self) -> TakePayload {
+        match self.inner.try_take_one_with(PayloadDecoder) {
+            Ok(Some(change)) => {
+                let origin = SampleOrigin {
+                    source_timestamp: change
+                        .write_options
+                        .source_timestamp()
+                        .map_or(SourceTimestamp::NONE, |time| SourceTimestamp(time.to_ticks())),
+                    writer: Guid(change.writer_guid.to_bytes()),
+                    sequence: i64::from(change.sequence_number),
+                };
+                let (payload, encapsulation) = change.sample;
+                TakePayload::Sample(origin, payload, encapsulation)
+            }
+            Ok(None) => TakePayload::Empty,
+            Err(_) => TakePayload::Malformed,
         }
     }
 

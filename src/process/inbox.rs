@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::task::Waker;
 
-use crate::dds::{ArrivalFlag, Payload, RawReader, Take};
+use crate::dds::{ArrivalFlag, RawReader, Take, TakePayload};
 use crate::model::{Encapsulation, Guid};
 
 /// One take in so many tries the last reader first, so that a flood of samples at the first reader cannot
@@ -54,21 +54,17 @@ impl Inbox {
 
     /// Takes the next sample, like [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: a later
     /// arrival unparks it.
-    pub fn take(&self, lend: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
-        self.take_with(|reader| reader.take(lend))
+    pub fn take(&self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
+        self.take_payload().read(read)
     }
 
     /// Takes the next sample, like [`RawReader::take_payload`].
-    pub fn take_payload(&self, receive: &mut dyn FnMut(Payload<'_>, Encapsulation)) -> Take {
-        self.take_with(|reader| reader.take_payload(receive))
-    }
-
-    fn take_with(&self, mut take_one: impl FnMut(&RawReader) -> Take) -> Take {
+    pub fn take_payload(&self) -> TakePayload {
         if !self.flag.is_raised() {
-            return Take::Empty;
+            return TakePayload::Empty;
         }
-        let take = self.take_first(&mut take_one);
-        if take != Take::Empty {
+        let take = self.take_first();
+        if !take.is_empty() {
             return take;
         }
         // Arm the readers, then poll once more for a sample that arrived before they were armed.
@@ -76,21 +72,22 @@ impl Inbox {
         for reader in &self.readers {
             reader.arm(&self.waker);
         }
-        let take = self.take_first(&mut take_one);
-        if take != Take::Empty {
+        let take = self.take_first();
+        if !take.is_empty() {
             self.flag.raise_quietly();
         }
         take
     }
 
     /// Takes from the first reader that has a sample.
-    fn take_first(&self, take_one: &mut impl FnMut(&RawReader) -> Take) -> Take {
+    fn take_first(&self) -> TakePayload {
         let [first, last] = self.readers.as_slice() else {
-            return self.readers.first().map_or(Take::Empty, take_one);
+            return self.readers.first().map_or(TakePayload::Empty, RawReader::take_payload);
         };
         let takes = self.takes.get().wrapping_add(1);
         self.takes.set(takes);
         let order = if takes.is_multiple_of(LAST_READER_FIRST_EVERY) { [last, first] } else { [first, last] };
-        order.into_iter().map(take_one).find(|take| *take != Take::Empty).unwrap_or(Take::Empty)
+        let mut takes = order.into_iter().map(RawReader::take_payload);
+        takes.find(|take| !take.is_empty()).unwrap_or(TakePayload::Empty)
     }
 }

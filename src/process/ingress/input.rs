@@ -14,7 +14,7 @@ use super::source::{ReaderPlan, Source, label};
 use super::writer_sequences::WriterSequences;
 use crate::clock;
 use crate::config::{Route, Settings};
-use crate::dds::{ArrivalFlag, Endpoint, Participant, Payload, ReaderEvent, ReaderQos, SampleOrigin, Take};
+use crate::dds::{ArrivalFlag, Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload};
 use crate::model::{
     DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability, RouteInfo,
     SampleHeader, TopicName,
@@ -120,21 +120,12 @@ impl Input {
     /// Takes one sample and publishes it; `wake` wakes the lanes. Returns whether there was a sample. If not,
     /// the flag is cleared until the next arrival.
     pub fn step(&mut self, wake: impl FnOnce()) -> bool {
-        let pool = &self.pool;
-        let mut received: Option<(Filled, Encapsulation)> = None;
-        let mut receive = |payload: Payload<'_>, encapsulation: Encapsulation| {
-            received = Some((pool.fill(payload), encapsulation));
-        };
-        match self.inbox.take_payload(&mut receive) {
-            Take::Empty => return false,
-            Take::Sample(origin) => match received {
-                Some((filled, encapsulation)) => {
-                    self.publish(filled, encapsulation, origin, wake);
-                }
-                // The library returned a sample without its payload; it has no such path today.
-                None => self.count_malformed(),
-            },
-            Take::Malformed => self.count_malformed(),
+        match self.inbox.take_payload() {
+            TakePayload::Empty => return false,
+            TakePayload::Sample(origin, payload, encapsulation) => {
+                self.publish(self.pool.fill(payload), encapsulation, origin, wake);
+            }
+            TakePayload::Malformed => self.count_malformed(),
         }
         true
     }

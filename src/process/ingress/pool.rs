@@ -4,12 +4,15 @@
 //! The library borrows and drops slots on the receiving thread, which never waits, not even for the main
 //! thread while that connects a lane to the pool.
 
-use std::any::Any;
+use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dds::{LentMemory, Payload, SampleMemory};
 use crate::shm::{LentSlot, LoanError, SamplePublisher, Slot};
+
+/// Finished loans that wait for `fill`, which takes each at once.
+const FINISHED_SLOTS: usize = 1;
 
 /// The pool, as the main thread and the DDS library share it.
 pub(super) struct Pool {
@@ -17,6 +20,7 @@ pub(super) struct Pool {
     /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
     connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
+    finished: Arc<Mutex<VecDeque<Slot>>>,
 }
 
 /// The pool, as the input of the route owns it.
@@ -29,7 +33,8 @@ pub(super) struct PoolOwner {
 impl PoolOwner {
     pub fn new(publisher: SamplePublisher) -> Self {
         let (sender, abandoned) = channel();
-        let pool = Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender });
+        let finished = Arc::new(Mutex::new(VecDeque::with_capacity(FINISHED_SLOTS)));
+        let pool = Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender, finished });
         Self { pool, abandoned }
     }
 
@@ -50,16 +55,16 @@ impl PoolOwner {
     }
 
     /// Returns the slot in which the DDS library assembled the payload, or copies the payload into a new one.
-    pub fn fill(&self, payload: Payload<'_>) -> Filled {
+    pub fn fill(&self, payload: Payload) -> Filled {
         match payload {
             Payload::Bytes(bytes) => {
-                Filled { slot: self.pool.publisher.copy_in(bytes), bytes: bytes.len(), in_place: false }
+                Filled { slot: self.pool.publisher.copy_in(&bytes), bytes: bytes.len(), in_place: false }
             }
             Payload::Lent(mut memory) => {
                 let bytes = memory.bytes().len();
-                let memory: Box<dyn Any> = memory;
-                let slot = memory.downcast::<Borrowed>().ok().and_then(|borrowed| borrowed.into_slot());
-                // Only this pool lends memory to the reader, so the error does not occur.
+                // Only this pool lends memory to the reader: it has the slot as soon as the loan ends.
+                memory.finish();
+                let slot = lock(&self.pool.finished).pop_front();
                 Filled { slot: slot.ok_or(LoanError::Failed("not of the pool")), bytes, in_place: true }
             }
         }
@@ -78,31 +83,33 @@ impl SampleMemory for Pool {
     fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
         let _not_connecting = self.connecting.try_lock().ok()?;
         let slot = self.publisher.lend(len)?;
-        Some(Box::new(Borrowed { slot: Some(slot), abandoned: self.abandoned.clone() }))
+        let (abandoned, finished) = (self.abandoned.clone(), self.finished.clone());
+        Some(Box::new(Loan { slot: Some(slot), abandoned, finished }))
     }
 }
 
 /// A slot while the DDS library holds it. If the library drops it, the main thread frees the slot, because
 /// that may have to wait for a lock.
-struct Borrowed {
-    /// `Some` until `into_slot` takes it.
+struct Loan {
+    /// `Some` until `finish` takes it.
     slot: Option<LentSlot>,
     abandoned: Sender<LentSlot>,
+    finished: Arc<Mutex<VecDeque<Slot>>>,
 }
 
-impl Borrowed {
-    fn into_slot(mut self) -> Option<Slot> {
-        self.slot.take().map(LentSlot::into_slot)
-    }
-}
-
-impl LentMemory for Borrowed {
+impl LentMemory for Loan {
     fn bytes(&mut self) -> &mut [u8] {
         self.slot.as_mut().map_or(&mut [], LentSlot::payload_mut)
     }
+
+    fn finish(mut self: Box<Self>) {
+        if let Some(slot) = self.slot.take() {
+            lock(&self.finished).push_back(slot.into_slot());
+        }
+    }
 }
 
-impl Drop for Borrowed {
+impl Drop for Loan {
     fn drop(&mut self) {
         if let Some(slot) = self.slot.take() {
             // Fails only after the owner is dropped; then the slot is dropped here.
@@ -111,8 +118,18 @@ impl Drop for Borrowed {
     }
 }
 
+#[allow(
+    clippy::disallowed_methods,
+    reason = "the thread that takes samples locks it, which is one at a time"
+)]
+fn lock(finished: &Mutex<VecDeque<Slot>>) -> MutexGuard<'_, VecDeque<Slot>> {
+    finished.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 #[cfg(test)]
 mod tests {
+    use bytes::Bytes;
+
     use super::*;
     use crate::model::{InstanceName, RouteId};
     use crate::shm::{QueueLimits, RouteChannel, ShmNode};
@@ -145,7 +162,7 @@ mod tests {
         assert!(lender.lend(10).is_none());
         owner.housekeeping();
         assert!(lender.lend(10).is_some());
-        let filled = owner.fill(Payload::Bytes(&[1; 100]));
+        let filled = owner.fill(Payload::Bytes(Bytes::from_static(&[1; 100])));
         assert!(filled.slot.is_ok() && !filled.in_place);
     }
 
