@@ -79,7 +79,7 @@ impl DropIns {
         };
         service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, Vec::new());
         for lane in &settings.lanes {
-            let critical = lane.class == TrafficClass::Critical;
+            let critical = lane.class() == TrafficClass::Critical;
             service(egress(lane.name.as_str()), &lane.scheduling, critical, Vec::new());
         }
         let mut own = Vec::new();

@@ -5,7 +5,7 @@ use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
 use super::rates::{self, RoutingPolicy};
-use super::settings::{DdsNetwork, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
+use super::settings::{DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
 use crate::model::{LaneName, TrafficClass};
 
 /// The most lanes. Each is a process with its own DDS participant, and a domain allows 120 participants on a
@@ -106,17 +106,19 @@ impl LaneReader<'_> {
         let qos = field.get("qos");
         let lane = Lane {
             name,
-            class,
+            forwarding: match class {
+                TrafficClass::Critical => {
+                    rates::refuse_rates(field);
+                    Forwarding::Everything
+                }
+                TrafficClass::Noncritical => Forwarding::Limited(self.policy.lane_rates(field)),
+            },
             network: network(field, self.input, self.environment),
             outputs: Vec::new(),
             queue_depth: field.get("queue_depth").count().unwrap_or(queue_depth),
             max_borrowed: field.get("max_borrowed").count_or_default(),
             by_reference_min_bytes: field.get("by_reference_min_bytes").count_or_default(),
             window_samples: field.get("window_samples").count_or_default(),
-            rates: match class {
-                TrafficClass::Critical => rates::critical_rates(field),
-                TrafficClass::Noncritical => self.policy.lane_rates(field),
-            },
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
         };
         let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };

@@ -29,7 +29,7 @@ pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_de
 pub use problem::{ConfigError, Place, Problem};
 pub use reload::{Change, Reload};
 pub use settings::{
-    Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, InputQos, Lane, LaneRates,
-    MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules, Scheduling,
-    SchedulingPolicy, SecretSource, Security, Settings, SharedMemory, TrustMode, Verbosity,
+    Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, Forwarding, InputQos, Lane,
+    LaneRates, MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules,
+    Scheduling, SchedulingPolicy, SecretSource, Security, Settings, SharedMemory, TrustMode, Verbosity,
 };

@@ -26,23 +26,15 @@ const RATE_KEYS: &[&str] = &[
     "queue_samples",
 ];
 
-/// The rates of a critical lane, which are unlimited: it forwards every sample. Reports a rate in the file,
-/// because it would have no effect.
-pub(super) fn critical_rates(lane: &Field<'_>) -> LaneRates {
+/// Reports a rate that the file gives for a critical lane, because it would have no effect: the lane forwards
+/// every sample.
+pub(super) fn refuse_rates(lane: &Field<'_>) {
     for key in RATE_KEYS {
         let rate = lane.get(key);
         if rate.is_given() {
             rate.report::<()>("must not be given: the critical lane forwards every sample");
         }
     }
-    let unlimited = RatePolicy {
-        max_rate_hz: f64::INFINITY,
-        max_bytes_per_s: None,
-        stale_threshold_ms: 0,
-        drop_policy: DropPolicy::DropOldest,
-        queue_samples: 1,
-    };
-    LaneRates { normal: unlimited, degraded: unlimited }
 }
 
 /// The section `routing_policy`: the defaults of all noncritical lanes.

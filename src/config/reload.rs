@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 
 use super::keys::Key;
 use super::settings::{
-    Classifier, DdsNetwork, Diagnostics, InputQos, Lane, LaneRates, Output, Probes, RatePolicy, Route,
-    Safety, Scheduling, Security, Settings, SharedMemory,
+    Classifier, DdsNetwork, Diagnostics, Forwarding, InputQos, Lane, LaneRates, Output, Probes, RatePolicy,
+    Route, Safety, Scheduling, Security, Settings, SharedMemory,
 };
 use super::shown::Shown;
-use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, TrafficClass, fnv1a};
+use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, fnv1a};
 
 /// One setting that differs between the configuration in force and a file, with its values as in the file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -236,31 +236,35 @@ fn reload_lane(d: &mut Differ, old: &Lane, new: &Lane) -> Lane {
         Lane {
             queue_depth, max_borrowed, by_reference_min_bytes, window_samples;
             name: old.name.clone(),
-            class: old.class,
+            forwarding: forwarding(d, old, new),
             network: network(d, &of, &old.network, &new.network),
             outputs: old.outputs.clone(),
-            rates: lane_rates(d, old, new),
             scheduling: scheduling(d, &of, &old.scheduling, &new.scheduling),
         }
     )
 }
 
-fn lane_rates(d: &mut Differ, old: &Lane, new: &Lane) -> LaneRates {
+fn forwarding(d: &mut Differ, old: &Lane, new: &Lane) -> Forwarding {
+    // A lane of the same name has the same class.
+    let (Forwarding::Limited(old_rates), Forwarding::Limited(new_rates)) = (&old.forwarding, &new.forwarding)
+    else {
+        return old.forwarding.clone();
+    };
     // Samples that wait in the lane occupy shared memory, whose size is fixed at the start.
-    let would_borrow = Lane { rates: new.rates, ..old.clone() }.max_borrowed_in_all();
-    let has_room = old.class == TrafficClass::Critical || would_borrow == old.max_borrowed_in_all();
-    let LaneRates { normal, degraded } = &old.rates;
-    LaneRates {
-        normal: rate_policy(d, &old.name, ["", ""], has_room, normal, new.rates.normal),
+    let would_borrow = Lane { forwarding: new.forwarding.clone(), ..old.clone() }.max_borrowed_in_all();
+    let has_room = would_borrow == old.max_borrowed_in_all();
+    let LaneRates { normal, degraded } = old_rates;
+    Forwarding::Limited(LaneRates {
+        normal: rate_policy(d, &old.name, ["", ""], has_room, normal, new_rates.normal),
         degraded: rate_policy(
             d,
             &old.name,
             ["degraded_", " in DEGRADED"],
             has_room,
             degraded,
-            new.rates.degraded,
+            new_rates.degraded,
         ),
-    }
+    })
 }
 
 /// Reloads the rates of one mode. `mode` has the prefix of keys that exist for each mode, and the suffix that

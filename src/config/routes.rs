@@ -168,7 +168,7 @@ impl<'f> RouteReader<'_, 'f> {
                 }
                 _ => continue,
             };
-            let qos = override_qos.over(profile.unwrap_or(*lane_qos)).complete(lane.class);
+            let qos = override_qos.over(profile.unwrap_or(*lane_qos)).complete(lane.class());
             outputs.push(OutputDraft { lane: index, topic, field: given, qos });
         }
         outputs

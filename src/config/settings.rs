@@ -125,13 +125,22 @@ pub struct InputQos {
     pub deadline_ms: Option<u64>,
 }
 
+/// What a lane forwards of the samples of its routes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Forwarding {
+    /// Every sample, at once: a critical lane.
+    Everything,
+    /// Samples that are not too old, as many as these rates allow in each mode: a noncritical lane.
+    Limited(LaneRates),
+}
+
 /// One lane: a process, its DDS participant and a writer for each route.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Lane {
     /// Its name.
     pub name: LaneName,
-    /// Critical or noncritical.
-    pub class: TrafficClass,
+    /// What it forwards, which makes it critical or noncritical.
+    pub forwarding: Forwarding,
     /// The network of its subscribers.
     pub network: DdsNetwork,
     /// Its outputs, one for each route that it serves, in the order of the routes.
@@ -144,13 +153,19 @@ pub struct Lane {
     pub by_reference_min_bytes: usize,
     /// The most unacknowledged samples of a RELIABLE writer of the lane.
     pub window_samples: usize,
-    /// Rates and staleness by mode. A critical lane does not use them; its rate is infinite.
-    pub rates: LaneRates,
     /// Scheduling of the lane's process.
     pub scheduling: Scheduling,
 }
 
 impl Lane {
+    /// Critical or noncritical.
+    pub const fn class(&self) -> TrafficClass {
+        match self.forwarding {
+            Forwarding::Everything => TrafficClass::Critical,
+            Forwarding::Limited(_) => TrafficClass::Noncritical,
+        }
+    }
+
     /// Whether any route has an output on this lane. The two built-in lanes always exist; a lane without an
     /// output has no process.
     pub fn is_used(&self) -> bool {
@@ -160,11 +175,9 @@ impl Lane {
     /// The most samples of each route that the lane holds in shared memory: a noncritical lane also holds
     /// those in its own queue, the sample that it takes next and the one that it sends.
     pub fn max_borrowed_in_all(&self) -> usize {
-        let waiting = match self.class {
-            TrafficClass::Critical => 0,
-            TrafficClass::Noncritical => {
-                self.rates.normal.queue_samples.max(self.rates.degraded.queue_samples) + 2
-            }
+        let waiting = match &self.forwarding {
+            Forwarding::Everything => 0,
+            Forwarding::Limited(rates) => rates.normal.queue_samples.max(rates.degraded.queue_samples) + 2,
         };
         self.max_borrowed.max(waiting)
     }

@@ -32,6 +32,13 @@ fn messages_in(text: &str, env: &dyn Fn(&str) -> Option<String>) -> Vec<String> 
     }
 }
 
+fn rates(lane: &Lane) -> LaneRates {
+    match &lane.forwarding {
+        Forwarding::Limited(rates) => *rates,
+        Forwarding::Everything => panic!("lane {} has no rates", lane.name),
+    }
+}
+
 fn lane<'a>(settings: &'a Settings, name: &str) -> &'a Lane {
     settings.lane(&LaneName::try_from(name).unwrap()).unwrap()
 }
@@ -54,8 +61,8 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
         queue_samples: 5,
     };
     let degraded = RatePolicy { max_rate_hz: 3.0, queue_samples: 2, ..normal };
-    assert_eq!(noncritical.rates, LaneRates { normal, degraded });
-    assert_eq!(critical.rates.normal.max_rate_hz, f64::INFINITY);
+    assert_eq!(noncritical.forwarding, Forwarding::Limited(LaneRates { normal, degraded }));
+    assert_eq!(critical.forwarding, Forwarding::Everything);
     assert_eq!(settings.routes[0].max_sample_bytes, 1 << 20);
     assert_eq!(settings.routes[0].retained_samples, 8);
     assert_eq!(settings.routes[0].input_qos, InputQos::default());
@@ -169,7 +176,7 @@ fn rates_come_from_lane_then_mode_then_routing_policy() {
         drop_policy,
         queue_samples,
     };
-    let rates = |name: &str| lane(&settings, name).rates;
+    let rates = |name: &str| rates(lane(&settings, name));
     assert_eq!(rates("noncritical").normal, policy(20.0, None, 900, DropPolicy::DropLatest, 12));
     assert_eq!(rates("noncritical").degraded, policy(3.0, None, 100, DropPolicy::DropStale, 1));
     assert_eq!(rates("slow").normal, policy(2.0, Some(1000), 0, DropPolicy::DropLatest, 9));
@@ -182,17 +189,17 @@ fn rates_come_from_lane_then_mode_then_routing_policy() {
 fn the_safety_limit_applies_to_the_queue_of_a_mode_without_its_own_limit() {
     let text =
         "safety: {max_noncritical_queue: 6}\nrouting_policy: {modes: {normal: {noncritical_depth: 30}}}\n";
-    assert_eq!(with(text).lanes[1].rates.normal.queue_samples, 6);
+    assert_eq!(rates(&with(text).lanes[1]).normal.queue_samples, 6);
 }
 
 #[test]
 fn disabled_noncritical_lanes_forward_nothing() {
     let settings = with("routing_policy: {noncritical_enabled: false}\nlanes: {rviz: {max_rate_hz: 5}}\n");
     for name in ["noncritical", "rviz"] {
-        let rates = lane(&settings, name).rates;
+        let rates = rates(lane(&settings, name));
         assert_eq!((rates.normal.max_rate_hz, rates.degraded.max_rate_hz), (0.0, 0.0));
     }
-    assert_eq!(settings.lanes[0].rates.normal.max_rate_hz, f64::INFINITY);
+    assert_eq!(settings.lanes[0].forwarding, Forwarding::Everything);
 }
 
 #[test]

@@ -112,7 +112,7 @@ pub fn up(
     for lane in settings.lanes.iter().filter(|lane| lane.is_used()) {
         let name = format!("egress-{}", lane.name);
         let own = ["egress", "--lane", lane.name.as_str()];
-        let hang_ms = if lane.class == TrafficClass::Critical { HANG_CRITICAL_MS } else { HANG_MS };
+        let hang_ms = if lane.class() == TrafficClass::Critical { HANG_CRITICAL_MS } else { HANG_MS };
         children.push(Supervised::new(&name, &own, arguments, &folder, hang_ms));
     }
     children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));

@@ -194,10 +194,10 @@ impl Snapshot {
             let egress = process(boards, format!("egress-{}", lane.name), ProcessRole::Egress(index), now)?;
             let policy = consistent(boards.policy(index))?;
             let hold_ms = settings.policy_hold_ms;
-            let (mode, reason, ends_at) = mode_of(&policy, lane.class, control_runs, now, hold_ms);
+            let (mode, reason, ends_at) = mode_of(&policy, lane.class(), control_runs, now, hold_ms);
             lanes.push(LaneReading {
                 name: lane.name.clone(),
-                class: lane.class,
+                class: lane.class(),
                 policy,
                 mode,
                 reason,

@@ -6,8 +6,8 @@ use std::fs;
 use std::path::Path;
 
 use adaptive_bridge::config::{
-    self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, KEYS, Kind, LaneRates,
-    Place, Probes, RatePolicy, Row, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
+    self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, Forwarding, KEYS, Kind,
+    LaneRates, Place, Probes, RatePolicy, Row, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
 };
 use adaptive_bridge::model::{QosProfile, TopicName, TypeName};
 use proptest::prelude::*;
@@ -130,7 +130,7 @@ fn the_originals_default_file_keeps_its_meaning() {
     assert_eq!(lane.outputs[0].qos, QosProfile { lifespan_ms: Some(500), ..QosProfile::NONCRITICAL });
     let normal = policy(10.0, 5, DropPolicy::DropOldest, 500);
     let degraded = policy(3.0, 2, DropPolicy::DropStale, 250);
-    assert_eq!(lane.rates, LaneRates { normal, degraded });
+    assert_eq!(lane.forwarding, Forwarding::Limited(LaneRates { normal, degraded }));
     assert_eq!(settings.classifier, original_classifier());
     assert_eq!(settings.probes, original_probes());
     assert_eq!(settings.safety, original_safety(50));
@@ -146,7 +146,7 @@ fn the_originals_minimal_file_keeps_its_meaning() {
     assert_eq!(lane.outputs[0].qos, QosProfile::NONCRITICAL);
     let normal = policy(5.0, 3, DropPolicy::DropOldest, 600);
     let degraded = policy(1.0, 1, DropPolicy::DropStale, 300);
-    assert_eq!(lane.rates, LaneRates { normal, degraded });
+    assert_eq!(lane.forwarding, Forwarding::Limited(LaneRates { normal, degraded }));
     assert_eq!(settings.classifier, original_classifier());
     let probes = Probes {
         rate_hz: 2.0,
@@ -171,7 +171,7 @@ fn the_originals_stress_file_keeps_its_meaning() {
     assert_eq!(lane.outputs[0].qos, QosProfile { lifespan_ms: Some(500), ..QosProfile::NONCRITICAL });
     let normal = policy(3.0, 3, DropPolicy::DropStale, 300);
     let degraded = policy(1.0, 1, DropPolicy::DropStale, 150);
-    assert_eq!(lane.rates, LaneRates { normal, degraded });
+    assert_eq!(lane.forwarding, Forwarding::Limited(LaneRates { normal, degraded }));
     let classifier = Classifier {
         evaluate_rate_hz: 5.0,
         thresholds: ClassifierThresholds {
@@ -646,7 +646,10 @@ fn a_longer_queue_is_reloaded_only_if_shared_memory_has_room_for_it() {
              lanes: {{noncritical: {{queue_samples: {samples}, max_rate_hz: {samples}}}}}"
         ))
     };
-    let rates = |settings: &Settings| settings.lanes[1].rates.normal;
+    let rates = |settings: &Settings| match &settings.lanes[1].forwarding {
+        Forwarding::Limited(rates) => rates.normal,
+        Forwarding::Everything => panic!("{:?}", settings.lanes[1]),
+    };
     let (reloaded, reload) = with(5).reloaded(with(6));
     assert_eq!((rates(&reloaded).queue_samples, reload.waits.len()), (6, 0));
     for (old, new) in [(5, 50), (50, 5)] {

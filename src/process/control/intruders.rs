@@ -86,7 +86,7 @@ impl EndpointMonitor {
                 }
                 for output in &configured.outputs {
                     outputs.insert(output.topic.to_dds(), (lane, output.route));
-                    if configured.class != TrafficClass::Critical {
+                    if configured.class() != TrafficClass::Critical {
                         continue;
                     }
                     guarded.push(GuardedTopic {
@@ -342,7 +342,7 @@ impl WatchedNetwork {
 
 /// The output topic of a route on a noncritical lane.
 fn noncritical_output(settings: &Settings, route: usize) -> Option<crate::model::TopicName> {
-    let noncritical = settings.lanes.iter().filter(|lane| lane.class == TrafficClass::Noncritical);
+    let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
     outputs.find(|output| output.route == route).map(|output| output.topic.clone())
 }

@@ -268,7 +268,7 @@ impl Control {
     /// Decides the mode of a lane and the safety floor (the mildest mode that the safety supervisor allows).
     /// Logs changes.
     fn decide_lane(&mut self, lane: usize) -> (LaneMode, LaneMode) {
-        let class = self.settings.lanes[lane].class;
+        let class = self.settings.lanes[lane].class();
         let decision = self.subscribers.lane_mode(&self.settings, lane);
         let safety_floor = safety_floor(
             class,

@@ -165,7 +165,7 @@ impl Supervision {
             queued = queued.max(queued_samples(&counters, published[output.route]));
             waiting = waiting.max(counters.waiting);
             caught_up += counters.caught_up;
-            let lag_ms = self.read_writer_lag_ms(boards, lane, output.route, configured.class);
+            let lag_ms = self.read_writer_lag_ms(boards, lane, output.route, configured.class());
             writer_lag_ms = match (writer_lag_ms, lag_ms) {
                 (Some(one), Some(other)) => Some(one.max(other)),
                 (one, other) => one.or(other),
@@ -178,7 +178,7 @@ impl Supervision {
             writer_lag_ms = None;
         }
         let (silent_ms, errors) = previous.advance(boards, ProcessRole::Egress(lane), total, now)?;
-        let is_critical = configured.class == TrafficClass::Critical;
+        let is_critical = configured.class() == TrafficClass::Critical;
         Some(ProcessLoad {
             silent_ms,
             errors,
@@ -186,7 +186,7 @@ impl Supervision {
             queue_capacity: if is_critical { configured.queue_depth as u64 } else { 0 },
             waiting: if is_critical { 0 } else { waiting },
             writer_lag_ms,
-            ..ProcessLoad::idle(configured.name.as_str(), configured.class)
+            ..ProcessLoad::idle(configured.name.as_str(), configured.class())
         })
     }
 

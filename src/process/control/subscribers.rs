@@ -292,7 +292,7 @@ impl Subscribers {
             .filter(|subscriber| subscriber.lane == lane)
             .map(|subscriber| (subscriber.id.as_str(), subscriber.classifier.state(thresholds)));
         let enabled = settings.classifier.enabled || !settings.overrides.is_empty();
-        lane_mode(settings.lanes[lane].class, enabled, states, &settings.safety.rules)
+        lane_mode(settings.lanes[lane].class(), enabled, states, &settings.safety.rules)
     }
 
     /// The number of subscribers.

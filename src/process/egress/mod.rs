@@ -23,7 +23,7 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{Configuration, Lane, Settings};
+use crate::config::{Configuration, Forwarding, Lane, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::effective_mode;
@@ -67,7 +67,7 @@ pub fn egress(
     let lane = &settings.lanes[index];
     info!(
         lane = name,
-        class = lane.class.label(),
+        class = lane.class().label(),
         routes = lane.outputs.len(),
         domain_id = lane.network.domain_id,
         "egress is up"
@@ -135,9 +135,9 @@ impl Egress {
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
         }
         let now = clock::monotonic();
-        let forwarder = match lane.class {
-            TrafficClass::Critical => Forwarder::Critical,
-            TrafficClass::Noncritical => Forwarder::Noncritical(Noncritical::new(lane, now)),
+        let forwarder = match &lane.forwarding {
+            Forwarding::Everything => Forwarder::Critical,
+            Forwarding::Limited(rates) => Forwarder::Noncritical(Noncritical::new(lane, *rates, now)),
         };
         let sleeper = role.boards.sleeper(index);
         let mut egress = Self {
@@ -233,12 +233,13 @@ impl Egress {
             return;
         };
         self.policy.policy_hold_ms = settings.policy_hold_ms;
-        let rates = settings.lanes[self.index].rates;
-        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
-            lane.set_rates(rates, &mut self.outputs, now);
-            for output in &mut self.outputs {
-                output.set_drop_policy(rates.normal.drop_policy);
-            }
+        let forwarding = &settings.lanes[self.index].forwarding;
+        if let (Forwarder::Noncritical(lane), Forwarding::Limited(rates)) = (&mut self.forwarder, forwarding)
+        {
+            lane.set_rates(*rates, &mut self.outputs, now);
+        }
+        for output in &mut self.outputs {
+            output.set_forwarding(forwarding);
         }
     }
 
@@ -303,7 +304,7 @@ impl PolicyWatch {
         Self {
             lane: index,
             name: lane.name.clone(),
-            class: lane.class,
+            class: lane.class(),
             policy_hold_ms: settings.policy_hold_ms,
             policy: LanePolicy::default(),
             mode: LaneMode::Normal,

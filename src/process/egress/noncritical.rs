@@ -21,16 +21,16 @@ pub(super) struct Noncritical {
 }
 
 impl Noncritical {
-    pub fn new(lane: &Lane, now: MonotonicNs) -> Self {
+    pub fn new(lane: &Lane, rates: LaneRates, now: MonotonicNs) -> Self {
         let shapers = lane
             .outputs
             .iter()
-            .map(|output| RouteShaper::new(rates_of(lane.rates, output.qos.durability), now))
+            .map(|output| RouteShaper::new(rates_of(rates, output.qos.durability), now))
             .collect();
         Self {
-            rates: lane.rates,
+            rates,
             mode: LaneMode::Normal,
-            budget: ByteBudget::new(lane.rates.normal.max_bytes_per_s, now),
+            budget: ByteBudget::new(rates.normal.max_bytes_per_s, now),
             turn_order: PollOrder::default(),
             shapers,
         }

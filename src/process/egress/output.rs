@@ -11,7 +11,7 @@ use super::super::role::{Role, RoleError};
 use super::late_joiners::{KeptSample, LateJoiners};
 use super::unsent::{Unsent, UnsentSamples};
 use crate::clock;
-use crate::config::{self, DropPolicy, Settings};
+use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
@@ -114,14 +114,14 @@ impl Output {
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
-            class: lane.class,
+            class: lane.class(),
             route: output.route,
             dds_topic: output.topic.to_dds(),
             qos: output.qos,
             window_samples: lane.window_samples,
             by_reference_min_bytes: lane.by_reference_min_bytes,
-            overwrite_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
-            gap_reason: overwrite_reason(lane.class, lane.rates.normal.drop_policy),
+            overwrite_reason: overwrite_reason(&lane.forwarding),
+            gap_reason: overwrite_reason(&lane.forwarding),
             mode: LaneMode::Normal,
             subscriber,
             writer: None,
@@ -293,9 +293,9 @@ impl Output {
         };
     }
 
-    /// Applies another drop policy of the lane.
-    pub fn set_drop_policy(&mut self, policy: DropPolicy) {
-        self.overwrite_reason = overwrite_reason(self.class, policy);
+    /// Applies another drop policy of the lane, which is the reason of gaps in its channel queue.
+    pub fn set_forwarding(&mut self, forwarding: &Forwarding) {
+        self.overwrite_reason = overwrite_reason(forwarding);
         self.set_mode(self.mode);
     }
 
@@ -546,10 +546,12 @@ fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
 /// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too
 /// slow. A noncritical one sleeps until it has a token, and the drop policy decides which samples are lost
 /// meanwhile.
-const fn overwrite_reason(class: TrafficClass, policy: DropPolicy) -> DropReason {
-    match (class, policy) {
-        (TrafficClass::Critical, _) => DropReason::QueueOverflow,
-        (TrafficClass::Noncritical, DropPolicy::DropOldest) => DropReason::Superseded,
-        (TrafficClass::Noncritical, _) => DropReason::QueueFull,
+const fn overwrite_reason(forwarding: &Forwarding) -> DropReason {
+    match forwarding {
+        Forwarding::Everything => DropReason::QueueOverflow,
+        Forwarding::Limited(rates) => match rates.normal.drop_policy {
+            DropPolicy::DropOldest => DropReason::Superseded,
+            _ => DropReason::QueueFull,
+        },
     }
 }

@@ -68,7 +68,7 @@ impl Drop for EarlyWaker {
 fn apart(settings: &Settings) -> Option<Vec<usize>> {
     let ingress = &settings.ingress_scheduling.cpus;
     let mut cpus = Vec::new();
-    for lane in settings.lanes.iter().filter(|lane| lane.class == TrafficClass::Critical) {
+    for lane in settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Critical) {
         let of_lane = &lane.scheduling.cpus;
         if of_lane.is_empty() || of_lane.iter().any(|cpu| ingress.contains(cpu)) {
             return None;

@@ -107,7 +107,7 @@ impl Ingress {
         }
         let mut lanes = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
-            for (index, lane) in settings.lanes.iter().enumerate().filter(|(_, lane)| lane.class == class) {
+            for (index, lane) in settings.lanes.iter().enumerate().filter(|(_, lane)| lane.class() == class) {
                 let serves = (0..settings.routes.len())
                     .map(|route| lane.outputs.iter().any(|output| output.route == route))
                     .collect();
