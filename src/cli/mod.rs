@@ -64,7 +64,7 @@ enum Command {
     /// Run control: probe and classify subscribers, set the lanes' modes, supervise the bridge
     Control(ConfigArguments),
     /// Run the whole bridge: a supervisor with all other processes as its children
-    Up(ConfigArguments),
+    Up(roles::UpArguments),
     /// Show the state of the running bridge: problems, processes, rates, drops, latencies
     Status(status::Arguments),
     /// Read the samples of a route directly from shared memory

@@ -24,6 +24,17 @@ pub(super) struct EgressArguments {
     config: ConfigArguments,
 }
 
+/// The arguments of `up`.
+#[derive(Args, Debug)]
+pub(super) struct UpArguments {
+    /// Leave processes alone that make no progress, for example because a debugger has stopped them; otherwise
+    /// they are killed and restarted after 2 s (ingress, critical lane) or 5 s
+    #[arg(long)]
+    no_watchdog: bool,
+    #[command(flatten)]
+    config: ConfigArguments,
+}
+
 pub(super) fn ingress(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
     role(arguments, |configuration, reloads, stop| process::ingress(&configuration.settings, reloads, stop))
 }
@@ -48,16 +59,20 @@ pub(super) fn control(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode>
     })
 }
 
-pub(super) fn up(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
+pub(super) fn up(arguments: &UpArguments) -> Result<ExitCode, ExitCode> {
     let hang_up = HangUp::on_signal().map_err(|error| failed(&error))?;
     // `up` starts the whole bridge, so it reads the file and not the configuration in force.
-    let configuration = arguments.try_load_configuration().map_err(|error| bad_configuration(&error))?;
+    let configuration =
+        arguments.config.try_load_configuration().map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
-    let child_arguments: Vec<OsString> = match arguments.path() {
+    let child_arguments: Vec<OsString> = match arguments.config.path() {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
     };
-    run(|stop| process::up(configuration, &arguments.file(), &child_arguments, &hang_up, stop))
+    let watchdog = !arguments.no_watchdog;
+    run(|stop| {
+        process::up(configuration, &arguments.config.file(), &child_arguments, watchdog, &hang_up, stop)
+    })
 }
 
 /// Runs one process of the bridge with the configuration in force.

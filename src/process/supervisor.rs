@@ -91,7 +91,7 @@ pub fn end_with_supervisor() {
 /// Puts `configuration`, which was read from `file`, in force, and runs ingress, every lane and control as
 /// children until `stop` is requested. Each child gets `arguments` (such as the configuration file) after its
 /// own. The supervisor forwards a SIGHUP to its children, each of which validates the file before it applies
-/// any change. Lanes that were added to the file after the start are not started.
+/// any change. With `watchdog` it restarts children that make no progress. Lanes that were added to the file after the start are not started.
 ///
 /// # Errors
 /// The bridge runs already, the first start of a child failed, or all children gave up.
@@ -99,6 +99,7 @@ pub fn up(
     configuration: Configuration,
     file: &Path,
     arguments: &[OsString],
+    watchdog: bool,
     hang_up: &HangUp,
     stop: &Stop,
 ) -> Result<(), SupervisorError> {
@@ -123,7 +124,7 @@ pub fn up(
             break;
         }
     }
-    let mut report = ManagerReport::new(settings);
+    let mut report = ManagerReport::new(settings, watchdog);
     while outcome.is_ok() && !stop.is_requested() {
         #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
         std::thread::sleep(Duration::from_millis(POLL_MS));
@@ -156,14 +157,16 @@ pub fn up(
 /// manager of `up`, where there is one.
 struct ManagerReport<'a> {
     settings: &'a Settings,
+    /// Whether to kill children that hang.
+    watchdog: bool,
     notifier: Notifier,
     read_at: MonotonicNs,
     last: Option<Snapshot>,
 }
 
 impl<'a> ManagerReport<'a> {
-    fn new(settings: &'a Settings) -> Self {
-        Self { settings, notifier: Notifier::new(), read_at: MonotonicNs(0), last: None }
+    fn new(settings: &'a Settings, watchdog: bool) -> Self {
+        Self { settings, watchdog, notifier: Notifier::new(), read_at: MonotonicNs(0), last: None }
     }
 
     /// Kills children that hang, feeds the watchdog, reports readiness, and sends the status line. `up` is
@@ -191,7 +194,9 @@ impl<'a> ManagerReport<'a> {
             // A child that has not completed its first turn is still starting.
             if let Some(health) = health.filter(|one| one.turns > 0 && Some(one.pid) == child.pid()) {
                 turned += 1;
-                child.check_progress(health.alive_at, now);
+                if self.watchdog {
+                    child.check_progress(health.alive_at, now);
+                }
             }
         }
         if !self.notifier.is_enabled() {

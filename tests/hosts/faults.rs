@@ -61,7 +61,7 @@ fn shared_memory_of(instance: &str) -> Vec<String> {
 #[test]
 fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample() {
     let test = "a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample";
-    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let Some(bed) = Bed::start_without_watchdog(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let slow = bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL);
     slow.wait_received(5);
