@@ -27,8 +27,8 @@ pub(super) struct EgressArguments {
 /// The arguments of `up`.
 #[derive(Args, Debug)]
 pub(super) struct UpArguments {
-    /// Leave processes alone that make no progress, for example because a debugger has stopped them; otherwise
-    /// they are killed and restarted after 2 s (ingress, critical lane) or 5 s
+    /// Leave processes alone that make no progress, for example because a debugger has stopped them;
+    /// otherwise they are killed and restarted after 2 s (ingress, critical lane) or 5 s
     #[arg(long)]
     no_watchdog: bool,
     #[command(flatten)]

@@ -2,7 +2,8 @@
 //!
 //! Payloads are forwarded as the bytes that were on the wire, with their encapsulation header, and are never
 //! decoded; so the bridge forwards any message type. The public interface has no RustDDS types, so that
-//! another DDS library could replace RustDDS, except the two traits by which it borrows memory from the bridge.
+//! another DDS library could replace RustDDS, except the two traits by which that borrows memory from the
+//! bridge.
 
 mod arrival_flag;
 mod arrivals;

@@ -91,7 +91,8 @@ pub fn end_with_supervisor() {
 /// Puts `configuration`, which was read from `file`, in force, and runs ingress, every lane and control as
 /// children until `stop` is requested. Each child gets `arguments` (such as the configuration file) after its
 /// own. The supervisor forwards a SIGHUP to its children, each of which validates the file before it applies
-/// any change. With `watchdog` it restarts children that make no progress. Lanes that were added to the file after the start are not started.
+/// any change. With `watchdog` it restarts children that make no progress. Lanes that were added to the file
+/// after the start are not started.
 ///
 /// # Errors
 /// The bridge runs already, the first start of a child failed, or all children gave up.

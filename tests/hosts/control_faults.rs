@@ -60,8 +60,8 @@ fn file(more: &str) -> String {
     )
 }
 
-/// Starts the whole bridge and waits until every process is running.
-// Several tests stop a process for longer than the watchdog allows.
+/// Starts the whole bridge and waits until every process is running. Without the watchdog, because several
+/// tests stop a process for longer than it allows.
 fn up(bridge: &Bridge, host: &Host) -> Process {
     let up = bridge.start_on(host, "up --no-watchdog");
     wait_running(bridge);
