@@ -99,7 +99,7 @@ const fn verdict_class(verdict: Verdict) -> &'static str {
     match verdict {
         Verdict::Confirmed => "good",
         Verdict::Partly => "fair",
-        Verdict::NotConfirmed => "poor",
+        Verdict::Contradicted => "poor",
         Verdict::Incomplete | Verdict::NotSeen | Verdict::NotTested => "none",
     }
 }

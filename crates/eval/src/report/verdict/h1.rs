@@ -32,7 +32,7 @@ struct AtPlace {
 pub fn finding(results: &Results, reading: &str) -> Finding {
     let (mut criteria, mut places) = (Vec::new(), Vec::new());
     for place in results.places() {
-        let Some(clean) = results.cell(place, reading, "baseline_clean") else { continue };
+        let Some(clean) = clean_baseline(results, place, reading) else { continue };
         let mut at =
             AtPlace { place: place.clone(), rate: Vec::new(), latency: Vec::new(), levels: 0, gap_ms: 0.0 };
         for scenario in LEVELS {
@@ -60,7 +60,7 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
     } else if any {
         Verdict::Partly
     } else if places.iter().filter(on_fast).any(|at| at.levels == whole) {
-        Verdict::NotConfirmed
+        Verdict::Contradicted
     } else {
         Verdict::NotSeen
     };
@@ -87,6 +87,17 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
         criteria,
         missing: missing.collect(),
     }
+}
+
+/// The clean baseline at a place, or else with the other switch: without loss the switch has nothing to
+/// reassemble or to discard.
+fn clean_baseline<'a>(results: &'a Results, place: &Place, reading: &str) -> Option<&'a Cell> {
+    let scenario = "baseline_clean";
+    let same_but_switch =
+        |other: &&Place| (&other.library, &other.bed) == (&place.library, &place.bed);
+    results.cell(place, reading, scenario).or_else(|| {
+        results.places().into_iter().filter(same_but_switch).find_map(|other| results.cell(other, reading, scenario))
+    })
 }
 
 impl AtPlace {
@@ -159,10 +170,16 @@ pub fn mechanism(cell: &Cell) -> Option<String> {
     {
         text += &format!(
             " While calls fail, the publisher sends no samples: the critical subscriber was without a sample \
-             for up to {} s, and each sample that the writer took reached it within {} ms.",
+             for up to {} s. It received samples up to {} ms after they were written",
             format::number(gap_ms / 1e3, 1),
             format::ms(max_ms)
         );
+        let lost = cell.median(|one| Some(one.critical.lost as f64)).unwrap_or(0.0);
+        text += &if lost > 0.0 {
+            format!(", and missed {} that the writer took.", format::count(lost))
+        } else {
+            ", and each one that the writer took.".to_owned()
+        };
     }
     if memory > 0.0 || discarded > 0.0 {
         text += &format!(

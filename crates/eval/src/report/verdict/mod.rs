@@ -1,6 +1,6 @@
 //! Verdicts on the paper's hypotheses (section IV-A), computed from the runs by rules that the report lists.
 //!
-//! A verdict can be "not confirmed", and a hypothesis whose scenarios were not run is never confirmed.
+//! A verdict can be "contradicted", and a hypothesis whose scenarios were not run is never confirmed.
 
 mod below_dds;
 mod h1;
@@ -21,7 +21,7 @@ pub enum Verdict {
     /// Some rules hold, and some do not.
     Partly,
     /// The required scenarios were run, and no rule holds.
-    NotConfirmed,
+    Contradicted,
     /// All rules hold in the scenarios that were run, but some required scenarios were not run.
     Incomplete,
     /// No rule holds in the scenarios that were run, but some required scenarios were not run.
@@ -36,7 +36,7 @@ impl Verdict {
         match self {
             Self::Confirmed => "confirmed",
             Self::Partly => "partly confirmed",
-            Self::NotConfirmed => "not confirmed",
+            Self::Contradicted => "contradicted",
             Self::Incomplete => "holds so far, incomplete",
             Self::NotSeen => "not seen so far, incomplete",
             Self::NotTested => "not tested",
@@ -94,7 +94,7 @@ impl Finding {
             (_, 0, 0) => Verdict::Confirmed,
             (_, 0, _) => Verdict::Incomplete,
             (rules, broken, _) if broken < rules => Verdict::Partly,
-            _ => Verdict::NotConfirmed,
+            _ => Verdict::Contradicted,
         };
         let because = if rules.is_empty() {
             "None of the required scenarios was run.".to_owned()

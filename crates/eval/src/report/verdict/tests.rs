@@ -34,15 +34,15 @@ fn h1_is_confirmed_for_the_reading_in_which_all_rules_hold() {
 }
 
 #[test]
-fn h1_is_partly_confirmed_or_not_confirmed() {
+fn h1_is_partly_confirmed_or_contradicted() {
     assert_eq!(finding(&baselines("as-run", 20.0, 0.9), 1).verdict, Verdict::Partly);
     let none = finding(&baselines("as-printed", 30.0, 0.95), 0);
-    assert_eq!(none.verdict, Verdict::NotConfirmed);
+    assert_eq!(none.verdict, Verdict::Contradicted);
     assert!(none.because.contains("rate degraded at no level"), "{}", none.because);
     // The limits: 5 % of the rate, ten times the latency.
-    assert_eq!(finding(&baselines("as-run", 28.6, 8.9), 1).verdict, Verdict::NotConfirmed);
+    assert_eq!(finding(&baselines("as-run", 28.6, 8.9), 1).verdict, Verdict::Contradicted);
     assert_eq!(finding(&baselines("as-run", 28.4, 9.1), 1).verdict, Verdict::Confirmed);
-    // One level is not enough for "not confirmed", and without a clean run there is no verdict.
+    // One level is not enough for "contradicted", and without a clean run there is no verdict.
     let some: Vec<MadeUp> = baselines("as-run", 30.0, 0.9).into_iter().take(2).collect();
     assert_eq!(finding(&some, 1).verdict, Verdict::NotSeen);
     assert_eq!(finding(&baselines("as-run", 20.0, 12_000.0)[1..], 1).verdict, Verdict::NotTested);
