@@ -11,7 +11,10 @@ use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter, ReaderQos, Take};
-use crate::model::{Encapsulation, FixedText, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp};
+use crate::model::{
+    Encapsulation, FixedText, Guid, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp,
+};
+use crate::policy::SenderLimits;
 
 /// History depth of the response reader: the responses of 64 responders at 5 Hz for three seconds.
 const RESPONSE_DEPTH: u32 = 1024;
@@ -19,6 +22,12 @@ const RESPONSE_DEPTH: u32 = 1024;
 /// Probes that a link remembers, to distinguish a late or repeated response from an unsolicited one: 100 s at
 /// 5 Hz.
 const REMEMBERED_PROBES: usize = 512;
+
+/// Responders whose responses are limited in rate one by one; further ones share one rate.
+const MAX_RESPONDERS: usize = 2 * MAX_SUBSCRIBERS;
+
+/// The time whose responses may arrive at once, after an outage of a responder's link.
+const BURST_S: f64 = 10.0;
 
 /// A probe request that was sent.
 #[derive(Clone, Debug)]
@@ -59,6 +68,7 @@ pub(super) struct Link {
     probes: VecDeque<Probe>,
     next_seq: u64,
     scratch: Vec<u8>,
+    limits: SenderLimits<Guid>,
 }
 
 impl Link {
@@ -75,7 +85,13 @@ impl Link {
             probes: VecDeque::with_capacity(REMEMBERED_PROBES),
             next_seq: 1,
             scratch: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
+            limits: SenderLimits::with_burst(max_rate_hz(settings), BURST_S, MAX_RESPONDERS, clock::monotonic()),
         })
+    }
+
+    /// Applies a new configuration.
+    pub fn apply(&mut self, settings: &Settings, now: MonotonicNs) {
+        self.limits.set_rate(max_rate_hz(settings), now);
     }
 
     /// Sends the next probe; `None` if it could not be sent.
@@ -126,9 +142,9 @@ impl Link {
             match take {
                 Take::Empty => return None,
                 Take::Malformed => invalid.refused.add(ProbeRefusal::Malformed, 1),
-                Take::Sample(_) => {
+                Take::Sample(origin) => {
                     let arrived_at = clock::monotonic();
-                    match self.check(encapsulation, trust) {
+                    match self.check(encapsulation, trust, origin.writer, arrived_at) {
                         Ok((response, tolerated)) => {
                             if let Some(reason) = tolerated {
                                 invalid.accepted.add(reason, 1);
@@ -152,9 +168,11 @@ impl Link {
     /// Checks the message in the scratch buffer. The second value is the reason for which trust mode
     /// `default_deny` would have refused the response; `None` for an authentic one.
     fn check(
-        &self,
+        &mut self,
         encapsulation: Encapsulation,
         trust: &mut Trust,
+        writer: Guid,
+        now: MonotonicNs,
     ) -> Result<(ProbeResponse, Option<ProbeRefusal>), ProbeRefusal> {
         let response = ProbeResponse::decode(&self.scratch, encapsulation)?;
         // Checked before the signature: it is cheaper, and a response to another bridge's probe on a shared
@@ -164,9 +182,17 @@ impl Link {
         if probe.is_none_or(|probe| probe.id() != response.probe_id) {
             return Err(ProbeRefusal::Unsolicited);
         }
+        // After that, because a responder also answers other bridges on this topic, at their rates.
+        if !self.limits.allow(writer, now) {
+            return Err(ProbeRefusal::RateLimited);
+        }
         let tolerated = trust.check(&response, clock::wall())?;
         Ok((response, tolerated))
     }
+}
+
+fn max_rate_hz(settings: &Settings) -> f64 {
+    f64::from(settings.security.max_probe_rate_hz)
 }
 
 /// The id by which responders distinguish this bridge from others: instance and host name.

@@ -311,6 +311,7 @@ impl Control {
             self.settings = settings.clone();
             self.trust = load_trust(settings, inline_secret.as_ref());
             self.subscribers.apply(&self.settings, &self.link_of_lane, now);
+            self.links.iter_mut().for_each(|link| link.apply(&self.settings, now));
             // At once, together with the resulting modes, instead of at the next evaluation.
             self.subscribers.write_table(&self.settings);
             self.diagnostics.apply(&self.settings);

@@ -82,6 +82,15 @@ proptest! {
 }
 
 #[test]
+fn messages_held_up_by_an_outage_are_within_the_burst_and_a_flood_is_not() {
+    let mut limits = SenderLimits::with_burst(20.0, 10.0, 8, at_ms(0));
+    assert!((0..100).all(|_| limits.allow("laptop", at_ms(0))), "the responses of 5 s of probes at 20 Hz");
+    let flood = (0..10_000_u64).filter(|number| limits.allow("forger", at_ms(number / 10))).count();
+    assert!((203..=224).contains(&flood), "{flood} in one second");
+    assert!(limits.allow("laptop", at_ms(1_000)));
+}
+
+#[test]
 fn each_sender_has_its_own_rate() {
     let mut limits = SenderLimits::new(20.0, 8, at_ms(0));
     // One floods, one sends at 5 Hz.

@@ -118,6 +118,8 @@ pub const IDLE_SENDER_MS: u64 = 10_000;
 #[derive(Clone, Debug)]
 pub struct SenderLimits<K> {
     rate_hz: f64,
+    /// The time whose messages may arrive at once.
+    burst_s: f64,
     capacity: usize,
     senders: Vec<Sender<K>>,
     /// Shared by the senders that are not in the table.
@@ -135,21 +137,37 @@ struct Sender<K> {
 impl<K: PartialEq> SenderLimits<K> {
     /// A limit of `rate_hz` for each of at most `capacity` senders.
     pub fn new(rate_hz: f64, capacity: usize, now: MonotonicNs) -> Self {
-        Self {
-            rate_hz,
-            capacity,
-            senders: Vec::with_capacity(capacity),
-            others: TokenBucket::new(rate_hz, burst_for(rate_hz), now),
-            refused: 0,
+        let others = TokenBucket::new(rate_hz, burst_for(rate_hz), now);
+        Self { rate_hz, burst_s: 0.0, capacity, senders: Vec::with_capacity(capacity), others, refused: 0 }
+    }
+
+    /// Like [`new`](Self::new), but the messages of `burst_s` seconds may arrive at once, as after an outage
+    /// of the sender's link.
+    pub fn with_burst(rate_hz: f64, burst_s: f64, capacity: usize, now: MonotonicNs) -> Self {
+        let mut limits = Self { burst_s, ..Self::new(rate_hz, capacity, now) };
+        limits.others = limits.bucket(now);
+        limits
+    }
+
+    fn burst(&self) -> f64 {
+        burst_for(self.rate_hz) + self.rate_hz * self.burst_s
+    }
+
+    fn bucket(&self, now: MonotonicNs) -> TokenBucket {
+        if self.burst_s > 0.0 {
+            TokenBucket::full(self.rate_hz, self.burst(), now)
+        } else {
+            TokenBucket::new(self.rate_hz, self.burst(), now)
         }
     }
 
     /// Applies a new rate.
     pub fn set_rate(&mut self, rate_hz: f64, now: MonotonicNs) {
         self.rate_hz = rate_hz;
+        let burst = self.burst();
         let buckets = self.senders.iter_mut().map(|sender| &mut sender.bucket);
         for bucket in buckets.chain([&mut self.others]) {
-            bucket.set_rate(rate_hz, burst_for(rate_hz), now);
+            bucket.set_rate(rate_hz, burst, now);
         }
     }
 
@@ -183,7 +201,7 @@ impl<K: PartialEq> SenderLimits<K> {
     }
 
     fn allow_new(&mut self, key: K, now: MonotonicNs) -> bool {
-        let mut bucket = TokenBucket::new(self.rate_hz, burst_for(self.rate_hz), now);
+        let mut bucket = self.bucket(now);
         let idle_ns = IDLE_SENDER_MS * 1_000_000;
         if self.senders.len() < self.capacity {
             let allowed = bucket.try_take(now);
