@@ -738,6 +738,21 @@ impl DomainParticipant {
     Ok(())
   }
 
+  /// Readers of the topic that are made from now on do not return samples that
+  /// former Readers of the topic have received, which the participant keeps.
+  pub fn begin_now(&self, topic: &Topic) -> CreateResult<()> {
+    let cache = self.dds_cache();
+    let cache = cache
+      .read()
+      .map_err(|e| CreateError::Poisoned { reason: format!("DDSCache: {e}") })?;
+    let topic_cache = cache.get_existing_topic_cache(&topic.name())?;
+    let mut topic_cache = topic_cache
+      .lock()
+      .map_err(|e| CreateError::Poisoned { reason: format!("TopicCache: {e}") })?;
+    topic_cache.begin_now();
+    Ok(())
+  }
+
   /// Get a `DomainDomainParticipantStatusListener` that can be used
   /// to get `DomainParticipantStatusEvent`s for this DomainParticipant.
   pub fn status_listener(&self) -> DomainParticipantStatusListener {

@@ -162,6 +162,10 @@ pub(crate) struct TopicCache {
   // What the application has taken of each Writer before: Readers of the topic that
   // are made from now on begin after these samples.
   pub(crate) taken: BTreeMap<GUID, SequenceNumber>,
+
+  // BestEffort Readers of the topic that are made from now on begin after this key
+  // of `changes`.
+  pub(crate) begin_instant: Timestamp,
 }
 
 impl TopicCache {
@@ -180,11 +184,21 @@ impl TopicCache {
       received_reliably_before: BTreeMap::new(),
       lender: Lender::default(),
       taken: BTreeMap::new(),
+      begin_instant: Timestamp::ZERO,
     };
 
     new_self.update_keep_limits(topic_qos);
 
     new_self
+  }
+
+  // Lets Readers that are made from now on begin after what is here.
+  pub fn begin_now(&mut self) {
+    self.begin_instant = self.last_added_instant;
+    let highest = |(writer, numbers): (&GUID, &BTreeMap<SequenceNumber, Timestamp>)| {
+      numbers.last_key_value().map(|(number, _)| (*writer, *number))
+    };
+    self.taken = self.sequence_numbers.iter().filter_map(highest).collect();
   }
 
   pub fn update_keep_limits(&mut self, qos: &QosPolicies) {
@@ -736,6 +750,39 @@ mod tests {
       read_after_repair(&Discovery::builtin_sedp_reader_qos()),
       [SequenceNumber::new(1), SequenceNumber::new(2)]
     );
+  }
+
+  // A new Reader must not get what a former one has received, nor lose what comes
+  // from the moment of its creation on.
+  #[test]
+  fn a_reader_that_begins_now_gets_only_later_samples() {
+    let mut topic_cache = keep_all_topic_cache();
+    let writer = GUID::new(GuidPrefix::new(&[1; 12]), EntityId::SEDP_BUILTIN_PUBLICATIONS_WRITER);
+    let mut add = |topic_cache: &mut TopicCache, sn| {
+      let change = CacheChange::new(
+        writer,
+        SequenceNumber::new(sn),
+        WriteOptions::default(),
+        DDSData::new(SerializedPayload::default()),
+      );
+      topic_cache.add_change(&Timestamp::now(), change);
+      topic_cache.mark_reliably_received_before(writer, SequenceNumber::new(sn + 1));
+    };
+    for sn in 1..=3 {
+      add(&mut topic_cache, sn);
+    }
+    topic_cache.begin_now();
+    for sn in 4..=5 {
+      add(&mut topic_cache, sn);
+    }
+    let (begin, taken) = (topic_cache.begin_instant, topic_cache.taken.clone());
+    for is_reliable in [false, true] {
+      let numbers: Vec<i64> = topic_cache
+        .get_changes_in_range(is_reliable, begin, &taken)
+        .map(|(_, change)| i64::from(change.sequence_number))
+        .collect();
+      assert_eq!(numbers, [4, 5], "{is_reliable}");
+    }
   }
 
   fn keep_all_topic_cache() -> TopicCache {

@@ -64,9 +64,9 @@ pub(crate) struct ReadState<K: Key> {
 }
 
 impl<K: Key> ReadState<K> {
-  fn new(taken: BTreeMap<GUID, SequenceNumber>) -> Self {
+  fn new(begin_instant: Timestamp, taken: BTreeMap<GUID, SequenceNumber>) -> Self {
     ReadState {
-      latest_instant: Timestamp::ZERO,
+      latest_instant: begin_instant,
       last_read_sn: taken,
       hash_to_key_map: BTreeMap::<KeyHash, K>::new(),
     }
@@ -197,7 +197,10 @@ where
       });
     }
 
-    let taken = topic_cache.lock().unwrap().taken.clone();
+    let (begin_instant, taken) = {
+      let topic_cache = topic_cache.lock().unwrap();
+      (topic_cache.begin_instant, topic_cache.taken.clone())
+    };
 
     Ok(Self {
       my_subscriber: subscriber,
@@ -205,7 +208,7 @@ where
       my_guid,
       notification_receiver: Mutex::new(notification_receiver),
       topic_cache,
-      read_state: Mutex::new(ReadState::new(taken)),
+      read_state: Mutex::new(ReadState::new(begin_instant, taken)),
       my_topic: topic,
       deserializer_type: PhantomData,
       discovery_command,
