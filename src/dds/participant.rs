@@ -11,7 +11,7 @@ use super::graph;
 use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
 use super::network;
 use super::qos::{self, ReaderQos};
-use super::reader::{RawReader, Take};
+use super::reader::RawReader;
 use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
     QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic, TopicKind,
@@ -211,9 +211,9 @@ impl Participant {
         dds_type: &str,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
+        self.begin_now(topic, dds_type, reader_qos)?;
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         self.add_to_graph(&reader);
-        discard_earlier_samples(&reader);
         Ok(reader)
     }
 
@@ -254,11 +254,21 @@ impl Participant {
         dds_type: &str,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
+        self.begin_now(topic, dds_type, reader_qos)?;
         let reader = self.make_reader(topic, dds_type, reader_qos)?;
         reader.ignore_reliable_writers();
         self.add_to_graph(&reader);
-        discard_earlier_samples(&reader);
         Ok(reader)
+    }
+
+    /// Makes the next reader of the topic begin with samples that arrive after its creation. The library keeps
+    /// samples by topic, beyond the life of a reader, so the new reader would take samples again that an
+    /// earlier one has taken.
+    fn begin_now(&self, topic: &str, dds_type: &str, reader_qos: &ReaderQos) -> Result<(), DdsError> {
+        let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
+        self.participant
+            .begin_now(&made_topic)
+            .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))
     }
 
     /// Adds the reader to the node's graph entry.
@@ -371,12 +381,6 @@ impl Participant {
             tracing::warn!(node = self.node_name, %error, "cannot publish the node's ROS 2 graph entry");
         }
     }
-}
-
-/// Discards the samples that are already there for a new reader. The library keeps samples by topic, beyond
-/// the life of a reader, so the new reader would take samples again that an earlier one has taken.
-fn discard_earlier_samples(reader: &RawReader) {
-    while reader.take(&mut |_, _| {}) != Take::Empty {}
 }
 
 fn make_topic(
