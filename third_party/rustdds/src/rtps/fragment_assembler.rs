@@ -238,6 +238,10 @@ const MAX_ASSEMBLY_BUFFERS: usize = 128;
 // The largest sample that is assembled. A single datagram can claim up to 4 GiB.
 const MAX_ASSEMBLED_SIZE: usize = 64 * 1024 * 1024 + 4;
 
+// The same bound in bytes, of what the samples claim: where memory is locked
+// (mlockall), zeroed memory is committed at once, and 128 such samples are 8 GiB.
+const MAX_ASSEMBLY_BYTES: usize = 2 * MAX_ASSEMBLED_SIZE;
+
 // Assembles fragments from a single (remote) Writer
 // So there is only one sequence of SNs
 pub(crate) struct FragmentAssembler {
@@ -338,7 +342,12 @@ impl FragmentAssembler {
       //  * Best effort: there is no retransmission, so a low incomplete buffer is
       //    lost anyway. Evict the OLDEST (lowest SN) to free room for newer samples
       //    that may still complete.
-      while self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS {
+      //
+      // Only a new buffer can exceed a limit.
+      while is_first
+        && (self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS
+          || (self.assembly_buffers.len() > 1 && self.own_bytes() > MAX_ASSEMBLY_BYTES))
+      {
         let evicted = if self.reliable {
           self.assembly_buffers.pop_last()
         } else {
@@ -350,6 +359,15 @@ impl FragmentAssembler {
       }
       None
     }
+  }
+
+  // Memory of the library that unfinished samples take.
+  fn own_bytes(&self) -> usize {
+    let own = |buffer: &AssemblyBuffer| match buffer.memory {
+      Memory::Own(_) => buffer.data_size,
+      Memory::Lent { .. } => 0,
+    };
+    self.assembly_buffers.values().map(own).sum()
   }
 
   pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
@@ -400,7 +418,7 @@ mod tests {
   use crate::{
     dds::{ddsdata::DDSData, lent::LentMemory},
     messages::submessages::submessages::{DATAFRAG_Flags, DataFrag},
-    structure::sequence_number::FragmentNumber,
+    structure::sequence_number::{FragmentNumber, SequenceNumber},
   };
 
   // Build a DATAFRAG submessage carrying the contiguous run of `k` fragments
@@ -481,6 +499,30 @@ mod tests {
     assert!(fa
       .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None, |_| None)
       .is_none());
+  }
+
+  // One fragment each of samples that claim 60 MiB take two samples' memory at most.
+  #[test]
+  fn what_unfinished_samples_claim_is_bounded_in_bytes() {
+    let claimed = 60 << 20;
+    for reliable in [false, true] {
+      let mut fa = FragmentAssembler::new(reliable);
+      for number in 1..=10 {
+        let fragment = DataFrag {
+          writer_sn: SequenceNumber::new(number),
+          ..datafrag(1, 1, 60_000, claimed, vec![7; 60_000])
+        };
+        let none = BitFlags::<DATAFRAG_Flags>::empty();
+        assert!(fa
+          .new_datafrag(&fragment, none, None, |_| None)
+          .is_none());
+      }
+      let kept: Vec<i64> = (1..=10)
+        .filter(|number| fa.is_partially_received(SequenceNumber::new(*number)))
+        .collect();
+      // A Reliable reader needs the oldest first, and the others come again.
+      assert_eq!(kept, if reliable { [1, 2] } else { [9, 10] });
+    }
   }
 
   // Memory of an application, with what an older sample left in it.
