@@ -261,9 +261,9 @@ impl Participant {
         Ok(reader)
     }
 
-    /// Makes the next reader of the topic begin with samples that arrive after its creation. The library keeps
-    /// samples by topic, beyond the life of a reader, so the new reader would take samples again that an
-    /// earlier one has taken.
+    /// Makes the next reader of the topic begin with samples that arrive after its creation. The library
+    /// keeps samples by topic, beyond the life of a reader, so the new reader would take samples again that
+    /// an earlier one has taken.
     fn begin_now(&self, topic: &str, dds_type: &str, reader_qos: &ReaderQos) -> Result<(), DdsError> {
         let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
         self.participant

@@ -12,7 +12,8 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter, ReaderQos, Take};
 use crate::model::{
-    Encapsulation, FixedText, Guid, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp,
+    Encapsulation, FixedText, Guid, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, RefusalCounts,
+    SourceTimestamp,
 };
 use crate::policy::SenderLimits;
 
@@ -85,7 +86,12 @@ impl Link {
             probes: VecDeque::with_capacity(REMEMBERED_PROBES),
             next_seq: 1,
             scratch: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
-            limits: SenderLimits::with_burst(max_rate_hz(settings), BURST_S, MAX_RESPONDERS, clock::monotonic()),
+            limits: SenderLimits::with_burst(
+                max_rate_hz(settings),
+                BURST_S,
+                MAX_RESPONDERS,
+                clock::monotonic(),
+            ),
         })
     }
 

@@ -93,10 +93,13 @@ pub fn finding(results: &Results, reading: &str) -> Finding {
 /// reassemble or to discard.
 fn clean_baseline<'a>(results: &'a Results, place: &Place, reading: &str) -> Option<&'a Cell> {
     let scenario = "baseline_clean";
-    let same_but_switch =
-        |other: &&Place| (&other.library, &other.bed) == (&place.library, &place.bed);
+    let same_but_switch = |other: &&Place| (&other.library, &other.bed) == (&place.library, &place.bed);
     results.cell(place, reading, scenario).or_else(|| {
-        results.places().into_iter().filter(same_but_switch).find_map(|other| results.cell(other, reading, scenario))
+        results
+            .places()
+            .into_iter()
+            .filter(same_but_switch)
+            .find_map(|other| results.cell(other, reading, scenario))
     })
 }
 
