@@ -1,7 +1,6 @@
 //! Passes raw payloads through RustDDS' serialization traits without encoding or decoding them.
 
 use std::convert::Infallible;
-use std::fmt;
 
 use bytes::Bytes;
 
@@ -49,16 +48,9 @@ static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
 pub(super) struct PayloadDecoder;
 
 /// Another reader of the topic has taken the memory in which the sample was.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
+#[error("another reader has taken the payload")]
 pub(super) struct MemoryTaken;
-
-impl fmt::Display for MemoryTaken {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("another reader has taken the payload")
-    }
-}
-
-impl std::error::Error for MemoryTaken {}
 
 impl Decode<'_, Received> for PayloadDecoder {
     type Error = MemoryTaken;

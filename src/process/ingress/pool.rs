@@ -4,15 +4,11 @@
 //! The library borrows and drops slots on the receiving thread, which never waits, not even for the main
 //! thread while that connects a lane to the pool.
 
-use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dds::{LentMemory, Payload, SampleMemory};
 use crate::shm::{LentSlot, LoanError, SamplePublisher, Slot};
-
-/// Finished loans that wait for `fill`, which takes each at once.
-const FINISHED_SLOTS: usize = 1;
 
 /// The pool, as the main thread and the DDS library share it.
 pub(super) struct Pool {
@@ -20,7 +16,8 @@ pub(super) struct Pool {
     /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
     connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
-    finished: Arc<Mutex<VecDeque<Slot>>>,
+    /// The slot of a loan that has ended, until `fill` takes it, at once.
+    finished: Arc<Mutex<Option<Slot>>>,
 }
 
 /// The pool, as the input of the route owns it.
@@ -33,7 +30,7 @@ pub(super) struct PoolOwner {
 impl PoolOwner {
     pub fn new(publisher: SamplePublisher) -> Self {
         let (sender, abandoned) = channel();
-        let finished = Arc::new(Mutex::new(VecDeque::with_capacity(FINISHED_SLOTS)));
+        let finished = Arc::new(Mutex::new(None));
         let pool = Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender, finished });
         Self { pool, abandoned }
     }
@@ -64,7 +61,7 @@ impl PoolOwner {
                 let bytes = memory.bytes().len();
                 // Only this pool lends memory to the reader: it has the slot as soon as the loan ends.
                 memory.finish();
-                let slot = lock(&self.pool.finished).pop_front();
+                let slot = lock(&self.pool.finished).take();
                 Filled { slot: slot.ok_or(LoanError::Failed("not of the pool")), bytes, in_place: true }
             }
         }
@@ -94,7 +91,7 @@ struct Loan {
     /// `Some` until `finish` takes it.
     slot: Option<LentSlot>,
     abandoned: Sender<LentSlot>,
-    finished: Arc<Mutex<VecDeque<Slot>>>,
+    finished: Arc<Mutex<Option<Slot>>>,
 }
 
 impl LentMemory for Loan {
@@ -104,7 +101,7 @@ impl LentMemory for Loan {
 
     fn finish(mut self: Box<Self>) {
         if let Some(slot) = self.slot.take() {
-            lock(&self.finished).push_back(slot.into_slot());
+            *lock(&self.finished) = Some(slot.into_slot());
         }
     }
 }
@@ -122,7 +119,7 @@ impl Drop for Loan {
     clippy::disallowed_methods,
     reason = "the thread that takes samples locks it, which is one at a time"
 )]
-fn lock(finished: &Mutex<VecDeque<Slot>>) -> MutexGuard<'_, VecDeque<Slot>> {
+fn lock(finished: &Mutex<Option<Slot>>) -> MutexGuard<'_, Option<Slot>> {
     finished.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
