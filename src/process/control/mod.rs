@@ -321,9 +321,9 @@ impl Control {
         self.refused_log.log_refused(&self.invalid_responses.refused, now);
         self.accepted_log.log_accepted(&self.invalid_responses.accepted, now);
         self.write_record();
-        // Every participant is asked, so that each one's threads are woken.
-        let stuck = self.participants.iter_mut().filter_map(|one| (!one.have_threads_turned()).then_some(()));
-        if stuck.count() == 0 {
+        // Asks every participant, because that wakes its threads.
+        let turned = self.participants.iter_mut().map(Participant::have_threads_turned);
+        if turned.fold(true, |all, one| all & one) {
             self.role.report_turn(self.supervision.mode() as u8, 0);
         }
         // Only the first call has an effect: control has completed its first turn.
