@@ -205,7 +205,7 @@ impl Responder {
                 self.listens_on
             );
         }
-        telemetry::log_left_out();
+        telemetry::log_left_out(now);
         // Reports readiness at the first housekeeping, when all endpoints exist.
         self.notifier.ready();
         if self.participant.have_threads_turned() {

@@ -13,9 +13,6 @@ use crate::model::{Guid, MonotonicNs, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
 use crate::telemetry;
 
-/// Interval at which the process logs how many log lines were left out.
-const LEFT_OUT_MS: u64 = 1_000;
-
 /// Why a process could not start, or had to end.
 #[derive(Debug, thiserror::Error)]
 pub enum RoleError {
@@ -64,8 +61,6 @@ pub(super) struct Role {
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
     notifier: Notifier,
-    /// When to log next how many log lines were left out.
-    left_out_at: MonotonicNs,
     /// The participant of the predecessor of this process; all zero for none, and once it is disposed of.
     former_participant: Guid,
     /// The last field, so that the lock is released only after everything else is dropped.
@@ -110,16 +105,7 @@ impl Role {
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self {
-            node,
-            boards,
-            reloads,
-            health,
-            notifier: Notifier::new(),
-            left_out_at: now,
-            former_participant,
-            _lock: lock,
-        })
+        Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former_participant, _lock: lock })
     }
 
     /// Opens the DDS participant. If the predecessor of this process was killed, the participant disposes of
@@ -188,10 +174,7 @@ impl Role {
     /// left out, both at most once a second.
     pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
         self.notifier.status(now, describe);
-        if now >= self.left_out_at {
-            telemetry::log_left_out();
-            self.left_out_at = now.plus_ms(LEFT_OUT_MS);
-        }
+        telemetry::log_left_out(now);
     }
 
     /// Reports that the process has begun to shut down.

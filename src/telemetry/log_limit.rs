@@ -19,10 +19,18 @@ const LINES_PER_S: f64 = 5.0;
 /// A burst: more than the lines of a start with a hundred endpoints.
 const BURST_LINES: f64 = 200.0;
 
+/// Interval at which the lines that were left out are reported.
+const REPORT_MS: u64 = 1_000;
+
 /// The places in the source that have logged, and what each may still log.
 static PLACES: LazyLock<Mutex<Places>> = LazyLock::new(Mutex::default);
 
-type Places = HashMap<Identifier, Place>;
+#[derive(Default)]
+struct Places {
+    by_callsite: HashMap<Identifier, Place>,
+    /// When the lines that were left out were reported last.
+    reported_at: MonotonicNs,
+}
 
 struct Place {
     bucket: TokenBucket,
@@ -48,7 +56,7 @@ impl<S: Subscriber> Layer<S> for LogLimit {
 }
 
 fn admit(places: &mut Places, callsite: Identifier, name: &'static str, now: MonotonicNs) -> bool {
-    let place = places.entry(callsite).or_insert_with(|| Place {
+    let place = places.by_callsite.entry(callsite).or_insert_with(|| Place {
         bucket: TokenBucket::full(LINES_PER_S, BURST_LINES, now),
         name,
         left_out: 0,
@@ -58,10 +66,16 @@ fn admit(places: &mut Places, callsite: Identifier, name: &'static str, now: Mon
     admitted
 }
 
-/// Logs, for each place, how many lines were left out since the last call. To be called about once a second.
-pub fn log_left_out() {
+/// Logs, at most once a second and for each place, how many lines were left out since the last time. To be
+/// called at each housekeeping.
+pub fn log_left_out(now: MonotonicNs) {
     let Some(mut places) = try_lock() else { return };
+    if now < places.reported_at.plus_ms(REPORT_MS) {
+        return;
+    }
+    places.reported_at = now;
     let left_out: Vec<_> = places
+        .by_callsite
         .values_mut()
         .filter(|place| place.left_out > 0)
         .map(|place| (place.name, std::mem::take(&mut place.left_out)))
@@ -111,9 +125,10 @@ mod tests {
             assert!((BURST_LINES as u64..BURST_LINES as u64 + 100).contains(&logged), "{logged}");
             info!("another place");
             assert_eq!(LINES.load(Ordering::Relaxed), logged + 1);
-            log_left_out();
+            let later = clock::monotonic().plus_ms(REPORT_MS);
+            log_left_out(later);
             assert_eq!(LINES.load(Ordering::Relaxed), logged + 2, "one line for the place");
-            log_left_out();
+            log_left_out(later.plus_ms(REPORT_MS));
             assert_eq!(LINES.load(Ordering::Relaxed), logged + 2, "reported once");
         });
     }
