@@ -92,6 +92,7 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
     spdp_liveness_sender,
     None,
     Rc::new(RefCell::new(InterfaceObservations::new())),
+    Arc::default(),
   );
 
   let mut qos = QosPolicyBuilder::new().history(policy::History::KeepLast { depth: 4 });

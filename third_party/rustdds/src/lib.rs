@@ -183,6 +183,7 @@ pub mod discovery; // to access some Discovered data in e.g. ros2-client crate
 pub mod fuzzing; // what reads bytes off the network, without sockets
 mod messages;
 mod network;
+mod network_counts;
 pub use network::util::NetworkSelector;
 mod rtps;
 
@@ -237,6 +238,8 @@ pub use serialization::{
 };
 /// How often the threads of a participant have turned.
 pub use polling::ThreadTurns;
+/// What a participant refused of the network.
+pub use network_counts::{NetworkCounters, NetworkCounts};
 /// What a datagram claims to hold, for one who looks at it.
 pub use rtps::arriving::sample_arriving;
 pub use rtps::reader_progress::MatchedReader;

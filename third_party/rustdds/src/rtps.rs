@@ -6,6 +6,7 @@ pub(crate) mod direct_send;
 pub(crate) mod dp_event_loop;
 pub(crate) mod fragment_assembler;
 pub(crate) mod message_receiver;
+pub(crate) mod newcomers;
 pub(crate) mod outbound;
 pub(crate) mod reader;
 pub(crate) mod reader_progress;

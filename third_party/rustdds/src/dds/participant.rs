@@ -34,7 +34,7 @@ use crate::{
   },
   discovery::{
     discovery::{Discovery, DiscoveryCommand},
-    discovery_db::DiscoveryDB,
+    discovery_db::{discovery_db_read, DiscoveryDB},
     sedp_messages::{DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData},
   },
   network::{
@@ -615,6 +615,11 @@ impl DomainParticipant {
     event_loop.wake();
     discovery.wake();
     turns
+  }
+
+  /// Counts what this participant refuses of the network.
+  pub fn network_counters(&self) -> Arc<crate::NetworkCounters> {
+    discovery_db_read(&self.discovery_db()).counters()
   }
 
   /// The sockets that user traffic comes to, for a thread of the application that

@@ -26,7 +26,9 @@ use crate::{
   discovery::{
     announced::Announced,
     builtin_endpoint::BuiltinEndpointSet,
-    discovery_db::{discovery_db_read, discovery_db_write, DiscoveredVia, DiscoveryDB},
+    discovery_db::{
+      discovery_db_read, discovery_db_write, DiscoveredVia, DiscoveryDB, ParticipantUpdate,
+    },
     sedp_messages::{
       DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData,
       ParticipantMessageData, ParticipantMessageDataKind,
@@ -1267,8 +1269,18 @@ impl Discovery {
     &mut self,
     participant_data: &SpdpDiscoveredParticipantData,
   ) {
-    let was_new = discovery_db_write(&self.discovery_db).update_participant(participant_data);
+    let update = discovery_db_write(&self.discovery_db).update_participant(participant_data);
     let guid_prefix = participant_data.participant_guid.prefix;
+    let was_new = match update {
+      ParticipantUpdate::Refused => return,
+      ParticipantUpdate::Known => false,
+      ParticipantUpdate::New { evicted } => {
+        if let Some(evicted) = evicted {
+          self.participant_is_gone(evicted);
+        }
+        true
+      }
+    };
 
     // Send notification to dp_event_loop. It will update local reader/writer
     // proxies as the SpdpDiscoveredParticipantData contains a bitmap of the
@@ -1343,6 +1355,11 @@ impl Discovery {
 
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
     discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true); // true = actively removed
+    self.participant_is_gone(participant_guidp);
+  }
+
+  // Tells the event loop and the application of one that the database has removed.
+  fn participant_is_gone(&mut self, participant_guidp: GuidPrefix) {
     self.silent.retain(|(silent, _)| *silent != participant_guidp);
     self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost {
       guid_prefix: participant_guidp,
@@ -1471,7 +1488,9 @@ impl Discovery {
         match d {
           Sample::Value(d) => {
             trace!("sedp_receive_subscription - {d:?}");
-            let drd = discovery_db_write(&self.discovery_db).update_subscription(&d);
+            let Some(drd) = discovery_db_write(&self.discovery_db).update_subscription(&d) else {
+              continue;
+            };
             debug!(
               "sedp_receive_subscription - send_discovery_notification ReaderUpdated  {:?}",
               drd
@@ -1550,8 +1569,10 @@ impl Discovery {
         match d {
           Sample::Value(dwd) => {
             trace!("sedp_receive_publication discovered {:?}", dwd);
-            let discovered_writer_data =
-              discovery_db_write(&self.discovery_db).update_publication(&dwd);
+            let update = discovery_db_write(&self.discovery_db).update_publication(&dwd);
+            let Some(discovered_writer_data) = update else {
+              continue;
+            };
             self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
               discovered_writer_data,
             });
@@ -1963,7 +1984,9 @@ impl Discovery {
           Sample::Value(sec_sub) => {
             // Currently we use only the DiscoveredReaderData field, no DataTag
             let drd_from_topic = sec_sub.discovered_reader_data;
-            let drd = discovery_db_write(&self.discovery_db).update_subscription(&drd_from_topic);
+            let Some(drd) = discovery_db_write(&self.discovery_db).update_subscription(&drd_from_topic) else {
+              continue;
+            };
             self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
               discovered_reader_data: drd,
             });
@@ -2010,7 +2033,9 @@ impl Discovery {
           Sample::Value(se_pub) => {
             // Currently we use only the DiscoveredWriterData field, no DataTag
             let dwd_from_topic = se_pub.discovered_writer_data;
-            let dwd = discovery_db_write(&self.discovery_db).update_publication(&dwd_from_topic);
+            let Some(dwd) = discovery_db_write(&self.discovery_db).update_publication(&dwd_from_topic) else {
+              continue;
+            };
             self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
               discovered_writer_data: dwd,
             });

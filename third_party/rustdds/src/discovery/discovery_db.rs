@@ -15,6 +15,10 @@ use crate::{
     statusevents::{DomainParticipantStatusEvent, LostReason, StatusChannelSender},
     topic::{Topic, TopicDescription},
   },
+  network_counts::{
+    NetworkCounters, MAX_ENDPOINTS, MAX_ENDPOINTS_PER_PARTICIPANT, MAX_LEASE, MAX_PARTICIPANTS,
+    MAX_TOPICS,
+  },
   rtps::{
     reader::ReaderIngredients, rtps_reader_proxy::RtpsReaderProxy,
     rtps_writer_proxy::RtpsWriterProxy,
@@ -55,6 +59,8 @@ pub(crate) struct DiscoveryDB {
   my_guid: GUID,
   participant_proxies: BTreeMap<GuidPrefix, SpdpDiscoveredParticipantData>,
   participant_last_life_signs: BTreeMap<GuidPrefix, Instant>,
+  // The keys of participant_proxies, the one discovered first in front.
+  discovery_order: VecDeque<GuidPrefix>,
 
   // Authentication statuses of participants
   #[cfg(feature = "security")]
@@ -86,6 +92,19 @@ pub(crate) struct DiscoveryDB {
   topic_updated_sender: std::sync::mpsc::SyncSender<()>,
 
   participant_status_sender: StatusChannelSender<DomainParticipantStatusEvent>,
+
+  counters: Arc<NetworkCounters>,
+}
+
+/// What an announcement of a participant did to the database.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ParticipantUpdate {
+  /// It was there before.
+  Known,
+  /// It was added, and another one removed if there was no room.
+  New { evicted: Option<GuidPrefix> },
+  /// It is ill-formed, or there is no room for it.
+  Refused,
 }
 
 // How did we discover this topic
@@ -136,6 +155,7 @@ impl DiscoveryDB {
       my_guid,
       participant_proxies: BTreeMap::new(),
       participant_last_life_signs: BTreeMap::new(),
+      discovery_order: VecDeque::new(),
       #[cfg(feature = "security")]
       authentication_statuses: BTreeMap::new(),
       local_topic_writers: BTreeMap::new(),
@@ -149,7 +169,12 @@ impl DiscoveryDB {
       topics: BTreeMap::new(),
       topic_updated_sender,
       participant_status_sender,
+      counters: Arc::default(),
     }
+  }
+
+  pub fn counters(&self) -> Arc<NetworkCounters> {
+    Arc::clone(&self.counters)
   }
 
   fn send_participant_status(&self, event: DomainParticipantStatusEvent) {
@@ -159,16 +184,15 @@ impl DiscoveryDB {
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
   }
 
-  // Returns if participant was previously unknown
-  pub fn update_participant(&mut self, data: &SpdpDiscoveredParticipantData) -> bool {
+  pub fn update_participant(&mut self, data: &SpdpDiscoveredParticipantData) -> ParticipantUpdate {
     debug!("update_participant: {:?}", data);
     let guid = data.participant_guid;
 
     // sanity check
     if guid.entity_id != EntityId::PARTICIPANT {
       error!("Discovered participant GUID entity_id is not for participant: {guid:?}");
-      // Maybe we should discard the participant here?
-      return false;
+      self.counters.announcements_refused.increment();
+      return ParticipantUpdate::Refused;
     }
 
     // We allow discovery to discover self, since our discovery readers
@@ -181,17 +205,19 @@ impl DiscoveryDB {
     //   return
     // }
 
-    self.participant_attic.remove(&guid.prefix);
-    self.attic_order.retain(|prefix| *prefix != guid.prefix);
-
-    let mut new_participant = false;
+    let mut update = ParticipantUpdate::Known;
     if !self.participant_proxies.contains_key(&guid.prefix) {
+      let Ok(evicted) = self.make_room_for_a_participant() else {
+        self.counters.announcements_refused.increment();
+        return ParticipantUpdate::Refused;
+      };
       info!("New remote participant: {:?}", data);
-      new_participant = true;
       if guid == self.my_guid {
         info!("Remote participant {guid:?} is myself, but some reflection is good.");
-        new_participant = false;
+      } else {
+        update = ParticipantUpdate::New { evicted };
       }
+      self.discovery_order.push_back(guid.prefix);
 
       // This may be a rediscovery: Participant lease time timed out, but then
       // came back, e.g. by network outage. We then restore readers/writers from
@@ -208,6 +234,9 @@ impl DiscoveryDB {
       );
     }
 
+    self.participant_attic.remove(&guid.prefix);
+    self.attic_order.retain(|prefix| *prefix != guid.prefix);
+
     // In any case:
     // Update SpdpDiscoveredParticipantData to DB
     self.participant_proxies.insert(guid.prefix, data.clone());
@@ -216,7 +245,50 @@ impl DiscoveryDB {
       .participant_last_life_signs
       .insert(guid.prefix, Instant::now());
 
-    new_participant
+    update
+  }
+
+  // Evicts the participant that was discovered first of those that have no endpoint
+  // with a topic of ours, if there is no room for another. An error if all have one.
+  fn make_room_for_a_participant(&mut self) -> Result<Option<GuidPrefix>, ()> {
+    if self.participant_proxies.len() < MAX_PARTICIPANTS {
+      return Ok(None);
+    }
+    let candidates = self.discovery_order.iter().copied();
+    let evicted = candidates
+      .into_iter()
+      .find(|prefix| *prefix != self.my_guid.prefix && !self.has_endpoint_with_local_topic(*prefix))
+      .ok_or(())?;
+    self.counters.participants_evicted.increment();
+    self.remove_participant(evicted, true);
+    Ok(Some(evicted))
+  }
+
+  fn has_endpoint_with_local_topic(&self, prefix: GuidPrefix) -> bool {
+    let mut readers = self.external_topic_readers.range(prefix.range());
+    let mut writers = self.external_topic_writers.range(prefix.range());
+    readers.any(|(_, reader)| self.is_local_topic(reader.subscription_topic_data.topic_name()))
+      || writers.any(|(_, writer)| self.is_local_topic(&writer.publication_topic_data.topic_name))
+  }
+
+  fn is_local_topic(&self, name: &str) -> bool {
+    let mut readers = self.local_topic_readers.values();
+    let mut writers = self.local_topic_writers.values();
+    readers.any(|reader| reader.subscription_topic_data.topic_name() == name)
+      || writers.any(|writer| writer.publication_topic_data.topic_name == name)
+  }
+
+  // Whether there is room for one more endpoint, given the endpoints of its kind.
+  fn has_room_for_endpoint<D>(&self, of_kind: &BTreeMap<GUID, D>, guid: GUID, topic: &str) -> bool {
+    let of_participant = of_kind.range(guid.prefix.range()).count();
+    let has_room = of_kind.contains_key(&guid)
+      || of_participant < MAX_ENDPOINTS_PER_PARTICIPANT
+        && (of_kind.len() < MAX_ENDPOINTS
+          || of_kind.len() < 2 * MAX_ENDPOINTS && self.is_local_topic(topic));
+    if !has_room {
+      self.counters.endpoints_refused.increment();
+    }
+    has_room
   }
 
   /// Whether it is one whose lease has expired: then its last announcement.
@@ -253,6 +325,7 @@ impl DiscoveryDB {
     info!("removing participant {guid_prefix:?}");
     let participant_data = self.participant_proxies.remove(&guid_prefix);
     self.participant_last_life_signs.remove(&guid_prefix);
+    self.discovery_order.retain(|prefix| *prefix != guid_prefix);
     #[cfg(feature = "security")]
     self.authentication_statuses.remove(&guid_prefix);
 
@@ -378,7 +451,8 @@ impl DiscoveryDB {
     for (&guid, sp) in &self.participant_proxies {
       let lease_duration = sp
         .lease_duration
-        .unwrap_or(DEFAULT_PARTICIPANT_LEASE_DURATION);
+        .unwrap_or(DEFAULT_PARTICIPANT_LEASE_DURATION)
+        .min(Duration::from_std(MAX_LEASE));
       // let lease_duration = lease_duration + lease_duration; // double it
       match self.participant_last_life_signs.get(&guid) {
         Some(&last_life) => {
@@ -486,8 +560,17 @@ impl DiscoveryDB {
   // them from the remote participant.
   //
   // The topic is updated to the topics table.
-  pub fn update_subscription(&mut self, data: &DiscoveredReaderData) -> DiscoveredReaderData {
+  //
+  // None if there is no room for it.
+  pub fn update_subscription(
+    &mut self,
+    data: &DiscoveredReaderData,
+  ) -> Option<DiscoveredReaderData> {
     let guid = data.reader_proxy.remote_reader_guid;
+    let topic = data.subscription_topic_data.topic_name();
+    if !self.has_room_for_endpoint(&self.external_topic_readers, guid, topic) {
+      return None;
+    }
 
     // fill in the default locators from participant, in case DRD did not provide
     // any
@@ -539,12 +622,21 @@ impl DiscoveryDB {
     // reader update. If there is a DiscoveredVia::Topic record, use QosPolicies
     // from that record and modify by QoS given in the DRD.
 
-    enriched
+    Some(enriched)
   }
 
   // TODO: This is silly. Returns one of the parameters cloned, or None
-  pub fn update_publication(&mut self, data: &DiscoveredWriterData) -> DiscoveredWriterData {
+  //
+  // None if there is no room for it.
+  pub fn update_publication(
+    &mut self,
+    data: &DiscoveredWriterData,
+  ) -> Option<DiscoveredWriterData> {
     let guid = data.writer_proxy.remote_writer_guid;
+    let topic = &data.publication_topic_data.topic_name;
+    if !self.has_room_for_endpoint(&self.external_topic_writers, guid, topic) {
+      return None;
+    }
 
     // fill in the default locators from participant, in case DRD did not provide
     // any
@@ -592,7 +684,7 @@ impl DiscoveryDB {
       DiscoveredVia::Publication,
     );
 
-    enriched
+    Some(enriched)
   }
 
   // This is for local participant updating the topic table
@@ -676,6 +768,8 @@ impl DiscoveryDB {
         t.insert(updater, (discovered_via, dtd.clone())); // this should return None
         notify = true;
       }
+    } else if self.topics.len() >= MAX_TOPICS && discovered_via != DiscoveredVia::SelfDefined {
+      self.counters.endpoints_refused.increment();
     } else {
       // new topic to us
       let mut b = BTreeMap::new();
@@ -965,6 +1059,106 @@ mod tests {
     // TODO: more operations tests
   }
 
+  fn database() -> DiscoveryDB {
+    let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
+    let (status_sender, _status_receiver) = sync_status_channel(16).unwrap();
+    DiscoveryDB::new(GUID::new_participant_guid(), updated_sender, status_sender)
+  }
+
+  fn new_participant() -> SpdpDiscoveredParticipantData {
+    let mut participant = spdp_participant_data().unwrap();
+    participant.participant_guid = GUID::new_participant_guid();
+    participant
+  }
+
+  fn new_reader(participant: GUID, number: u32, topic: &str) -> DiscoveredReaderData {
+    let mut reader = DiscoveredReaderData::default(topic.to_string(), "RandomData".to_string());
+    let [_, key @ ..] = number.to_be_bytes();
+    let id = EntityId::create_custom_entity_id(key, EntityKind::READER_NO_KEY_USER_DEFINED);
+    reader.reader_proxy.remote_reader_guid = GUID::new(participant.prefix, id);
+    reader
+  }
+
+  #[test]
+  fn a_flood_of_participants_evicts_the_oldest_without_a_topic_of_ours() {
+    let mut db = database();
+    let (matched, unmatched) = (new_participant(), new_participant());
+    let local = new_reader(GUID::new_participant_guid(), 1, "ours");
+    db.update_local_topic_reader(local.clone());
+    for participant in [&matched, &unmatched] {
+      db.update_participant(participant);
+    }
+    let reader = new_reader(matched.participant_guid, 1, "ours");
+    assert!(db.update_subscription(&reader).is_some());
+    let flood = (0..3_000).map(|_| db.update_participant(&new_participant()));
+    let evicted: Vec<GuidPrefix> = flood
+      .filter_map(|update| match update {
+        ParticipantUpdate::New { evicted } => evicted,
+        other => panic!("{other:?}"),
+      })
+      .collect();
+    assert_eq!(db.participant_proxies.len(), MAX_PARTICIPANTS);
+    assert_eq!(evicted[0], unmatched.participant_guid.prefix);
+    assert!(db.participant_proxies.contains_key(&matched.participant_guid.prefix));
+    assert_eq!(db.discovery_order.len(), MAX_PARTICIPANTS);
+    assert!(db.attic_order.len() <= MAX_PARTICIPANTS_IN_ATTIC);
+    assert_eq!(db.counters().counts().participants_evicted, evicted.len() as u64);
+  }
+
+  #[test]
+  fn a_participant_is_refused_when_all_others_have_a_topic_of_ours() {
+    let mut db = database();
+    db.update_local_topic_reader(new_reader(GUID::new_participant_guid(), 1, "ours"));
+    for number in 0..MAX_PARTICIPANTS {
+      let participant = new_participant();
+      db.update_participant(&participant);
+      db.update_subscription(&new_reader(participant.participant_guid, number as u32, "ours"));
+    }
+    assert_eq!(db.update_participant(&new_participant()), ParticipantUpdate::Refused);
+    assert_eq!(db.counters().counts().announcements_refused, 1);
+  }
+
+  #[test]
+  fn endpoints_are_limited_for_each_participant_and_for_all() {
+    let mut db = database();
+    db.update_local_topic_reader(new_reader(GUID::new_participant_guid(), 1, "ours"));
+    let greedy = new_participant().participant_guid;
+    let accepts = |db: &mut DiscoveryDB, participant: GUID, number: usize, topic: &str| {
+      let reader = new_reader(participant, number as u32, topic);
+      db.update_subscription(&reader).is_some()
+    };
+    let accepted = (0..5_000).filter(|n| accepts(&mut db, greedy, *n, "greedy")).count();
+    assert_eq!(accepted, MAX_ENDPOINTS_PER_PARTICIPANT);
+    assert!(accepts(&mut db, greedy, 1, "greedy"), "an endpoint that is known is updated");
+    for topic in 0..20 {
+      let other = new_participant().participant_guid;
+      for n in 0..1_000 {
+        accepts(&mut db, other, n, &format!("theirs{topic}"));
+      }
+    }
+    assert_eq!(db.external_topic_readers.len(), MAX_ENDPOINTS);
+    let late = new_participant().participant_guid;
+    assert!(!accepts(&mut db, late, 1, "theirs"));
+    assert!(accepts(&mut db, late, 2, "ours"), "a reader of our topic is accepted");
+    assert!(db.counters().counts().endpoints_refused > 5_000 - MAX_ENDPOINTS_PER_PARTICIPANT as u64);
+  }
+
+  #[test]
+  fn a_lease_is_granted_for_five_minutes_at_most() {
+    let mut db = database();
+    let mut participant = new_participant();
+    participant.lease_duration = Some(Duration::INFINITE);
+    db.update_participant(&participant);
+    let prefix = participant.participant_guid.prefix;
+    let heard = |db: &mut DiscoveryDB, ago_s: u64| {
+      let sign = Instant::now().checked_sub(StdDuration::from_secs(ago_s)).unwrap();
+      db.participant_last_life_signs.insert(prefix, sign);
+      db.participant_cleanup().len()
+    };
+    assert_eq!(heard(&mut db, 299), 0);
+    assert_eq!(heard(&mut db, 301), 1);
+  }
+
   #[test]
   fn endpoints_of_a_disposed_participant_are_restored_with_its_next_announcement() {
     let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
@@ -992,7 +1186,8 @@ mod tests {
       db.remove_participant(prefix, true);
       assert_eq!(db.endpoints_of(prefix).0.len(), 0);
       assert!(db.participant_is_alive(prefix).is_none(), "a late datagram does not restore it");
-      assert!(db.update_participant(&participant), "it is new");
+      let update = db.update_participant(&participant);
+      assert_eq!(update, ParticipantUpdate::New { evicted: None });
       assert_eq!(db.endpoints_of(prefix).0.len(), 1);
     }
 

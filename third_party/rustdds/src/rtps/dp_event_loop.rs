@@ -250,6 +250,7 @@ impl DPEventLoop {
     let mut interface_observations = InterfaceObservations::new();
     interface_observations.follow_addresses(interfaces.iter().map(|ifa| ifa.ip).collect());
     let interface_observations = Rc::new(RefCell::new(interface_observations));
+    let counters = discovery_db_read(&discovery_db).counters();
     let local_interfaces: Rc<[IfAddr]> = Rc::from(interfaces);
 
     Ok(Self {
@@ -265,6 +266,7 @@ impl DPEventLoop {
         spdp_liveness_sender,
         security_plugins_opt.clone(),
         Rc::clone(&interface_observations),
+        counters,
       ),
       interface_observations,
       local_interfaces,
@@ -855,6 +857,10 @@ impl DPEventLoop {
         error!("Participant was updated, but DB does not have it. Strange.");
         return;
       };
+    self
+      .message_receiver
+      .newcomers
+      .insert_known(participant_guid_prefix);
 
     // Select which builtin endpoints of the remote participant are updated to local
     // readers & writers
@@ -1055,6 +1061,10 @@ impl DPEventLoop {
       writer.participant_lost(participant_guid_prefix);
     }
 
+    self
+      .message_receiver
+      .newcomers
+      .remove_known(participant_guid_prefix);
     for reader in self.message_receiver.available_readers.values_mut() {
       reader.participant_lost(participant_guid_prefix);
     }

@@ -3,7 +3,8 @@ use std::{
   collections::{btree_map::Entry, BTreeMap},
   net::SocketAddr,
   rc::Rc,
-  sync::mpsc::TrySendError,
+  sync::{mpsc::TrySendError, Arc},
+  time::Instant,
 };
 
 use enumflags2::BitFlags;
@@ -14,8 +15,12 @@ use bytes::Bytes;
 use crate::{
   messages::{protocol_version::ProtocolVersion, submessages::submessages::*, vendor_id::VendorId},
   network::udp_listener::PacketOrigin,
+  network_counts::NetworkCounters,
   polling::WakeSender,
-  rtps::{reader::Reader, transmit::InterfaceObservations, Message, Submessage, SubmessageBody},
+  rtps::{
+    newcomers::Newcomers, reader::Reader, transmit::InterfaceObservations, Message, Submessage,
+    SubmessageBody,
+  },
   structure::{
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
@@ -136,6 +141,10 @@ pub(crate) struct MessageReceiver {
   // which consumes it to resolve interface-aware send routes.
   interface_observations: Rc<RefCell<InterfaceObservations>>,
 
+  // The participants that Discovery knows, and the budgets of those that it does not.
+  pub newcomers: Newcomers,
+  counters: Arc<NetworkCounters>,
+
   own_guid_prefix: GuidPrefix,
   pub source_version: ProtocolVersion,
   pub source_vendor_id: VendorId,
@@ -164,6 +173,7 @@ impl MessageReceiver {
     spdp_liveness_sender: WakeSender<GuidPrefix>,
     security_plugins: Option<SecurityPluginsHandle>,
     interface_observations: Rc<RefCell<InterfaceObservations>>,
+    counters: Arc<NetworkCounters>,
   ) -> Self {
     Self {
       available_readers: BTreeMap::new(),
@@ -171,6 +181,8 @@ impl MessageReceiver {
       spdp_liveness_sender,
       security_plugins,
       interface_observations,
+      newcomers: Newcomers::default(),
+      counters,
       own_guid_prefix: participant_guid_prefix,
 
       source_version: ProtocolVersion::THIS_IMPLEMENTATION,
@@ -265,6 +277,7 @@ impl MessageReceiver {
         info!("Received RTPS PING. Do not know how to respond.");
         debug!("Data was {:?}", msg_bytes);
       } else {
+        self.counters.malformed_datagrams.increment();
         warn!("Message is shorter than RTPS header. Cannot deserialize.");
         debug!("Data was {:?}", msg_bytes);
       }
@@ -283,6 +296,7 @@ impl MessageReceiver {
         info!("Received message with RTPX header. Ignoring.");
         return;
       } else {
+        self.counters.malformed_datagrams.increment();
         warn!("Received message with unknown start of header {magic:x?}. Ignoring.");
         return;
       }
@@ -293,11 +307,17 @@ impl MessageReceiver {
     let rtps_message = match Message::read_from_buffer(msg_bytes) {
       Ok(m) => m,
       Err(speedy_err) => {
+        self.counters.malformed_datagrams.increment();
         warn!("RTPS deserialize error {speedy_err:?}");
         debug!("Data was {msg_bytes:?}");
         return;
       }
     };
+
+    if self.is_refused_announcement(&rtps_message, origin) {
+      self.counters.announcements_refused.increment();
+      return;
+    }
 
     // Record how this remote participant's traffic reaches us, so route
     // resolution can later narrow sends to the observed interface/address.
@@ -311,6 +331,22 @@ impl MessageReceiver {
     self.handle_parsed_message(rtps_message);
     // Messages of this participant to itself come without a datagram.
     self.source_address = None;
+  }
+
+  /// Whether a message announces a participant that Discovery does not know, and too
+  /// many others have been announced just now.
+  fn is_refused_announcement(&mut self, message: &Message, origin: PacketOrigin) -> bool {
+    let Some(source) = origin.source else {
+      return false;
+    };
+    let announces = message.submessages.iter().any(|submessage| {
+      matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, _))
+        if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER)
+    });
+    let prefix = message.header.guid_prefix;
+    announces
+      && prefix != self.own_guid_prefix
+      && !self.newcomers.admit(prefix, source.ip(), Instant::now())
   }
 
   /// Note the interface/source a packet from `source_prefix` arrived on.
@@ -1228,6 +1264,7 @@ mod tests {
       spdp_liveness_sender,
       None,
       Rc::new(RefCell::new(InterfaceObservations::new())),
+      Arc::default(),
     );
 
     // Create a reader to process the message
@@ -1358,6 +1395,7 @@ mod tests {
       spdp_liveness_sender,
       None,
       Rc::new(RefCell::new(InterfaceObservations::new())),
+      Arc::default(),
     );
 
     message_receiver.handle_received_packet(&udp_bits1, PacketOrigin::UNKNOWN);

@@ -758,7 +758,7 @@ mod tests {
   fn a_reader_that_begins_now_gets_only_later_samples() {
     let mut topic_cache = keep_all_topic_cache();
     let writer = GUID::new(GuidPrefix::new(&[1; 12]), EntityId::SEDP_BUILTIN_PUBLICATIONS_WRITER);
-    let mut add = |topic_cache: &mut TopicCache, sn| {
+    let add = |topic_cache: &mut TopicCache, sn| {
       let change = CacheChange::new(
         writer,
         SequenceNumber::new(sn),

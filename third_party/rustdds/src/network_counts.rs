@@ -1,0 +1,80 @@
+//! Counts of what a participant refuses of the network, and the limits beyond which
+//! it refuses.
+//!
+//! Whoever can send to a participant can announce participants and endpoints that do
+//! not exist, each well-formed. All that discovery keeps of others is bounded by these
+//! limits.
+
+use std::{
+  sync::atomic::{AtomicU64, Ordering},
+  time::Duration,
+};
+
+/// Remote participants that discovery keeps. At this number it evicts, for each new
+/// one, the oldest participant of which no endpoint has a topic of ours. 1,024 are
+/// several times the nodes of a large robot; each takes up to 20 KiB.
+pub(crate) const MAX_PARTICIPANTS: usize = 1_024;
+
+/// Readers, and as many writers, that discovery keeps of one participant. A process of
+/// 100 ROS 2 nodes has some 1,500.
+pub(crate) const MAX_ENDPOINTS_PER_PARTICIPANT: usize = 4_096;
+
+/// Readers, and as many writers, that discovery keeps of all participants. Those with
+/// a topic of ours are accepted up to twice this number.
+pub(crate) const MAX_ENDPOINTS: usize = 16_384;
+
+/// Topic names that discovery keeps.
+pub(crate) const MAX_TOPICS: usize = 16_384;
+
+/// The longest lease that a participant is granted. One that claims a longer lease,
+/// or an infinite one, and is silent for this long is removed, and is back with its
+/// next announcement.
+pub(crate) const MAX_LEASE: Duration = Duration::from_secs(300);
+
+/// What a participant has refused of the network since it was created.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct NetworkCounts {
+  /// Datagrams that are not RTPS, or not well-formed.
+  pub malformed_datagrams: u64,
+  /// Announcements of unknown participants that were dropped: too many at a time, or
+  /// no room for another participant.
+  pub announcements_refused: u64,
+  /// Participants that were removed to make room for new ones.
+  pub participants_evicted: u64,
+  /// Announcements of endpoints and topics that were dropped: no room for another.
+  pub endpoints_refused: u64,
+}
+
+/// The counters behind [`NetworkCounts`], which both threads of a participant increment.
+#[derive(Debug, Default)]
+pub struct NetworkCounters {
+  pub(crate) malformed_datagrams: Counter,
+  pub(crate) announcements_refused: Counter,
+  pub(crate) participants_evicted: Counter,
+  pub(crate) endpoints_refused: Counter,
+}
+
+impl NetworkCounters {
+  /// The counts so far. Waits for no other thread.
+  pub fn counts(&self) -> NetworkCounts {
+    NetworkCounts {
+      malformed_datagrams: self.malformed_datagrams.get(),
+      announcements_refused: self.announcements_refused.get(),
+      participants_evicted: self.participants_evicted.get(),
+      endpoints_refused: self.endpoints_refused.get(),
+    }
+  }
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct Counter(AtomicU64);
+
+impl Counter {
+  pub fn increment(&self) {
+    self.0.fetch_add(1, Ordering::Relaxed);
+  }
+
+  fn get(&self) -> u64 {
+    self.0.load(Ordering::Relaxed)
+  }
+}
