@@ -1,5 +1,6 @@
 //! A DDS participant that appears as one ROS 2 node.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -13,12 +14,15 @@ use super::network;
 use super::qos::{self, ReaderQos};
 use super::reader::RawReader;
 use super::rustdds::{
-    DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
-    QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic, TopicKind,
+    DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, NetworkCounters,
+    Publisher, QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic,
+    TopicKind,
 };
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
-use crate::model::{Durability, Guid, History, QosProfile, Reliability, SourceTimestamp};
+use crate::model::{
+    Durability, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile, Reliability, SourceTimestamp,
+};
 
 /// The settings of a participant.
 #[derive(Clone, Debug)]
@@ -49,6 +53,7 @@ pub struct Participant {
     writers: Vec<Guid>,
     /// The turns of the library's threads at the last call of `have_threads_turned` that returned true.
     turns_seen: ThreadTurns,
+    network_counters: Arc<NetworkCounters>,
 }
 
 /// The QoS of the graph entries, as in `rmw_dds_common`: the last entry is delivered reliably, also to late
@@ -133,6 +138,7 @@ impl Participant {
             graph::TYPE,
             &qos::of_writer(&GRAPH_QOS, GRAPH_WINDOW_SAMPLES),
         )?;
+        let network_counters = participant.network_counters();
         let opened = Self {
             participant,
             publisher,
@@ -145,6 +151,7 @@ impl Participant {
             readers: Vec::new(),
             writers: Vec::new(),
             turns_seen: ThreadTurns::default(),
+            network_counters,
         };
         opened.publish_graph_entry();
         Ok(opened)
@@ -170,6 +177,17 @@ impl Participant {
             self.turns_seen = turns;
         }
         turned
+    }
+
+    /// What the participant has refused of the network since it was opened.
+    pub fn network_refusals(&self) -> NetworkRefusals {
+        let counts = self.network_counters.counts();
+        let mut refusals = NetworkRefusals::default();
+        refusals.add(NetworkRefusal::MalformedDatagram, counts.malformed_datagrams);
+        refusals.add(NetworkRefusal::TooManyParticipants, counts.announcements_refused);
+        refusals.add(NetworkRefusal::EvictedParticipant, counts.participants_evicted);
+        refusals.add(NetworkRefusal::TooManyEndpoints, counts.endpoints_refused);
+        refusals
     }
 
     /// Returns a watch of the sockets on which samples arrive, for a thread that peeks at datagrams before

@@ -9,7 +9,7 @@ use super::scheduling;
 use crate::clock;
 use crate::config::{Configuration, Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
-use crate::model::{Guid, MonotonicNs, ProcessHealth};
+use crate::model::{Guid, MonotonicNs, NetworkRefusals, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
 use crate::telemetry;
 
@@ -187,14 +187,16 @@ impl Role {
         self.health.update(|health| health.errors += 1);
     }
 
-    /// Records a turn of the data path, and the mode and policy that it applies; feeds the watchdog.
-    pub fn report_turn(&mut self, mode: u8, policy_epoch: u64) {
+    /// Records a turn of the data path, the mode and policy that it applies, and what its participants have
+    /// refused of the network; feeds the watchdog.
+    pub fn report_turn(&mut self, mode: u8, policy_epoch: u64, network_refusals: NetworkRefusals) {
         let now = clock::monotonic();
         self.health.update(|health| {
             health.alive_at = now;
             health.turns += 1;
             health.mode = mode;
             health.policy_epoch = policy_epoch;
+            health.network_refusals = network_refusals;
         });
         self.notifier.feed_watchdog(now);
     }

@@ -37,7 +37,8 @@ pub(super) unsafe trait Plain: Copy + Default {
     };
 }
 
-// SAFETY: `repr(C)`; words of 8 bytes, then `mode` and 7 reserved bytes, then a word; integers only.
+// SAFETY: `repr(C)`; words of 8 bytes, one of them `mode`, `ended` and 6 reserved bytes; a GUID of 16 bytes
+// at a multiple of 8; an array of words. Integers only.
 unsafe impl Plain for ProcessHealth {}
 // SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
 unsafe impl Plain for IngressCounters {}
@@ -65,7 +66,7 @@ unsafe impl Plain for RouteInfo {}
 unsafe impl Plain for LatencyHistogram {}
 
 const _: () = {
-    assert!(size_of::<ProcessHealth>() == 12 * 8);
+    assert!(size_of::<ProcessHealth>() == 16 * 8);
     assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
     assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
     assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);

@@ -52,7 +52,8 @@ impl fmt::Display for Report {
             let process = process(&format!("egress-{}", lane.name));
             let title = format!("lane {}: {};", lane.name, mode_text(lane));
             let process = process.map(process_text).unwrap_or_default();
-            write!(f, "\n{}", wrapped("", "  ", [title.as_str(), &process].into_iter(), " "))?;
+            let text = format!("{title} {process}");
+            write!(f, "\n{}", wrapped("", "  ", text.split(' '), " "))?;
             if matches!(lane.mode_reason, "control" | "safety" | "held") {
                 f.write_str(&wrapped("  why: ", "    ", lane.mode_detail.split(' '), " "))?;
             }
@@ -300,6 +301,9 @@ fn process_text(process: &ProcessReport) -> String {
     }
     if process.refused_reloads > 0 {
         let _ = write!(failures, ", {} refused", counted(process.refused_reloads, "reload"));
+    }
+    for (reason, count) in process.network_refusals.iter() {
+        let _ = write!(failures, ", refused {count} ({reason})");
     }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
     format!("process {} {}{up}, {restarts}{failures}", process.pid, process.state.label())

@@ -171,6 +171,7 @@ fn process(name: &str) -> ProcessReport {
         last_turn_age_ms: Some(99_999.0),
         errors: 99_999,
         refused_reloads: 99_999,
+        network_refusals: counts(99_999),
         settings_fingerprint: None,
     }
 }

@@ -5,6 +5,7 @@ mod control;
 mod control_faults;
 mod crowds;
 mod faults;
+mod forged_participants;
 mod hangs;
 mod hostile;
 mod hostile_readers;

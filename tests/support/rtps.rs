@@ -93,6 +93,24 @@ impl Message {
         Self(bytes)
     }
 
+    /// The announcement (SPDP) of a participant that receives at `address`.
+    pub fn announcement(source: Prefix, address: SocketAddrV4) -> Self {
+        let participant = Parameters::default()
+            .with(pid::PROTOCOL_VERSION, &[2, 3])
+            .with(pid::VENDOR_ID, &[1, 0x0f])
+            .with(pid::PARTICIPANT_GUID, &[source.as_slice(), &PARTICIPANT].concat())
+            .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, address)
+            .with_locator(pid::DEFAULT_UNICAST_LOCATOR, address)
+            .with(pid::PARTICIPANT_LEASE_DURATION, &[LEASE_S, 0].map(u32::to_le_bytes).concat())
+            .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
+        Self::of(source).data(SPDP_READER, SPDP_WRITER, 1, &participant)
+    }
+
+    /// The datagram.
+    pub fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+
     /// Adds INFO_DST: the following submessages are for a given participant.
     pub fn to(self, destination: Prefix) -> Self {
         self.submessage(kind::INFO_DST, 0x01, &destination)
@@ -251,15 +269,7 @@ impl ForgedReader {
     /// announced themselves (SEDP).
     pub fn announce_endpoint(&self, topic: &str, type_name: &str) {
         let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
-        let participant = Parameters::default()
-            .with(pid::PROTOCOL_VERSION, &[2, 3])
-            .with(pid::VENDOR_ID, &[1, 0x0f])
-            .with(pid::PARTICIPANT_GUID, &guid(PARTICIPANT))
-            .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, self.address)
-            .with_locator(pid::DEFAULT_UNICAST_LOCATOR, self.address)
-            .with(pid::PARTICIPANT_LEASE_DURATION, &[LEASE_S, 0].map(u32::to_le_bytes).concat())
-            .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
-        let announcement = Message::of(self.prefix).data(SPDP_READER, SPDP_WRITER, 1, &participant);
+        let announcement = Message::announcement(self.prefix, self.address);
         self.send(&announcement, SocketAddrV4::new(SPDP_MULTICAST.0, SPDP_MULTICAST.1));
 
         let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();

@@ -27,7 +27,8 @@ use crate::clock;
 use crate::config::{Configuration, DdsNetwork, InlineSecret, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{
-    ControlRecord, FixedText, LaneMode, LanePolicy, MonotonicNs, ProbeRefusal, RefusalCounts, SafetyMode,
+    ControlRecord, FixedText, LaneMode, LanePolicy, MonotonicNs, NetworkRefusals, ProbeRefusal,
+    RefusalCounts, SafetyMode,
 };
 use crate::policy::{LaneDecision, LaneReason, safety_floor};
 use crate::shm::{BoardWriter, ProcessRole};
@@ -324,7 +325,11 @@ impl Control {
         // Asks every participant, because that wakes its threads.
         let turned = self.participants.iter_mut().map(Participant::have_threads_turned);
         if turned.fold(true, |all, one| all & one) {
-            self.role.report_turn(self.supervision.mode() as u8, 0);
+            let mut refusals = NetworkRefusals::default();
+            for participant in &self.participants {
+                refusals.merge(&participant.network_refusals());
+            }
+            self.role.report_turn(self.supervision.mode() as u8, 0, refusals);
         }
         // Only the first call has an effect: control has completed its first turn.
         self.role.ready();

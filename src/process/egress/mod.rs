@@ -221,7 +221,8 @@ impl Egress {
         self.reload(now);
         // A turn of this thread forwards nothing if a thread of the DDS library hangs.
         if self.participant.have_threads_turned() {
-            self.role.report_turn(self.policy.mode as u8, self.policy.epoch);
+            let refusals = self.participant.network_refusals();
+            self.role.report_turn(self.policy.mode as u8, self.policy.epoch, refusals);
         }
         self.role.status(now, |line| describe(&self.outputs, self.policy.mode, &mut self.meters, line, now));
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);

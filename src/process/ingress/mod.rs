@@ -205,7 +205,7 @@ impl Ingress {
         // After the last lock of an input, because this wakes the receiving thread, which may have skipped a
         // locked one.
         if self.participant.have_threads_turned() {
-            self.role.report_turn(LaneMode::Normal as u8, 0);
+            self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
         outcome

@@ -12,7 +12,7 @@ pub use server::{MetricsError, MetricsServer};
 use super::liveness::ProcessState;
 use super::problem::Level;
 use super::report::{Latency, OutputReport, ProcessReport, Report, RouteReport, SubscriberReport};
-use crate::model::{DropReason, LaneMode, ProbeRefusal, SafetyMode, SubscriberState};
+use crate::model::{DropReason, LaneMode, NetworkRefusal, ProbeRefusal, SafetyMode, SubscriberState};
 use page::Kind::{Counter, Gauge, Histogram};
 use page::{Page, Value};
 
@@ -75,6 +75,14 @@ fn processes(page: &mut Page, report: &Report) {
     each("adaptive_bridge_process_last_turn_age_seconds", Gauge, "Time since its last turn.", &|process| {
         seconds(process.last_turn_age_ms)
     });
+    let help = "Datagrams and announcements that its participants refused, by reason.";
+    page.family("adaptive_bridge_process_network_refusals_total", Counter, help);
+    for process in &report.processes {
+        for reason in NetworkRefusal::ALL {
+            let labels = [("process", process.name.as_str()), ("reason", reason.label())];
+            page.sample(&labels, Some(process.network_refusals.get(*reason)));
+        }
+    }
 }
 
 fn lanes(page: &mut Page, report: &Report) {

@@ -1,7 +1,7 @@
 //! Problems that control found, and problems of control itself and of the settings.
 
 use super::{Level, Problem};
-use crate::model::{AbsenceKind, MAX_INTRUDERS, ProbeRefusal, SafetyMode, SubscriberState};
+use crate::model::{AbsenceKind, MAX_INTRUDERS, NetworkRefusal, ProbeRefusal, SafetyMode, SubscriberState};
 use crate::shm::ProcessRole;
 use crate::telemetry::report::SubscriberReport;
 use crate::telemetry::snapshot::{ModeReason, Snapshot};
@@ -98,7 +98,19 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         if let Some(errors) = grown(process.health.errors, former.health.errors) {
             let errors = counted(errors, "error");
             let text = format!("{}: {errors} in the last {window}; read its log", process.name);
-            problems.push(Problem::new(about, Level::Warn, text));
+            problems.push(Problem::new(about.clone(), Level::Warn, text));
+        }
+        let refused = process.health.network_refusals.since(&former.health.network_refusals);
+        // A malformed datagram, as of a port scan, is counted and harms nothing.
+        let refused = refused.iter().filter(|(reason, _)| *reason != NetworkRefusal::MalformedDatagram);
+        for (reason, count) in refused {
+            let meaning = reason.meaning();
+            let text = format!(
+                "{} refused {count} in the last {window}: {meaning} ({reason}); new subscribers and publishers may \
+                 not be found until a program on the network stops announcing so many",
+                process.name
+            );
+            problems.push(Problem::new(about.clone(), Level::Warn, text));
         }
     }
     problems
@@ -370,6 +382,20 @@ mod tests {
         assert!(found[1].starts_with("egress-critical refused a reload in the last 1.0 s"), "{found:?}");
         assert_eq!(found[2], "egress-noncritical: 3 errors in the last 1.0 s; read its log");
         assert_eq!(found.len(), 3);
+    }
+
+    #[test]
+    fn refused_announcements_are_problems_and_malformed_datagrams_are_not() {
+        let found = problems_after(|now| {
+            let refusals = &mut now.processes[1].health.network_refusals;
+            refusals.add(NetworkRefusal::MalformedDatagram, 7);
+            refusals.add(NetworkRefusal::TooManyParticipants, 9);
+        });
+        let [found] = &found[..] else { panic!("{found:?}") };
+        let meaning = NetworkRefusal::TooManyParticipants.meaning();
+        let text =
+            format!("egress-critical refused 9 in the last 1.0 s: {meaning} (too_many_participants); ");
+        assert!(found.starts_with(&text), "{found}");
     }
 
     #[test]

@@ -12,7 +12,9 @@ use super::liveness::ProcessState;
 use super::problem::Problem;
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
-use crate::model::{DropCounts, FixedText, Guid, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord};
+use crate::model::{
+    DropCounts, FixedText, Guid, LaneMode, MonotonicNs, NetworkRefusals, PublisherAccount, ReaderRecord,
+};
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -66,6 +68,8 @@ pub struct ProcessReport {
     pub errors: u64,
     /// Reloads that it refused because of errors in the configuration file.
     pub refused_reloads: u64,
+    /// What its participants refused of the network, by reason.
+    pub network_refusals: NetworkRefusals,
     /// A hash of the settings that it applies, in hexadecimal, to compare processes; null until it is known.
     pub settings_fingerprint: Option<String>,
 }
@@ -444,6 +448,7 @@ fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
         last_turn_age_ms: age_ms(health.alive_at, now),
         errors: health.errors,
         refused_reloads: health.refused_reloads,
+        network_refusals: health.network_refusals,
         settings_fingerprint: (health.settings_fingerprint != 0)
             .then(|| format!("{:016x}", health.settings_fingerprint)),
     }

@@ -2,6 +2,7 @@
 //! after the process that wrote them has died.
 
 use super::drops::DropCounts;
+use super::network::NetworkRefusals;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 
@@ -241,6 +242,8 @@ pub struct ProcessHealth {
     pub settings_fingerprint: u64,
     /// Reloads that the process refused because the file was bad.
     pub refused_reloads: u64,
+    /// What its participants refused of the network since it started.
+    pub network_refusals: NetworkRefusals,
 }
 
 /// The policy of one lane on the policy board: control's decision, the floor of the safety supervisor and an

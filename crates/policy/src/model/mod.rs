@@ -10,6 +10,7 @@ mod hash;
 mod health;
 mod modes;
 mod names;
+mod network;
 mod probe;
 mod qos;
 mod rates;
@@ -30,6 +31,7 @@ pub use health::{
 };
 pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
+pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};

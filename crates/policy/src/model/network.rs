@@ -1,0 +1,20 @@
+//! What a process refuses of the network.
+
+use super::counts::{Counts, reasons};
+
+reasons! {
+    /// Why a DDS participant of the bridge refused something that it received. A refused datagram or
+    /// announcement is counted and has no other effect.
+    NetworkRefusal:
+    /// A datagram that is not RTPS, or not well-formed.
+    MalformedDatagram = "malformed_datagram", "datagrams that are not well-formed RTPS",
+    /// An announcement of an unknown participant: too many in a short time, or no room for another one.
+    TooManyParticipants = "too_many_participants", "announcements of more participants than the bridge follows",
+    /// A participant without a topic of the bridge was removed to make room for a new one.
+    EvictedParticipant = "evicted_participant", "participants were removed to make room for new ones",
+    /// An announcement of an endpoint or a topic without room for another one.
+    TooManyEndpoints = "too_many_endpoints", "announcements of more endpoints than the bridge follows",
+}
+
+/// Counts of what a participant refused of the network, by reason.
+pub type NetworkRefusals = Counts<NetworkRefusal, { NetworkRefusal::COUNT }>;
