@@ -14,7 +14,8 @@ use std::time::Duration;
 use adaptive_bridge::config::{self, DdsNetwork};
 use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, WriterEvent};
 use adaptive_bridge::model::{
-    DropReason, Durability, Encapsulation, ProbeRefusal, QosProfile, Reliability, SourceTimestamp,
+    DropReason, Durability, Encapsulation, NetworkRefusal, ProbeRefusal, QosProfile, Reliability,
+    SourceTimestamp,
 };
 use bytes::Bytes;
 use nix::sys::signal::Signal;
@@ -272,6 +273,12 @@ fn keys(value: &Value, path: &str, found: &mut BTreeSet<String>) {
             assert_eq!(names, all, "{path}");
             found.insert(format!("{path}.<refusal>"));
         }
+        Value::Object(map) if path.ends_with("network_refusals") => {
+            let names: BTreeSet<&str> = map.keys().map(String::as_str).collect();
+            let all: BTreeSet<&str> = NetworkRefusal::ALL.iter().map(|cause| cause.label()).collect();
+            assert_eq!(names, all, "{path}");
+            found.insert(format!("{path}.<cause>"));
+        }
         Value::Object(map) => {
             for (key, value) in map {
                 let below = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
@@ -314,6 +321,8 @@ fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
     assert_eq!(table("Key | Meaning").into_iter().filter(is_there).collect::<BTreeSet<_>>(), found);
     let refusals: BTreeSet<String> = ProbeRefusal::ALL.iter().map(|one| one.label().to_owned()).collect();
     assert_eq!(table("Refusal | Meaning"), refusals);
+    let causes: BTreeSet<String> = NetworkRefusal::ALL.iter().map(|one| one.label().to_owned()).collect();
+    assert_eq!(table("Cause | Meaning"), causes);
     let reasons: BTreeSet<String> = DropReason::ALL.iter().map(|reason| reason.label().to_owned()).collect();
     assert_eq!(table("Reason | Where | Meaning"), reasons);
     let latency = ["count", "max_us", "p50_us", "p99_us"].map(str::to_owned);
