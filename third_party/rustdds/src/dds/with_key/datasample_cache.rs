@@ -20,6 +20,11 @@ use crate::{
 
 // use std::num::Zero; unstable
 
+// How many instances are remembered of which there is no sample. What is known of them
+// tells the application whether it has seen the instance before. Without a limit,
+// each participant and endpoint that is ever discovered stays here, 250 bytes each.
+const MAX_INSTANCES_WITHOUT_SAMPLES: usize = 256;
+
 // DataSampleCache is a structure local to DataReader and DataWriter. It acts as
 // a buffer between e.g. RTPS Reader and the application-facing DataReader. It
 // keeps track of what each DataReader has "read" or "taken".
@@ -32,6 +37,9 @@ pub struct DataSampleCache<D: Keyed> {
   datasamples: BTreeMap<Timestamp, SampleWithMetaData<D>>, /* ordered storage for deserialized
                                                             * samples */
   pub(crate) instance_map: BTreeMap<D::K, InstanceMetaData>, // ordered storage for instances
+  // The living instances without samples, by InstanceMetaData::idle_since.
+  idle_instances: BTreeMap<u64, D::K>,
+  next_idle: u64,
 }
 
 pub(crate) struct InstanceMetaData {
@@ -39,6 +47,7 @@ pub(crate) struct InstanceMetaData {
   instance_state: InstanceState,         // latest known alive/not_alive state for this instance
   latest_generation_available: NotAliveGenerationCounts, // in this instance
   last_generation_accessed: NotAliveGenerationCounts, // in this instance
+  idle_since: Option<u64>,               // its key in idle_instances
 }
 
 struct SampleWithMetaData<D: Keyed> {
@@ -75,6 +84,8 @@ where
       qos,
       datasamples: BTreeMap::new(),
       instance_map: BTreeMap::new(),
+      idle_instances: BTreeMap::new(),
+      next_idle: 0,
     }
   }
 
@@ -134,6 +145,7 @@ where
         latest_generation_available: NotAliveGenerationCounts::zero(), /* this is new instance,
                                                                         * so start from zero */
         last_generation_accessed: NotAliveGenerationCounts::sub_zero(), // never accessed
+        idle_since: None,
       };
       self.instance_map.insert(instance_key.clone(), imd);
       self
@@ -144,6 +156,9 @@ where
     };
 
     // update instance metadata
+    if let Some(idle) = instance_metadata.idle_since.take() {
+      self.idle_instances.remove(&idle);
+    }
     instance_metadata.instance_samples.insert(receive_timestamp);
 
     match (instance_metadata.instance_state, new_instance_state) {
@@ -396,6 +411,31 @@ where
     }
   }
 
+  // After a sample has been taken. An instance without samples is forgotten if it has
+  // been disposed; of those that are alive, the ones that have had no sample for longest
+  // are forgotten beyond a limit.
+  fn sample_taken(&mut self, instant: Timestamp, key: &D::K) {
+    let Some(imd) = self.instance_map.get_mut(key) else {
+      return;
+    };
+    imd.instance_samples.remove(&instant);
+    if !imd.instance_samples.is_empty() {
+      return;
+    }
+    if imd.instance_state == InstanceState::NotAliveDisposed {
+      self.instance_map.remove(key);
+      return;
+    }
+    imd.idle_since = Some(self.next_idle);
+    self.idle_instances.insert(self.next_idle, key.clone());
+    self.next_idle += 1;
+    if self.idle_instances.len() > MAX_INSTANCES_WITHOUT_SAMPLES {
+      if let Some((_, forgotten)) = self.idle_instances.pop_first() {
+        self.instance_map.remove(&forgotten);
+      }
+    }
+  }
+
   // read methods perform actual read or take. They must be called with key
   // vectors obtained from select_*_for_access -methods above, or their
   // subvectors.
@@ -519,6 +559,9 @@ where
     }
 
     self.mark_instances_viewed(&instance_generations);
+    for (ts, key) in keys {
+      self.sample_taken(*ts, key);
+    }
     result
   }
 
@@ -595,6 +638,9 @@ where
     }
 
     self.mark_instances_viewed(&instance_generations);
+    for (ts, key) in keys {
+      self.sample_taken(*ts, key);
+    }
     result
   }
 
@@ -618,41 +664,105 @@ pub(crate) fn result_ok_as_ref_err_clone<T, E: Clone>(r: &Sample<T, E>) -> Sampl
 
 #[cfg(test)]
 mod tests {
-  // use super::*;
-  // use crate::{
-  //   structure::{time::Timestamp},
-  // };
-  // use crate::dds::ddsdata::DDSData;
-  // use crate::dds::traits::key::Keyed;
-  // use crate::test::random_data::*;
+  use super::*;
+
+  #[derive(Clone)]
+  struct Counter {
+    name: u32,
+  }
+
+  impl Keyed for Counter {
+    type K = u32;
+
+    fn key(&self) -> u32 {
+      self.name
+    }
+  }
+
+  fn keep_all() -> DataSampleCache<Counter> {
+    let qos = crate::QosPolicyBuilder::new().history(policy::History::KeepAll);
+    DataSampleCache::new(qos.build())
+  }
+
+  fn add(cache: &mut DataSampleCache<Counter>, sample: Sample<Counter, u32>) {
+    cache.add_sample(
+      sample,
+      GUID::GUID_UNKNOWN,
+      SequenceNumber::from(1),
+      Timestamp::now(),
+      WriteOptions::default(),
+    );
+  }
+
+  fn take_all(cache: &mut DataSampleCache<Counter>) -> Vec<SampleInfo> {
+    let keys = cache.select_keys_for_access(ReadCondition::any());
+    let taken = cache.take_by_keys(&keys);
+    taken.iter().map(|s| s.sample_info().clone()).collect()
+  }
 
   #[test]
-  fn dsc_empty_qos() {
-    /*
-    let qos = QosPolicies::qos_none();
-    let mut datasample_cache = DataSampleCache::<RandomData>::new(qos);
-
-    let timestamp = Timestamp::now();
-    let data = RandomData {
-      a: 4,
-      b: "Fobar".to_string(),
-    };
-
-    let org_ddsdata = DDSData::from(&data, Some(timestamp));
-
-    let key = data.key().clone();
-    datasample_cache.add_sample(Ok(data.clone()), GUID::GUID_UNKNOWN, timestamp, None);
-    //datasample_cache.add_datasample(datasample).unwrap();
-
-    let samples = datasample_cache.read_by_keys(&[(timestamp, key)]);
-    assert_eq!(samples.len(), 1);
-    match &samples.get(0).unwrap().value() {
-      Ok(huh) => {
-        let ddssample = DDSData::from(huh, Some(timestamp));
-        assert_eq!(org_ddsdata, ddssample);
-      }
-      _ => (),
+  fn a_disposed_instance_is_forgotten_with_its_last_sample() {
+    let mut cache = keep_all();
+    for name in 0..10 {
+      add(&mut cache, Sample::Value(Counter { name }));
+      add(&mut cache, Sample::Dispose(name));
     }
-    */
+    let first = cache.select_keys_for_access(ReadCondition::any())[0];
+    cache.take_by_keys(&[first]);
+    assert_eq!(cache.instance_map.len(), 10);
+    take_all(&mut cache);
+    assert!(cache.instance_map.is_empty() && cache.idle_instances.is_empty());
+
+    // Also where only a dispose is received, and samples are taken without their
+    // metadata.
+    add(&mut cache, Sample::Dispose(3));
+    let keys = cache.select_keys_for_access(ReadCondition::any());
+    cache.take_bare_by_keys(&keys);
+    assert!(cache.instance_map.is_empty() && cache.idle_instances.is_empty());
+  }
+
+  #[test]
+  fn living_instances_without_samples_are_remembered_up_to_a_limit() {
+    let mut cache = keep_all();
+    let limit = MAX_INSTANCES_WITHOUT_SAMPLES as u32;
+    // One that is never taken, and one that has a sample again and again.
+    add(&mut cache, Sample::Value(Counter { name: 0 }));
+    let take = |cache: &mut DataSampleCache<Counter>, name| {
+      let keys = cache.select_instance_keys_for_access(&name, ReadCondition::any());
+      let taken = cache.take_by_keys(&keys);
+      taken[0].sample_info().view_state()
+    };
+    for name in 2..3 * limit {
+      for name in [1, name] {
+        add(&mut cache, Sample::Value(Counter { name }));
+        let is_new = take(&mut cache, name) == ViewState::New;
+        assert_eq!(is_new, name > 1 || cache.next_idle == 1, "{name}");
+      }
+      assert!(cache.instance_map.len() as u32 <= limit + 1);
+      assert!(cache.idle_instances.len() as u32 <= limit);
+    }
+    // The one with a sample is there, those of which a sample was taken last too.
+    for (name, state) in [
+      (0, ViewState::New),
+      (3 * limit - 1, ViewState::NotNew),
+      (2, ViewState::New),
+    ] {
+      if name > 0 {
+        add(&mut cache, Sample::Value(Counter { name }));
+      }
+      assert_eq!(take(&mut cache, name), state, "{name}");
+    }
+  }
+
+  #[test]
+  fn a_taken_sample_does_not_count_for_the_depth() {
+    let qos = crate::QosPolicyBuilder::new().history(policy::History::KeepLast { depth: 2 });
+    let mut cache = DataSampleCache::new(qos.build());
+    add(&mut cache, Sample::Value(Counter { name: 1 }));
+    add(&mut cache, Sample::Value(Counter { name: 1 }));
+    let newest = cache.select_keys_for_access(ReadCondition::any())[1];
+    cache.take_by_keys(&[newest]);
+    add(&mut cache, Sample::Value(Counter { name: 1 }));
+    assert_eq!(take_all(&mut cache).len(), 2);
   }
 }
