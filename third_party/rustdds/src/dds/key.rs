@@ -57,6 +57,10 @@ impl KeyHash {
     Vec::from(self.0)
   }
 
+  pub fn to_bytes(self) -> [u8; 16] {
+    self.0
+  }
+
   pub fn into_pl_cdr_bytes(self) -> Result<Vec<u8>, PlCdrSerializeError> {
     Ok(self.to_vec())
   }
@@ -118,7 +122,17 @@ pub trait Key:
 {
   // no methods required
 
-  // provided method:
+  // provided methods:
+
+  /// The key that has this hash, for a type whose [`hash_key`](Self::hash_key)
+  /// is the serialized key itself. Readers need not remember the keys of such a
+  /// type to understand a dispose that has only the hash.
+  ///
+  /// A type has it for all hashes or, as by default, for none.
+  fn from_key_hash(_hash: KeyHash) -> Option<Self> {
+    None
+  }
+
   fn hash_key(&self, force_md5: bool) -> KeyHash {
     // See RTPS Spec v2.3 Section 9.6.3.8 KeyHash
 
@@ -186,6 +200,10 @@ impl Key for () {
   fn hash_key(&self, _force_md5: bool) -> KeyHash {
     KeyHash::zero()
   }
+
+  fn from_key_hash(_hash: KeyHash) -> Option<Self> {
+    Some(())
+  }
 }
 
 /// Key for a reference type `&D` is the same as for the value type `D`.
@@ -232,5 +250,20 @@ impl BuiltInTopicKey {
     Self {
       value: [rng.random(), rng.random(), rng.random()],
     }
+  }
+}
+
+#[cfg(test)]
+mod tests {
+  use super::*;
+  use crate::structure::guid::GUID;
+
+  #[test]
+  fn the_hash_of_a_guid_is_the_guid() {
+    let bytes: [u8; 16] = std::array::from_fn(|i| i as u8 + 1);
+    let guid = GUID::from_bytes(bytes);
+    assert_eq!(guid.hash_key(false), KeyHash(bytes));
+    assert_eq!(GUID::from_key_hash(KeyHash(bytes)), Some(guid));
+    assert_eq!(String::from_key_hash(KeyHash(bytes)), None);
   }
 }

@@ -2,6 +2,7 @@ pub(crate) mod datareader;
 pub(crate) mod datasample;
 pub(crate) mod datasample_cache;
 pub(crate) mod datawriter;
+pub(crate) mod known_keys;
 pub(crate) mod simpledatareader;
 
 pub use simpledatareader::*;

@@ -11,6 +11,7 @@ use cdr_encoding_size::*;
 use crate::{
   dds::{
     adapters::with_key::SerializerAdapter,
+    key::KeyHash,
     participant::DomainParticipant,
     qos::{
       policy::{
@@ -60,7 +61,11 @@ use crate::structure::guid::EntityKind;
 #[derive(PartialEq, Eq, PartialOrd, Ord, Debug, Clone, Copy, CdrEncodingSize, Hash, Serialize)]
 pub struct Endpoint_GUID(pub GUID);
 
-impl Key for Endpoint_GUID {}
+impl Key for Endpoint_GUID {
+  fn from_key_hash(hash: KeyHash) -> Option<Self> {
+    GUID::from_key_hash(hash).map(Self)
+  }
+}
 
 impl PlCdrDeserialize for Endpoint_GUID {
   fn from_pl_cdr_bytes(
@@ -1307,7 +1312,16 @@ impl Keyed for ParticipantMessageData {
 )]
 pub struct ParticipantMessageDataKey(GuidPrefix, ParticipantMessageDataKind);
 
-impl Key for ParticipantMessageDataKey {}
+impl Key for ParticipantMessageDataKey {
+  fn from_key_hash(hash: KeyHash) -> Option<Self> {
+    let bytes = hash.to_bytes();
+    let (prefix, kind) = bytes.split_at(12);
+    let kind = ParticipantMessageDataKind {
+      value: kind.try_into().ok()?,
+    };
+    Some(Self(GuidPrefix::new(prefix), kind))
+  }
+}
 
 // =======================================================================
 // =======================================================================

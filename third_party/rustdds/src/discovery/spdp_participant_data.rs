@@ -7,7 +7,7 @@ use bytes::Bytes;
 use cdr_encoding_size::CdrEncodingSize;
 
 use crate::{
-  dds::{participant::DomainParticipant, qos::QosPolicies},
+  dds::{key::KeyHash, participant::DomainParticipant, qos::QosPolicies},
   messages::{
     protocol_version::ProtocolVersion,
     submessages::elements::{
@@ -512,7 +512,11 @@ impl ParameterListable for SpdpDiscoveredParticipantData {
 )]
 pub struct Participant_GUID(pub GUID);
 
-impl Key for Participant_GUID {}
+impl Key for Participant_GUID {
+  fn from_key_hash(hash: KeyHash) -> Option<Self> {
+    GUID::from_key_hash(hash).map(Self)
+  }
+}
 
 impl Keyed for SpdpDiscoveredParticipantData {
   type K = Participant_GUID;

@@ -500,6 +500,19 @@ impl TopicCache {
     self.received_reliably_before.contains_key(&writer)
   }
 
+  /// Whether anything is known of the Writer: samples, or how far a Reliable Reader
+  /// has received it.
+  pub fn has_writer(&self, writer: GUID) -> bool {
+    self.sequence_numbers.contains_key(&writer)
+      || self.received_reliably_before.contains_key(&writer)
+      || self.taken.contains_key(&writer)
+  }
+
+  /// The number of Writers of which something is known, or more.
+  pub fn writer_count(&self) -> usize {
+    self.sequence_numbers.len() + self.received_reliably_before.len() + self.taken.len()
+  }
+
   fn reliable_before(&self, writer: GUID) -> SequenceNumber {
     self
       .received_reliably_before

@@ -7,7 +7,10 @@ use mio1::Token;
 use log::warn;
 use static_assertions as sa;
 
-use crate::{dds::key::Key, messages::vendor_id::VendorId};
+use crate::{
+  dds::key::{Key, KeyHash},
+  messages::vendor_id::VendorId,
+};
 
 /// DDS/RTPS Participant GuidPrefix
 #[derive(
@@ -625,7 +628,11 @@ impl GUID {
   }
 }
 
-impl Key for GUID {}
+impl Key for GUID {
+  fn from_key_hash(hash: KeyHash) -> Option<Self> {
+    Some(Self::from_bytes(hash.to_bytes()))
+  }
+}
 
 impl fmt::Debug for GUID {
   fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -27,7 +27,10 @@ use crate::{
     result::*,
     statusevents::*,
     topic::{Topic, TopicDescription},
-    with_key::datasample::{DeserializedCacheChange, Sample},
+    with_key::{
+      datasample::{DeserializedCacheChange, Sample},
+      known_keys::KnownKeys,
+    },
   },
   discovery::discovery::DiscoveryCommand,
   mio_source::PollEventSource,
@@ -51,16 +54,18 @@ pub(crate) enum ReaderCommand {
   IgnoreReliableWriters,
 }
 
+// Of so many Writers, with those that are gone, a Reliable Reader remembers what it has
+// read last. As many as the participants in the attic of discovery: a Writer that
+// returns after it is forgotten is read from its first sample on.
+const MAX_FORMER_WRITERS: usize = 256;
+
 // This is helper struct.
 // All mutable state needed for reading should go here.
 pub(crate) struct ReadState<K: Key> {
   latest_instant: Timestamp, /* This is used as a read pointer from dds_cache for BEST_EFFORT
                               * reading */
   last_read_sn: BTreeMap<GUID, SequenceNumber>, // collection of read pointers for RELIABLE reading
-  /// hash_to_key_map is used for decoding received key hashes back to original
-  /// key values. This is needed when we receive a dispose message via hash
-  /// only.
-  hash_to_key_map: BTreeMap<KeyHash, K>, // TODO: garbage collect this somehow
+  known_keys: KnownKeys<K>,
 }
 
 impl<K: Key> ReadState<K> {
@@ -68,25 +73,34 @@ impl<K: Key> ReadState<K> {
     ReadState {
       latest_instant: begin_instant,
       last_read_sn: taken,
-      hash_to_key_map: BTreeMap::<KeyHash, K>::new(),
+      known_keys: KnownKeys::new(),
     }
   }
 
   // This is a helper function so that borrow checker understands
   // that we are splitting one mutable borrow into two _disjoint_ mutable
   // borrows.
-  fn get_sn_map_and_hash_map(
+  fn get_sn_map_and_known_keys(
     &mut self,
-  ) -> (
-    &mut BTreeMap<GUID, SequenceNumber>,
-    &mut BTreeMap<KeyHash, K>,
-  ) {
+  ) -> (&mut BTreeMap<GUID, SequenceNumber>, &mut KnownKeys<K>) {
     let ReadState {
       last_read_sn,
-      hash_to_key_map,
+      known_keys,
       ..
     } = self;
-    (last_read_sn, hash_to_key_map)
+    (last_read_sn, known_keys)
+  }
+
+  // Moves the read pointer of a Writer for RELIABLE reading.
+  fn set_last_read_sn(&mut self, writer: GUID, sn: SequenceNumber, topic_cache: &TopicCache) {
+    self.last_read_sn.insert(writer, sn);
+    // Looks for Writers that are gone only after the map has doubled, so that a sample
+    // costs no more on average than with few Writers.
+    if self.last_read_sn.len() > max(MAX_FORMER_WRITERS, 2 * topic_cache.writer_count()) {
+      self
+        .last_read_sn
+        .retain(|writer, _| topic_cache.has_writer(*writer));
+    }
   }
 }
 
@@ -258,22 +272,11 @@ where
     topic_cache.get_changes_in_range(is_reliable, latest_instant, last_read_sn)
   }
 
-  fn update_hash_to_key_map(
-    hash_to_key_map: &mut BTreeMap<KeyHash, D::K>,
-    deserialized: &Sample<D, D::K>,
-  ) {
-    let instance_key = match deserialized {
-      Sample::Value(d) => d.key(),
-      Sample::Dispose(k) => k.clone(),
-    };
-    hash_to_key_map.insert(instance_key.hash_key(false), instance_key);
-  }
-
   fn deserialize_with<S>(
     &self,
     timestamp: Timestamp,
     cc: &CacheChange,
-    hash_to_key_map: &mut BTreeMap<KeyHash, D::K>,
+    known_keys: &mut KnownKeys<D::K>,
     decoder: S,
   ) -> ReadResult<DeserializedCacheChange<D>>
   where
@@ -314,9 +317,12 @@ where
           match decoded {
             // Data update, decoded ok
             Ok(payload) => {
-              let p = Sample::Value(payload);
-              Self::update_hash_to_key_map(hash_to_key_map, &p);
-              Ok(DeserializedCacheChange::new(timestamp, cc, p))
+              known_keys.remember(|| payload.key());
+              Ok(DeserializedCacheChange::new(
+                timestamp,
+                cc,
+                Sample::Value(payload),
+              ))
             }
             Err(e) => Err(ReadError::Deserialization {
               reason: format!(
@@ -356,9 +362,12 @@ where
           decoder,
         ) {
           Ok(key) => {
-            let k = Sample::Dispose(key);
-            Self::update_hash_to_key_map(hash_to_key_map, &k);
-            Ok(DeserializedCacheChange::new(timestamp, cc, k))
+            known_keys.forget(&key);
+            Ok(DeserializedCacheChange::new(
+              timestamp,
+              cc,
+              Sample::Dispose(key),
+            ))
           }
           Err(e) => Err(ReadError::Deserialization {
             reason: format!(
@@ -374,11 +383,11 @@ where
       DDSData::DisposeByKeyHash { key_hash, .. } => {
         // The cache should know hash -> key mapping even if the sample
         // has been disposed or .take()n
-        if let Some(key) = hash_to_key_map.get(&key_hash) {
+        if let Some(key) = known_keys.forget_by_hash(key_hash) {
           Ok(DeserializedCacheChange::new(
             timestamp,
             cc,
-            Sample::Dispose(key.clone()),
+            Sample::Dispose(key),
           ))
         } else {
           Err(ReadError::UnknownKey {
@@ -419,7 +428,7 @@ where
 
     let mut read_state_ref = self.read_state.lock().unwrap();
     let latest_instant = read_state_ref.latest_instant;
-    let (last_read_sn, hash_to_key_map) = read_state_ref.get_sn_map_and_hash_map();
+    let (last_read_sn, known_keys) = read_state_ref.get_sn_map_and_known_keys();
 
     let mut changes =
       Self::try_take_undecoded(is_reliable, &topic_cache, latest_instant, last_read_sn);
@@ -443,7 +452,7 @@ where
         continue;
       }
 
-      let result = self.deserialize_with(timestamp, cc, hash_to_key_map, decoder.clone());
+      let result = self.deserialize_with(timestamp, cc, known_keys, decoder.clone());
 
       if let Err(ReadError::UnknownKey { .. }) = result {
         // ignore unknown key hash, continue looping
@@ -458,9 +467,9 @@ where
         // Advance read pointer, error or not, because otherwise
         // the SimpleDatareader is stuck.
         read_state_ref.latest_instant = max(latest_instant, timestamp);
-        read_state_ref
-          .last_read_sn
-          .insert(writer_guid, sequence_number);
+        if is_reliable {
+          read_state_ref.set_last_read_sn(writer_guid, sequence_number, &topic_cache);
+        }
 
         // // Debug sanity check:
         // use crate::Duration;
@@ -793,5 +802,62 @@ where
       .status_receiver
       .as_async_status_stream()
       .is_terminated()
+  }
+}
+
+#[cfg(test)]
+mod tests {
+  use super::*;
+  use crate::{
+    dds::typedesc::TypeDesc,
+    messages::submessages::elements::serialized_payload::SerializedPayload,
+    structure::guid::GuidPrefix, with_key::WriteOptions,
+  };
+
+  fn writer(number: usize) -> GUID {
+    let mut prefix = [0; 12];
+    prefix[4..].copy_from_slice(&number.to_be_bytes());
+    GUID::new(
+      GuidPrefix::new(&prefix),
+      EntityId::SEDP_BUILTIN_PUBLICATIONS_WRITER,
+    )
+  }
+
+  // Reads a sample of each of so many Writers, and returns what is remembered of them.
+  fn read_of_many(count: usize, are_gone: bool) -> ReadState<GUID> {
+    let topic_type = TypeDesc::new("test".to_string());
+    let mut topic_cache = TopicCache::new("test".to_string(), topic_type, &QosPolicies::qos_none());
+    let mut state = ReadState::<GUID>::new(Timestamp::ZERO, BTreeMap::new());
+    for number in 0..count {
+      let change = CacheChange::new(
+        writer(number),
+        SequenceNumber::new(1),
+        WriteOptions::default(),
+        DDSData::new(SerializedPayload::default()),
+      );
+      topic_cache.add_change(&Timestamp::now(), change);
+      topic_cache.mark_reliably_received_before(writer(number), SequenceNumber::new(2));
+      state.set_last_read_sn(writer(number), SequenceNumber::new(1), &topic_cache);
+      if are_gone && number > 0 {
+        topic_cache.forget_reliable_writer(writer(number));
+      }
+    }
+    let again = topic_cache.get_changes_in_range(true, Timestamp::ZERO, &state.last_read_sn);
+    assert_eq!(again.count(), 0, "samples that were read before");
+    state
+  }
+
+  #[test]
+  fn writers_that_are_gone_are_remembered_up_to_a_limit() {
+    let state = read_of_many(10 * MAX_FORMER_WRITERS, true);
+    assert!(state.last_read_sn.len() <= MAX_FORMER_WRITERS);
+    // The one that is still there.
+    assert!(state.last_read_sn.contains_key(&writer(0)));
+  }
+
+  #[test]
+  fn all_writers_that_are_there_are_remembered() {
+    let count = 3 * MAX_FORMER_WRITERS;
+    assert_eq!(read_of_many(count, false).last_read_sn.len(), count);
   }
 }
