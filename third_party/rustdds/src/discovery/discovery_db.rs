@@ -232,6 +232,7 @@ impl DiscoveryDB {
         &mut self.external_topic_writers_attic,
         &mut self.external_topic_writers,
       );
+      self.restore_topics_of(guid.prefix);
     }
 
     self.participant_attic.remove(&guid.prefix);
@@ -329,6 +330,8 @@ impl DiscoveryDB {
     #[cfg(feature = "security")]
     self.authentication_statuses.remove(&guid_prefix);
 
+    self.forget_topics_of(guid_prefix);
+
     if participant_data.is_some() {
       self.remember_in_attic(guid_prefix);
     }
@@ -354,6 +357,49 @@ impl DiscoveryDB {
       &mut self.external_topic_writers,
       &mut self.external_topic_writers_attic,
     );
+  }
+
+  // What the participant and its endpoints announced of topics. A topic with another
+  // user stays, so that without this `ros_discovery_info` of ROS 2 would keep 400 bytes
+  // of each endpoint that ever used it.
+  fn forget_topics_of(&mut self, guid_prefix: GuidPrefix) {
+    for announced in self.topics.values_mut() {
+      let gone: Vec<GUID> = announced
+        .range(guid_prefix.range())
+        .map(|(g, _)| *g)
+        .collect();
+      for guid in gone {
+        announced.remove(&guid);
+      }
+    }
+  }
+
+  fn forget_topic_of(&mut self, endpoint: GUID, topic_name: &str) {
+    if let Some(announced) = self.topics.get_mut(topic_name) {
+      announced.remove(&endpoint);
+    }
+  }
+
+  // The opposite, for endpoints that have returned from the attic.
+  fn restore_topics_of(&mut self, guid_prefix: GuidPrefix) {
+    let (readers, writers) = self.endpoints_of(guid_prefix);
+    let readers = readers.iter().map(|reader| {
+      (
+        reader.reader_proxy.remote_reader_guid,
+        reader.subscription_topic_data.to_topic_data(),
+        DiscoveredVia::Subscription,
+      )
+    });
+    let writers = writers.iter().map(|writer| {
+      (
+        writer.writer_proxy.remote_writer_guid,
+        writer.publication_topic_data.to_topic_data(),
+        DiscoveredVia::Publication,
+      )
+    });
+    for (guid, topic, via) in readers.chain(writers) {
+      self.update_topic_data(&DiscoveredTopicData::new(Utc::now(), topic), guid, via);
+    }
   }
 
   fn remember_in_attic(&mut self, guid_prefix: GuidPrefix) {
@@ -410,7 +456,9 @@ impl DiscoveryDB {
 
   pub fn remove_topic_reader(&mut self, guid: GUID) {
     info!("remove_topic_reader {guid:?}");
-    self.external_topic_readers.remove(&guid);
+    if let Some(reader) = self.external_topic_readers.remove(&guid) {
+      self.forget_topic_of(guid, reader.subscription_topic_data.topic_name());
+    }
   }
 
   #[cfg(feature = "security")]
@@ -437,7 +485,9 @@ impl DiscoveryDB {
   }
 
   pub fn remove_topic_writer(&mut self, guid: GUID) {
-    self.external_topic_writers.remove(&guid);
+    if let Some(writer) = self.external_topic_writers.remove(&guid) {
+      self.forget_topic_of(guid, writer.publication_topic_data.topic_name());
+    }
   }
 
   // Delete participant proxies, if we have not heard of them within
@@ -1491,5 +1541,44 @@ mod tests {
     ));
     assert_eq!(discoverydb.get_local_topic_readers(&topic).len(), 2);
     assert_eq!(discoverydb.get_all_local_topic_readers().count(), 2);
+  }
+
+  #[test]
+  fn what_endpoints_announced_of_a_topic_goes_with_them() {
+    let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
+    let (status_sender, _status_receiver) = sync_status_channel(16).unwrap();
+    let mut db = DiscoveryDB::new(GUID::new_participant_guid(), updated_sender, status_sender);
+    let mut participant = spdp_participant_data().unwrap();
+    participant.participant_guid = GUID::new_participant_guid();
+    let prefix = participant.participant_guid.prefix;
+    let new_reader = |number: u8, prefix: GuidPrefix| {
+      let mut reader =
+        DiscoveredReaderData::default("some_topic".to_string(), "RandomData".to_string());
+      reader.reader_proxy.remote_reader_guid = GUID::new(
+        prefix,
+        EntityId::create_custom_entity_id([0, 0, number], EntityKind::READER_NO_KEY_USER_DEFINED),
+      );
+      reader
+    };
+    // One of another participant stays.
+    let stays = new_reader(1, GUID::new_participant_guid().prefix);
+    db.update_subscription(&stays);
+    db.update_participant(&participant);
+    for number in 1..=3 {
+      db.update_subscription(&new_reader(number, prefix));
+    }
+    assert_eq!(db.topics["some_topic"].len(), 4);
+    db.remove_topic_reader(new_reader(2, prefix).reader_proxy.remote_reader_guid);
+    assert_eq!(db.topics["some_topic"].len(), 3);
+    for is_disposed in [true, false] {
+      db.remove_participant(prefix, is_disposed);
+      assert_eq!(db.topics["some_topic"].len(), 1);
+      // It returns with the endpoints that are in the attic.
+      db.update_participant(&participant);
+      assert_eq!(db.topics["some_topic"].len(), 3);
+    }
+    db.remove_participant(prefix, true);
+    db.remove_topic_reader(stays.reader_proxy.remote_reader_guid);
+    assert!(db.get_topic("some_topic").is_none());
   }
 }
