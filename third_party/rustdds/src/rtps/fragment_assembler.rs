@@ -370,6 +370,11 @@ impl FragmentAssembler {
     self.assembly_buffers.values().map(own).sum()
   }
 
+  /// Whether there is no unfinished sample.
+  pub fn is_empty(&self) -> bool {
+    self.assembly_buffers.is_empty()
+  }
+
   pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
     self.assembly_buffers.retain(|sn, ab| {
       let retain = ab.modified_time >= expire_before;

@@ -821,6 +821,9 @@ impl Reader {
           debug!("AssemblyBuffer GC writer {writer:?}");
           fa.garbage_collect_before(expire_before);
         });
+      // Also of Writers that are not matched and therefore never removed: those of
+      // builtin topics, of which everything is accepted.
+      self.fragment_assemblers.retain(|_, fa| !fa.is_empty());
     } else {
       trace!("Not yet AssemblyBuffer GC time.");
     }
