@@ -18,6 +18,7 @@ pub mod process;
 pub mod prometheus;
 pub mod ros;
 pub mod rtps;
+pub mod visitors;
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};

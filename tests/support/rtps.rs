@@ -13,21 +13,23 @@ pub type Prefix = [u8; 12];
 /// The part of a GUID that identifies the reader or writer.
 pub type EntityId = [u8; 4];
 
-const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
-const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
-const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
-const SEDP_SUBSCRIPTIONS_WRITER: EntityId = [0, 0, 4, 0xc2];
-const SEDP_SUBSCRIPTIONS_READER: EntityId = [0, 0, 4, 0xc7];
+pub(super) const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
+pub(super) const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
+pub(super) const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
+/// The reader and the writer of announcements of writers.
+pub(super) const SEDP_PUBLICATIONS: (EntityId, EntityId) = ([0, 0, 3, 0xc7], [0, 0, 3, 0xc2]);
+/// The reader and the writer of announcements of readers.
+pub(super) const SEDP_SUBSCRIPTIONS: (EntityId, EntityId) = ([0, 0, 4, 0xc7], [0, 0, 4, 0xc2]);
 /// The entity id of the forged reader: a user-defined reader of a topic without a key.
 const READER: EntityId = [0, 0, 1, 0x04];
 /// The entity kind (last byte of the entity id) of a user-defined writer of a topic without a key.
 const WRITER_KIND: u8 = 0x03;
 
 /// The multicast address of participant discovery in domain 0.
-const SPDP_MULTICAST: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
+pub(super) const SPDP_MULTICAST: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7400);
 /// The announced built-in endpoints: announcers and detectors of participants, publications and
 /// subscriptions.
-const BUILTIN_ENDPOINTS: u32 = 0x3f;
+pub(super) const BUILTIN_ENDPOINTS: u32 = 0x3f;
 /// The announced lease, longer than any test.
 const LEASE_S: u32 = 600;
 
@@ -42,7 +44,7 @@ mod kind {
 }
 
 /// Ids of discovery parameters (clause 9.6.4).
-mod pid {
+pub(super) mod pid {
     pub const SENTINEL: u16 = 0x0001;
     pub const PARTICIPANT_LEASE_DURATION: u16 = 0x0002;
     pub const TOPIC_NAME: u16 = 0x0005;
@@ -57,6 +59,8 @@ mod pid {
     pub const PARTICIPANT_GUID: u16 = 0x0050;
     pub const BUILTIN_ENDPOINT_SET: u16 = 0x0058;
     pub const ENDPOINT_GUID: u16 = 0x005a;
+    pub const KEY_HASH: u16 = 0x0070;
+    pub const STATUS_INFO: u16 = 0x0071;
 }
 
 /// A number set of ACKNACK and NACK_FRAG (clause 9.4.2.6): `bits` numbers from `base` on, of which `words`
@@ -145,25 +149,43 @@ impl Message {
     }
 
     /// Adds DATA with a parameter list in little endian.
-    fn data(self, reader: EntityId, writer: EntityId, sequence: i64, parameters: &Parameters) -> Self {
-        // No extra flags; 16 bytes from here to the offset of the inline QoS, which is absent.
-        let mut body = vec![0, 0, 16, 0];
-        body.extend([reader, writer].concat());
-        body.extend(number(sequence));
-        body.extend([0x00, 0x03, 0, 0]);
-        body.extend(&parameters.0);
-        body.extend(pid::SENTINEL.to_le_bytes());
-        body.extend([0, 0]);
+    pub(super) fn data(
+        self,
+        reader: EntityId,
+        writer: EntityId,
+        sequence: i64,
+        parameters: &Parameters,
+    ) -> Self {
+        let payload = [&[0x00, 0x03, 0, 0], parameters.ended().as_slice()].concat();
+        self.sample(reader, writer, sequence, &payload)
+    }
+
+    /// Adds DATA with a payload, which begins with its encapsulation header.
+    pub(super) fn sample(self, reader: EntityId, writer: EntityId, sequence: i64, payload: &[u8]) -> Self {
+        let body = [&data_header(reader, writer, sequence), payload].concat();
         self.submessage(kind::DATA, 0x05, &body)
     }
 
+    /// Adds DATA that disposes and unregisters an instance, whose key is a GUID.
+    pub(super) fn dispose(self, reader: EntityId, writer: EntityId, sequence: i64, key: &[u8]) -> Self {
+        let inline_qos =
+            Parameters::default().with(pid::KEY_HASH, key).with(pid::STATUS_INFO, &[0, 0, 0, 3]).ended();
+        let body = [data_header(reader, writer, sequence), inline_qos].concat();
+        self.submessage(kind::DATA, 0x03, &body)
+    }
+
     /// Adds HEARTBEAT.
-    fn heartbeat(self, reader: EntityId, writer: EntityId, first: i64, last: i64, count: i32) -> Self {
+    pub(super) fn heartbeat(self, reader: EntityId, writer: EntityId, first: i64, last: i64, count: i32) -> Self {
         let mut body = [reader, writer].concat();
         body.extend(number(first));
         body.extend(number(last));
         body.extend(count.to_le_bytes());
         self.submessage(kind::HEARTBEAT, 0x01, &body)
+    }
+
+    /// Sends it; one that cannot be sent is lost, as datagrams can be.
+    pub(super) fn send(&self, socket: &UdpSocket, to: SocketAddrV4) {
+        let _ = socket.send_to(&self.0, to);
     }
 
     fn submessage(mut self, kind: u8, flags: u8, body: &[u8]) -> Self {
@@ -174,6 +196,11 @@ impl Message {
     }
 }
 
+/// The beginning of DATA: no extra flags, and 16 bytes from here to the inline QoS or the payload.
+fn data_header(reader: EntityId, writer: EntityId, sequence: i64) -> Vec<u8> {
+    [&[0, 0, 16, 0], reader.as_slice(), &writer, &number(sequence)].concat()
+}
+
 /// Encodes a sequence number: the high half first, each half in little endian.
 fn number(value: i64) -> [u8; 8] {
     let [high, low] = [(value >> 32) as u32, value as u32].map(u32::to_le_bytes);
@@ -182,10 +209,15 @@ fn number(value: i64) -> [u8; 8] {
 
 /// A list of discovery parameters.
 #[derive(Default)]
-struct Parameters(Vec<u8>);
+pub(super) struct Parameters(Vec<u8>);
 
 impl Parameters {
-    fn with(mut self, id: u16, value: &[u8]) -> Self {
+    /// The list with its end.
+    fn ended(&self) -> Vec<u8> {
+        [&self.0, pid::SENTINEL.to_le_bytes().as_slice(), &[0, 0]].concat()
+    }
+
+    pub(super) fn with(mut self, id: u16, value: &[u8]) -> Self {
         let padded = value.len().next_multiple_of(4);
         self.0.extend(id.to_le_bytes());
         self.0.extend((padded as u16).to_le_bytes());
@@ -194,14 +226,14 @@ impl Parameters {
         self
     }
 
-    fn with_text(self, id: u16, text: &str) -> Self {
+    pub(super) fn with_text(self, id: u16, text: &str) -> Self {
         let mut value = (text.len() as u32 + 1).to_le_bytes().to_vec();
         value.extend(text.as_bytes());
         value.push(0);
         self.with(id, &value)
     }
 
-    fn with_locator(self, id: u16, address: SocketAddrV4) -> Self {
+    pub(super) fn with_locator(self, id: u16, address: SocketAddrV4) -> Self {
         let mut value = 1_u32.to_le_bytes().to_vec();
         value.extend(u32::from(address.port()).to_le_bytes());
         value.extend([0; 12]);
@@ -261,6 +293,16 @@ impl ForgedReader {
         self.prefix
     }
 
+    /// The address of its socket.
+    pub(super) fn address(&self) -> SocketAddrV4 {
+        self.address
+    }
+
+    /// The participants that have announced themselves to it.
+    pub(super) fn announced(&self) -> &BTreeMap<Prefix, Announced> {
+        &self.announced
+    }
+
     pub fn entity(&self) -> EntityId {
         READER
     }
@@ -270,7 +312,7 @@ impl ForgedReader {
     pub fn announce_endpoint(&self, topic: &str, type_name: &str) {
         let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
         let announcement = Message::announcement(self.prefix, self.address);
-        self.send(&announcement, SocketAddrV4::new(SPDP_MULTICAST.0, SPDP_MULTICAST.1));
+        self.send(&announcement, SPDP_MULTICAST);
 
         let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();
         let reader = Parameters::default()
@@ -281,11 +323,12 @@ impl ForgedReader {
             .with(pid::RELIABILITY, &reliable_100_ms)
             .with(pid::DURABILITY, &[0; 4])
             .with_locator(pid::UNICAST_LOCATOR, self.address);
+        let (to, from) = SEDP_SUBSCRIPTIONS;
         for (prefix, announced) in &self.announced {
             let endpoint = Message::of(self.prefix)
                 .to(*prefix)
-                .data(SEDP_SUBSCRIPTIONS_READER, SEDP_SUBSCRIPTIONS_WRITER, 1, &reader)
-                .heartbeat(SEDP_SUBSCRIPTIONS_READER, SEDP_SUBSCRIPTIONS_WRITER, 1, 1, 1);
+                .data(to, from, 1, &reader)
+                .heartbeat(to, from, 1, 1, 1);
             self.send(&endpoint, announced.discovery);
         }
     }
@@ -306,7 +349,7 @@ impl ForgedReader {
 
     /// Sends a datagram; one that cannot be sent is lost, as datagrams can be.
     pub fn send(&self, message: &Message, to: SocketAddrV4) {
-        let _ = self.socket.send_to(&message.0, to);
+        message.send(&self.socket, to);
     }
 
     fn handle(&mut self, datagram: &[u8]) -> Option<()> {

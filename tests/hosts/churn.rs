@@ -1,0 +1,76 @@
+//! Participants that come and go: the bridge keeps nothing of those who are gone.
+
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE};
+use support::visitors::{Endpoint, Leave, Visitors};
+use support::wait_until;
+
+/// The visitors that are present at the same time.
+const AT_ONCE: usize = 100;
+/// Half of the visitors end normally, half are killed.
+const WAYS: [Leave; 4] = [Leave::Close, Leave::Kill, Leave::CloseParticipant, Leave::Kill];
+/// The processes that have a DDS participant.
+const PROCESSES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
+
+/// What a visitor has: readers of both outputs, a publisher of the input, and what each ROS 2 node has.
+fn endpoints() -> Vec<Endpoint> {
+    let graph = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
+    let events = "rcl_interfaces::msg::dds_::ParameterEvent_";
+    vec![
+        Endpoint::reader(CRITICAL, SCAN_TYPE),
+        Endpoint::reader(NONCRITICAL, SCAN_TYPE).best_effort(),
+        Endpoint::reader("ros_discovery_info", graph).transient_local(),
+        Endpoint::reader("rt/parameter_events", events),
+        Endpoint::writer(INPUT, SCAN_TYPE).samples(vec![vec![7; 100]; 2]),
+        Endpoint::writer("ros_discovery_info", graph).transient_local(),
+        Endpoint::writer("rt/parameter_events", events),
+        Endpoint::writer("rt/rosout", "rcl_interfaces::msg::dds_::Log_").transient_local(),
+    ]
+}
+
+/// The number of matched readers of each output.
+fn readers(bed: &Bed) -> Vec<u64> {
+    let status = bed.bridge.try_status().unwrap_or_default();
+    let outputs = support::bed::outputs(&status);
+    outputs.filter_map(|output| output["readers"].as_u64()).collect()
+}
+
+/// Lets visitors come and go until so many have been there.
+fn churn(bed: &Bed, visitors: &mut Visitors, count: usize) {
+    for _ in 0..count / AT_ONCE {
+        visitors.come(AT_ONCE);
+        wait_until("the readers of all visitors", || {
+            visitors.announce();
+            readers(bed) == [AT_ONCE as u64; 2]
+        });
+        visitors.write();
+        visitors.leave(&WAYS);
+        wait_until("the end of the visitors that were killed", || readers(bed) == [0; 2]);
+    }
+}
+
+/// The memory of each process in KiB, without what it shares with others.
+fn memory_kib(bed: &Bed) -> [i64; PROCESSES.len()] {
+    PROCESSES.map(|process| {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", bed.pid(process))).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
+        line.trim().trim_end_matches(" kB").parse().unwrap()
+    })
+}
+
+#[test]
+fn experiment() {
+    let total: usize = std::env::var("CHURN").unwrap_or("2000".into()).parse().unwrap();
+    let Some(bed) = Bed::start("experiment", SCAN) else { return };
+    bed.up.wait_for_log("control is up");
+    let mut visitors = Visitors::new(bed.host("slow"), endpoints(), PROCESSES.len());
+    let begun = std::time::Instant::now();
+    for part in 0..total / 500 {
+        println!("{} {:?} {:.1?}", part * 500, memory_kib(&bed), begun.elapsed());
+        churn(&bed, &mut visitors, 500);
+    }
+    println!("{total} {:?} {:.1?}", memory_kib(&bed), begun.elapsed());
+    let status = bed.bridge.status();
+    println!("{}", status["routes"]);
+    println!("{}", bed.up.log());
+    bed.end();
+}
