@@ -175,7 +175,14 @@ impl Message {
     }
 
     /// Adds HEARTBEAT.
-    pub(super) fn heartbeat(self, reader: EntityId, writer: EntityId, first: i64, last: i64, count: i32) -> Self {
+    pub(super) fn heartbeat(
+        self,
+        reader: EntityId,
+        writer: EntityId,
+        first: i64,
+        last: i64,
+        count: i32,
+    ) -> Self {
         let mut body = [reader, writer].concat();
         body.extend(number(first));
         body.extend(number(last));
@@ -325,10 +332,8 @@ impl ForgedReader {
             .with_locator(pid::UNICAST_LOCATOR, self.address);
         let (to, from) = SEDP_SUBSCRIPTIONS;
         for (prefix, announced) in &self.announced {
-            let endpoint = Message::of(self.prefix)
-                .to(*prefix)
-                .data(to, from, 1, &reader)
-                .heartbeat(to, from, 1, 1, 1);
+            let endpoint =
+                Message::of(self.prefix).to(*prefix).data(to, from, 1, &reader).heartbeat(to, from, 1, 1, 1);
             self.send(&endpoint, announced.discovery);
         }
     }
