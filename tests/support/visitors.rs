@@ -13,8 +13,10 @@ use super::rtps::{
 };
 use super::wait_until;
 
-/// The lease of a visitor.
-const LEASE_S: u32 = 1;
+/// The lease of a visitor, longer than a test.
+const LEASE_S: u32 = 600;
+/// The lease that one announces before it is killed, so that its end is soon noticed.
+const LAST_LEASE_S: u32 = 1;
 /// The value of a QoS policy RELIABILITY with a blocking time of 100 ms; the first word is its kind.
 const BEST_EFFORT: [u32; 3] = [1, 0, 429_496_730];
 const RELIABLE: [u32; 3] = [2, 0, 429_496_730];
@@ -76,7 +78,7 @@ pub enum Leave {
     Close,
     /// It disposes only itself.
     CloseParticipant,
-    /// It sends nothing more, as a program that is killed.
+    /// It sends nothing more, as a program that is killed, after it has shortened its lease.
     Kill,
 }
 
@@ -123,16 +125,7 @@ impl Visitors {
         let address = self.resident.address();
         let participants = self.participants();
         for prefix in &self.present {
-            let participant = Parameters::default()
-                .with(pid::PROTOCOL_VERSION, &[2, 3])
-                .with(pid::VENDOR_ID, &[1, 0x0f])
-                .with(pid::PARTICIPANT_GUID, &guid(*prefix, PARTICIPANT))
-                .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, address)
-                .with_locator(pid::DEFAULT_UNICAST_LOCATOR, address)
-                .with(pid::PARTICIPANT_LEASE_DURATION, &[LEASE_S, 0].map(u32::to_le_bytes).concat())
-                .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
-            let announcement = Message::of(*prefix).data(SPDP_READER, SPDP_WRITER, 1, &participant);
-            self.resident.send(&announcement, SPDP_MULTICAST);
+            self.announce_participant(*prefix, 1, LEASE_S, SPDP_MULTICAST);
             for (participant, discovery) in &participants {
                 for writers in [true, false] {
                     let (reader, writer) = if writers { SEDP_PUBLICATIONS } else { SEDP_SUBSCRIPTIONS };
@@ -149,6 +142,20 @@ impl Visitors {
                 }
             }
         }
+    }
+
+    fn announce_participant(&self, prefix: Prefix, sequence: i64, lease_s: u32, to: SocketAddrV4) {
+        let address = self.resident.address();
+        let participant = Parameters::default()
+            .with(pid::PROTOCOL_VERSION, &[2, 3])
+            .with(pid::VENDOR_ID, &[1, 0x0f])
+            .with(pid::PARTICIPANT_GUID, &guid(prefix, PARTICIPANT))
+            .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, address)
+            .with_locator(pid::DEFAULT_UNICAST_LOCATOR, address)
+            .with(pid::PARTICIPANT_LEASE_DURATION, &[lease_s, 0].map(u32::to_le_bytes).concat())
+            .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
+        let announcement = Message::of(prefix).data(SPDP_READER, SPDP_WRITER, sequence, &participant);
+        self.resident.send(&announcement, to);
     }
 
     /// Sends the samples of those who are present, with the graph entry of each on `ros_discovery_info`.
@@ -191,15 +198,22 @@ impl Visitors {
         encode_graph(Guid(guid(prefix, PARTICIPANT)), "/", "visitor", &guids(false), &guids(true), 16)
     }
 
-    /// Lets all leave who are present, one after the other in the given ways.
+    /// Those who were present are gone.
+    pub fn are_gone(&mut self) {
+        self.present.clear();
+    }
+
+    /// Lets all leave who are present, one after the other in the given ways. What it sends can be lost, so
+    /// repeat it if they do not go; each time those who are killed live on for their last lease.
     pub fn leave(&mut self, ways: &[Leave]) {
         self.resident.receive();
         let participants = self.participants();
-        for (prefix, way) in std::mem::take(&mut self.present).into_iter().zip(ways.iter().cycle()) {
-            if *way == Leave::Kill {
-                continue;
-            }
+        for (&prefix, way) in self.present.iter().zip(ways.iter().cycle()) {
             for (participant, discovery) in &participants {
+                if *way == Leave::Kill {
+                    self.announce_participant(prefix, 2, LAST_LEASE_S, *discovery);
+                    continue;
+                }
                 let to = || Message::of(prefix).to(*participant);
                 if *way == Leave::Close {
                     for writers in [true, false] {
