@@ -303,7 +303,7 @@ fn process_text(process: &ProcessReport) -> String {
         let _ = write!(failures, ", {} refused", counted(process.refused_reloads, "reload"));
     }
     for (reason, count) in process.network_refusals.iter() {
-        let _ = write!(failures, ", refused {count} ({reason})");
+        let _ = write!(failures, ", {count} {reason}");
     }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
     format!("process {} {}{up}, {restarts}{failures}", process.pid, process.state.label())

@@ -1,6 +1,7 @@
-//! Participants that come and go: the bridge keeps nothing of those who are gone.
+//! Participants that join and leave: the memory of the bridge does not grow with those who have left.
 
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE};
+use support::process::memory_kib;
 use support::visitors::{Endpoint, Leave, Visitors};
 use support::wait_until;
 
@@ -9,7 +10,7 @@ const AT_ONCE: usize = 100;
 /// The visitors before memory is measured first. Most of what is kept of a limited number, such as the
 /// endpoints of the last 256 participants that are gone, is full then, and the allocator has its areas.
 const FIRST: usize = 1_000;
-/// The visitors after that; more with the variable.
+/// The visitors after that, or the variable's number rounded up to a multiple of [`FIRST`].
 const MORE: usize = 1_000;
 const MORE_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_VISITORS";
 /// The most that a process may have grown after that. When nothing of those who are gone was freed, 1,000
@@ -18,7 +19,7 @@ const MORE_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_VISITORS";
 const MAX_GROWTH_KIB: i64 = 3_072;
 /// Half of the visitors end normally, half are killed.
 const WAYS: [Leave; 4] = [Leave::Close, Leave::Kill, Leave::CloseParticipant, Leave::Kill];
-/// So seldom are they told to leave again: a poll takes 60 ms, and one that is killed is gone after 3 s.
+/// The goodbyes are repeated after so many polls of 60 ms each. A visitor that is killed is gone after 3 s.
 const POLLS_PER_LEAVE: u32 = 80;
 /// The processes that have a DDS participant.
 const PROCESSES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
@@ -46,10 +47,10 @@ fn readers(bed: &Bed) -> Vec<u64> {
     outputs.filter_map(|output| output["readers"].as_u64()).collect()
 }
 
-/// Lets visitors come and go until so many have been there.
+/// Lets so many visitors join and leave.
 fn churn(bed: &Bed, visitors: &mut Visitors, count: usize) {
     for _ in 0..count / AT_ONCE {
-        visitors.come(AT_ONCE);
+        visitors.join(AT_ONCE);
         wait_until("the readers of all visitors", || {
             visitors.announce();
             readers(bed) == [AT_ONCE as u64; 2]
@@ -63,17 +64,13 @@ fn churn(bed: &Bed, visitors: &mut Visitors, count: usize) {
             polls += 1;
             readers(bed) == [0; 2]
         });
-        visitors.are_gone();
+        visitors.clear();
     }
 }
 
 /// The memory of each process in KiB, without what it shares with others.
-fn memory_kib(bed: &Bed) -> [i64; PROCESSES.len()] {
-    PROCESSES.map(|process| {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", bed.pid(process))).unwrap();
-        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
-        line.trim().trim_end_matches(" kB").parse().unwrap()
-    })
+fn anonymous_kib(bed: &Bed) -> [i64; PROCESSES.len()] {
+    PROCESSES.map(|process| memory_kib(bed.pid(process), "RssAnon"))
 }
 
 #[test]
@@ -86,11 +83,11 @@ fn memory_does_not_grow_with_the_participants_that_are_gone() {
     bed.up.wait_for_log("control is up");
     let mut visitors = Visitors::new(bed.host("slow"), endpoints(), PROCESSES.len());
     churn(&bed, &mut visitors, FIRST);
-    let before = memory_kib(&bed);
+    let before = anonymous_kib(&bed);
     let more = std::env::var(MORE_VARIABLE).map_or(MORE, |count| count.parse().unwrap());
-    for number in 1..=more / FIRST {
+    for number in 1..=more.div_ceil(FIRST) {
         churn(&bed, &mut visitors, FIRST);
-        let after = memory_kib(&bed);
+        let after = anonymous_kib(&bed);
         println!("after {FIRST}: {before:?} KiB; after {} more: {after:?} KiB", number * FIRST);
         for ((process, before), after) in PROCESSES.iter().zip(before).zip(after) {
             assert!(

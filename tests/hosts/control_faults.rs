@@ -26,7 +26,7 @@ use support::bridge::{Bridge, program};
 use support::flow::{Flow, lane};
 use support::netns::{Host, Net, requires_root};
 use support::peer::Peer;
-use support::process::{Process, signal};
+use support::process::{Process, memory_kib, signal};
 use support::{prometheus, skip, wait_for, wait_until};
 
 const SECRET: &str = "an ill-kept secret of many bytes";
@@ -480,11 +480,6 @@ fn cdr(text: &str) -> Vec<u8> {
     [&(text.len() as u32 + 1).to_le_bytes()[..], text.as_bytes(), &[0]].concat()
 }
 
-fn resident_bytes(pid: i32) -> u64 {
-    let statm = std::fs::read_to_string(format!("/proc/{pid}/statm")).unwrap();
-    statm.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
-}
-
 fn refused(status: &Value, reason: ProbeRefusal) -> u64 {
     status["probes"]["refused"][reason.label()].as_u64().unwrap()
 }
@@ -583,7 +578,7 @@ fn forged_responses_change_nothing_in_trust_mode_default_deny() {
 
     // A flood of several thousand responses a second of different kinds, each with a new name.
     let control = pid(&bridge, "control");
-    let memory_before = resident_bytes(control);
+    let memory_before = memory_kib(control, "VmRSS");
     let refused_before = bridge.status();
     let mut sent = 0_u64;
     let until = Instant::now() + Duration::from_secs(5);
@@ -608,8 +603,8 @@ fn forged_responses_change_nothing_in_trust_mode_default_deny() {
     for kind in [ProbeRefusal::Malformed, ProbeRefusal::Unsigned, ProbeRefusal::BadSignature] {
         assert!(refused(&status, kind) > refused(&refused_before, kind), "{kind}: {status}");
     }
-    let grown = resident_bytes(control).saturating_sub(memory_before);
-    assert!(grown < 32 << 20, "{grown} bytes more");
+    let grown = memory_kib(control, "VmRSS") - memory_before;
+    assert!(grown < 32 << 10, "{grown} KiB more");
     assert_eq!(process(&status, "control")["starts"], 1);
 
     for text in [up.log(), laptop.log(), bridge.status().to_string()] {

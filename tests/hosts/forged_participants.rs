@@ -1,53 +1,46 @@
 //! Forged but well-formed discovery: a million participants that do not exist announce themselves while
 //! samples flow.
 
-use std::fs::{self, File};
-use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::net::{SocketAddrV4, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use nix::sched::{CloneFlags, setns};
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::netns::udp_ports;
 use support::peer::{Peer, Received, Sent};
-use support::rtps::Message;
+use support::process::memory_kib;
+use support::rtps::{LEASE_S, Message, Prefix};
 
 const PARTICIPANTS: u32 = 1_000_000;
 const ATTACK: Duration = Duration::from_secs(60);
 const ROLES: [&str; 4] = ["ingress", "control", "egress-critical", "egress-noncritical"];
 /// How much the resident memory of each process may grow.
-const MAX_GROWTH_KIB: u64 = 32 * 1024;
+const MAX_GROWTH_KIB: i64 = 32 * 1024;
+/// The most participants that a process evicts: it admits 128 at once and 32 a second from one address.
+const MAX_EVICTED: u64 = 10_000;
 
-fn resident_kib(pid: i32) -> u64 {
-    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
-    line.split_whitespace().next().unwrap().parse().unwrap()
+fn prefix(number: u32) -> Prefix {
+    let mut prefix = *b"\x01\x0fforged\0\0\0\0";
+    prefix[8..].copy_from_slice(&number.to_be_bytes());
+    prefix
 }
 
-/// The ports for unicast discovery traffic in the network namespace of a process: one for each participant.
-fn discovery_ports(pid: i32) -> Vec<u16> {
-    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
-    let ports = table
-        .lines()
-        .skip(1)
-        .filter_map(|line| u16::from_str_radix(line.split_whitespace().nth(1)?.rsplit(':').next()?, 16).ok());
-    // Unicast discovery traffic goes to 7400 + 10 + 2 * participant number (clause 9.6.1.1 of RTPS 2.5).
-    let mut ports: Vec<u16> = ports.filter(|port| (7410..7440).contains(port) && port % 2 == 0).collect();
-    ports.sort_unstable();
-    ports.dedup();
-    ports
-}
-
-/// Announces [`PARTICIPANTS`] from inside a network namespace, to the processes of the bridge in turn.
-fn announce(namespace: &str, source: Ipv4Addr, bridge: Ipv4Addr, ports: &[u16]) {
-    setns(File::open(format!("/run/netns/{namespace}")).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
-    let socket = UdpSocket::bind((source, 0)).unwrap();
+/// Announces participants to the processes of the bridge in turn: [`PARTICIPANTS`] within [`ATTACK`], and
+/// more until `stop`. Each fourth round, a participant that the processes know sends the announcement.
+fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
+    let address = SocketAddrV4::new([192, 0, 2, 1].into(), 9);
     let begin = Instant::now();
-    for number in 0..PARTICIPANTS {
-        let mut prefix = *b"\x01\x0fforged\0\0\0\0";
-        prefix[8..].copy_from_slice(&number.to_be_bytes());
-        let announcement = Message::announcement(prefix, SocketAddrV4::new(source, 9));
-        let port = ports[number as usize % ports.len()];
-        let _ = socket.send_to(announcement.bytes(), (bridge, port));
+    let mut number = 0;
+    while number < PARTICIPANTS || !stop.load(Ordering::Relaxed) {
+        let (round, process) = (number as usize / processes.len(), number as usize % processes.len());
+        let announced = prefix(number);
+        // The first round announces the participants that the others name as their sender.
+        let sender = if round > 0 && round.is_multiple_of(4) { prefix(process as u32) } else { announced };
+        let message = Message::of(sender).announcement(announced, address, i64::from(number) + 1, LEASE_S);
+        message.send(socket, processes[process]);
+        number += 1;
         if number % 32 == 0 {
             let due = ATTACK * number / PARTICIPANTS;
             std::thread::sleep(due.saturating_sub(begin.elapsed()));
@@ -55,10 +48,10 @@ fn announce(namespace: &str, source: Ipv4Addr, bridge: Ipv4Addr, ports: &[u16]) 
     }
 }
 
-fn refused(status: &Value, process: &str) -> u64 {
+fn refused(status: &Value, process: &str, cause: &str) -> u64 {
     let processes = status["processes"].as_array().unwrap();
     let process = processes.iter().find(|found| found["name"] == process).unwrap();
-    process["network_refusals"]["too_many_participants"].as_u64().unwrap()
+    process["network_refusals"][cause].as_u64().unwrap()
 }
 
 #[test]
@@ -69,30 +62,44 @@ fn a_million_forged_participants_take_little_memory_and_cost_no_critical_sample(
     let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
     critical.wait_received(500);
     let pids = ROLES.map(|role| bed.pid(role));
+    let resident_kib = |pid| memory_kib(pid, "VmRSS");
     let before = pids.map(resident_kib);
-    let ports = discovery_ports(pids[0]);
-    assert!(ports.len() >= ROLES.len(), "{ports:?}");
-
-    let attacker = bed.host("slow");
-    let (namespace, source) = (attacker.namespace().to_owned(), attacker.address());
     let bridge = bed.host("bridge").address();
-    let attack = std::thread::spawn(move || announce(&namespace, source, bridge, &ports));
-    // The limit is for each address, so that a subscriber on another host joins meanwhile.
-    support::wait_until("refused announcements", || refused(&bed.bridge.status(), "egress-critical") > 1_000);
+    // Unicast discovery traffic of domain 0 goes to 7410 + 2 * participant number (RTPS 2.5, clause 9.6.1.1).
+    let is_discovery = |port: &u16| (7410..7440).contains(port) && port.is_multiple_of(2);
+    let ports = udp_ports(pids[0]).into_iter().filter(is_discovery);
+    let processes: Vec<_> = ports.map(|port| SocketAddrV4::new(bridge, port)).collect();
+    assert!(processes.len() >= ROLES.len(), "{processes:?}");
+
+    let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
+    let attack = std::thread::spawn({
+        let stop = Arc::clone(&stop);
+        move || announce(&socket, &processes, &stop)
+    });
+    let too_many = "too_many_participants";
+    support::wait_until("refused announcements", || {
+        refused(&bed.bridge.status(), "egress-critical", too_many) > 1_000
+    });
+    // The limit is for each address, so that a subscriber on another host joins during the attack.
     let late = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
     late.wait_received(100);
+    stop.store(true, Ordering::Relaxed);
     attack.join().unwrap();
 
     let status = bed.bridge.status();
     let after = pids.map(resident_kib);
-    let counts = ROLES.map(|role| refused(&status, role));
-    println!("resident memory {before:?} KiB, then {after:?} KiB; refused {counts:?}");
+    let [many, malformed, evicted] = [too_many, "malformed_datagram", "evicted_participant"]
+        .map(|cause| ROLES.map(|role| refused(&status, role, cause)));
+    println!("resident memory {before:?} KiB, then {after:?} KiB");
+    println!("refused {many:?}, malformed {malformed:?}, evicted {evicted:?}");
     for (index, role) in ROLES.into_iter().enumerate() {
         assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
-        let growth = after[index].saturating_sub(before[index]);
+        let growth = after[index] - before[index];
         assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
         // A full socket buffer discards the others.
-        assert!(counts[index] > 10_000, "{role} refused {}", counts[index]);
+        assert!(many[index] > 10_000, "{role} refused {}", many[index]);
+        assert!(malformed[index] > 1_000, "{role} took {} of another sender", malformed[index]);
+        assert!(evicted[index] < MAX_EVICTED, "{role} evicted {}", evicted[index]);
     }
     let sent: Sent = publisher.end();
     critical.wait_received(sent.ok);

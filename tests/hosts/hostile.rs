@@ -1,12 +1,13 @@
 //! A hostile network: random, malformed and truncated RTPS datagrams at every port of a running bridge for a
 //! minute, while samples flow. No process crashes or is restarted, and no sample is lost.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
 
 use nix::sched::{CloneFlags, setns};
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::netns::udp_ports;
 use support::peer::{Peer, Received, Sent};
 
 const ATTACK: Duration = Duration::from_secs(60);
@@ -85,19 +86,6 @@ fn datagram(random: &mut Random) -> Vec<u8> {
         datagram.truncate(cut);
     }
     datagram
-}
-
-/// The open UDP ports in the network namespace of a process.
-fn udp_ports(pid: i32) -> Vec<u16> {
-    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
-    let mut ports: Vec<u16> = table
-        .lines()
-        .skip(1)
-        .filter_map(|line| u16::from_str_radix(line.split_whitespace().nth(1)?.rsplit(':').next()?, 16).ok())
-        .collect();
-    ports.sort_unstable();
-    ports.dedup();
-    ports
 }
 
 /// Sends datagrams for [`ATTACK`] from inside a network namespace; returns the number sent.

@@ -18,7 +18,7 @@ use nix::sched::{CloneFlags, setns};
 use serde_json::{Value, json};
 use support::bridge::program;
 use support::netns::{Host, Net, requires_root};
-use support::process::Process;
+use support::process::{Process, memory_kib};
 use support::{skip, wait_for, wait_until};
 
 const SECRET: &str = "an ill-kept secret of many bytes";
@@ -166,12 +166,6 @@ fn trust(secret: &Path) -> Trust {
     Trust::load(&security, None).unwrap()
 }
 
-/// Memory that the process has in RAM, in bytes.
-fn resident_bytes(process: &Process) -> u64 {
-    let statm = fs::read_to_string(format!("/proc/{}/statm", process.pid())).unwrap();
-    statm.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
-}
-
 fn run(arguments: &[&str]) -> Output {
     let mut command = Command::new(program());
     command.arg("responder").args(arguments).env_remove("ADAPTIVE_BRIDGE_CONFIG").output().unwrap()
@@ -300,7 +294,7 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     bad.assert_unanswered("bad");
 
     // A flood of all of them, while a bridge goes on asking.
-    let before = resident_bytes(&responder);
+    let before = memory_kib(responder.pid().as_raw(), "VmRSS");
     for round in 0..20 {
         for _ in 0..500 {
             let mut request = bad.request();
@@ -316,8 +310,8 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     }
     responder.wait_for_log("reason=\"rate_limited\"");
     bad.assert_unanswered("bad");
-    let grown = resident_bytes(&responder).saturating_sub(before);
-    assert!(grown < 32 << 20, "{grown} bytes more");
+    let grown = memory_kib(responder.pid().as_raw(), "VmRSS") - before;
+    assert!(grown < 32 << 10, "{grown} KiB more");
     // What was recorded was answered once.
     let answers = good.decoded().into_iter().filter(|it| it.probe_id == request.probe_id).count();
     assert_eq!(answers, 1);

@@ -305,3 +305,16 @@ impl Host {
         }
     }
 }
+
+/// The open UDP ports in the network namespace of a process.
+pub fn udp_ports(pid: i32) -> Vec<u16> {
+    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
+    let mut ports: Vec<u16> = table
+        .lines()
+        .skip(1)
+        .filter_map(|line| u16::from_str_radix(line.split_whitespace().nth(1)?.rsplit(':').next()?, 16).ok())
+        .collect();
+    ports.sort_unstable();
+    ports.dedup();
+    ports
+}

@@ -14,6 +14,13 @@ use super::patience;
 /// The number of output lines that are printed when a test fails.
 const TAIL_LINES: usize = 20;
 
+/// A figure of `/proc/PID/status` in KiB: `VmRSS`, the resident memory, or `RssAnon`, its anonymous part.
+pub fn memory_kib(pid: i32, field: &str) -> i64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix(field)).unwrap();
+    line.trim_start_matches(':').trim().trim_end_matches(" kB").parse().unwrap()
+}
+
 /// The lines of one output stream that have been read so far.
 #[derive(Default)]
 struct Lines {

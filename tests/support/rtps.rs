@@ -29,9 +29,9 @@ const WRITER_KIND: u8 = 0x03;
 pub(super) const SPDP_MULTICAST: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7400);
 /// The announced built-in endpoints: announcers and detectors of participants, publications and
 /// subscriptions.
-pub(super) const BUILTIN_ENDPOINTS: u32 = 0x3f;
+const BUILTIN_ENDPOINTS: u32 = 0x3f;
 /// The announced lease, longer than any test.
-const LEASE_S: u32 = 600;
+pub const LEASE_S: u32 = 600;
 
 /// Kinds of submessages (clause 9.4.5.1.1).
 mod kind {
@@ -97,22 +97,23 @@ impl Message {
         Self(bytes)
     }
 
-    /// The announcement (SPDP) of a participant that receives at `address`.
-    pub fn announcement(source: Prefix, address: SocketAddrV4) -> Self {
+    /// Adds the announcement (SPDP) of a participant that receives at `address`.
+    pub fn announcement(
+        self,
+        participant: Prefix,
+        address: SocketAddrV4,
+        sequence: i64,
+        lease_s: u32,
+    ) -> Self {
         let participant = Parameters::default()
             .with(pid::PROTOCOL_VERSION, &[2, 3])
             .with(pid::VENDOR_ID, &[1, 0x0f])
-            .with(pid::PARTICIPANT_GUID, &[source.as_slice(), &PARTICIPANT].concat())
+            .with(pid::PARTICIPANT_GUID, &[participant.as_slice(), &PARTICIPANT].concat())
             .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, address)
             .with_locator(pid::DEFAULT_UNICAST_LOCATOR, address)
-            .with(pid::PARTICIPANT_LEASE_DURATION, &[LEASE_S, 0].map(u32::to_le_bytes).concat())
+            .with(pid::PARTICIPANT_LEASE_DURATION, &[lease_s, 0].map(u32::to_le_bytes).concat())
             .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
-        Self::of(source).data(SPDP_READER, SPDP_WRITER, 1, &participant)
-    }
-
-    /// The datagram.
-    pub fn bytes(&self) -> &[u8] {
-        &self.0
+        self.data(SPDP_READER, SPDP_WRITER, sequence, &participant)
     }
 
     /// Adds INFO_DST: the following submessages are for a given participant.
@@ -191,7 +192,7 @@ impl Message {
     }
 
     /// Sends it; one that cannot be sent is lost, as datagrams can be.
-    pub(super) fn send(&self, socket: &UdpSocket, to: SocketAddrV4) {
+    pub fn send(&self, socket: &UdpSocket, to: SocketAddrV4) {
         let _ = socket.send_to(&self.0, to);
     }
 
@@ -318,7 +319,7 @@ impl ForgedReader {
     /// announced themselves (SEDP).
     pub fn announce_endpoint(&self, topic: &str, type_name: &str) {
         let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
-        let announcement = Message::announcement(self.prefix, self.address);
+        let announcement = Message::of(self.prefix).announcement(self.prefix, self.address, 1, LEASE_S);
         self.send(&announcement, SPDP_MULTICAST);
 
         let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();

@@ -1,5 +1,5 @@
-//! Forged ROS 2 participants in large numbers, each with the endpoints of a small node: they come, send a few
-//! samples, and leave, or fall silent until their lease ends.
+//! Forged ROS 2 participants in large numbers, each with the endpoints of a small node: they join, send a few
+//! samples, and leave with or without a goodbye.
 
 use std::net::SocketAddrV4;
 
@@ -8,13 +8,11 @@ use adaptive_bridge::model::Guid;
 
 use super::netns::Host;
 use super::rtps::{
-    BUILTIN_ENDPOINTS, EntityId, ForgedReader, Message, PARTICIPANT, Parameters, Prefix, SEDP_PUBLICATIONS,
+    EntityId, ForgedReader, LEASE_S, Message, PARTICIPANT, Parameters, Prefix, SEDP_PUBLICATIONS,
     SEDP_SUBSCRIPTIONS, SPDP_MULTICAST, SPDP_READER, SPDP_WRITER, pid,
 };
 use super::wait_until;
 
-/// The lease of a visitor, longer than a test.
-const LEASE_S: u32 = 600;
 /// The lease that one announces before it is killed, so that its end is soon noticed.
 const LAST_LEASE_S: u32 = 1;
 /// The value of a QoS policy RELIABILITY with a blocking time of 100 ms; the first word is its kind.
@@ -84,16 +82,17 @@ pub enum Leave {
 
 /// The visitors of a host, of which some are present.
 pub struct Visitors {
-    /// Has the socket of all visitors, and knows whom to announce them to.
+    /// Owns the socket of all visitors, and the addresses of the participants to announce them to.
     resident: ForgedReader,
     endpoints: Vec<Endpoint>,
     present: Vec<Prefix>,
-    /// The visitors that have come so far.
-    came: u64,
+    /// The number of visitors that have joined so far.
+    joined: u64,
 }
 
 impl Visitors {
-    /// Makes visitors that have these endpoints, and waits until the resident has heard of `participants`.
+    /// Creates visitors that have these endpoints, on a host, and waits until so many participants have
+    /// announced themselves to it.
     pub fn new(host: &Host, endpoints: Vec<Endpoint>, participants: usize) -> Self {
         let mut resident = ForgedReader::new(host, 0xff);
         wait_until("the announcements of the participants", || {
@@ -101,7 +100,7 @@ impl Visitors {
             resident.receive();
             resident.announced().len() == participants
         });
-        Self { resident, endpoints, present: Vec::new(), came: 0 }
+        Self { resident, endpoints, present: Vec::new(), joined: 0 }
     }
 
     /// The addresses of the participants, for discovery.
@@ -109,12 +108,12 @@ impl Visitors {
         self.resident.announced().iter().map(|(prefix, announced)| (*prefix, announced.discovery)).collect()
     }
 
-    /// Lets visitors come; announce them until they are known.
-    pub fn come(&mut self, count: usize) {
+    /// Adds visitors to those who are present. The caller announces them until the bridge has matched them.
+    pub fn join(&mut self, count: usize) {
         for _ in 0..count {
-            self.came += 1;
+            self.joined += 1;
             let mut prefix = [1, 0x0f, b'v', b'i', 0, 0, 0, 0, 0, 0, 0, 0];
-            prefix[4..].copy_from_slice(&self.came.to_be_bytes());
+            prefix[4..].copy_from_slice(&self.joined.to_be_bytes());
             self.present.push(prefix);
         }
     }
@@ -146,15 +145,7 @@ impl Visitors {
 
     fn announce_participant(&self, prefix: Prefix, sequence: i64, lease_s: u32, to: SocketAddrV4) {
         let address = self.resident.address();
-        let participant = Parameters::default()
-            .with(pid::PROTOCOL_VERSION, &[2, 3])
-            .with(pid::VENDOR_ID, &[1, 0x0f])
-            .with(pid::PARTICIPANT_GUID, &guid(prefix, PARTICIPANT))
-            .with_locator(pid::METATRAFFIC_UNICAST_LOCATOR, address)
-            .with_locator(pid::DEFAULT_UNICAST_LOCATOR, address)
-            .with(pid::PARTICIPANT_LEASE_DURATION, &[lease_s, 0].map(u32::to_le_bytes).concat())
-            .with(pid::BUILTIN_ENDPOINT_SET, &BUILTIN_ENDPOINTS.to_le_bytes());
-        let announcement = Message::of(prefix).data(SPDP_READER, SPDP_WRITER, sequence, &participant);
+        let announcement = Message::of(prefix).announcement(prefix, address, sequence, lease_s);
         self.resident.send(&announcement, to);
     }
 
@@ -198,8 +189,8 @@ impl Visitors {
         encode_graph(Guid(guid(prefix, PARTICIPANT)), "/", "visitor", &guids(false), &guids(true), 16)
     }
 
-    /// Those who were present are gone.
-    pub fn are_gone(&mut self) {
+    /// Removes all visitors from those who are present.
+    pub fn clear(&mut self) {
         self.present.clear();
     }
 

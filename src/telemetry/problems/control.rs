@@ -106,8 +106,8 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         for (reason, count) in refused {
             let meaning = reason.meaning();
             let text = format!(
-                "{} refused {count} in the last {window}: {meaning} ({reason}); new subscribers and publishers may \
-                 not be found until a program on the network stops announcing so many",
+                "{}: {count} {meaning} in the last {window} ({reason}); nodes that start now may not be found; \
+                 `tcpdump -n udp portrange 7400-7500` shows which host announces so many",
                 process.name
             );
             problems.push(Problem::new(about.clone(), Level::Warn, text));
@@ -393,8 +393,7 @@ mod tests {
         });
         let [found] = &found[..] else { panic!("{found:?}") };
         let meaning = NetworkRefusal::TooManyParticipants.meaning();
-        let text =
-            format!("egress-critical refused 9 in the last 1.0 s: {meaning} (too_many_participants); ");
+        let text = format!("egress-critical: 9 {meaning} in the last 1.0 s (too_many_participants); ");
         assert!(found.starts_with(&text), "{found}");
     }
 

@@ -1,9 +1,8 @@
 //! Counts of what a participant refuses of the network, and the limits beyond which
 //! it refuses.
 //!
-//! Whoever can send to a participant can announce participants and endpoints that do
-//! not exist, each well-formed. All that discovery keeps of others is bounded by these
-//! limits.
+//! Any host of the network can announce participants and endpoints that do not exist.
+//! These limits bound the memory that discovery uses for them.
 
 use std::{
   sync::atomic::{AtomicU64, Ordering},
@@ -12,11 +11,11 @@ use std::{
 
 /// Remote participants that discovery keeps. At this number it evicts, for each new
 /// one, the oldest participant of which no endpoint has a topic of ours. 1,024 are
-/// several times the nodes of a large robot; each takes up to 20 KiB.
+/// several times the nodes of a large robot; each takes some 12 KiB.
 pub(crate) const MAX_PARTICIPANTS: usize = 1_024;
 
-/// Readers, and as many writers, that discovery keeps of one participant. A process of
-/// 100 ROS 2 nodes has some 1,500.
+/// Readers, and as many writers, that discovery keeps of one participant. A ROS 2 node
+/// has some 8 of each, so that a process of 500 nodes is within the limit.
 pub(crate) const MAX_ENDPOINTS_PER_PARTICIPANT: usize = 4_096;
 
 /// Readers, and as many writers, that discovery keeps of all participants. Those with
@@ -34,7 +33,8 @@ pub(crate) const MAX_LEASE: Duration = Duration::from_secs(300);
 /// What a participant has refused of the network since it was created.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct NetworkCounts {
-  /// Datagrams that are not RTPS, or not well-formed.
+  /// Datagrams that are not RTPS or not well-formed, and announcements of participants
+  /// that are not well-formed or not sent by that participant.
   pub malformed_datagrams: u64,
   /// Announcements of unknown participants that were dropped: too many at a time, or
   /// no room for another participant.

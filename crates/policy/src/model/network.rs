@@ -6,14 +6,15 @@ reasons! {
     /// Why a DDS participant of the bridge refused something that it received. A refused datagram or
     /// announcement is counted and has no other effect.
     NetworkRefusal:
-    /// A datagram that is not RTPS, or not well-formed.
-    MalformedDatagram = "malformed_datagram", "datagrams that are not well-formed RTPS",
+    /// A datagram that is not RTPS or not well-formed, or an announcement of a participant that is not
+    /// well-formed or not sent by that participant.
+    MalformedDatagram = "malformed_datagram", "malformed datagrams dropped",
     /// An announcement of an unknown participant: too many in a short time, or no room for another one.
-    TooManyParticipants = "too_many_participants", "announcements of more participants than the bridge follows",
+    TooManyParticipants = "too_many_participants", "announcements of new participants refused",
     /// A participant without a topic of the bridge was removed to make room for a new one.
-    EvictedParticipant = "evicted_participant", "participants were removed to make room for new ones",
+    EvictedParticipant = "evicted_participant", "participants removed to make room for new ones",
     /// An announcement of an endpoint or a topic without room for another one.
-    TooManyEndpoints = "too_many_endpoints", "announcements of more endpoints than the bridge follows",
+    TooManyEndpoints = "too_many_endpoints", "announcements of readers, writers and topics refused",
 }
 
 /// Counts of what a participant refused of the network, by reason.

@@ -1216,11 +1216,17 @@ impl Discovery {
             NormalDiscoveryPermission::Allow
           };
 
+          let writer = ds.sample_info.writer_guid();
           if permission == NormalDiscoveryPermission::Allow {
             match ds.value {
               Sample::Value(participant_data) => {
                 debug!("spdp_receive discovered {:?}", participant_data);
-                self.process_discovered_participant_data(&participant_data);
+                if participant_data.participant_guid.prefix == writer.prefix {
+                  self.process_discovered_participant_data(&participant_data);
+                } else {
+                  // The limits of newcomers go by the sender.
+                  discovery_db_read(&self.discovery_db).counters().malformed_datagrams.increment();
+                }
               }
               // Sample::Dispose means that DomainParticipant was disposed
               Sample::Dispose(participant_guid) => {
@@ -1354,8 +1360,10 @@ impl Discovery {
   }
 
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
-    discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true); // true = actively removed
-    self.participant_is_gone(participant_guidp);
+    // Anybody can dispose any GUID, so the event loop hears only of those that are known.
+    if discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true) {
+      self.participant_is_gone(participant_guidp);
+    }
   }
 
   // Tells the event loop and the application of one that the database has removed.

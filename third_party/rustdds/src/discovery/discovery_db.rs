@@ -191,7 +191,7 @@ impl DiscoveryDB {
     // sanity check
     if guid.entity_id != EntityId::PARTICIPANT {
       error!("Discovered participant GUID entity_id is not for participant: {guid:?}");
-      self.counters.announcements_refused.increment();
+      self.counters.malformed_datagrams.increment();
       return ParticipantUpdate::Refused;
     }
 
@@ -207,10 +207,12 @@ impl DiscoveryDB {
 
     let mut update = ParticipantUpdate::Known;
     if !self.participant_proxies.contains_key(&guid.prefix) {
-      let Ok(evicted) = self.make_room_for_a_participant() else {
+      let is_full = self.participant_proxies.len() >= MAX_PARTICIPANTS;
+      let evicted = is_full.then(|| self.oldest_without_local_topic()).flatten();
+      if is_full && evicted.is_none() {
         self.counters.announcements_refused.increment();
         return ParticipantUpdate::Refused;
-      };
+      }
       info!("New remote participant: {:?}", data);
       if guid == self.my_guid {
         info!("Remote participant {guid:?} is myself, but some reflection is good.");
@@ -233,10 +235,15 @@ impl DiscoveryDB {
         &mut self.external_topic_writers,
       );
       self.restore_topics_of(guid.prefix);
-    }
 
-    self.participant_attic.remove(&guid.prefix);
-    self.attic_order.retain(|prefix| *prefix != guid.prefix);
+      // After the new one has left the attic, which the evicted one enters.
+      self.participant_attic.remove(&guid.prefix);
+      self.attic_order.retain(|prefix| *prefix != guid.prefix);
+      if let Some(evicted) = evicted {
+        self.counters.participants_evicted.increment();
+        self.remove_participant(evicted, true);
+      }
+    }
 
     // In any case:
     // Update SpdpDiscoveredParticipantData to DB
@@ -249,20 +256,13 @@ impl DiscoveryDB {
     update
   }
 
-  // Evicts the participant that was discovered first of those that have no endpoint
-  // with a topic of ours, if there is no room for another. An error if all have one.
-  fn make_room_for_a_participant(&mut self) -> Result<Option<GuidPrefix>, ()> {
-    if self.participant_proxies.len() < MAX_PARTICIPANTS {
-      return Ok(None);
-    }
-    let candidates = self.discovery_order.iter().copied();
-    let evicted = candidates
-      .into_iter()
-      .find(|prefix| *prefix != self.my_guid.prefix && !self.has_endpoint_with_local_topic(*prefix))
-      .ok_or(())?;
-    self.counters.participants_evicted.increment();
-    self.remove_participant(evicted, true);
-    Ok(Some(evicted))
+  // The participant that was discovered first of those that have no endpoint with a
+  // topic of ours, if there is one.
+  fn oldest_without_local_topic(&self) -> Option<GuidPrefix> {
+    let mut remote = self.discovery_order.iter().copied();
+    remote.find(|prefix| {
+      *prefix != self.my_guid.prefix && !self.has_endpoint_with_local_topic(*prefix)
+    })
   }
 
   fn has_endpoint_with_local_topic(&self, prefix: GuidPrefix) -> bool {
@@ -281,9 +281,9 @@ impl DiscoveryDB {
 
   // Whether there is room for one more endpoint, given the endpoints of its kind.
   fn has_room_for_endpoint<D>(&self, of_kind: &BTreeMap<GUID, D>, guid: GUID, topic: &str) -> bool {
-    let of_participant = of_kind.range(guid.prefix.range()).count();
+    let of_participant = || of_kind.range(guid.prefix.range()).count();
     let has_room = of_kind.contains_key(&guid)
-      || of_participant < MAX_ENDPOINTS_PER_PARTICIPANT
+      || of_participant() < MAX_ENDPOINTS_PER_PARTICIPANT
         && (of_kind.len() < MAX_ENDPOINTS
           || of_kind.len() < 2 * MAX_ENDPOINTS && self.is_local_topic(topic));
     if !has_room {
@@ -322,7 +322,9 @@ impl DiscoveryDB {
   // Its readers and writers are remembered in both cases: a participant that
   // reintroduces itself disposes itself first, and our readers drop the endpoints that
   // it announces afterwards, because they have received them before.
-  pub fn remove_participant(&mut self, guid_prefix: GuidPrefix, active_disposal: bool) {
+  //
+  // Returns whether it was known, or its endpoints were.
+  pub fn remove_participant(&mut self, guid_prefix: GuidPrefix, active_disposal: bool) -> bool {
     info!("removing participant {guid_prefix:?}");
     let participant_data = self.participant_proxies.remove(&guid_prefix);
     self.participant_last_life_signs.remove(&guid_prefix);
@@ -343,9 +345,11 @@ impl DiscoveryDB {
     }
     if !self.attic_order.contains(&guid_prefix) {
       // Endpoints of a participant that was never discovered.
+      let endpoints = |db: &Self| db.external_topic_readers.len() + db.external_topic_writers.len();
+      let before = endpoints(self);
       self.remove_topic_reader_with_prefix(guid_prefix);
       self.remove_topic_writer_with_prefix(guid_prefix);
-      return;
+      return endpoints(self) < before;
     }
     move_by_guid_prefix(
       guid_prefix,
@@ -357,6 +361,7 @@ impl DiscoveryDB {
       &mut self.external_topic_writers,
       &mut self.external_topic_writers_attic,
     );
+    true
   }
 
   // What the participant and its endpoints announced of topics. A topic with another
@@ -1134,7 +1139,7 @@ mod tests {
     let mut db = database();
     let (matched, unmatched) = (new_participant(), new_participant());
     let local = new_reader(GUID::new_participant_guid(), 1, "ours");
-    db.update_local_topic_reader(local.clone());
+    db.update_local_topic_reader(local);
     for participant in [&matched, &unmatched] {
       db.update_participant(participant);
     }
@@ -1153,6 +1158,29 @@ mod tests {
     assert_eq!(db.discovery_order.len(), MAX_PARTICIPANTS);
     assert!(db.attic_order.len() <= MAX_PARTICIPANTS_IN_ATTIC);
     assert_eq!(db.counters().counts().participants_evicted, evicted.len() as u64);
+  }
+
+  #[test]
+  fn the_endpoints_of_one_that_returns_survive_the_eviction_that_makes_room_for_it() {
+    let mut db = database();
+    let returning = new_participant();
+    let prefix = returning.participant_guid.prefix;
+    db.update_participant(&returning);
+    db.update_subscription(&new_reader(returning.participant_guid, 1, "theirs"));
+    db.remove_participant(prefix, false);
+    // It is the oldest one in the attic, which is full.
+    while db.attic_order.len() < MAX_PARTICIPANTS_IN_ATTIC {
+      let other = new_participant();
+      db.update_participant(&other);
+      db.remove_participant(other.participant_guid.prefix, true);
+    }
+    while db.participant_proxies.len() < MAX_PARTICIPANTS {
+      db.update_participant(&new_participant());
+    }
+    let update = db.update_participant(&returning);
+    assert!(matches!(update, ParticipantUpdate::New { evicted: Some(_) }), "{update:?}");
+    assert_eq!(db.endpoints_of(prefix).0.len(), 1);
+    assert!(db.participant_attic.get(&prefix).is_none() && !db.attic_order.contains(&prefix));
   }
 
   #[test]

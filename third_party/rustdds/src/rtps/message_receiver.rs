@@ -141,7 +141,7 @@ pub(crate) struct MessageReceiver {
   // which consumes it to resolve interface-aware send routes.
   interface_observations: Rc<RefCell<InterfaceObservations>>,
 
-  // The participants that Discovery knows, and the budgets of those that it does not.
+  // Decides which announcements of participants are handled.
   pub newcomers: Newcomers,
   counters: Arc<NetworkCounters>,
 
@@ -334,19 +334,32 @@ impl MessageReceiver {
   }
 
   /// Whether a message announces a participant that Discovery does not know, and too
-  /// many others have been announced just now.
+  /// many others have been announced just now. The SPDP reader accepts samples of any
+  /// writer, also in fragments, and a message can change its sender (INFO_SRC).
   fn is_refused_announcement(&mut self, message: &Message, origin: PacketOrigin) -> bool {
     let Some(source) = origin.source else {
       return false;
     };
-    let announces = message.submessages.iter().any(|submessage| {
-      matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, _))
-        if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER)
-    });
-    let prefix = message.header.guid_prefix;
-    announces
-      && prefix != self.own_guid_prefix
-      && !self.newcomers.admit(prefix, source.ip(), Instant::now())
+    let mut sender = message.header.guid_prefix;
+    for submessage in &message.submessages {
+      let (reader, writer) = match &submessage.body {
+        SubmessageBody::Interpreter(InterpreterSubmessage::InfoSource(info, _)) => {
+          sender = info.guid_prefix;
+          continue;
+        }
+        SubmessageBody::Writer(WriterSubmessage::Data(data, _)) => (data.reader_id, data.writer_id),
+        SubmessageBody::Writer(WriterSubmessage::DataFrag(fragment, _)) => {
+          (fragment.reader_id, fragment.writer_id)
+        }
+        _ => continue,
+      };
+      let announces = reader == EntityId::SPDP_BUILTIN_PARTICIPANT_READER
+        || writer == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER;
+      if announces && !self.newcomers.admit(sender, source.ip(), Instant::now()) {
+        return true;
+      }
+    }
+    false
   }
 
   /// Note the interface/source a packet from `source_prefix` arrived on.
@@ -1413,5 +1426,77 @@ mod tests {
     let bytes = header.write_to_vec().unwrap();
     let new_header = Header::read_from_buffer(&bytes).unwrap();
     assert_eq!(header, new_header);
+  }
+
+  // A message of the participant of this number, with these submessages.
+  fn message_of(number: u8, submessages: &[&[u8]]) -> Message {
+    let header = [b"RTPS\x02\x03\x01\x0f".as_slice(), &[number; 12]].concat();
+    let bytes = [header, submessages.concat()].concat();
+    Message::read_from_buffer(&Bytes::from(bytes)).unwrap()
+  }
+
+  fn submessage(kind: u8, body: &[&[u8]]) -> Vec<u8> {
+    let body = body.concat();
+    [&[kind, 0x05, body.len() as u8, 0], body.as_slice()].concat()
+  }
+
+  #[test]
+  fn announcements_are_limited_whoever_they_claim_to_be_from() {
+    const SPDP_WRITER: [u8; 4] = [0, 1, 0, 0xc2];
+    const SPDP_READER: [u8; 4] = [0, 1, 0, 0xc7];
+    const OTHER: [u8; 4] = [0, 0, 1, 0x03];
+    let number = [0, 0, 0, 0, 1, 0, 0, 0];
+    let empty_list = [0, 3, 0, 0, 1, 0, 0, 0];
+    let data = |reader: [u8; 4], writer: [u8; 4]| {
+      submessage(0x15, &[&[0, 0, 16, 0], &reader, &writer, &number, &empty_list])
+    };
+    // The first of one fragment, of 8 bytes.
+    let fragment = submessage(
+      0x16,
+      &[
+        &[0, 0, 28, 0],
+        &SPDP_READER,
+        &OTHER,
+        &number,
+        &[1, 0, 0, 0, 1, 0, 8, 0, 8, 0, 0, 0],
+        &empty_list,
+      ],
+    );
+    let from_another = |other: u8| submessage(0x0c, &[&[0; 4], &[2, 3, 1, 15], &[other; 12]]);
+    let waker = LoopWaker::new();
+    let (acknack_sender, _acknack_receiver) = wake_channel(8, &waker);
+    let (spdp_liveness_sender, _spdp_liveness_receiver) = wake_channel(8, &waker);
+    let own = GuidPrefix::new(&[9; 12]);
+    let mut receiver = MessageReceiver::new(
+      own,
+      acknack_sender,
+      spdp_liveness_sender,
+      None,
+      Rc::new(RefCell::new(InterfaceObservations::new())),
+      Arc::default(),
+    );
+    receiver.newcomers.insert_known(own);
+    receiver.newcomers.insert_known(GuidPrefix::new(&[1; 12]));
+    let origin = PacketOrigin {
+      source: Some("10.0.0.7:7410".parse().unwrap()),
+      local_if: None,
+    };
+    let mut is_refused =
+      |message: &Message| receiver.is_refused_announcement(message, origin.clone());
+    let plain = message_of(2, &[&data([0; 4], SPDP_WRITER)]);
+    let admitted = (0..1_000).filter(|_| !is_refused(&plain)).count();
+    assert!(admitted < 1_000, "the budget of the address is used up");
+    for (what, message) in [
+      ("another writer", message_of(2, &[&data(SPDP_READER, OTHER)])),
+      ("fragments", message_of(2, &[&fragment])),
+      ("INFO_SRC", message_of(1, &[&from_another(2), &data([0; 4], SPDP_WRITER)])),
+    ] {
+      // Without the clock: a new token takes 31 ms.
+      let refused = (0..100).filter(|_| is_refused(&message)).count();
+      assert!(refused > 0, "{what}");
+    }
+    assert!(!is_refused(&message_of(1, &[&data([0; 4], SPDP_WRITER)])), "a known participant");
+    assert!(!is_refused(&message_of(9, &[&data([0; 4], SPDP_WRITER)])), "ourselves");
+    assert!(!is_refused(&message_of(2, &[&data([0; 4], OTHER)])), "no announcement");
   }
 }

@@ -1,8 +1,8 @@
 //! Limits how often announcements of unknown participants reach discovery.
 //!
-//! Each new participant costs both threads some 0.2 ms and a dozen datagrams: its
-//! built-in endpoints are matched, and it is told of all of ours. Announcements can be
-//! forged at any rate, and the thread that handles them also receives samples.
+//! For each new participant the event loop matches its built-in endpoints and sends it
+//! the announcements of all local endpoints. Announcements can be forged at any rate,
+//! and the same thread receives samples.
 
 use std::{
   collections::{BTreeMap, BTreeSet},
@@ -30,7 +30,7 @@ struct Limit {
   burst: u32,
 }
 
-// Time up to which a sender has used its share.
+// The time up to which announcements have used their share.
 #[derive(Clone, Copy)]
 struct PaidUntil(Instant);
 
@@ -68,11 +68,13 @@ impl Newcomers {
       return true;
     }
     let unused = PaidUntil(now);
-    if self.by_address.len() >= MAX_ADDRESSES && !self.by_address.contains_key(&address) {
+    let is_full = |by_address: &BTreeMap<IpAddr, PaidUntil>| {
+      by_address.len() >= MAX_ADDRESSES && !by_address.contains_key(&address)
+    };
+    if is_full(&self.by_address) {
       self.by_address.retain(|_, paid| paid.0 > now);
     }
-    let is_full = self.by_address.len() >= MAX_ADDRESSES && !self.by_address.contains_key(&address);
-    let of_address = if is_full {
+    let of_address = if is_full(&self.by_address) {
       self.of_others.get_or_insert(unused)
     } else {
       self.by_address.entry(address).or_insert(unused)
