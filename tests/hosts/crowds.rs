@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, outputs};
 use support::impairment::Impairment;
+use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
 
@@ -23,6 +24,9 @@ struct Flow {
     max_sample_bytes: usize,
     /// The history of a subscriber.
     depth: u32,
+    /// The samples that a subscriber that keeps up may lack before the publisher waits for it. The lane
+    /// retains 256 samples and 32 MiB for a subscriber that does not acknowledge.
+    lag: u64,
     bad: BadLibraries,
     /// Whether the subscribers are on the bridge's host, except the one behind a lossy link. Each remote
     /// subscriber of 1 MiB at 30 Hz takes 23,000 packets a second; two CPUs can handle two such subscribers.
@@ -121,29 +125,32 @@ fn crowd(test: &str, flow: &Flow) {
     let idle: Vec<RunningPeer> = idle.collect();
     let publisher = flow.peer(Library::Cyclone, "").keep_last(1_000).rate_hz(flow.rate_hz);
     let publisher = bed.publish(publisher, INPUT);
-    let crowd = [&killed, &short, &long, &beyond_lease, &lossy, &far, &muted];
-    for subscribers in crowd.into_iter().chain([&healthy]) {
-        wait_more(subscribers, 5);
-    }
-    let _loss = Impairment::start(bed.host("lossy"), bridge, LOSS);
-    let _delay = Impairment::start(bed.host("far"), bridge, DELAY);
-    mute(&bed, "mute");
-    for mut victim in killed {
-        victim.kill9();
-    }
-    for victim in [&short, &long, &beyond_lease].into_iter().flatten() {
-        victim.stop();
-    }
-    // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
-    for (stopped, after_s) in [(&short, 1), (&long, 9), (&beyond_lease, 12)] {
-        std::thread::sleep(Duration::from_secs(after_s));
-        for victim in stopped {
-            victim.cont();
+    let _impairments = paced(&publisher, &healthy, flow.lag, || {
+        let crowd = [&killed, &short, &long, &beyond_lease, &lossy, &far, &muted];
+        for subscribers in crowd.into_iter().chain([&healthy]) {
+            wait_more(subscribers, 5);
         }
-    }
-    for returned in [&short, &long, &beyond_lease, &lossy, &far] {
-        wait_more(returned, 5);
-    }
+        let loss = Impairment::start(bed.host("lossy"), bridge, LOSS);
+        let delay = Impairment::start(bed.host("far"), bridge, DELAY);
+        mute(&bed, "mute");
+        for mut victim in killed {
+            victim.kill9();
+        }
+        for victim in [&short, &long, &beyond_lease].into_iter().flatten() {
+            victim.stop();
+        }
+        // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
+        for (stopped, after_s) in [(&short, 1), (&long, 9), (&beyond_lease, 12)] {
+            std::thread::sleep(Duration::from_secs(after_s));
+            for victim in stopped {
+                victim.cont();
+            }
+        }
+        for returned in [&short, &long, &beyond_lease, &lossy, &far] {
+            wait_more(returned, 5);
+        }
+        (loss, delay)
+    });
     let sent: Sent = publisher.end();
     assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
     for subscriber in healthy {
@@ -170,6 +177,7 @@ fn a_crowd_at_30_hz_costs_the_others_no_sample() {
         bytes: 2_948,
         max_sample_bytes: 65_536,
         depth: 1_000,
+        lag: 100,
         on_robot: false,
         bad: BadLibraries::All,
     };
@@ -183,6 +191,7 @@ fn a_crowd_at_200_hz_costs_the_others_no_sample() {
         bytes: 2_948,
         max_sample_bytes: 65_536,
         depth: 1_000,
+        lag: 100,
         on_robot: false,
         bad: BadLibraries::Rotated(0),
     };
@@ -196,6 +205,7 @@ fn a_crowd_at_1_khz_costs_the_others_no_sample() {
         bytes: 1_000,
         max_sample_bytes: 65_536,
         depth: 1_000,
+        lag: 200,
         on_robot: false,
         bad: BadLibraries::Rotated(1),
     };
@@ -209,6 +219,7 @@ fn a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample() {
         bytes: 1 << 20,
         max_sample_bytes: 2 << 20,
         depth: 60,
+        lag: 12,
         on_robot: true,
         bad: BadLibraries::Rotated(2),
     };

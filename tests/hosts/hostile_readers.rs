@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN_TYPE, outputs};
+use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
 use support::rtps::{EntityId, ForgedReader, Message, NumberSet, Prefix, Writer};
@@ -277,13 +278,16 @@ fn twenty_hostile_readers_cost_the_others_no_sample() {
     };
     measure("silent readers", &mut || std::thread::sleep(Duration::from_secs(5)));
     let mut sent = 0;
-    let (before, after) = measure("attacking readers", &mut || sent = run_attacks(&mut readers, &others));
+    let (before, after) = paced(&publisher, &healthy, 100, || {
+        let memory = measure("attacking readers", &mut || sent = run_attacks(&mut readers, &others));
+        // After the attack all subscribers still receive samples.
+        for subscriber in healthy.iter().chain(&victims) {
+            subscriber.wait_received(subscriber.received() + 50);
+        }
+        memory
+    });
     println!("{sent} hostile datagrams");
 
-    // After the attack all subscribers still receive samples.
-    for subscriber in healthy.iter().chain(&victims) {
-        subscriber.wait_received(subscriber.received() + 50);
-    }
     let hostile_address = bed.host("slow").address().to_string();
     let status = bed.bridge.wait_status("the hostile readers in the status", |status| {
         readers.iter().zip(ATTACKS).all(|(reader, attack)| {

@@ -6,6 +6,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};
+use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::process::signal;
 use support::ros;
@@ -78,6 +79,15 @@ impl<'b> Scene<'b> {
         wait_more(self.flows.iter().flat_map(|flow| &flow.healthy), samples);
     }
 
+    /// Does some work while no subscriber that keeps up lacks more than 100 samples, of which the lane retains
+    /// 256.
+    fn paced(&self, work: impl FnOnce()) {
+        let [bridged, plain] = &self.flows;
+        paced(&bridged.publisher, &bridged.healthy, 100, || {
+            paced(&plain.publisher, &plain.healthy, 100, work);
+        });
+    }
+
     /// Starts one more subscriber of each library on another host; returns those of the bridge, then the
     /// others.
     fn join(&self, node: &str) -> [Vec<RunningPeer>; 2] {
@@ -137,13 +147,15 @@ fn critical(status: &Value) -> &Value {
 fn killed_critical_subscribers_cost_the_others_no_sample() {
     let Some(bed) = bed("killed_critical_subscribers_cost_the_others_no_sample") else { return };
     let scene = Scene::start(&bed);
-    for mut victim in scene.join("crashing").into_iter().flatten() {
-        victim.wait_received(10);
-        victim.kill9();
-    }
-    // Four times the samples that a writer retains for a subscriber that does not acknowledge, sent long
-    // before a lease ends.
-    scene.wait_more(1024);
+    scene.paced(|| {
+        for mut victim in scene.join("crashing").into_iter().flatten() {
+            victim.wait_received(10);
+            victim.kill9();
+        }
+        // Four times the samples that a writer retains for a subscriber that does not acknowledge, sent long
+        // before a lease ends.
+        scene.wait_more(1024);
+    });
     scene.end();
     bed.end();
 }
@@ -153,23 +165,25 @@ fn critical_subscribers_stopped_beyond_their_lease_cost_the_others_no_sample_and
     let test = "critical_subscribers_stopped_beyond_their_lease_cost_the_others_no_sample_and_receive_again";
     let Some(bed) = bed(test) else { return };
     let scene = Scene::start(&bed);
-    let stopped = scene.join("debugged");
-    for victim in stopped.iter().flatten() {
-        victim.wait_received(10);
-        victim.stop();
-    }
-    // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
-    std::thread::sleep(Duration::from_secs(22));
-    scene.wait_more(100);
-    for victim in stopped.iter().flatten() {
-        victim.cont();
-    }
-    // Without the bridge, Fast DDS 2.14 does not serve its subscriber again.
-    let [bridged, _plain] = stopped;
-    wait_more(&bridged, 100);
-    for victim in bridged {
-        victim.end::<Received>().assert_sound();
-    }
+    scene.paced(|| {
+        let stopped = scene.join("debugged");
+        for victim in stopped.iter().flatten() {
+            victim.wait_received(10);
+            victim.stop();
+        }
+        // The lease of a participant is 20 s in Fast DDS and 10 s in Cyclone DDS.
+        std::thread::sleep(Duration::from_secs(22));
+        scene.wait_more(100);
+        for victim in stopped.iter().flatten() {
+            victim.cont();
+        }
+        // Without the bridge, Fast DDS 2.14 does not serve its subscriber again.
+        let [bridged, _plain] = stopped;
+        wait_more(&bridged, 100);
+        for victim in bridged {
+            victim.end::<Received>().assert_sound();
+        }
+    });
     scene.end();
     bed.end();
 }
@@ -180,10 +194,18 @@ fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and
         "twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and_receive_no_history";
     let Some(bed) = bed(test) else { return };
     let scene = Scene::start(&bed);
+    scene.paced(|| twenty_visits(&bed, &scene.flows[0].healthy[1]));
+    scene.wait_more(512);
+    scene.end();
+    bed.end();
+}
+
+/// Starts subscribers of both flows one after the other; half of them leave normally, the others are killed.
+fn twenty_visits(bed: &Bed, planner: &RunningPeer) {
     for visit in 0..20 {
         let library = LIBRARIES[visit % LIBRARIES.len()];
-        let published = scene.flows[0].healthy[1].received();
-        let visitors = [CRITICAL, PLAIN].map(|topic| subscribe(&bed, "slow", library, "visitor", topic));
+        let published = planner.received();
+        let visitors = [CRITICAL, PLAIN].map(|topic| subscribe(bed, "slow", library, "visitor", topic));
         for (mut visitor, topic) in visitors.into_iter().zip([CRITICAL, PLAIN]) {
             visitor.wait_received(10);
             if visit % 2 == 0 {
@@ -198,9 +220,6 @@ fn twenty_critical_subscribers_that_join_and_leave_cost_the_others_no_sample_and
             }
         }
     }
-    scene.wait_more(512);
-    scene.end();
-    bed.end();
 }
 
 #[test]

@@ -4,6 +4,7 @@
 
 use support::bed::{Bed, CRITICAL, INPUT, outputs};
 use support::impairment::Impairment;
+use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
 
@@ -95,9 +96,11 @@ fn visits(test: &str, lane: Durability, delay: Option<&str>) {
     let publisher = bed.publish(publisher, INPUT);
     healthy[1].wait_received(200);
     let link = delay.map(|delay| Impairment::start(bed.host("slow"), bed.host("bridge"), delay));
-    for batch in 0..VISITS / AT_ONCE {
-        visit(&bed, lane, batch, &healthy[1]);
-    }
+    paced(&publisher, &healthy, 1_000, || {
+        for batch in 0..VISITS / AT_ONCE {
+            visit(&bed, lane, batch, &healthy[1]);
+        }
+    });
     drop(link);
 
     let sent: Sent = publisher.end();

@@ -13,6 +13,7 @@ pub mod flow;
 pub mod impairment;
 pub mod machine;
 pub mod netns;
+pub mod pacer;
 pub mod peer;
 pub mod process;
 pub mod prometheus;

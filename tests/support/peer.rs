@@ -396,15 +396,17 @@ impl RunningPeer {
     pub fn received(&self) -> u64 {
         let mut after = 0;
         // Searches from the end: there are thousands of events after some minutes.
-        for line in self.process.stdout_lines().iter().rev() {
+        let before = self.process.find_last_line(|line| {
             let event = event_of(line);
-            if event["event"] == "sample" {
-                after += 1;
-            } else if let Some(received) = event["received"].as_u64() {
-                return received + after;
-            }
-        }
-        after
+            after += u64::from(event["event"] == "sample");
+            event["received"].as_u64()
+        });
+        before.unwrap_or(0) + after
+    }
+
+    /// The number of samples that a publisher has written, up to 100 ms ago.
+    pub fn written(&self) -> u64 {
+        self.process.find_last_line(|line| event_of(line)["attempted"].as_u64()).unwrap_or(0)
     }
 
     /// Waits until a subscriber has received so many samples.
@@ -446,7 +448,7 @@ struct MissingSamples<'a> {
 impl Display for MissingSamples<'_> {
     fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
         let Self { peer, samples } = self;
-        write!(formatter, "{samples} samples received, {} so far", peer.received())?;
+        write!(formatter, "{samples} samples at {}, {} so far", peer.process.name(), peer.received())?;
         let events = peer.events();
         let received: BTreeSet<u64> = events
             .iter()

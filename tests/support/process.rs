@@ -160,9 +160,19 @@ impl Process {
         status
     }
 
+    /// What it is, for messages: such as `Cyclone sub on laptop`.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// The lines of its stdout so far.
     pub fn stdout_lines(&self) -> Vec<String> {
         self.stdout.state.lock().unwrap().lines.clone()
+    }
+
+    /// Searches the lines of its stdout so far from the last one back.
+    pub fn find_last_line<T>(&self, find: impl FnMut(&String) -> Option<T>) -> Option<T> {
+        self.stdout.state.lock().unwrap().lines.iter().rev().find_map(find)
     }
 
     /// Its output on stderr so far.
