@@ -106,9 +106,6 @@ impl Bed {
 
     /// Waits until every lane accounts for every sample and none waits; returns the status.
     pub fn wait_accounted(&self) -> Value {
-        if self.bridge.try_status().is_err() {
-            return Value::Null;
-        }
         self.bridge.wait_status("all samples accounted for, none waiting", is_accounted_and_idle)
     }
 
