@@ -12,7 +12,10 @@ use support::bridge::Bridge;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::{Process, signal};
 
-/// A flow of 200 Hz to a critical subscriber on a separate host.
+/// Samples that the publisher of a flow writes in a second.
+const RATE_HZ: u32 = 200;
+
+/// A flow of [`RATE_HZ`] to a critical subscriber on a separate host.
 struct Flow {
     publisher: RunningPeer,
     critical: RunningPeer,
@@ -23,16 +26,19 @@ impl Flow {
         let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
         // Not Fast DDS: 2.9.1 as Debian builds it aborts in an assertion of its statistics module
         // (OutputTrafficManager) when a reader, such as that of a restarted ingress, joins while it sends.
-        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(200.0), INPUT);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ.into()), INPUT);
         critical.wait_received(50);
         Self { publisher, critical }
     }
 
-    /// Waits for some seconds and asserts that samples flow in that time.
+    /// Waits for some seconds and asserts that samples flow in that time at half the rate at least: a fault
+    /// that blocks the publisher for its duration costs nearly all of them, a loaded machine a few.
     fn flow_for(&self, seconds: u64) {
         let before = self.critical.received();
         std::thread::sleep(Duration::from_secs(seconds));
-        assert!(self.critical.received() > before, "no sample reached the critical subscriber");
+        let received = self.critical.received() - before;
+        let expected = seconds * u64::from(RATE_HZ);
+        assert!(received >= expected / 2, "{received} of {expected} samples reached the critical subscriber");
     }
 
     /// Ends the flow. Asserts that the publisher was never blocked and that the critical subscriber received
@@ -42,7 +48,7 @@ impl Flow {
         self.critical.wait_received(sent.ok);
         let received: Received = self.critical.end();
         received.assert_all_of(&sent);
-        assert_eq!(sent.failed, 0, "{sent:?}");
+        sent.assert_not_blocked();
         (sent, received)
     }
 }
@@ -162,7 +168,7 @@ fn a_killed_critical_egress_is_restarted_and_counts_the_lost_samples() {
         flow.critical.wait_received(before + 100);
     }
     let sent: Sent = flow.publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    sent.assert_not_blocked();
     let status = bed.wait_accounted();
     let critical = lane(&status, "critical");
     let received: Received = flow.critical.end();
@@ -217,7 +223,7 @@ fn a_publisher_on_fast_dds_does_not_wait_for_an_ingress_that_was_killed() {
     let before = critical.received();
     critical.wait_received(before + 600);
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "{sent:?}");
+    sent.assert_not_blocked();
     critical.end::<Received>().assert_sound();
     bed.end();
 }
@@ -273,7 +279,7 @@ fn a_stopped_critical_subscriber_costs_the_others_no_sample_and_its_overrun_is_c
     stopped.wait_received(before + 100);
     bed.up.wait_for_log("a subscriber does not keep up");
     let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    sent.assert_not_blocked();
     bed.wait_accounted();
     let status = bed.bridge.wait_status("all acknowledged", |status| {
         let readers = lane(status, "critical")["matched_readers"].as_array().unwrap().clone();
