@@ -21,9 +21,7 @@ use crate::{
   discovery::{
     DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData, SpdpDiscoveredParticipantData,
   },
-  messages::submessages::{
-    elements::serialized_payload::SerializedPayload, submessages::InterpreterSubmessage,
-  },
+  messages::submessages::elements::serialized_payload::SerializedPayload,
   mio_source,
   network::udp_sender::UDPSender,
   rtps::transmit::InterfaceObservations,
@@ -35,7 +33,7 @@ use crate::{
     rtps_writer_proxy::RtpsWriterProxy,
     writer::{Writer, WriterIngredients},
     writer_send_buffer::WriterSendBuffer,
-    Message, SubmessageBody,
+    Message,
   },
   serialization::pl_cdr_adapters::PlCdrDeserialize,
   structure::{
@@ -167,16 +165,9 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
   };
 
   for datagram in datagrams {
-    let Ok(mut message) = Message::read_from_buffer(&Bytes::copy_from_slice(datagram)) else {
+    let Ok(message) = Message::read_from_buffer(&Bytes::copy_from_slice(datagram)) else {
       continue;
     };
-    // INFO_REPLY names addresses that replies are to go to.
-    message.submessages.retain(|submessage| {
-      !matches!(
-        submessage.body,
-        SubmessageBody::Interpreter(InterpreterSubmessage::InfoReply(..))
-      )
-    });
     message_receiver.handle_parsed_message(message);
     while let Ok((prefix, acknack)) = acknack_receiver.try_recv() {
       writer.handle_ack_nack(prefix, &acknack);

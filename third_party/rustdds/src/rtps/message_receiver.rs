@@ -1125,26 +1125,10 @@ impl MessageReceiver {
         self.source_timestamp = None; // TODO: Why does InfoSource set timestamp
                                       // to None?
       }
-      InterpreterSubmessage::InfoReply(info_reply, flags) => {
-        self.unicast_reply_locator_list = info_reply.unicast_locator_list;
-        self.multicast_reply_locator_list = match (
-          flags.contains(INFOREPLY_Flags::Multicast),
-          info_reply.multicast_locator_list,
-        ) {
-          (true, Some(ll)) => ll, // expected case
-          (true, None) => {
-            warn!(
-              "InfoReply submessage flag indicates multicast_reply_locator_list, but none found."
-            );
-            vec![]
-          }
-          (false, None) => vec![], // This one is normal again
-          (false, Some(_)) => {
-            warn!("InfoReply submessage has unexpected multicast_reply_locator_list, ignoring.");
-            vec![]
-          }
-        };
-      }
+      // The addresses that replies are to go to are not used: nobody on a robot sends
+      // them, and anybody could make this participant send to any host, dozens of
+      // ACKNACKs for one datagram.
+      InterpreterSubmessage::InfoReply(_, _) => {}
       InterpreterSubmessage::InfoDestination(info_dest, _flags) => {
         if info_dest.guid_prefix == GUID::GUID_UNKNOWN.prefix {
           self.dest_guid_prefix = self.own_guid_prefix;
@@ -1235,6 +1219,35 @@ mod tests {
     structure::{dds_cache::DDSCache, guid::EntityKind},
   };
   use super::*;
+
+  #[test]
+  fn replies_do_not_go_where_a_datagram_says() {
+    let waker = LoopWaker::new();
+    let (acknack_sender, _acknacks) = wake_channel(1, &waker);
+    let (spdp_liveness_sender, _spdp_liveness) = wake_channel(1, &waker);
+    let observations = Rc::new(RefCell::new(InterfaceObservations::new()));
+    let mut receiver = MessageReceiver::new(
+      GuidPrefix::new(&[1; 12]),
+      acknack_sender,
+      spdp_liveness_sender,
+      None,
+      observations,
+      Arc::default(),
+    );
+    // INFO_REPLY with one address, 127.0.0.1:7410.
+    let mut datagram = b"RTPS\x02\x03\x01\x0f".to_vec();
+    datagram.extend([2; 12]);
+    datagram.extend([0x0f, 1, 28, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0xf2, 0x1c, 0, 0]);
+    datagram.extend([0; 12]);
+    datagram.extend([127, 0, 0, 1]);
+    receiver.handle_received_packet(&Bytes::from(datagram), PacketOrigin::UNKNOWN);
+    assert_eq!(receiver.submessage_count, 1);
+    let lists = [
+      &receiver.unicast_reply_locator_list,
+      &receiver.multicast_reply_locator_list,
+    ];
+    assert!(!lists.into_iter().flatten().any(Locator::is_udp), "{lists:?}");
+  }
 
   #[test]
 

@@ -226,7 +226,7 @@ impl Submessage {
       SubmessageKind::INFO_REPLY => {
         let f = BitFlags::<INFOREPLY_Flags>::from_bits_truncate(sub_header.flags);
         mk_i_subm(InterpreterSubmessage::InfoReply(
-          InfoReply::read_from_buffer_with_ctx(e, &sub_content_buffer)?,
+          InfoReply::read(e, &sub_content_buffer, f.contains(INFOREPLY_Flags::Multicast))?,
           f,
         ))
       }
