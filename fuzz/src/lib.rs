@@ -16,7 +16,7 @@ use adaptive_bridge::model::{
 use adaptive_bridge::policy::effective_mode;
 use adaptive_bridge::process::probes::{MAX_MESSAGE_BYTES, ProbeRequest, ProbeResponse};
 use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
-use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing};
+use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing, sample_arriving};
 
 /// A target's name and function.
 pub type Target = (&'static str, fn(&[u8]));
@@ -29,6 +29,7 @@ pub const TARGETS: &[Target] = &[
     ("names", names),
     ("graph", graph),
     ("rtps_message", rtps_message),
+    ("rtps_arriving", rtps_arriving),
     ("rtps_receive", rtps_receive),
     ("rtps_discovery", rtps_discovery),
     ("probe", probe),
@@ -316,6 +317,23 @@ impl Cdr<'_> {
 /// A datagram, read as an RTPS message.
 pub fn rtps_message(bytes: &[u8]) {
     fuzzing::read_message(bytes);
+}
+
+/// A datagram that is looked at before it is received, of which the bridge reads 256 bytes.
+pub fn rtps_arriving(bytes: &[u8]) {
+    let whole = sample_arriving(bytes);
+    if let Some((writer, _, left_bytes)) = whole {
+        let writer = writer.to_bytes();
+        assert!(bytes.starts_with(b"RTPS") && writer[..12] == bytes[8..20]);
+        // The two highest bits of an entity's kind are 0 for those of a user (RTPS 2.5, clause 9.3.1.2).
+        assert_eq!(writer[15] & 0xc0, 0, "{writer:?}");
+        assert!(u32::try_from(left_bytes).is_ok());
+    }
+    // A part of a datagram tells the same as the whole, or nothing.
+    for length in [256, bytes.len() / 2, bytes.len().saturating_sub(1)] {
+        let part = sample_arriving(&bytes[..length.min(bytes.len())]);
+        assert!(part.is_none() || part == whole, "{length} bytes: {part:?}, all: {whole:?}");
+    }
 }
 
 /// Datagrams of the submessages of a writer that a reader has matched, each after its length in two bytes;
