@@ -6,3 +6,4 @@ mod control_policy;
 mod policy;
 mod regressions;
 mod tidy;
+mod units;

@@ -1,0 +1,77 @@
+//! The service units have the settings that docs/hardening.md promises. `tests/root/systemd.rs` runs them.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+/// The settings of a file of systemd, `NAME=VALUE`.
+fn settings(file: &str) -> BTreeSet<String> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd").join(file);
+    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    text.lines().filter(|line| line.contains('=') && !line.starts_with('#')).map(str::to_owned).collect()
+}
+
+const COMMON: &str = "adaptive-bridge-.service.d/10-common.conf";
+/// The services of ingress and of the critical lane.
+const CRITICAL: [&str; 2] =
+    ["adaptive-bridge-ingress.service", "adaptive-bridge-egress@critical.service.d/50-critical.conf"];
+const OTHERS: [&str; 4] = [
+    COMMON,
+    "adaptive-bridge-control.service",
+    "adaptive-bridge-egress@.service",
+    "adaptive-bridge-responder@.service",
+];
+
+#[test]
+fn services_have_no_capabilities_and_write_only_to_shared_memory() {
+    let common = settings(COMMON);
+    for setting in [
+        "User=adaptive-bridge",
+        "CapabilityBoundingSet=",
+        "AmbientCapabilities=",
+        "NoNewPrivileges=yes",
+        "PrivateUsers=yes",
+        "PrivateDevices=yes",
+        "PrivateTmp=yes",
+        "ProtectSystem=strict",
+        "ProtectHome=yes",
+        "ProtectProc=invisible",
+        "RemoveIPC=no",
+        "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
+        "SystemCallFilter=@system-service",
+        "UMask=0077",
+    ] {
+        assert!(common.contains(setting), "{setting} is missing in {COMMON}");
+    }
+    // No unit takes one of them back; a later setting replaces or extends an earlier one.
+    let names: BTreeSet<&str> = common.iter().filter_map(|setting| setting.split('=').next()).collect();
+    for unit in CRITICAL.into_iter().chain(OTHERS).filter(|unit| *unit != COMMON) {
+        for setting in settings(unit) {
+            let name = setting.split('=').next().unwrap_or_default();
+            let protects = ["Capab", "Ambient", "NoNew", "Private", "Protect", "Remove", "System", "UMask"];
+            assert!(
+                !(names.contains(name) && protects.iter().any(|start| name.starts_with(start))),
+                "{unit} replaces {setting}"
+            );
+        }
+    }
+}
+
+#[test]
+fn only_ingress_and_the_critical_lane_may_use_real_time_scheduling_and_lock_memory() {
+    for unit in CRITICAL {
+        let settings = settings(unit);
+        for setting in ["RestrictRealtime=no", "LimitRTPRIO=50", "LimitMEMLOCK=infinity"] {
+            assert!(settings.contains(setting), "{setting} is missing in {unit}");
+        }
+        let limit = settings.iter().find(|setting| setting.starts_with("LimitRTTIME="));
+        assert!(limit.is_some_and(|limit| limit != "LimitRTTIME=infinity"), "{unit}: {limit:?}");
+    }
+    for unit in OTHERS {
+        assert!(unit == COMMON || settings(unit).contains("RestrictRealtime=yes"), "{unit}");
+        for setting in settings(unit) {
+            let grants = ["LimitRTPRIO=", "LimitMEMLOCK=", "RestrictRealtime=no"];
+            assert!(!grants.iter().any(|grant| setting.starts_with(grant)), "{setting} in {unit}");
+        }
+    }
+}
