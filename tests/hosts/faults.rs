@@ -31,14 +31,14 @@ impl Flow {
         Self { publisher, critical }
     }
 
-    /// Waits for some seconds and asserts that samples flow in that time at half the rate at least: a fault
-    /// that blocks the publisher for its duration costs nearly all of them, a loaded machine a few.
+    /// Waits for some seconds and asserts that samples flow in that time, at a quarter of the rate at least: a
+    /// fault that blocks the publisher for its duration costs nearly all of them, a busy machine a few.
     fn flow_for(&self, seconds: u64) {
         let before = self.critical.received();
         std::thread::sleep(Duration::from_secs(seconds));
         let received = self.critical.received() - before;
         let expected = seconds * u64::from(RATE_HZ);
-        assert!(received >= expected / 2, "{received} of {expected} samples reached the critical subscriber");
+        assert!(received >= expected / 4, "{received} of {expected} samples reached the critical subscriber");
     }
 
     /// Ends the flow. Asserts that the publisher was never blocked and that the critical subscriber received

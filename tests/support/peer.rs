@@ -549,12 +549,12 @@ pub struct Received {
 }
 
 impl Sent {
-    /// Asserts that no write failed and that the publisher kept at least half of its rate. A write that
+    /// Asserts that no write failed and that the publisher kept at least a quarter of its rate. A write that
     /// blocks for less than its time limit does not fail, nor does one with KEEP_LAST, but each skips the
-    /// periods that it takes. Half, as a loaded machine costs some periods, and a blocked writer nearly all.
+    /// periods that it takes. A quarter: a busy machine costs some periods, a blocked writer nearly all.
     pub fn assert_not_blocked(&self) {
         assert_eq!(self.failed, 0, "the publisher was blocked: {self:?}");
-        assert!(self.skipped_ticks <= self.ok, "the publisher was slowed down: {self:?}");
+        assert!(self.skipped_ticks <= 3 * self.ok, "the publisher was slowed down: {self:?}");
     }
 }
 
