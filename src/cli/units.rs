@@ -30,8 +30,8 @@ const MAX_PRIORITY: u8 = 50;
 /// `MemoryMax` of the installed units of ingress and the critical lane, in MiB.
 const MEMORY_MAX_MIB: u64 = 1024;
 
-/// The memory of ingress and of the critical lane beside shared memory, at most, in MiB: 20 in use, samples that
-/// readers have not acknowledged, unfinished samples of several fragments, and discovery under attack.
+/// The memory of ingress and of the critical lane beside shared memory, at most, in MiB: 20 in use, samples
+/// that readers have not acknowledged, unfinished samples of several fragments, and discovery under attack.
 const OWN_MEMORY_MIB: u64 = 512;
 
 /// The arguments of `units`.
@@ -224,8 +224,9 @@ fn scheduling(configured: &Scheduling, critical: bool) -> Vec<String> {
     lines
 }
 
-/// The line that lets a process of the critical path use the configured shared memory, if the installed limit is
-/// too low for it. The kernel counts a page for the process that touches it first, so each is granted all.
+/// The line that lets a process of the critical path use the configured shared memory, if the installed
+/// limit is too low for it. The kernel counts a page for the process that touches it first, so that each
+/// process is granted all.
 fn memory(settings: &Settings) -> Vec<String> {
     let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
     let needed_mib = pools.sum::<u64>().div_ceil(1 << 20) + OWN_MEMORY_MIB;

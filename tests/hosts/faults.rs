@@ -31,8 +31,8 @@ impl Flow {
         Self { publisher, critical }
     }
 
-    /// Waits for some seconds and asserts that samples flow in that time, at a quarter of the rate at least: a
-    /// fault that blocks the publisher for its duration costs nearly all of them, a busy machine a few.
+    /// Waits for some seconds and asserts that samples flow in that time, at a quarter of the rate at least:
+    /// a fault that blocks the publisher for its duration costs nearly all of them, a busy machine a few.
     fn flow_for(&self, seconds: u64) {
         let before = self.critical.received();
         std::thread::sleep(Duration::from_secs(seconds));

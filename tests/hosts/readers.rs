@@ -79,8 +79,7 @@ impl<'b> Scene<'b> {
         wait_more(self.flows.iter().flat_map(|flow| &flow.healthy), samples);
     }
 
-    /// Does some work while no subscriber that keeps up lacks more than 100 samples, of which the lane retains
-    /// 256.
+    /// Does some work while no subscriber that keeps up lacks more than 100 samples; the lane retains 256.
     fn paced(&self, work: impl FnOnce()) {
         let [bridged, plain] = &self.flows;
         paced(&bridged.publisher, &bridged.healthy, 100, || {
