@@ -3827,6 +3827,23 @@ mod tests {
       assert_eq!(f.writer.send_buffer.matched_readers().len(), 1);
     }
 
+    // A sample that is written, but not sent, when a reader joins is sent to that
+    // reader. A HEARTBEAT that begins after it would withdraw it first.
+    #[test]
+    fn a_joining_volatile_reader_is_offered_what_is_not_sent_yet() {
+      let mut f = keep_last();
+      write(&f, 5, 8);
+      f.writer.set_last_sent(SequenceNumber::new(4));
+      let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
+      let qos = f.writer.qos_policies.clone();
+      f.writer
+        .update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+      assert_eq!(f.writer.readers[&late].first_offered(), SequenceNumber::new(5));
+      let readers = f.writer.send_buffer.matched_readers();
+      let joined = readers.iter().find(|reader| reader.guid == late).unwrap();
+      assert_eq!((joined.offered, joined.unacknowledged), (1, 1));
+    }
+
     // Of a writer that keeps history, a TRANSIENT_LOCAL reader gets the last `depth`
     // samples, whatever another reader has not acknowledged, and a VOLATILE one nothing.
     #[test]

@@ -493,7 +493,8 @@ impl WriterSendBuffer {
   /// Registers a matched reader and returns the first sample that it is offered,
   /// with the record of its progress. `wants_history` is whether the reader is to
   /// get samples that were written before it was matched: of a KEEP_LAST writer
-  /// the last `depth` ones.
+  /// the last `depth` ones. Any other reader is offered what has not been sent yet,
+  /// because that is sent to it, too. The caller holds the lock of the direct send.
   pub fn reader_matched(
     &self,
     reader: GUID,
@@ -503,7 +504,7 @@ impl WriterSendBuffer {
     let mut inner = self.shared.inner.lock().unwrap();
     let next = inner.last_seq.plus_1();
     let first_offered = if !wants_history {
-      next
+      self.shared.direct_send.last_sent().plus_1().min(next)
     } else {
       match self.shared.keep_last {
         Some(depth) => max(inner.first_seq, next - SequenceNumber::from(depth)),
