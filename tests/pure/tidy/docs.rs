@@ -154,8 +154,7 @@ fn tests_by_file(text: &str) -> Vec<(&str, &str)> {
 }
 
 #[test]
-fn every_file_and_test_that_the_page_of_rustdds_names_is_there() {
-    let page = std::fs::read_to_string(root().join("docs/rustdds-changes.md")).unwrap();
+fn every_file_and_test_that_the_pages_of_rustdds_and_of_promises_name_is_there() {
     let read = |file: &str| {
         let path = match file.strip_prefix("rustdds/") {
             Some(inside) => root().join("third_party/rustdds/src").join(inside),
@@ -163,15 +162,18 @@ fn every_file_and_test_that_the_page_of_rustdds_names_is_there() {
         };
         std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
     };
-    for line in page.lines() {
-        files_and_functions(line).0.iter().filter(|file| file.ends_with(".rs")).for_each(|file| {
-            read(file);
-        });
-    }
-    let tests = tests_by_file(&page);
-    assert!(tests.len() > 30, "{} tests", tests.len());
-    for (file, test) in tests {
-        assert!(read(file).contains(&format!("fn {test}(")), "no test {test} in {file}");
+    for page in ["docs/rustdds-changes.md", "docs/promises.md"] {
+        let page = std::fs::read_to_string(root().join(page)).unwrap();
+        for line in page.lines() {
+            files_and_functions(line).0.iter().filter(|file| file.ends_with(".rs")).for_each(|file| {
+                read(file);
+            });
+        }
+        let tests = tests_by_file(&page);
+        assert!(tests.len() > 30, "{} tests", tests.len());
+        for (file, test) in tests {
+            assert!(read(file).contains(&format!("fn {test}(")), "no test {test} in {file}");
+        }
     }
 }
 
