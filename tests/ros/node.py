@@ -368,6 +368,7 @@ class Subscriber:
                 end = now + options.stall_for
                 while not self.signals.stop and time.monotonic() < end:
                     time.sleep(0.01)
+                    self.matches.look()
                 stalled = time.monotonic()
             if options.count and len(self.seen) >= options.count:
                 break
