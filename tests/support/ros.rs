@@ -24,6 +24,11 @@ pub fn node_program() -> PathBuf {
     sources().join("node.py")
 }
 
+/// The Python program of the original package's probing nodes.
+pub fn original_probes() -> PathBuf {
+    sources().join("original_probes.py")
+}
+
 /// Returns why a node cannot be started: rclpy is not installed, or not in the required versions.
 pub fn missing() -> Option<String> {
     let wanted = std::fs::read(sources().join(REQUIREMENTS)).unwrap();

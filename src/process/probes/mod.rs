@@ -16,16 +16,18 @@ pub use trust::{Signed, Trust};
 /// History depth of the readers: one message each of 64 senders that send at the same time.
 const PROBE_DEPTH: u32 = 64;
 
-/// QoS of the writers of both topics.
+/// QoS of the writers of both topics: RELIABLE, so that the RELIABLE subscriptions of the original Python
+/// package match. A writer with KEEP_LAST never waits for a reader.
 pub const PROBE_WRITER_QOS: QosProfile = QosProfile {
-    reliability: Reliability::BestEffort,
+    reliability: Reliability::Reliable,
     history: History::KeepLast { depth: 1 },
     durability: Durability::Volatile,
     lifespan_ms: None,
     deadline_ms: None,
 };
 
-/// QoS of the readers of both topics.
+/// QoS of the readers of both topics: BEST_EFFORT, because a repaired message would hide the loss that the
+/// probes measure. Such a reader matches writers of both reliabilities.
 pub const PROBE_READER_QOS: ReaderQos = ReaderQos {
     reliability: Reliability::BestEffort,
     durability: Durability::Volatile,
