@@ -12,7 +12,6 @@ use clap::Args;
 use super::{ConfigArguments, failed, print};
 use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
 use crate::model::TrafficClass;
-use crate::shm::RouteChannel;
 
 /// The folder of the administrator's units (systemd.unit(5)).
 pub(super) const FOLDER: &str = "/etc/systemd/system";
@@ -26,13 +25,6 @@ const FILE: &str = "60-configuration.conf";
 
 /// The highest real-time priority that the installed units of the critical path allow.
 const MAX_PRIORITY: u8 = 50;
-
-/// `MemoryMax` of the installed units of ingress and the critical lane, in MiB.
-const MEMORY_MAX_MIB: u64 = 1024;
-
-/// The memory of ingress and of the critical lane beside shared memory, at most, in MiB: 20 in use, samples
-/// that readers have not acknowledged, unfinished samples of several fragments, and discovery under attack.
-const OWN_MEMORY_MIB: u64 = 512;
 
 /// The arguments of `units`.
 ///
@@ -85,12 +77,10 @@ impl DropIns {
         let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Vec<String>| {
             add(unit, "Service", [common.clone(), scheduling(configured, critical), own].concat());
         };
-        let ingress = "adaptive-bridge-ingress.service".to_owned();
-        service(ingress, &settings.ingress_scheduling, true, memory(settings));
+        service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, Vec::new());
         for lane in &settings.lanes {
             let critical = lane.class() == TrafficClass::Critical;
-            let own = if lane.name.as_str() == "critical" { memory(settings) } else { Vec::new() };
-            service(egress(lane.name.as_str()), &lane.scheduling, critical, own);
+            service(egress(lane.name.as_str()), &lane.scheduling, critical, Vec::new());
         }
         let mut own = Vec::new();
         if let Some(MetricsListener::Unix(socket)) = &settings.diagnostics.metrics {
@@ -224,15 +214,6 @@ fn scheduling(configured: &Scheduling, critical: bool) -> Vec<String> {
     lines
 }
 
-/// The line that lets a process of the critical path use the configured shared memory, if the installed
-/// limit is too low for it. The kernel counts a page for the process that touches it first, so that each
-/// process is granted all.
-fn memory(settings: &Settings) -> Vec<String> {
-    let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
-    let needed_mib = pools.sum::<u64>().div_ceil(1 << 20) + OWN_MEMORY_MIB;
-    (needed_mib > MEMORY_MAX_MIB).then(|| format!("MemoryMax={needed_mib}M")).into_iter().collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -275,31 +256,6 @@ mod tests {
             ["LimitRTPRIO=7", "RestrictRealtime=no", "LimitRTTIME=500ms:1s", "LimitMEMLOCK=infinity"];
         assert_eq!(lines(&egress("noncritical"))[4..], real_time);
         assert_eq!(lines("adaptive-bridge-control.service")[4..], [r#"ReadWritePaths="/run/metrics""#]);
-    }
-
-    #[test]
-    fn ingress_and_the_critical_lane_may_use_the_shared_memory_of_large_samples() {
-        let large = "topics: [{id: map, input_topic: /map, max_sample_bytes: 67108864}]\n";
-        let settings = settings(large);
-        let pool_mib = RouteChannel::of(&settings, 0).pool_size().bytes.div_ceil(1 << 20);
-        assert!(pool_mib > MEMORY_MAX_MIB - OWN_MEMORY_MIB, "{pool_mib}");
-        let drop_ins = DropIns::of(&settings, Path::new(config::DEFAULT_PATH));
-        let expected = format!("{HEADER}[Service]\nMemoryMax={}M\n", pool_mib + OWN_MEMORY_MIB);
-        for unit in ["adaptive-bridge-ingress.service", &egress("critical")] {
-            assert_eq!(drop_ins.0[unit], expected);
-        }
-        assert_eq!(drop_ins.0.len(), 2);
-    }
-
-    #[test]
-    fn the_installed_units_set_the_limit_of_memory_that_drop_ins_raise() {
-        let limit = format!("MemoryMax={}M\n", MEMORY_MAX_MIB);
-        let units = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd");
-        for unit in
-            ["adaptive-bridge-ingress.service", "adaptive-bridge-egress@critical.service.d/50-critical.conf"]
-        {
-            assert!(fs::read_to_string(units.join(unit)).unwrap().contains(&limit), "{unit}");
-        }
     }
 
     #[test]
