@@ -1125,9 +1125,8 @@ impl MessageReceiver {
         self.source_timestamp = None; // TODO: Why does InfoSource set timestamp
                                       // to None?
       }
-      // The addresses that replies are to go to are not used: nobody on a robot sends
-      // them, and anybody could make this participant send to any host, dozens of
-      // ACKNACKs for one datagram.
+      // The receiver ignores the addresses of an INFO_REPLY: with them, one forged
+      // datagram would make this participant send ACKNACKs to any host.
       InterpreterSubmessage::InfoReply(_, _) => {}
       InterpreterSubmessage::InfoDestination(info_dest, _flags) => {
         if info_dest.guid_prefix == GUID::GUID_UNKNOWN.prefix {
