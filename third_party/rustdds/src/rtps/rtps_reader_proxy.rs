@@ -12,7 +12,7 @@ use log::{debug, error, info, trace, warn};
 use crate::{
   dds::{participant::DomainParticipant, qos::QosPolicies},
   discovery::sedp_messages::DiscoveredReaderData,
-  messages::submessages::submessage::AckSubmessage,
+  messages::submessages::{ack_nack::AckNack, submessage::AckSubmessage},
   network::util::{path_mtu_payload_for_peer, IfAddr},
   rtps::{
     constant::*,
@@ -34,6 +34,8 @@ const BULK_GAP_MIN_SAMPLES: usize = 128;
 
 // What one GAP can list (RTPS v2.5 Section 8.3.5.5).
 const GAP_MAX_SPAN: i64 = 256;
+// Fast DDS repeats its ACKNACK seven times a second while it has no HEARTBEAT.
+const JOINING_MAX_ACKNACKS: u8 = 20;
 
 /// Samples that a reader requested and that are no longer retained.
 #[derive(Debug, PartialEq, Eq)]
@@ -78,6 +80,9 @@ pub(crate) struct RtpsReaderProxy {
   expects_in_line_qos: bool,
   /// Specifies whether the remote Reader is responsive to the Writer
   is_active: bool,
+
+  // The ACKNACKs of a joining reader so far, see `start_joining`. `None` of any other.
+  acknacks_while_joining: Option<u8>,
 
   // Reader has positively acked all SequenceNumbers _before_ this.
   // This is directly the same as readerSNState.base in ACKNACK submessage.
@@ -140,6 +145,7 @@ impl RtpsReaderProxy {
       loopback_unicast_locators: Vec::default(),
       expects_in_line_qos,
       is_active: true,
+      acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
       overrun_counted_before: SequenceNumber::zero(),
@@ -240,6 +246,53 @@ impl RtpsReaderProxy {
       self.all_acked_before = progress.first_offered();
     }
     self.progress = Some(progress);
+  }
+
+  /// The reader is joining: it may not have matched the Writer yet.
+  ///
+  /// A Writer often knows a reader before the reader knows the Writer. What is sent to
+  /// it meanwhile is lost, and a VOLATILE reader of Cyclone DDS takes every sample up to
+  /// the end of its first HEARTBEAT for history. So a joining reader gets no samples,
+  /// and HEARTBEATs that end before the first sample that it is offered.
+  pub fn start_joining(&mut self) {
+    self.acknacks_while_joining = Some(0);
+  }
+
+  pub fn is_joining(&self) -> bool {
+    self.acknacks_while_joining.is_some()
+  }
+
+  /// Whether an ACKNACK shows that a joining reader has had a HEARTBEAT.
+  ///
+  /// Base 0 (Fast DDS) or 1 (Cyclone DDS) shows it only when the Writer answered an
+  /// ACKNACK before: both repeat it until they have a HEARTBEAT. A reader that sends
+  /// nothing else is served after `JOINING_MAX_ACKNACKS`.
+  pub fn ends_joining(&mut self, acknack: &AckNack) -> bool {
+    let Some(acknacks) = &mut self.acknacks_while_joining else {
+      return false;
+    };
+    let first_offered = self
+      .progress
+      .as_ref()
+      .map_or_else(SequenceNumber::zero, |progress| progress.first_offered());
+    let one = SequenceNumber::from(1);
+    let base = acknack.reader_sn_state.base();
+    let has_heartbeat = base > first_offered.max(one)
+      || (base == first_offered && (base > one || *acknacks > 0))
+      || acknack.reader_sn_state.iter().any(|sn| sn >= first_offered);
+    if has_heartbeat || *acknacks >= JOINING_MAX_ACKNACKS {
+      self.acknacks_while_joining = None;
+      return true;
+    }
+    *acknacks += 1;
+    false
+  }
+
+  /// Sends the samples `first..=last` with the next repair.
+  pub fn send_all(&mut self, first: SequenceNumber, last: SequenceNumber) {
+    self
+      .unsent_changes
+      .extend(SequenceNumber::range_inclusive(first, last));
   }
 
   /// The first sample that the reader is offered.
@@ -359,6 +412,7 @@ impl RtpsReaderProxy {
       loopback_unicast_locators: Vec::new(),
       expects_in_line_qos: false,
       is_active: true,
+      acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
       overrun_counted_before: SequenceNumber::zero(),
@@ -443,6 +497,7 @@ impl RtpsReaderProxy {
       loopback_unicast_locators,
       expects_in_line_qos: discovered_reader_data.reader_proxy.expects_inline_qos,
       is_active: true,
+      acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
       overrun_counted_before: SequenceNumber::zero(),

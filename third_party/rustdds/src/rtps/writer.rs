@@ -630,6 +630,11 @@ impl Writer {
       .unwrap_or(self.min_datagram_payload)
   }
 
+  // The readers that a sample is sent to when it is written.
+  fn receivers(&self) -> impl Iterator<Item = &RtpsReaderProxy> {
+    self.readers.values().filter(|reader| !reader.is_joining())
+  }
+
   fn takes_large_datagrams(&self, reader: &RtpsReaderProxy) -> bool {
     reader.max_datagram_payload() >= 2 * self.min_datagram_payload
   }
@@ -825,7 +830,7 @@ impl Writer {
     let blocked = self.send_message_to_readers(
       DeliveryMode::Multicast,
       message,
-      &mut self.readers.values(),
+      &mut self.receivers(),
       TrafficClass::Bulk,
     );
 
@@ -1129,8 +1134,7 @@ impl Writer {
           DeliveryMode::Multicast,
           msg,
           &mut self
-            .readers
-            .values()
+            .receivers()
             .filter(|reader| self.is_in_audience(reader, audience)),
           class,
         ),
@@ -1223,9 +1227,11 @@ impl Writer {
       // second as long as one other does not: for its lease, if that one was killed.
       // An assertion of liveliness is for all.
       let mut addressed = self
-        .readers
-        .values()
+        .receivers()
         .filter(|rp| is_manual_assertion || is_behind(rp));
+      for joining in self.readers.values().filter(|rp| rp.is_joining()) {
+        self.offer_to_new_reader(joining.remote_reader_guid);
+      }
       // In the volatile key exchange topic we cannot send to multiple readers by any
       // means, so we handle that separately.
       if self.entity_id() == EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER {
@@ -1301,7 +1307,7 @@ impl Writer {
         let mut frontier_moved = false;
 
         if let Some(reader_proxy) = self.readers.get_mut(&reader_guid) {
-          let my_topic = &self.my_topic_name; // for debugging
+          let my_topic = self.my_topic_name.as_str(); // for debugging
           if reader_proxy.last_acknack_count == Some(an.count)
             && reader_proxy.last_acknack_base == an.reader_sn_state.base()
           {
@@ -1393,6 +1399,15 @@ impl Writer {
             }
           }
 
+          if reader_proxy.ends_joining(an) {
+            self.start_sending_to(reader_guid);
+          } else if reader_proxy.is_joining() {
+            self.offer_to_new_reader(reader_guid);
+            return;
+          }
+          let Some(reader_proxy) = self.readers.get_mut(&reader_guid) else {
+            return;
+          };
           // if we cannot send more data, we are done.
           // This is to prevent empty "repair data" messages from being sent.
           // One that only acknowledges asks for nothing, also when more has been
@@ -2100,12 +2115,12 @@ impl Writer {
       || !self.push_mode
       || self.security_plugins.is_some()
       || !self.extra_unicast_destinations.is_empty()
-      || self.readers.is_empty()
+      || self.receivers().next().is_none()
     {
       return None;
     }
     let mut addresses: Vec<SocketAddr> = Vec::new();
-    for reader in self.readers.values() {
+    for reader in self.receivers() {
       // Readers of this participant get samples from its cache.
       if reader.remote_reader_guid.prefix == self.my_guid.prefix {
         return None;
@@ -2507,6 +2522,20 @@ impl Writer {
     // Capture the interface set once; resolution consults current observations.
     let multicast_ifaces = self.udp_sender.multicast_interfaces();
     let selector = DefaultRouteSelector::new(self.prefer_loopback_same_host);
+    // Cyclone DDS has one state for all readers of a participant. Readers of our own
+    // participant know this Writer.
+    let new_guid = updated_reader_proxy.remote_reader_guid;
+    let has_received_sibling = self
+      .readers
+      .range(new_guid.prefix.range())
+      .any(|(_, sibling)| sibling.qos().is_reliable() && !sibling.is_joining());
+    let joins = self.is_reliable()
+      && !is_builtin
+      && !self.like_stateless
+      && updated_reader_proxy.qos().is_reliable()
+      && (!writer_keeps_history || updated_reader_proxy.qos().is_volatile())
+      && !has_received_sibling
+      && new_guid.prefix != self.my_guid.prefix;
     self
       .readers
       .entry(updated_reader_proxy.remote_reader_guid)
@@ -2536,6 +2565,9 @@ impl Writer {
           wants_history,
         );
         new_proxy.start_progress(progress, is_builtin);
+        if joins {
+          new_proxy.start_joining();
+        }
         new_proxy.resolve_send_route(
           &self.interface_observations.borrow(),
           &multicast_ifaces,
@@ -2551,7 +2583,8 @@ impl Writer {
     is_new
   }
 
-  // The first HEARTBEAT to a reader that was matched a moment ago.
+  // The first HEARTBEAT to a reader that was matched a moment ago. That of a joining
+  // reader ends before its first sample.
   //
   // It is for that reader alone: another one of its participant would take samples
   // before `first` for gone, although they are yet to be sent or repaired. Cyclone DDS
@@ -2570,10 +2603,12 @@ impl Writer {
     } else {
       max(first_retained, new_reader.first_offered())
     };
-    let last = max(
-      self.last_advertised(),
-      first - SequenceNumber::from(1),
-    );
+    let before_first = first - SequenceNumber::from(1);
+    let last = if new_reader.is_joining() {
+      before_first
+    } else {
+      max(self.last_advertised(), before_first)
+    };
     let hb_message = MessageBuilder::new()
       .ts_msg(self.endianness, Some(Timestamp::now()))
       .heartbeat_msg(
@@ -2592,6 +2627,20 @@ impl Writer {
       hb_message,
       &mut std::iter::once(new_reader),
     );
+  }
+
+  // The reader has joined: what was written meanwhile goes to it as a repair, and what
+  // follows when it is written.
+  fn start_sending_to(&mut self, reader_guid: GUID) {
+    let send_buffer = self.send_buffer.clone();
+    let mut no_other_sender = send_buffer.direct_send().lock();
+    let last = self.last_sent();
+    let first_retained = send_buffer.first_change_sequence_number();
+    if let Some(reader) = self.readers.get_mut(&reader_guid) {
+      let first = max(first_retained, reader.all_acked_before);
+      reader.send_all(first, last);
+    }
+    *no_other_sender = self.direct_plan();
   }
 
   /// Recompute [`min_datagram_payload`](Self::min_datagram_payload) as the
@@ -3249,10 +3298,10 @@ mod tests {
       discovery::discovery::Discovery,
       messages::submessages::{
         elements::serialized_payload::SerializedPayload,
-        submessages::{AckNack, NackFrag},
+        submessages::{AckNack, NackFrag, WriterSubmessage},
       },
       polling::new_shared_timer,
-      rtps::writer_send_buffer::Admission,
+      rtps::{writer_send_buffer::Admission, Submessage, SubmessageBody},
       structure::{
         guid::EntityKind,
         sequence_number::{FragmentNumberSet, SequenceNumberSet},
@@ -3721,7 +3770,18 @@ mod tests {
       )
       .keep_last(10);
       let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
-      Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None)
+      let mut f = Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None);
+      let has_nothing = AckNack {
+        reader_id: reader,
+        writer_id: guid,
+        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(1)),
+        count: 0,
+      };
+      let proxy = f.writer.readers.get_mut(&f.reader_guid).unwrap();
+      while proxy.is_joining() {
+        proxy.ends_joining(&has_nothing);
+      }
+      f
     }
 
     fn only_reader(f: &Fixture) -> crate::MatchedReader {
@@ -3842,6 +3902,49 @@ mod tests {
       let readers = f.writer.send_buffer.matched_readers();
       let joined = readers.iter().find(|reader| reader.guid == late).unwrap();
       assert_eq!((joined.offered, joined.unacknowledged), (1, 1));
+    }
+
+    // Each HEARTBEAT before the reader acknowledges one ends before what it is offered:
+    // Cyclone DDS would take what a first one tells of for history.
+    #[test]
+    fn a_joining_volatile_reader_gets_what_was_written_before_it_knew_the_writer() {
+      for written_before in [0, 5] {
+        let mut f = keep_last();
+        write(&f, written_before, 8);
+        f.writer.reader_lost(f.reader_guid);
+        let first = written_before as i64 + 1;
+        let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
+        let qos = f.writer.qos_policies.clone();
+        let mut proxy = RtpsReaderProxy::new(late, qos.clone(), false);
+        proxy.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+        f.writer.update_reader_proxy(&proxy, &qos);
+        // As if it were no loopback locator, which is not used before the route is resolved.
+        let reader = f.writer.readers.get_mut(&late).unwrap();
+        reader.unicast_locator_list = proxy.unicast_locator_list;
+        f.reader_guid = late;
+
+        let last_sent = f.writer.last_sent();
+        write(&f, 3, 8);
+        f.writer.set_last_sent(last_sent);
+        f.writer.process_pending();
+        assert_eq!(f.writer.last_sent(), SequenceNumber::new(first + 2));
+        assert_eq!(received(&socket), 0);
+        assert!(f.writer.direct_plan().is_none());
+
+        f.writer.handle_heartbeat_tick(false);
+        assert_eq!(heartbeats(&socket), [(first, first - 1)]);
+        acknowledge(&mut f, 1, &[], 1);
+        assert_eq!(heartbeats(&socket), [(first, first - 1)]);
+        assert!(f.reader_proxy().is_joining());
+        assert_eq!(f.unsent(), 0);
+        acknowledge(&mut f, first, &[], 2);
+        assert!(!f.reader_proxy().is_joining());
+        assert_eq!(heartbeats(&socket), [(first, first + 2)]);
+        assert_eq!(f.repair_round(), 3);
+        assert_eq!(received(&socket), 1, "one datagram with the three samples");
+        assert_eq!(f.writer.direct_plan().map(|plan| plan.addresses.len()), Some(1));
+      }
     }
 
     // Of a writer that keeps history, a TRANSIENT_LOCAL reader gets the last `depth`
@@ -4053,6 +4156,26 @@ mod tests {
       assert_eq!(ack_nack(&mut f, 1, &[1, 2, 3, 4, 5]), 0);
       assert_eq!(f.unsent(), 5);
       assert!(f.next_repair_event(StdDuration::from_secs(10)).is_some());
+    }
+
+    // The first and the last sample of each HEARTBEAT that a reader at `socket` has got.
+    fn heartbeats(socket: &std::net::UdpSocket) -> Vec<(i64, i64)> {
+      socket
+        .set_read_timeout(Some(StdDuration::from_millis(200)))
+        .unwrap();
+      let mut buffer = [0; 4096];
+      let datagrams = std::iter::from_fn(|| {
+        let len = socket.recv(&mut buffer).ok()?;
+        Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..len])).ok()
+      });
+      let submessages = datagrams.flat_map(|message| message.submessages);
+      let heartbeat = |submessage: Submessage| match submessage.body {
+        SubmessageBody::Writer(WriterSubmessage::Heartbeat(heartbeat, _)) => {
+          Some((heartbeat.first_sn.into(), heartbeat.last_sn.into()))
+        }
+        _ => None,
+      };
+      submessages.filter_map(heartbeat).collect()
     }
 
     // Each datagram that a reader at `socket` has got, by now.
