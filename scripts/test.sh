@@ -31,9 +31,9 @@ begin=$(date +%s)
 step scripts/setup.sh
 step make --no-print-directory peers
 step make --no-print-directory lint
-# Tests that load the machine or use network namespaces exclude each other with a lock (tests/support), so the test
-# programs may run their tests in parallel.
-step cargo test --locked --workspace --no-fail-fast
+# Most tests wait for DDS and for leases to run out. Those that load the machine run alone (tests/support), and of the
+# others with network namespaces three at a time.
+step env RUST_TEST_THREADS="${RUST_TEST_THREADS:-4}" cargo test --locked --workspace --no-fail-fast
 # The tests of the patched DDS library, a separate package with its own development dependencies.
 export CARGO_PROFILE_DEV_DEBUG=line-tables-only
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds

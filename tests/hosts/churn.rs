@@ -77,6 +77,7 @@ fn anonymous_kib(bed: &Bed) -> [i64; PROCESSES.len()] {
 fn memory_does_not_grow_with_the_participants_that_are_gone() {
     let test = "memory_does_not_grow_with_the_participants_that_are_gone";
     // A process that is restarted, on a machine that is busy otherwise, would begin with less memory.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start_without_watchdog(test, SCAN) else {
         return;
     };

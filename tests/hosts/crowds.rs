@@ -97,6 +97,7 @@ fn crowd(test: &str, flow: &Flow) {
          max_sample_bytes: {}}}\n",
         flow.max_sample_bytes
     );
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start_with(test, &yaml, &["lossy", "far", "mute"]) else { return };
     let bridge = bed.host("bridge");
     let [near, slow] = if flow.on_robot { ["bridge"; 2] } else { ["critical", "slow"] };

@@ -57,6 +57,7 @@ fn refused(status: &Value, process: &str, cause: &str) -> u64 {
 #[test]
 fn a_million_forged_participants_take_little_memory_and_cost_no_critical_sample() {
     let test = "a_million_forged_participants_take_little_memory_and_cost_no_critical_sample";
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
     let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);

@@ -146,6 +146,7 @@ fn send(address: Ipv4Addr, ports: &[u16], seconds: u64, seed: u64, known: &[Pref
 #[test]
 fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process() {
     let test = "a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process";
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     // Two subscribers in whose names datagrams come. They may miss samples; the others may not.
     let named = [
@@ -173,6 +174,7 @@ fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no
 #[test]
 fn malformed_datagrams_in_the_names_of_all_participants_restart_no_process() {
     let test = "malformed_datagrams_in_the_names_of_all_participants_restart_no_process";
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
     let publisher = bed.publish(Peer::cyclone().rate_hz(100.0), INPUT);

@@ -212,6 +212,7 @@ fn twenty_hostile_readers_cost_the_others_no_sample() {
     if let Some(reason) = ros::missing() {
         return support::skip(test, &reason);
     }
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start_with(test, YAML, &["victim"]) else { return };
     let subscribe = |host: &str| -> Vec<RunningPeer> {
         LIBRARIES

@@ -87,6 +87,7 @@ fn visits(test: &str, lane: Durability, delay: Option<&str>) {
          max_sample_bytes: 65536, qos_overrides: {{critical: {{durability: {durability}, depth: {DEPTH}}}}}}}\n\
          lanes:\n  critical: {{queue_depth: 1024, window_samples: 4096}}\n"
     );
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, &yaml) else { return };
     // Starting a hundred programs delays the others on the machine, so that the lane and the subscribers have
     // room for four seconds.

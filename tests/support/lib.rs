@@ -21,6 +21,7 @@ pub mod ros;
 pub mod rtps;
 pub mod visitors;
 
+use std::cell::Cell;
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
@@ -99,15 +100,60 @@ pub fn testbed_missing() -> Option<String> {
     netns::requires_root().or_else(peer::missing)
 }
 
-/// A lock that one test at a time holds, among all test programs of this source tree.
+/// The tests that share the machine at most. Most of them wait: they use a tenth of two CPUs.
+const SHARED_TESTS: usize = 3;
+
+thread_local! {
+    /// Whether this test has the machine for itself.
+    static IS_EXCLUSIVE: Cell<bool> = const { Cell::new(false) };
+}
+
+/// The machine for one test alone, among all test programs of this source tree.
 pub struct Exclusive(#[allow(dead_code, reason = "holds the lock")] Flock<File>);
 
-/// Waits for the lock and takes it. [`netns::Net`] takes it as well; a test that takes it twice deadlocks.
-///
-/// With it, tests that load the machine run one after another under any test runner, with any number of
-/// threads.
-pub fn exclusive() -> Exclusive {
+/// A part of the machine: [`SHARED_TESTS`] tests have one at the same time.
+pub struct Shared(#[allow(dead_code, reason = "holds the locks")] [Flock<File>; 2]);
+
+fn lock_file(name: &str) -> File {
     fs::create_dir_all(target_dir()).unwrap();
-    let file = File::create(target_dir().join("testbed.lock")).unwrap();
-    Exclusive(Flock::lock(file, FlockArg::LockExclusive).map_err(|(_, error)| error).unwrap())
+    File::create(target_dir().join(name)).unwrap()
+}
+
+fn lock(name: &str, how: FlockArg) -> Flock<File> {
+    Flock::lock(lock_file(name), how).map_err(|(_, error)| error).unwrap()
+}
+
+/// Waits until no other test uses the machine: for a test that needs most of it, or that measures. Taken
+/// before [`bed::Bed`] or [`netns::Net`], which otherwise take a part ([`shared`]).
+///
+/// With it, such tests run one after another under any test runner, with any number of threads.
+pub fn exclusive() -> Exclusive {
+    // While this test waits, none that shares the machine starts.
+    let _entrance = lock("testbed.entrance.lock", FlockArg::LockExclusive);
+    let lock = lock("testbed.lock", FlockArg::LockExclusive);
+    IS_EXCLUSIVE.set(true);
+    Exclusive(lock)
+}
+
+impl Drop for Exclusive {
+    fn drop(&mut self) {
+        IS_EXCLUSIVE.set(false);
+    }
+}
+
+/// Waits for a part of the machine; `None` if this test has it for itself.
+pub fn shared() -> Option<Shared> {
+    if IS_EXCLUSIVE.get() {
+        return None;
+    }
+    loop {
+        for place in 0..SHARED_TESTS {
+            let file = lock_file(&format!("testbed.{place}.lock"));
+            if let Ok(place) = Flock::lock(file, FlockArg::LockExclusiveNonblock) {
+                let _entrance = lock("testbed.entrance.lock", FlockArg::LockExclusive);
+                return Some(Shared([place, lock("testbed.lock", FlockArg::LockShared)]));
+            }
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
 }

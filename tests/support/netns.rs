@@ -13,7 +13,7 @@ use nix::sched::{CloneFlags, setns};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::{Exclusive, exclusive};
+use super::{Shared, shared};
 
 /// The prefix of the namespaces' names, `ab-PID-NUMBER-HOST`. PID is the test program's process id.
 const PREFIX: &str = "ab-";
@@ -101,12 +101,12 @@ thread_local! {
     static HAS_NET: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Hosts on one switch. Only one exists at a time for a source tree (see [`exclusive`]). Dropping it kills
-/// all processes on its hosts and removes them.
+/// Hosts on one switch, with a part of the machine (see [`shared`]). Dropping it kills all processes on its
+/// hosts and removes them.
 pub struct Net {
     id: String,
     hosts: Vec<Host>,
-    _exclusive: Exclusive,
+    _shared: Option<Shared>,
 }
 
 impl Net {
@@ -114,14 +114,14 @@ impl Net {
     pub fn new(hosts: &[&str]) -> Net {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         assert!(!HAS_NET.replace(true), "a test can have one Net: drop it before creating another");
-        let exclusive = exclusive();
+        let shared = shared();
         remove_stale();
         remove_stale_shared_memory();
 
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
         let pid = std::process::id();
         let id = format!("{PREFIX}{pid}-{number}");
-        let mut net = Net { id, hosts: Vec::new(), _exclusive: exclusive };
+        let mut net = Net { id, hosts: Vec::new(), _shared: shared };
         let switch = net.switch();
         ip(&format!("netns add {switch}"));
         ip(&format!("-n {switch} link add br0 type bridge mcast_snooping 0"));
