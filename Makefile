@@ -48,11 +48,14 @@ bench:
 fuzz:
 	scripts/fuzz.sh $(FUZZ_SECONDS)
 
-# What takes hours: each fuzz target for SOAK_FUZZ_SECONDS, and memory over time under load for SOAK_TIME.
+# What takes hours: each fuzz target for SOAK_FUZZ_SECONDS, chaos for SOAK_CHAOS_SECONDS, and memory over time under load
+# for SOAK_TIME.
 SOAK_FUZZ_SECONDS ?= 600
+SOAK_CHAOS_SECONDS ?= 1800
 SOAK_TIME ?= 1h
 soak:
 	scripts/fuzz.sh $(SOAK_FUZZ_SECONDS)
+	ADAPTIVE_BRIDGE_TEST_CHAOS_S=$(SOAK_CHAOS_SECONDS) cargo test --locked --test hosts -- --nocapture chaos::
 	cargo bench --locked -- --soak $(SOAK_TIME)
 
 clean:

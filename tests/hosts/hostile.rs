@@ -14,7 +14,7 @@ use support::rtps::Prefix;
 const ROLES: [&str; 3] = ["ingress", "egress-critical", "egress-noncritical"];
 
 /// A pseudo-random sequence that is reproducible from its seed (xorshift64*).
-struct Random(u64);
+pub(super) struct Random(pub(super) u64);
 
 impl Random {
     fn next(&mut self) -> u64 {
@@ -24,7 +24,7 @@ impl Random {
         self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
     }
 
-    fn below(&mut self, bound: usize) -> usize {
+    pub(super) fn below(&mut self, bound: usize) -> usize {
         (self.next() % bound as u64) as usize
     }
 
@@ -115,20 +115,27 @@ fn attack(bed: &Bed, seconds: u64, known: &[Prefix]) {
     let seed = u64::from(std::process::id()) | 1;
     println!("seed {seed}");
     let address = bed.host("bridge").address();
-    let sent = bed.host("slow").within(|| send(address, &ports, seconds, seed, known));
+    let until = Instant::now() + Duration::from_secs(seconds);
+    let go_on = || Instant::now() < until;
+    let sent = bed.host("slow").within(|| send(address, &ports, seed, known, go_on));
     assert!(sent > 10_000, "only {sent} datagrams were sent");
     for role in ROLES {
         assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
     }
 }
 
-/// Sends datagrams for some time; returns the number sent.
-fn send(address: Ipv4Addr, ports: &[u16], seconds: u64, seed: u64, known: &[Prefix]) -> u64 {
+/// Sends datagrams while `go_on` is true; returns the number sent.
+pub(super) fn send(
+    address: Ipv4Addr,
+    ports: &[u16],
+    seed: u64,
+    known: &[Prefix],
+    go_on: impl Fn() -> bool,
+) -> u64 {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
     let mut random = Random(seed);
-    let until = Instant::now() + Duration::from_secs(seconds);
     let mut sent = 0;
-    while Instant::now() < until {
+    while go_on() {
         // About 20,000 datagrams a second: more than a robot's network carries, but few enough that the
         // machine, which also runs the bridge, has time to forward.
         for _ in 0..40 {

@@ -1,6 +1,7 @@
 //! Tests with several hosts, which are network namespaces: they need root or a user namespace, and the DDS
 //! peers (`make peers`). One file: `cargo test --test hosts networks::`.
 
+mod chaos;
 mod churn;
 mod control;
 mod control_faults;
