@@ -33,10 +33,20 @@ use crate::{
 pub(crate) struct Plan {
   pub socket: Arc<UdpSocket>,
   pub addresses: Vec<SocketAddr>,
+  /// The joining readers, see `RtpsReaderProxy::start_joining`.
+  pub offers: Vec<Offer>,
   /// The largest serialized payload that fits one datagram to each of them.
   pub max_payload: usize,
   /// Whether the Writer is Reliable.
   pub heartbeat: bool,
+}
+
+/// What a joining reader gets instead of a sample: a HEARTBEAT that ends before the first
+/// sample that the reader is offered.
+pub(crate) struct Offer {
+  pub address: SocketAddr,
+  pub reader: EntityId,
+  pub first: SequenceNumber,
 }
 
 pub(crate) struct DirectSend {
@@ -133,7 +143,30 @@ impl DirectSend {
         Err(e) => log::warn!("try_send to {address}: {e:?} len={}", datagram.len()),
       }
     }
+    for offer in &plan.offers {
+      self.send_offer(writer_guid, plan, offer);
+    }
     self.set_last_sent(sequence_number);
     true
+  }
+
+  fn send_offer(&self, writer_guid: GUID, plan: &Plan, offer: &Offer) {
+    let endianness = Endianness::LittleEndian;
+    let message = MessageBuilder::new()
+      .heartbeat_msg(
+        writer_guid.entity_id,
+        offer.first,
+        offer.first - SequenceNumber::from(1),
+        self.next_heartbeat_count(),
+        endianness,
+        offer.reader,
+        false, // final_flag: request ACKNACK
+        false, // liveliness_flag
+      )
+      .add_header_and_build(writer_guid.prefix);
+    if let Ok(datagram) = message.write_to_vec_fast(endianness) {
+      // The next sample repeats it.
+      let _ = plan.socket.send_to(&datagram, offer.address);
+    }
   }
 }

@@ -36,7 +36,7 @@ use crate::{
       REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
       REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
     },
-    direct_send::Plan,
+    direct_send::{Offer, Plan},
     outbound::{SocketId, TrafficClass},
     rtps_reader_proxy::{EvictedRequests, RtpsReaderProxy},
     timed_event::DpTimerEvent,
@@ -879,6 +879,7 @@ impl Writer {
             self.set_last_sent(last_seq);
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(last_seq);
+            self.offer_to_joining_readers();
             continue;
           }
           Some(BatchOutcome::Blocked { blocked }) => {
@@ -991,6 +992,7 @@ impl Writer {
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(sequence_number);
             self.mark_change_sent_to_all_readers(sequence_number);
+            self.offer_to_joining_readers();
           }
           SendProgress::Blocked { cursor, blocked } => {
             // Reliable writers always back-pressure. Best-effort writers only if
@@ -1229,9 +1231,7 @@ impl Writer {
       let mut addressed = self
         .receivers()
         .filter(|rp| is_manual_assertion || is_behind(rp));
-      for joining in self.readers.values().filter(|rp| rp.is_joining()) {
-        self.offer_to_new_reader(joining.remote_reader_guid);
-      }
+      self.offer_to_joining_readers();
       // In the volatile key exchange topic we cannot send to multiple readers by any
       // means, so we handle that separately.
       if self.entity_id() == EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER {
@@ -2115,12 +2115,13 @@ impl Writer {
       || !self.push_mode
       || self.security_plugins.is_some()
       || !self.extra_unicast_destinations.is_empty()
-      || self.receivers().next().is_none()
+      || self.readers.is_empty()
     {
       return None;
     }
     let mut addresses: Vec<SocketAddr> = Vec::new();
-    for reader in self.receivers() {
+    let mut offers: Vec<Offer> = Vec::new();
+    for reader in self.readers.values() {
       // Readers of this participant get samples from its cache.
       if reader.remote_reader_guid.prefix == self.my_guid.prefix {
         return None;
@@ -2142,7 +2143,14 @@ impl Writer {
         if address.ip().is_multicast() {
           return None;
         }
-        if addresses.contains(&address) {
+        if reader.is_joining() {
+          known += 1;
+          offers.push(Offer {
+            address,
+            reader: reader.remote_reader_guid.entity_id,
+            first: reader.first_offered().max(SequenceNumber::from(1)),
+          });
+        } else if addresses.contains(&address) {
           known += 1;
         } else {
           addresses.push(address);
@@ -2155,6 +2163,7 @@ impl Writer {
     Some(Plan {
       socket: self.udp_sender.unicast_socket(),
       addresses,
+      offers,
       max_payload: self.max_unfragmented_serialized_payload(None),
       heartbeat: self.is_reliable(),
     })
@@ -2627,6 +2636,14 @@ impl Writer {
       hb_message,
       &mut std::iter::once(new_reader),
     );
+  }
+
+  // With each sample, so that a joining reader has a HEARTBEAT as soon as it knows the
+  // Writer. Fast DDS repeats its own request each 140 ms.
+  fn offer_to_joining_readers(&self) {
+    for joining in self.readers.values().filter(|rp| rp.is_joining()) {
+      self.offer_to_new_reader(joining.remote_reader_guid);
+    }
   }
 
   // The reader has joined: what was written meanwhile goes to it as a repair, and what
@@ -3301,7 +3318,7 @@ mod tests {
         submessages::{AckNack, NackFrag, WriterSubmessage},
       },
       polling::new_shared_timer,
-      rtps::{writer_send_buffer::Admission, Submessage, SubmessageBody},
+      rtps::{writer_send_buffer::Admission, SubmessageBody},
       structure::{
         guid::EntityKind,
         sequence_number::{FragmentNumberSet, SequenceNumberSet},
@@ -3929,21 +3946,24 @@ mod tests {
         f.writer.set_last_sent(last_sent);
         f.writer.process_pending();
         assert_eq!(f.writer.last_sent(), SequenceNumber::new(first + 2));
-        assert_eq!(received(&socket), 0);
-        assert!(f.writer.direct_plan().is_none());
+        let offer = (0, vec![(first, first - 1)]);
+        assert_eq!(received_messages(&socket), offer, "one datagram for three samples");
+        let plan = f.writer.direct_plan().expect("a plan with an offer");
+        assert_eq!((plan.addresses.len(), plan.offers.len()), (0, 1));
 
         f.writer.handle_heartbeat_tick(false);
-        assert_eq!(heartbeats(&socket), [(first, first - 1)]);
+        assert_eq!(received_messages(&socket), offer);
         acknowledge(&mut f, 1, &[], 1);
-        assert_eq!(heartbeats(&socket), [(first, first - 1)]);
+        assert_eq!(received_messages(&socket), offer);
         assert!(f.reader_proxy().is_joining());
         assert_eq!(f.unsent(), 0);
         acknowledge(&mut f, first, &[], 2);
         assert!(!f.reader_proxy().is_joining());
-        assert_eq!(heartbeats(&socket), [(first, first + 2)]);
+        assert_eq!(received_messages(&socket), (0, vec![(first, first + 2)]));
         assert_eq!(f.repair_round(), 3);
-        assert_eq!(received(&socket), 1, "one datagram with the three samples");
-        assert_eq!(f.writer.direct_plan().map(|plan| plan.addresses.len()), Some(1));
+        assert_eq!(received_messages(&socket).0, 3);
+        let plan = f.writer.direct_plan().expect("a plan with an address");
+        assert_eq!((plan.addresses.len(), plan.offers.len()), (1, 0));
       }
     }
 
@@ -4158,24 +4178,27 @@ mod tests {
       assert!(f.next_repair_event(StdDuration::from_secs(10)).is_some());
     }
 
-    // The first and the last sample of each HEARTBEAT that a reader at `socket` has got.
-    fn heartbeats(socket: &std::net::UdpSocket) -> Vec<(i64, i64)> {
+    // What a reader at `socket` has got by now: how many samples, and the first and the
+    // last sample of each HEARTBEAT.
+    fn received_messages(socket: &std::net::UdpSocket) -> (usize, Vec<(i64, i64)>) {
       socket
         .set_read_timeout(Some(StdDuration::from_millis(200)))
         .unwrap();
       let mut buffer = [0; 4096];
-      let datagrams = std::iter::from_fn(|| {
-        let len = socket.recv(&mut buffer).ok()?;
-        Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..len])).ok()
-      });
-      let submessages = datagrams.flat_map(|message| message.submessages);
-      let heartbeat = |submessage: Submessage| match submessage.body {
-        SubmessageBody::Writer(WriterSubmessage::Heartbeat(heartbeat, _)) => {
-          Some((heartbeat.first_sn.into(), heartbeat.last_sn.into()))
+      let (mut samples, mut heartbeats) = (0, Vec::new());
+      while let Ok(len) = socket.recv(&mut buffer) {
+        let datagram = bytes::Bytes::copy_from_slice(&buffer[..len]);
+        for submessage in Message::read_from_buffer(&datagram).unwrap().submessages {
+          match submessage.body {
+            SubmessageBody::Writer(WriterSubmessage::Heartbeat(heartbeat, _)) => {
+              heartbeats.push((heartbeat.first_sn.into(), heartbeat.last_sn.into()));
+            }
+            SubmessageBody::Writer(WriterSubmessage::Data(..)) => samples += 1,
+            _ => {}
+          }
         }
-        _ => None,
-      };
-      submessages.filter_map(heartbeat).collect()
+      }
+      (samples, heartbeats)
     }
 
     // Each datagram that a reader at `socket` has got, by now.
