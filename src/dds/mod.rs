@@ -25,7 +25,7 @@ pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
-pub use lent::{LentMemory, Payload, SampleMemory};
+pub use lent::{AssemblyLimits, LentMemory, Payload, SampleMemory};
 pub use network::{AbsentInterface, absent_interfaces, host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;

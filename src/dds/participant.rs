@@ -301,7 +301,9 @@ impl Participant {
     /// # Errors
     /// The DDS library cannot create the reader.
     pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
-        self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS).map(GraphWatch::new)
+        let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS)?;
+        reader.expect_small_samples();
+        Ok(GraphWatch::new(reader))
     }
 
     fn make_reader(

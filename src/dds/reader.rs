@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::task::Waker;
 
-use super::lent::{Payload, SampleMemory};
+use super::lent::{Payload, SampleMemory, SmallSamples};
 use super::payload::{PayloadDecoder, RawAdapter, Received};
 use super::rustdds::no_key::SimpleDataReader;
 use super::rustdds::{DataReaderStatus, StatusEvented};
@@ -109,6 +109,11 @@ impl RawReader {
     /// one participant, one must [ignore](Self::ignore_reliable_writers) the samples that the other takes.
     pub fn lend_memory(&self, memory: Arc<dyn SampleMemory>) {
         self.inner.set_sample_memory(memory);
+    }
+
+    /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all.
+    pub fn expect_small_samples(&self) {
+        self.lend_memory(Arc::new(SmallSamples));
     }
 
     /// Takes the next sample, if one waits, and calls `read` once with its payload and encapsulation.

@@ -125,6 +125,7 @@ impl Responder {
         )?;
         let requests =
             participant.create_reader(&options.request_topic.to_dds(), PROBE_TYPE, &PROBE_READER_QOS)?;
+        requests.expect_small_samples();
         let now = clock::monotonic();
         Ok(Self {
             requests: Inbox::new(requests),

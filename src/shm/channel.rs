@@ -306,6 +306,11 @@ impl SamplePublisher {
         })
     }
 
+    /// The largest payload that the route allows, in bytes.
+    pub fn max_sample_bytes(&self) -> usize {
+        self.max_sample_bytes
+    }
+
     /// Copies a payload into a free slot, which is the only copy in ingress. Neither allocates nor waits.
     pub fn copy_in(&self, payload: &[u8]) -> Result<Slot, LoanError> {
         let too_large = LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes };

@@ -8,6 +8,7 @@ mod control_faults;
 mod crowds;
 mod faults;
 mod forged_participants;
+mod fragments;
 mod hangs;
 mod hostile;
 mod hostile_readers;

@@ -17,9 +17,9 @@ pub(super) const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
 pub(super) const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
 pub(super) const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
 /// The reader and the writer of announcements of writers.
-pub(super) const SEDP_PUBLICATIONS: (EntityId, EntityId) = ([0, 0, 3, 0xc7], [0, 0, 3, 0xc2]);
+pub const SEDP_PUBLICATIONS: (EntityId, EntityId) = ([0, 0, 3, 0xc7], [0, 0, 3, 0xc2]);
 /// The reader and the writer of announcements of readers.
-pub(super) const SEDP_SUBSCRIPTIONS: (EntityId, EntityId) = ([0, 0, 4, 0xc7], [0, 0, 4, 0xc2]);
+pub const SEDP_SUBSCRIPTIONS: (EntityId, EntityId) = ([0, 0, 4, 0xc7], [0, 0, 4, 0xc2]);
 /// The entity id of the forged reader: a user-defined reader of a topic without a key.
 const READER: EntityId = [0, 0, 1, 0x04];
 /// The entity kind (last byte of the entity id) of a user-defined writer of a topic without a key.
@@ -82,6 +82,13 @@ impl NumberSet {
     pub fn all(base: i64) -> Self {
         Self { base, bits: 256, words: vec![u32::MAX; 8] }
     }
+}
+
+/// A fragment of a sample, with what it claims of the sample.
+pub struct Fragment {
+    pub sequence: i64,
+    pub size: u16,
+    pub sample_bytes: u32,
 }
 
 /// An RTPS message, sent as one datagram.
@@ -165,6 +172,19 @@ impl Message {
     pub(super) fn sample(self, reader: EntityId, writer: EntityId, sequence: i64, payload: &[u8]) -> Self {
         let body = [&data_header(reader, writer, sequence), payload].concat();
         self.submessage(kind::DATA, 0x05, &body)
+    }
+
+    /// Adds DATA_FRAG: the first fragment of a sample, of zeros.
+    pub fn first_fragment(self, reader: EntityId, writer: EntityId, fragment: &Fragment) -> Self {
+        // Fields of this length follow before the inline QoS (RTPS 2.5, clause 9.4.5.5).
+        let mut body = [0_u16, 28].map(u16::to_le_bytes).concat();
+        body.extend([reader, writer].concat());
+        body.extend(number(fragment.sequence));
+        body.extend(1_u32.to_le_bytes());
+        body.extend([1, fragment.size].map(u16::to_le_bytes).concat());
+        body.extend(fragment.sample_bytes.to_le_bytes());
+        body.resize(body.len() + usize::from(fragment.size), 0);
+        self.submessage(kind::DATA_FRAG, 0x01, &body)
     }
 
     /// Adds DATA that disposes and unregisters an instance, whose key is a GUID.

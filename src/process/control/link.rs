@@ -79,6 +79,7 @@ impl Link {
             participant.create_writer(&probes.request_topic.to_dds(), PROBE_TYPE, &PROBE_WRITER_QOS, 8)?;
         let qos = ReaderQos { depth: RESPONSE_DEPTH, ..PROBE_READER_QOS };
         let reader = participant.create_reader(&probes.response_topic.to_dds(), PROBE_TYPE, &qos)?;
+        reader.expect_small_samples();
         Ok(Self {
             writer,
             inbox: Inbox::new(reader),

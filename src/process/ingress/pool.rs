@@ -7,7 +7,7 @@
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use crate::dds::{LentMemory, Payload, SampleMemory};
+use crate::dds::{AssemblyLimits, LentMemory, Payload, SampleMemory};
 use crate::shm::{LentSlot, LoanError, SamplePublisher, Slot};
 
 /// The pool, as the main thread and the DDS library share it.
@@ -16,9 +16,17 @@ pub(super) struct Pool {
     /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
     connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
-    /// The slot of a loan that has ended, until `fill` takes it, at once.
-    finished: Arc<Mutex<Option<Slot>>>,
+    /// What became of a loan that has ended, until `fill` takes it, at once.
+    finished: Finished,
 }
+
+type Finished = Arc<Mutex<Option<Result<Slot, LoanError>>>>;
+
+/// The samples of a route that the DDS library assembles in its own memory at most, because only two slots
+/// are lent at a time: those of half a second at 30 Hz while fragments are repaired.
+const UNFINISHED_SAMPLES: usize = 16;
+/// The memory of the DDS library for them, but always enough for two.
+const UNFINISHED_BYTES: usize = 128 << 20;
 
 /// The pool, as the input of the route owns it.
 pub(super) struct PoolOwner {
@@ -58,11 +66,16 @@ impl PoolOwner {
                 Filled { slot: self.pool.publisher.copy_in(&bytes), bytes: bytes.len(), in_place: false }
             }
             Payload::Lent(mut memory) => {
-                let bytes = memory.bytes().len();
+                let assembled = memory.bytes().len();
                 // Only this pool lends memory to the reader: it has the slot as soon as the loan ends.
                 memory.finish();
-                let slot = lock(&self.pool.finished).take();
-                Filled { slot: slot.ok_or(LoanError::Failed("not of the pool")), bytes, in_place: true }
+                let finished = lock(&self.pool.finished).take();
+                let slot = finished.unwrap_or(Err(LoanError::Failed("not of the pool")));
+                let bytes = match &slot {
+                    Err(LoanError::TooLarge { len, .. }) => *len,
+                    _ => assembled,
+                };
+                Filled { slot, bytes, in_place: true }
             }
         }
     }
@@ -78,10 +91,40 @@ pub(super) struct Filled {
 
 impl SampleMemory for Pool {
     fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+        let finished = self.finished.clone();
+        let max = self.publisher.max_sample_bytes();
+        if len > max {
+            return Some(Box::new(Refused { error: LoanError::TooLarge { len, max }, finished }));
+        }
         let _not_connecting = self.connecting.try_lock().ok()?;
         let slot = self.publisher.lend(len)?;
-        let (abandoned, finished) = (self.abandoned.clone(), self.finished.clone());
-        Some(Box::new(Loan { slot: Some(slot), abandoned, finished }))
+        Some(Box::new(Loan { slot: Some(slot), abandoned: self.abandoned.clone(), finished }))
+    }
+
+    fn limits(&self) -> AssemblyLimits {
+        // With the encapsulation header.
+        let max_sample_bytes = self.publisher.max_sample_bytes() + 4;
+        let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
+        AssemblyLimits { max_sample_bytes, max_total_bytes: max_total_bytes.max(3 * max_sample_bytes) }
+    }
+}
+
+/// A sample that the route does not allow: its bytes are discarded as they arrive. It becomes complete like
+/// any other, so that a RELIABLE publisher has its acknowledgement, and is counted as too large.
+struct Refused {
+    error: LoanError,
+    finished: Finished,
+}
+
+impl LentMemory for Refused {
+    fn bytes(&mut self) -> &mut [u8] {
+        &mut []
+    }
+
+    fn write(&mut self, _from: usize, _data: &[u8]) {}
+
+    fn finish(self: Box<Self>) {
+        *lock(&self.finished) = Some(Err(self.error));
     }
 }
 
@@ -91,7 +134,7 @@ struct Loan {
     /// `Some` until `finish` takes it.
     slot: Option<LentSlot>,
     abandoned: Sender<LentSlot>,
-    finished: Arc<Mutex<Option<Slot>>>,
+    finished: Finished,
 }
 
 impl LentMemory for Loan {
@@ -101,7 +144,7 @@ impl LentMemory for Loan {
 
     fn finish(mut self: Box<Self>) {
         if let Some(slot) = self.slot.take() {
-            *lock(&self.finished) = Some(slot.into_slot());
+            *lock(&self.finished) = Some(Ok(slot.into_slot()));
         }
     }
 }
@@ -119,7 +162,7 @@ impl Drop for Loan {
     clippy::disallowed_methods,
     reason = "the thread that takes samples locks it, which is one at a time"
 )]
-fn lock(finished: &Mutex<Option<Slot>>) -> MutexGuard<'_, Option<Slot>> {
+fn lock(finished: &Finished) -> MutexGuard<'_, Option<Result<Slot, LoanError>>> {
     finished.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -145,7 +188,6 @@ mod tests {
     fn a_lent_slot_is_filled_or_freed_by_the_main_thread() {
         let (owner, _node, _root) = owner();
         let lender = owner.lender();
-        assert!(lender.lend(101).is_none(), "longer than the route allows");
         for _ in 0..10 {
             let mut memory = lender.lend(100).unwrap();
             memory.bytes().fill(7);
@@ -161,6 +203,18 @@ mod tests {
         assert!(lender.lend(10).is_some());
         let filled = owner.fill(Payload::Bytes(Bytes::from_static(&[1; 100])));
         assert!(filled.slot.is_ok() && !filled.in_place);
+    }
+
+    #[test]
+    fn a_sample_that_the_route_does_not_allow_is_discarded_and_its_size_is_known() {
+        let (owner, _node, _root) = owner();
+        for len in [101, 4 << 30] {
+            let mut memory = owner.lender().lend(len).unwrap();
+            memory.write(len - 3, &[1; 3]);
+            let filled = owner.fill(Payload::Lent(memory));
+            assert_eq!(filled.slot.unwrap_err(), LoanError::TooLarge { len, max: 100 });
+            assert_eq!(filled.bytes, len);
+        }
     }
 
     #[test]

@@ -214,7 +214,7 @@ pub mod serialization;
 #[doc(inline)]
 pub use dds::{
   key::{Key, Keyed},
-  lent::{LentMemory, SampleMemory},
+  lent::{AssemblyLimits, LentMemory, SampleMemory},
   participant::{DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener},
   pubsub::{Publisher, Subscriber},
   qos,

@@ -12,14 +12,66 @@ pub trait SampleMemory: Send + Sync {
   /// Memory of `len` bytes, for a payload without its encapsulation header;
   /// `None` has the library use its own. On the thread that receives, which
   /// waits meanwhile.
+  ///
+  /// `len` is what the writer claims, at most 4 GiB. For a sample that is too large
+  /// for the application, return memory that discards what is written to it.
   fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>>;
+
+  /// How much memory of its own the library uses.
+  fn limits(&self) -> AssemblyLimits {
+    AssemblyLimits::default()
+  }
+}
+
+/// How much of its own memory the library uses for samples of which fragments are
+/// missing, at one Reader.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AssemblyLimits {
+  /// The largest serialized sample. Fragments of a larger one are dropped.
+  pub max_sample_bytes: usize,
+  /// All samples together, with 4 KiB for each and one bit for each fragment. When they
+  /// need more, one sample of the Writer with the most of it is discarded.
+  pub max_total_bytes: usize,
+}
+
+impl Default for AssemblyLimits {
+  // Where memory is locked (mlockall), zeroed memory is committed at once.
+  fn default() -> Self {
+    Self {
+      max_sample_bytes: 64 * 1024 * 1024 + 4,
+      max_total_bytes: 2 * (64 * 1024 * 1024 + 4),
+    }
+  }
+}
+
+// Of the Readers of built-in topics, which assemble what any participant sends.
+struct BuiltIn;
+
+impl SampleMemory for BuiltIn {
+  fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
+    None
+  }
+
+  // Discovery data are parameter lists of some hundred bytes.
+  fn limits(&self) -> AssemblyLimits {
+    AssemblyLimits {
+      max_sample_bytes: 256 * 1024,
+      max_total_bytes: 4 * 1024 * 1024,
+    }
+  }
 }
 
 /// Memory for one sample. The library drops it when the sample never becomes
 /// complete, or when nobody takes it.
 pub trait LentMemory: Send {
-  /// The memory, as long as what was asked for. The same bytes at each call.
+  /// The memory, as long as what was asked for, or empty if [`write`](Self::write)
+  /// discards. The same bytes at each call.
   fn bytes(&mut self) -> &mut [u8];
+
+  /// Writes a part of the sample at `from`, within the length that was asked for.
+  fn write(&mut self, from: usize, data: &[u8]) {
+    self.bytes()[from..from + data.len()].copy_from_slice(data);
+  }
 
   /// Gives the memory, with the whole sample in it, back to the application that
   /// lent it, and has now taken the sample. The library does not call this.
@@ -68,6 +120,23 @@ impl Eq for Lent {}
 // Who is asked for memory, if anybody is.
 #[derive(Clone, Default)]
 pub(crate) struct Lender(pub Option<Arc<dyn SampleMemory>>);
+
+impl Lender {
+  pub fn built_in() -> Self {
+    Self(Some(Arc::new(BuiltIn)))
+  }
+
+  pub fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+    self.0.as_ref()?.lend(len)
+  }
+
+  pub fn limits(&self) -> AssemblyLimits {
+    self
+      .0
+      .as_ref()
+      .map_or_else(AssemblyLimits::default, |memory| memory.limits())
+  }
+}
 
 impl fmt::Debug for Lender {
   fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -13,7 +13,7 @@ use log::{debug, error, info, trace, warn};
 use crate::{
   dds::{
     ddsdata::DDSData,
-    lent::{Lent, LentMemory},
+    lent::{Lender, Lent, LentMemory},
   },
   messages::submessages::{
     elements::serialized_payload::SerializedPayload,
@@ -21,6 +21,7 @@ use crate::{
   },
   structure::{
     cache_change::ChangeKind,
+    guid::GUID,
     sequence_number::{FragmentNumber, SequenceNumber},
     time::Timestamp,
   },
@@ -54,7 +55,7 @@ impl Memory {
         );
         encapsulation[from.min(ENCAPSULATION_LEN)..][..head.len()].copy_from_slice(head);
         let from = (from + head.len()).saturating_sub(ENCAPSULATION_LEN);
-        payload.bytes()[from..from + tail.len()].copy_from_slice(tail);
+        payload.write(from, tail);
       }
     }
   }
@@ -102,15 +103,8 @@ struct AssemblyBuffer {
 }
 
 impl AssemblyBuffer {
-  pub fn new(
-    datafrag: &DataFrag,
-    lend: impl FnOnce(usize) -> Option<Box<dyn LentMemory>>,
-  ) -> Option<Self> {
+  pub fn new(datafrag: &DataFrag, is_key: bool, lender: &Lender) -> Option<Self> {
     let data_size: usize = datafrag.data_size.try_into().ok()?;
-    if data_size > MAX_ASSEMBLED_SIZE {
-      debug!("DATAFRAG of a sample of {data_size} bytes, more than {MAX_ASSEMBLED_SIZE}");
-      return None;
-    }
     let fragment_size: u16 = datafrag.fragment_size;
     debug!("new AssemblyBuffer data_size={data_size} frag_size={fragment_size}");
 
@@ -125,16 +119,27 @@ impl AssemblyBuffer {
       return None;
     }
 
-    // The size is what the sender claims. Zeroed memory costs nothing until it
-    // is written to.
-    let own = || Memory::Own(BytesMut::zeroed(data_size));
-    let memory = data_size
-      .checked_sub(ENCAPSULATION_LEN)
-      .and_then(lend)
-      .map_or_else(own, |payload| Memory::Lent {
+    if fragment_count > MAX_FRAGMENTS {
+      debug!("DATAFRAG of a sample of {fragment_count} fragments, more than {MAX_FRAGMENTS}");
+      return None;
+    }
+
+    // The size is what the sender claims.
+    let lend = |len| if is_key { None } else { lender.lend(len) };
+    let lent = data_size.checked_sub(ENCAPSULATION_LEN).and_then(lend);
+    let max_bytes = lender.limits().max_sample_bytes;
+    let memory = match lent {
+      Some(payload) => Memory::Lent {
         encapsulation: [0; ENCAPSULATION_LEN],
         payload,
-      });
+      },
+      None if data_size > max_bytes => {
+        debug!("DATAFRAG of a sample of {data_size} bytes, more than {max_bytes}");
+        return None;
+      }
+      // Zeroed memory costs nothing until it is written to.
+      None => Memory::Own(BytesMut::zeroed(data_size)),
+    };
 
     let now = Timestamp::now();
 
@@ -219,6 +224,15 @@ impl AssemblyBuffer {
     true
   }
 
+  // Memory of the library that the unfinished sample takes.
+  fn own_bytes(&self) -> usize {
+    let data = match self.memory {
+      Memory::Own(_) => self.data_size,
+      Memory::Lent { .. } => 0,
+    };
+    BUFFER_BYTES + self.fragment_count / 8 + data
+  }
+
   pub fn is_complete(&self) -> bool {
     self.received_bitmap.all() // return if all are received
   }
@@ -235,20 +249,22 @@ impl AssemblyBuffer {
 // under best effort is lost anyway and under reliable will be re-requested.
 const MAX_ASSEMBLY_BUFFERS: usize = 128;
 
-// The largest sample that is assembled. A single datagram can claim up to 4 GiB.
-const MAX_ASSEMBLED_SIZE: usize = 64 * 1024 * 1024 + 4;
+// What each unfinished sample counts at least: then a Reader has at most 1,024 of 4 MiB,
+// and to look for the Writer with the most takes microseconds.
+const BUFFER_BYTES: usize = 4096;
 
-// The same bound in bytes, of what the samples claim: where memory is locked
-// (mlockall), zeroed memory is committed at once, and 128 such samples are 8 GiB.
-const MAX_ASSEMBLY_BYTES: usize = 2 * MAX_ASSEMBLED_SIZE;
+// A bitmap of 1 MiB. A sample of 4 GiB in fragments of 1 KiB has half as many.
+const MAX_FRAGMENTS: usize = 8 * 1024 * 1024;
 
 // Assembles fragments from a single (remote) Writer
 // So there is only one sequence of SNs
 pub(crate) struct FragmentAssembler {
   assembly_buffers: BTreeMap<SequenceNumber, AssemblyBuffer>,
   // Whether the owning reader is Reliable. This decides which buffer to drop
-  // when `MAX_ASSEMBLY_BUFFERS` is exceeded (see `new_datafrag`).
+  // when a limit is exceeded (see `evict`).
   reliable: bool,
+  // The sum of the buffers' `own_bytes`.
+  own_bytes: usize,
 }
 
 impl fmt::Debug for FragmentAssembler {
@@ -265,6 +281,7 @@ impl FragmentAssembler {
     Self {
       assembly_buffers: BTreeMap::new(),
       reliable,
+      own_bytes: 0,
     }
   }
 
@@ -276,7 +293,7 @@ impl FragmentAssembler {
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
     source_timestamp: Option<Timestamp>,
-    lend: impl FnOnce(usize) -> Option<Box<dyn LentMemory>>,
+    lender: &Lender,
   ) -> Option<(DDSData, Option<Timestamp>)> {
     let writer_sn = datafrag.writer_sn;
     let is_key = flags.contains(DATAFRAG_Flags::Key);
@@ -284,11 +301,11 @@ impl FragmentAssembler {
     let sn = datafrag.writer_sn;
     let is_first = match self.assembly_buffers.entry(sn) {
       Entry::Vacant(v) => {
-        let lend = |len| if is_key { None } else { lend(len) };
-        let Some(buf) = AssemblyBuffer::new(datafrag, lend) else {
+        let Some(buf) = AssemblyBuffer::new(datafrag, is_key, lender) else {
           error!("new_datafrag: failed to create AssemblyBuffer for {sn:?}");
           return None;
         };
+        self.own_bytes += buf.own_bytes();
         v.insert(buf);
         true
       }
@@ -304,7 +321,7 @@ impl FragmentAssembler {
       error!("new_datafrag: rejected invalid DATAFRAG for {sn:?}");
       // What it claimed about its sample is not to be relied on.
       if is_first {
-        self.assembly_buffers.remove(&sn);
+        self.remove(sn);
       }
       return None;
     }
@@ -313,7 +330,7 @@ impl FragmentAssembler {
 
     if assembly_buffer.is_complete() {
       debug!("new_datafrag: COMPLETED FRAGMENT");
-      if let Some(assembly_buffer) = self.assembly_buffers.remove(&writer_sn) {
+      if let Some(assembly_buffer) = self.remove(writer_sn) {
         // Return what we have assembled.
         let source_timestamp = assembly_buffer.source_timestamp;
         let dds_data = assembly_buffer
@@ -328,46 +345,40 @@ impl FragmentAssembler {
       }
     } else {
       debug!("new_dataFrag: FRAGMENT NOT COMPLETED YET");
-      // Bound memory: never keep more than MAX_ASSEMBLY_BUFFERS incomplete
-      // reassemblies.
-      //
-      // Which one to evict depends on reliability:
-      //  * Reliable: the reader delivers strictly in order, so it must complete the
-      //    LOWEST sequence number first; that buffer is exactly the one blocking
-      //    progress. Dropping it would livelock, because a writer that bursts many
-      //    large samples ahead (e.g. Connext) would make the reader perpetually evict
-      //    the very sample it is waiting for. So evict the HIGHEST (newest) sequence
-      //    number instead; the writer keeps unacked samples in its history and
-      //    re-sends them once we catch up.
-      //  * Best effort: there is no retransmission, so a low incomplete buffer is
-      //    lost anyway. Evict the OLDEST (lowest SN) to free room for newer samples
-      //    that may still complete.
-      //
       // Only a new buffer can exceed a limit.
-      while is_first
-        && (self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS
-          || (self.assembly_buffers.len() > 1 && self.own_bytes() > MAX_ASSEMBLY_BYTES))
-      {
-        let evicted = if self.reliable {
-          self.assembly_buffers.pop_last()
-        } else {
-          self.assembly_buffers.pop_first()
-        };
-        if evicted.is_none() {
-          break;
-        }
+      if is_first && self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS {
+        self.evict();
       }
       None
     }
   }
 
-  // Memory of the library that unfinished samples take.
-  fn own_bytes(&self) -> usize {
-    let own = |buffer: &AssemblyBuffer| match buffer.memory {
-      Memory::Own(_) => buffer.data_size,
-      Memory::Lent { .. } => 0,
+  fn remove(&mut self, sn: SequenceNumber) -> Option<AssemblyBuffer> {
+    let removed = self.assembly_buffers.remove(&sn)?;
+    self.own_bytes -= removed.own_bytes();
+    Some(removed)
+  }
+
+  // Discards one unfinished sample.
+  //
+  // Which one depends on reliability:
+  //  * Reliable: the reader delivers strictly in order, so it must complete the
+  //    LOWEST sequence number first; that buffer is exactly the one blocking
+  //    progress. Dropping it would livelock, because a writer that bursts many
+  //    large samples ahead (e.g. Connext) would make the reader perpetually evict
+  //    the very sample it is waiting for. So evict the HIGHEST (newest) sequence
+  //    number instead; the writer keeps unacked samples in its history and
+  //    re-sends them once we catch up.
+  //  * Best effort: there is no retransmission, so a low incomplete buffer is
+  //    lost anyway. Evict the OLDEST (lowest SN) to free room for newer samples
+  //    that may still complete.
+  fn evict(&mut self) {
+    let evicted = if self.reliable {
+      self.assembly_buffers.pop_last()
+    } else {
+      self.assembly_buffers.pop_first()
     };
-    self.assembly_buffers.values().map(own).sum()
+    self.own_bytes -= evicted.map_or(0, |(_, buffer)| buffer.own_bytes());
   }
 
   /// Whether there is no unfinished sample.
@@ -376,10 +387,12 @@ impl FragmentAssembler {
   }
 
   pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
+    let own_bytes = &mut self.own_bytes;
     self.assembly_buffers.retain(|sn, ab| {
       let retain = ab.modified_time >= expire_before;
       if !retain {
         info!("AssemblyBuffer dropping {sn:?}");
+        *own_bytes -= ab.own_bytes();
       }
       retain
     });
@@ -414,16 +427,100 @@ impl FragmentAssembler {
   }
 }
 
+/// The fragment assemblers of a Reader, with a limit for all of them together.
+#[derive(Debug, Default)]
+pub(crate) struct FragmentAssemblers {
+  by_writer: BTreeMap<GUID, FragmentAssembler>,
+  own_bytes: usize,
+}
+
+impl FragmentAssemblers {
+  /// As [`FragmentAssembler::new_datafrag`], for a Reader that is Reliable or not.
+  ///
+  /// When the unfinished samples need more than the limit of `lender`, the Writer with
+  /// the most of it loses one: what one Writer claims does not cost another its samples.
+  pub fn new_datafrag(
+    &mut self,
+    writer: GUID,
+    reliable: bool,
+    datafrag: &DataFrag,
+    flags: BitFlags<DATAFRAG_Flags>,
+    source_timestamp: Option<Timestamp>,
+    lender: impl FnOnce() -> Lender,
+  ) -> Option<(DDSData, Option<Timestamp>)> {
+    let assembler = self
+      .by_writer
+      .entry(writer)
+      .or_insert_with(|| FragmentAssembler::new(reliable));
+    let is_first = !assembler.is_partially_received(datafrag.writer_sn);
+    let lender = if is_first { lender() } else { Lender::default() };
+    let before = assembler.own_bytes;
+    let completed = assembler.new_datafrag(datafrag, flags, source_timestamp, &lender);
+    self.own_bytes = self.own_bytes - before + assembler.own_bytes;
+    if assembler.is_empty() {
+      self.by_writer.remove(&writer);
+    }
+    if is_first {
+      self.evict_down_to(lender.limits().max_total_bytes);
+    }
+    completed
+  }
+
+  fn evict_down_to(&mut self, max_bytes: usize) {
+    while self.own_bytes > max_bytes {
+      let most = self
+        .by_writer
+        .iter_mut()
+        .max_by_key(|(_, fa)| fa.own_bytes);
+      let Some((&writer, fa)) = most else { break };
+      let before = fa.own_bytes;
+      fa.evict();
+      self.own_bytes -= before - fa.own_bytes;
+      if fa.is_empty() {
+        self.by_writer.remove(&writer);
+      }
+    }
+  }
+
+  pub fn get(&self, writer: GUID) -> Option<&FragmentAssembler> {
+    self.by_writer.get(&writer)
+  }
+
+  pub fn remove(&mut self, writer: GUID) {
+    let removed = self.by_writer.remove(&writer);
+    self.own_bytes -= removed.map_or(0, |fa| fa.own_bytes);
+  }
+
+  pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
+    self.by_writer.retain(|writer, fa| {
+      debug!("AssemblyBuffer GC writer {writer:?}");
+      fa.garbage_collect_before(expire_before);
+      // Also of Writers that are not matched and therefore never removed: those of
+      // builtin topics, of which everything is accepted.
+      !fa.is_empty()
+    });
+    self.own_bytes = self.by_writer.values().map(|fa| fa.own_bytes).sum();
+  }
+}
+
 #[cfg(test)]
 mod tests {
+  use std::sync::Arc;
+
   use bytes::Bytes;
   use enumflags2::BitFlags;
 
-  use super::{AssemblyBuffer, FragmentAssembler, Memory};
+  use super::{AssemblyBuffer, FragmentAssembler, FragmentAssemblers, Memory};
   use crate::{
-    dds::{ddsdata::DDSData, lent::LentMemory},
+    dds::{
+      ddsdata::DDSData,
+      lent::{Lender, LentMemory, SampleMemory},
+    },
     messages::submessages::submessages::{DATAFRAG_Flags, DataFrag},
-    structure::sequence_number::{FragmentNumber, SequenceNumber},
+    structure::{
+      guid::{EntityId, GuidPrefix, GUID},
+      sequence_number::{FragmentNumber, SequenceNumber},
+    },
   };
 
   // Build a DATAFRAG submessage carrying the contiguous run of `k` fragments
@@ -457,7 +554,7 @@ mod tests {
 
     // First submessage packs fragments 1 and 2 (K = 2, 2048 payload bytes).
     let first = datafrag(1, 2, frag_size, data_size, whole[0..2048].to_vec());
-    let mut ab = AssemblyBuffer::new(&first, |_| None).expect("valid first fragment");
+    let mut ab = AssemblyBuffer::new(&first, false, &Lender::default()).expect("valid first fragment");
     assert!(!ab.is_complete());
     ab.insert_frags(&first);
     assert!(!ab.is_complete(), "still missing the tail fragment");
@@ -477,7 +574,7 @@ mod tests {
     let whole: Vec<u8> = (0..data_size as usize).map(|i| (i % 97) as u8).collect();
 
     let all = datafrag(1, 3, frag_size, data_size, whole.clone());
-    let mut ab = AssemblyBuffer::new(&all, |_| None).expect("valid fragment set");
+    let mut ab = AssemblyBuffer::new(&all, false, &Lender::default()).expect("valid fragment set");
     ab.insert_frags(&all);
     assert!(ab.is_complete());
     assert_eq!(own(ab), whole);
@@ -490,7 +587,7 @@ mod tests {
     let frag_size = 256u16;
     let data_size = 512u32; // 2 fragments total
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
-    let mut ab = AssemblyBuffer::new(&bad, |_| None).expect("buffer for valid data_size");
+    let mut ab = AssemblyBuffer::new(&bad, false, &Lender::default()).expect("buffer for valid data_size");
     assert!(!ab.insert_frags(&bad));
     assert!(!ab.is_complete());
   }
@@ -502,31 +599,121 @@ mod tests {
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
     let mut fa = FragmentAssembler::new(true);
     assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None, |_| None)
+      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None, &Lender::default())
       .is_none());
+  }
+
+  // The first of several fragments of sample `number`.
+  fn first_of(number: i64, frag_size: u16, data_size: u32) -> DataFrag {
+    DataFrag {
+      writer_sn: SequenceNumber::new(number),
+      ..datafrag(1, 1, frag_size, data_size, vec![7; frag_size.into()])
+    }
+  }
+
+  fn insert(fas: &mut FragmentAssemblers, writer: GUID, reliable: bool, fragment: &DataFrag) {
+    let none = BitFlags::<DATAFRAG_Flags>::empty();
+    let completed = fas.new_datafrag(writer, reliable, fragment, none, None, Lender::default);
+    assert!(completed.is_none());
+  }
+
+  fn writer(number: u8) -> GUID {
+    GUID::new(GuidPrefix::new(&[number; 12]), EntityId::UNKNOWN)
   }
 
   // One fragment each of samples that claim 60 MiB take two samples' memory at most.
   #[test]
   fn what_unfinished_samples_claim_is_bounded_in_bytes() {
-    let claimed = 60 << 20;
     for reliable in [false, true] {
-      let mut fa = FragmentAssembler::new(reliable);
+      let mut fas = FragmentAssemblers::default();
       for number in 1..=10 {
-        let fragment = DataFrag {
-          writer_sn: SequenceNumber::new(number),
-          ..datafrag(1, 1, 60_000, claimed, vec![7; 60_000])
-        };
-        let none = BitFlags::<DATAFRAG_Flags>::empty();
-        assert!(fa
-          .new_datafrag(&fragment, none, None, |_| None)
-          .is_none());
+        insert(&mut fas, writer(1), reliable, &first_of(number, 60_000, 60 << 20));
       }
       let kept: Vec<i64> = (1..=10)
-        .filter(|number| fa.is_partially_received(SequenceNumber::new(*number)))
+        .filter(|number| {
+          let sn = SequenceNumber::new(*number);
+          fas.get(writer(1)).unwrap().is_partially_received(sn)
+        })
         .collect();
       // A Reliable reader needs the oldest first, and the others come again.
       assert_eq!(kept, if reliable { [1, 2] } else { [9, 10] });
+    }
+  }
+
+  // The bound is for all writers together, the bitmap of small fragments counts, and
+  // the writer that claims most is the one that loses a sample.
+  #[test]
+  fn what_many_writers_claim_is_bounded_and_costs_no_other_writer_its_sample() {
+    let mut fas = FragmentAssemblers::default();
+    insert(&mut fas, writer(1), true, &first_of(1, 1_000, 2_000));
+    for number in 2..=200 {
+      for sample in 1..=2 {
+        insert(&mut fas, writer(number), true, &first_of(sample, 10, 50 << 20));
+      }
+      let max = Lender::default().limits().max_total_bytes;
+      assert!(fas.own_bytes <= max, "{} bytes", fas.own_bytes);
+      let sum: usize = fas.by_writer.values().map(|fa| fa.own_bytes).sum();
+      assert_eq!(fas.own_bytes, sum);
+    }
+    let first = fas.get(writer(1)).expect("no writer but the first one has less");
+    assert!(first.is_partially_received(SequenceNumber::new(1)));
+    for number in 1..=200 {
+      fas.remove(writer(number));
+    }
+    assert_eq!(fas.own_bytes, 0);
+    assert!(fas.by_writer.is_empty());
+  }
+
+  // Anybody can send fragments to the built-in readers.
+  #[test]
+  fn fragments_of_discovery_data_take_4_mib_at_most() {
+    let mut fas = FragmentAssemblers::default();
+    let none = BitFlags::<DATAFRAG_Flags>::empty();
+    for number in 1..=250 {
+      for (sample, size) in [(1, 300 << 10), (2, 200 << 10), (3, 100)] {
+        let fragment = first_of(sample, 50, size);
+        fas.new_datafrag(writer(number), true, &fragment, none, None, Lender::built_in);
+      }
+      assert!(fas.own_bytes <= 4 << 20, "{} bytes", fas.own_bytes);
+    }
+    let mut kept = fas.by_writer.values();
+    assert!(kept.all(|fa| !fa.is_partially_received(SequenceNumber::new(1))), "too large");
+  }
+
+  // A sample of any length, of which the application wants nothing but to know of it.
+  #[test]
+  fn a_sample_that_the_application_discards_takes_no_memory() {
+    struct Discards;
+
+    impl LentMemory for Discards {
+      fn bytes(&mut self) -> &mut [u8] {
+        &mut []
+      }
+
+      fn write(&mut self, _from: usize, _data: &[u8]) {}
+
+      fn finish(self: Box<Self>) {}
+    }
+
+    impl SampleMemory for Discards {
+      fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
+        Some(Box::new(Discards))
+      }
+    }
+
+    let lender = || Lender(Some(Arc::new(Discards)));
+    let mut fas = FragmentAssemblers::default();
+    let count = 100_u32;
+    let data_size = count << 20;
+    for number in 1..=count * 32 {
+      let fragment = datafrag(number, 1, 1 << 15, data_size, vec![7; 1 << 15]);
+      let none = BitFlags::<DATAFRAG_Flags>::empty();
+      let completed = fas.new_datafrag(writer(1), true, &fragment, none, None, lender);
+      assert_eq!(completed.is_some(), number == count * 32);
+      if let Some((data, _)) = completed {
+        assert_eq!(data.payload_size(), data_size as usize);
+      }
+      assert!(fas.own_bytes < 8192);
     }
   }
 
@@ -541,8 +728,16 @@ mod tests {
     fn finish(self: Box<Self>) {}
   }
 
-  fn lend(len: usize) -> Option<Box<dyn LentMemory>> {
-    Some(Box::new(Used(vec![0xEE; len])))
+  struct Lends;
+
+  impl SampleMemory for Lends {
+    fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+      Some(Box::new(Used(vec![0xEE; len])))
+    }
+  }
+
+  fn lends() -> Lender {
+    Lender(Some(Arc::new(Lends)))
   }
 
   fn lent(data: &DDSData) -> ([u8; 2], [u8; 2], Vec<u8>) {
@@ -574,7 +769,7 @@ mod tests {
         let to = (from + usize::from(frag_size)).min(100);
         let fragment = datafrag(number, 1, frag_size, 100, whole[from..to].to_vec());
         assert!(done.is_none());
-        done = fa.new_datafrag(&fragment, BitFlags::empty(), None, lend);
+        done = fa.new_datafrag(&fragment, BitFlags::empty(), None, &lends());
       }
       let (data, _) = done.expect("complete");
       assert_eq!(data.payload_size(), 100);
@@ -587,7 +782,7 @@ mod tests {
   fn nothing_of_an_older_sample_is_left_in_memory_that_is_lent() {
     let mut fa = FragmentAssembler::new(true);
     let mut insert = |fragment: &DataFrag| {
-      fa.new_datafrag(fragment, BitFlags::empty(), None, lend)
+      fa.new_datafrag(fragment, BitFlags::empty(), None, &lends())
         .is_some()
     };
     assert!(!insert(&datafrag(1, 1, 50, 100, vec![1; 50])));
@@ -603,16 +798,24 @@ mod tests {
 
   #[test]
   fn a_key_and_a_sample_without_an_encapsulation_are_not_put_into_lent_memory() {
-    let refuse = |_| -> Option<Box<dyn LentMemory>> { panic!("asked for memory") };
+    struct Refuses;
+
+    impl SampleMemory for Refuses {
+      fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
+        panic!("asked for memory")
+      }
+    }
+
+    let refuse = Lender(Some(Arc::new(Refuses)));
     let mut fa = FragmentAssembler::new(true);
     let key = datafrag(1, 1, 50, 50, vec![1; 50]);
     let (data, _) = fa
-      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), None, refuse)
+      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), None, &refuse)
       .expect("complete");
     assert!(matches!(data, DDSData::DisposeByKey { .. }));
     let short = datafrag(1, 1, 3, 3, vec![1; 3]);
     assert!(fa
-      .new_datafrag(&short, BitFlags::empty(), None, refuse)
+      .new_datafrag(&short, BitFlags::empty(), None, &refuse)
       .is_none());
   }
 }

@@ -19,7 +19,7 @@ use speedy::Writable;
 use crate::{
   dds::{
     ddsdata::DDSData,
-    lent::LentMemory,
+    lent::Lender,
     qos::{policy, HasQoSPolicy, QosPolicies},
     statusevents::{
       CountWithChange, DataReaderStatus, DomainParticipantStatusEvent, StatusChannelSender,
@@ -45,7 +45,7 @@ use crate::{
   network::udp_sender::UDPSender,
   polling::{ReadySender, SharedTimer, WakeReceiver},
   rtps::{
-    constant::ACKNACK_DELAY, fragment_assembler::FragmentAssembler, message_receiver::MessageReceiverState,
+    constant::ACKNACK_DELAY, fragment_assembler::FragmentAssemblers, message_receiver::MessageReceiverState,
     rtps_writer_proxy::RtpsWriterProxy, timed_event::DpTimerEvent, Message,
   },
   structure::{
@@ -137,7 +137,7 @@ pub(crate) struct Reader {
 
   received_heartbeat_count: i32,
 
-  fragment_assemblers: BTreeMap<GUID, FragmentAssembler>,
+  fragment_assemblers: FragmentAssemblers,
   last_fragment_garbage_collect: Timestamp,
   matched_writers: BTreeMap<GUID, RtpsWriterProxy>,
   writer_match_count_total: i32, // total count, never decreases
@@ -208,11 +208,15 @@ fn reply_locators<'a>(
   }
 }
 
-// Memory of the application for a sample of the topic.
-fn lend(topic_cache: &Mutex<TopicCache>, len: usize) -> Option<Box<dyn LentMemory>> {
-  // Not under the lock, which the application's readers take.
-  let lender = topic_cache.lock().ok()?.lender.clone();
-  lender.0?.lend(len)
+// Where a sample of the topic is assembled.
+fn lender(reader: EntityId, topic_cache: &Mutex<TopicCache>) -> Lender {
+  if reader.kind().is_built_in() {
+    return Lender::built_in();
+  }
+  // Not used under the lock, which the application's readers take.
+  topic_cache
+    .lock()
+    .map_or_else(|_| Lender::default(), |cache| cache.lender.clone())
 }
 
 // What one NACK_FRAG can name, RTPS v2.5 Section 8.3.5.7, and how many of them one
@@ -267,7 +271,7 @@ impl Reader {
       heartbeat_response_delay: StdDuration::new(0, 500_000_000), // 0,5sec
       heartbeat_suppression_duration: StdDuration::new(0, 0),
       received_heartbeat_count: 0,
-      fragment_assemblers: BTreeMap::new(),
+      fragment_assemblers: FragmentAssemblers::default(),
       last_fragment_garbage_collect: Timestamp::now(),
       matched_writers: BTreeMap::new(),
       writer_match_count_total: 0,
@@ -599,7 +603,7 @@ impl Reader {
   pub fn remove_writer_proxy(&mut self, writer_guid: GUID) {
     if self.matched_writers.contains_key(&writer_guid) {
       self.matched_writers.remove(&writer_guid);
-      self.fragment_assemblers.remove(&writer_guid);
+      self.fragment_assemblers.remove(writer_guid);
       self
         .acquire_the_topic_cache_guard()
         .forget_reliable_writer(writer_guid);
@@ -775,16 +779,14 @@ impl Reader {
     // Feed to fragment assembler ...
     let writer_seq_num = datafrag.writer_sn; // for borrow checker
     let reliable = self.reliability != policy::Reliability::BestEffort;
-    let completed_dds_data = self
-      .fragment_assemblers
-      .entry(writer_guid)
-      .or_insert_with(|| FragmentAssembler::new(reliable))
-      .new_datafrag(
-        datafrag,
-        datafrag_flags,
-        mr_state.source_timestamp,
-        |len| lend(&self.topic_cache, len),
-      );
+    let completed_dds_data = self.fragment_assemblers.new_datafrag(
+      writer_guid,
+      reliable,
+      datafrag,
+      datafrag_flags,
+      mr_state.source_timestamp,
+      || lender(self.my_guid.entity_id, &self.topic_cache),
+    );
 
     // ... and continue processing, if data was completed.
     if let Some((dds_data, source_timestamp)) = completed_dds_data {
@@ -816,14 +818,7 @@ impl Reader {
 
       self
         .fragment_assemblers
-        .iter_mut()
-        .for_each(|(writer, fa)| {
-          debug!("AssemblyBuffer GC writer {writer:?}");
-          fa.garbage_collect_before(expire_before);
-        });
-      // Also of Writers that are not matched and therefore never removed: those of
-      // builtin topics, of which everything is accepted.
-      self.fragment_assemblers.retain(|_, fa| !fa.is_empty());
+        .garbage_collect_before(expire_before);
     } else {
       trace!("Not yet AssemblyBuffer GC time.");
     }
@@ -834,7 +829,7 @@ impl Reader {
     writer_guid: GUID,
     seq: SequenceNumber,
   ) -> Box<dyn '_ + Iterator<Item = FragmentNumber>> {
-    self.fragment_assemblers.get(&writer_guid).map_or_else(
+    self.fragment_assemblers.get(writer_guid).map_or_else(
       || Box::new(iter::empty()) as Box<dyn Iterator<Item = FragmentNumber>>,
       |fa| fa.missing_frags_for(seq),
     )
@@ -843,7 +838,7 @@ impl Reader {
   fn is_frag_partially_received(&self, writer_guid: GUID, seq: SequenceNumber) -> bool {
     self
       .fragment_assemblers
-      .get(&writer_guid)
+      .get(writer_guid)
       .is_some_and(|fa| fa.is_partially_received(seq))
   }
 
@@ -2292,13 +2287,13 @@ mod tests {
   struct CountedMemory(Vec<u8>, Arc<Mutex<usize>>);
 
   impl crate::SampleMemory for Counted {
-    fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+    fn lend(&self, len: usize) -> Option<Box<dyn crate::LentMemory>> {
       *self.0.lock().unwrap() += 1;
       Some(Box::new(CountedMemory(vec![0; len], Arc::clone(&self.0))))
     }
   }
 
-  impl LentMemory for CountedMemory {
+  impl crate::LentMemory for CountedMemory {
     fn bytes(&mut self) -> &mut [u8] {
       &mut self.0
     }

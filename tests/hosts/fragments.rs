@@ -1,0 +1,84 @@
+//! Fragments: samples that are larger than the route allows, and samples that never become complete, sent in
+//! the names of participants that do not exist.
+
+use std::net::{SocketAddrV4, UdpSocket};
+
+use serde_json::Value;
+use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::netns::udp_ports;
+use support::peer::{Peer, Received, Sent};
+use support::process::memory_kib;
+use support::rtps::{Fragment, Message, Prefix, SEDP_PUBLICATIONS, SEDP_SUBSCRIPTIONS};
+
+const ROLES: [&str; 4] = ["ingress", "control", "egress-critical", "egress-noncritical"];
+/// How much the resident memory of each process may grow. The fragments of the attack are 480 MB for each.
+const MAX_GROWTH_KIB: i64 = 16 * 1024;
+const FORGED: u32 = 2_000;
+const FRAGMENT_BYTES: u16 = 60_000;
+
+fn prefix(number: u32) -> Prefix {
+    let mut prefix = *b"\x01\x0ffrag\0\0\0\0\0\0";
+    prefix[8..].copy_from_slice(&number.to_be_bytes());
+    prefix
+}
+
+/// Sends the first fragment of samples of 60 MB and of 200 kB to the discovery readers of each process, each
+/// sample in the name of another participant.
+fn attack(socket: &UdpSocket, processes: &[SocketAddrV4]) {
+    for number in 0..FORGED {
+        for (sample_bytes, (reader, writer)) in [
+            (60_000_000, SEDP_PUBLICATIONS),
+            (200_000, SEDP_PUBLICATIONS),
+            (60_000_000, SEDP_SUBSCRIPTIONS),
+            (200_000, SEDP_SUBSCRIPTIONS),
+        ] {
+            let fragment = Fragment { sequence: i64::from(sample_bytes), size: FRAGMENT_BYTES, sample_bytes };
+            let message = Message::of(prefix(number)).first_fragment(reader, writer, &fragment);
+            for process in processes {
+                message.send(socket, *process);
+            }
+        }
+        // Leaves time for the bridge, whose sockets would discard most of it otherwise.
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn samples_that_never_become_complete_or_are_too_large_take_little_memory() {
+    let test = "samples_that_never_become_complete_or_are_too_large_take_little_memory";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+    critical.wait_received(500);
+    let pids = ROLES.map(|role| bed.pid(role));
+    let resident_kib = |pid| memory_kib(pid, "VmRSS");
+    let before = pids.map(resident_kib);
+
+    let address = bed.host("bridge").address();
+    let is_discovery = |port: &u16| (7410..7440).contains(port) && port.is_multiple_of(2);
+    let ports = udp_ports(pids[0]).into_iter().filter(is_discovery);
+    let processes: Vec<_> = ports.map(|port| SocketAddrV4::new(address, port)).collect();
+    assert!(processes.len() >= ROLES.len(), "{processes:?}");
+    attack(&bed.host("slow").udp_socket(), &processes);
+    // The largest sample of the route has 64 KiB.
+    let too_large = bed.publish(Peer::fast().keep_all().rate_hz(2.0).size(20 << 20).count(10), INPUT);
+    let too_large: Sent = too_large.finish();
+    let after = pids.map(resident_kib);
+
+    println!("resident memory {before:?} KiB, then {after:?} KiB");
+    for (index, role) in ROLES.into_iter().enumerate() {
+        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+        let growth = after[index] - before[index];
+        assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
+    }
+    let sent: Sent = publisher.end();
+    critical.wait_received(sent.ok);
+    critical.end::<Received>().assert_all_of(&sent);
+    let status = bed.wait_accounted();
+    let route: &Value = &status["routes"][0];
+    assert_eq!(route["drops"]["too_large"].as_u64(), Some(too_large.ok), "{route}");
+    assert_eq!(route["lost_upstream"].as_u64(), Some(0), "{route}");
+    assert!(route["received_bytes"].as_u64().unwrap() > too_large.ok * (20 << 20), "{route}");
+    bed.end();
+}
