@@ -40,6 +40,10 @@ const READ_BOARDS_MS: u64 = 250;
 const HANG_CRITICAL_MS: u64 = 2_000;
 const HANG_MS: u64 = 5_000;
 
+/// How long a child may take to complete its first turn before it is killed and restarted. The service units
+/// have the same as `TimeoutStartSec`.
+const START_MS: u64 = 30_000;
+
 /// How long a child may take to end after SIGTERM; then it is killed, and `up` fails. A process ends within a
 /// second of a request to stop, unless it has many endpoints to remove on a loaded machine. Less than the 5 s
 /// that the service units give (`TimeoutStopSec`), and than the 10 s of Docker.
@@ -181,8 +185,15 @@ impl<'a> ManagerReport<'a> {
         self.read_at = now.plus_ms(READ_BOARDS_MS);
         let next = match Snapshot::take(&root_of(self.settings), self.settings) {
             Ok(Some(next)) => next,
-            // The children have not created the boards yet, or the boards are of another configuration.
-            Ok(None) | Err(ShmError::Incompatible { .. }) => return,
+            // The children have not created the boards yet.
+            Ok(None) => {
+                if self.watchdog {
+                    children.iter_mut().for_each(|child| child.check_start(now));
+                }
+                return;
+            }
+            // The boards are of another configuration.
+            Err(ShmError::Incompatible { .. }) => return,
             Err(error) => {
                 warn!(%error, "cannot read the boards of the bridge");
                 return;
@@ -193,11 +204,12 @@ impl<'a> ManagerReport<'a> {
             let reading = next.processes.iter().find(|reading| reading.name == child.name);
             let health = reading.map(|reading| &reading.health);
             // A child that has not completed its first turn is still starting.
-            if let Some(health) = health.filter(|one| one.turns > 0 && Some(one.pid) == child.pid()) {
-                turned += 1;
-                if self.watchdog {
-                    child.check_progress(health.alive_at, now);
-                }
+            let health = health.filter(|one| one.turns > 0 && Some(one.pid) == child.pid());
+            turned += usize::from(health.is_some());
+            match health {
+                _ if !self.watchdog => {}
+                Some(health) => child.check_progress(health.alive_at, now),
+                None => child.check_start(now),
             }
         }
         if !self.notifier.is_enabled() {
@@ -272,6 +284,7 @@ struct Supervised {
     /// How long it may make no progress.
     hang_ms: u64,
     hang_watch: HangWatch,
+    start_watch: HangWatch,
 }
 
 impl Supervised {
@@ -288,6 +301,7 @@ impl Supervised {
             state: State::Running,
             hang_ms,
             hang_watch: HangWatch::new(hang_ms, now),
+            start_watch: HangWatch::new(START_MS, now),
         }
     }
 
@@ -309,7 +323,9 @@ impl Supervised {
         info!(child = self.name, pid = process.id(), "started");
         self.process = Some(process);
         self.state = State::Running;
-        self.hang_watch = HangWatch::new(self.hang_ms, clock::monotonic());
+        let now = clock::monotonic();
+        self.hang_watch = HangWatch::new(self.hang_ms, now);
+        self.start_watch = HangWatch::new(START_MS, now);
         Ok(())
     }
 
@@ -353,6 +369,15 @@ impl Supervised {
     fn check_progress(&mut self, alive_at: MonotonicNs, now: MonotonicNs) {
         if self.hang_watch.has_hung(alive_at, now) {
             error!(child = self.name, "no progress for {} ms; killed, to be restarted", self.hang_ms);
+            self.signal(Signal::SIGKILL);
+        }
+    }
+
+    /// Kills the child if it runs and has not completed its first turn for too long.
+    fn check_start(&mut self, now: MonotonicNs) {
+        // It has made no progress at all.
+        if self.state == State::Running && self.start_watch.has_hung(MonotonicNs(0), now) {
+            error!(child = self.name, "no first turn within {START_MS} ms; killed, to be restarted");
             self.signal(Signal::SIGKILL);
         }
     }

@@ -1,86 +1,14 @@
 //! A thread of a bridge's process that hangs or ends: the supervisor restarts the process, whichever thread
-//! it is. Uses real processes, whose threads are stopped and ended one by one with ptrace(2).
+//! it is. Uses real processes, whose threads are stopped and ended one by one.
 
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
-use nix::sys::ptrace;
-use nix::sys::signal::Signal;
-use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
+use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
 use support::peer::{Peer, Received, Sent};
-
-/// What happens to a thread.
-#[derive(Clone, Copy, Debug)]
-enum Fault {
-    /// It stays stopped, as in a deadlock.
-    Hang,
-    /// It ends without a trace, as after a panic that nothing handles.
-    End,
-}
-
-/// The threads without which a process does nothing: its main thread, the DDS library's event loop and its
-/// discovery thread, as the kernel shows their names.
-const THREADS: [Option<&str>; 3] = [None, Some("RustDDS Partici"), Some("RustDDS discove")];
-
-/// The id of the thread of this name, or of the main thread.
-fn thread(process: i32, name: Option<&str>) -> Pid {
-    let Some(name) = name else { return Pid::from_raw(process) };
-    let named = |entry: std::fs::DirEntry| {
-        let comm = std::fs::read_to_string(entry.path().join("comm")).ok()?;
-        (comm.trim_end() == name).then(|| entry.file_name().to_string_lossy().parse().ok())?
-    };
-    let tasks = || std::fs::read_dir(format!("/proc/{process}/task")).ok()?.flatten().find_map(named);
-    Pid::from_raw(support::wait_for(format!("thread {name} of process {process}"), tasks))
-}
-
-/// Waits until the kernel stops or ends the traced thread.
-fn wait(thread: Pid) -> WaitStatus {
-    waitpid(thread, Some(WaitPidFlag::__WALL)).unwrap()
-}
-
-/// Stops the thread. The calling thread traces it from then on.
-fn stop(thread: Pid) {
-    ptrace::seize(thread, ptrace::Options::empty()).unwrap();
-    ptrace::interrupt(thread).unwrap();
-    assert!(matches!(wait(thread), WaitStatus::PtraceEvent(..) | WaitStatus::Stopped(..)));
-}
-
-/// Lets a stopped thread call exit(2), which ends this thread only. Returns whether that was possible: the
-/// thread must wait in a system call, whose instruction it then executes again with another number.
-fn end(thread: Pid) -> bool {
-    const SYSCALL: i64 = 0x050f;
-    let mut registers = ptrace::getregs(thread).unwrap();
-    let instruction = registers.rip - 2;
-    if ptrace::read(thread, instruction as ptrace::AddressType).unwrap() & 0xffff != SYSCALL {
-        return false;
-    }
-    (registers.rip, registers.rax, registers.rdi) = (instruction, nix::libc::SYS_exit as u64, 0);
-    // The kernel would otherwise restart the interrupted system call in place of this one.
-    registers.orig_rax = u64::MAX;
-    ptrace::setregs(thread, registers).unwrap();
-    true
-}
-
-/// Causes the fault in a thread of the process, and waits until the process is dead.
-fn cause(fault: Fault, process: i32, thread: Pid) {
-    stop(thread);
-    if matches!(fault, Fault::End) {
-        while !end(thread) {
-            ptrace::cont(thread, None).unwrap();
-            ptrace::interrupt(thread).unwrap();
-            wait(thread);
-        }
-        ptrace::detach(thread, None).unwrap();
-    } else {
-        // The parent learns of the end of the process only after the tracer has.
-        while !matches!(wait(thread), WaitStatus::Exited(..) | WaitStatus::Signaled(_, Signal::SIGKILL, _)) {}
-    }
-    support::wait_until(format!("the end of process {process}"), || {
-        std::fs::read_to_string(format!("/proc/{process}/stat")).map_or(true, |stat| stat.contains(") Z "))
-            || !std::path::Path::new(&format!("/proc/{process}")).exists()
-    });
-}
+use support::threads::{Fault, THREADS, cause, thread};
 
 #[test]
 fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
@@ -103,7 +31,11 @@ fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
                         );
                         bed.bridge.wait_status(&format!("a turn of the new {role}"), |status| {
                             let processes = status["processes"].as_array().unwrap();
-                            processes.iter().any(|one| one["name"] == role && one["state"] == "running")
+                            let is_turning = |one: &Value| {
+                                one["state"] == "running"
+                                    && one["turns"].as_u64().is_some_and(|turns| turns > 0)
+                            };
+                            processes.iter().any(|one| one["name"] == role && is_turning(one))
                         });
                     }
                 }
@@ -113,5 +45,19 @@ fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
     subscriber.wait_received(subscriber.received() + 300);
     let _: Sent = publisher.end();
     let _: Received = subscriber.end();
+    bed.end();
+}
+
+#[test]
+fn up_restarts_a_process_that_hangs_before_its_first_turn() {
+    let test = "up_restarts_a_process_that_hangs_before_its_first_turn";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let role = "egress-noncritical";
+    kill(Pid::from_raw(bed.pid(role)), Signal::SIGKILL).unwrap();
+    support::wait_until("its restart", || bed.pids(role).len() == 2);
+    let process = bed.pid(role);
+    cause(Fault::Hang, process, thread(process, None));
+    support::wait_until("another restart", || bed.pids(role).len() == 3);
+    assert!(bed.up.log().contains("no first turn within 30000 ms"), "{}", bed.up.log());
     bed.end();
 }

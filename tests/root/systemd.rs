@@ -11,6 +11,7 @@ use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::machine::{Machine, install, machine_missing};
 use support::netns::{Host, Net};
 use support::peer::{Peer, Received, RunningPeer, Sent};
+use support::threads::{Fault, THREADS, cause, thread};
 
 const TARGET: &str = "adaptive-bridge.target";
 const INGRESS: &str = "adaptive-bridge-ingress.service";
@@ -226,16 +227,31 @@ fn a_restart_of_the_target_applies_the_edited_file_and_that_of_a_service_does_no
 }
 
 #[test]
-fn a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on() {
-    let test = "a_data_path_that_is_stuck_is_restarted_though_the_rest_of_its_process_goes_on";
+fn systemd_restarts_a_process_in_which_any_thread_hangs_or_ends() {
+    let test = "systemd_restarts_a_process_in_which_any_thread_hangs_or_ends";
     let Some(bed) = Bed::boot(test, SCAN) else { return };
     bed.start();
     let flow = bed.flow();
-    // The thread that takes samples; the one that keeps house, and feeds the watchdog, goes on.
-    bed.machine.freeze_thread(INGRESS, "RustDDS Partici");
-    bed.wait_restarts(INGRESS, 1);
-    let log = bed.machine.run(&["journalctl", "--unit", INGRESS]);
-    assert!(log.contains("Watchdog timeout"), "{log}");
+    std::thread::scope(|scope| {
+        for unit in UNITS {
+            let bed = &bed;
+            scope.spawn(move || {
+                let mut restarts = 0;
+                for fault in [Fault::Hang, Fault::End] {
+                    for name in THREADS {
+                        let process = bed.machine.outer_main_pid(unit);
+                        cause(fault, process, thread(process, name));
+                        restarts += 1;
+                        bed.wait_restarts(unit, restarts);
+                    }
+                }
+            });
+        }
+    });
+    for unit in UNITS {
+        let log = bed.machine.run(&["journalctl", "--unit", unit]);
+        assert!(log.matches("Watchdog timeout").count() >= 2 * THREADS.len(), "{unit}: {log}");
+    }
     flow.wait_on();
     flow.end();
     bed.stop();

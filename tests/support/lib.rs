@@ -19,6 +19,8 @@ pub mod process;
 pub mod prometheus;
 pub mod ros;
 pub mod rtps;
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+pub mod threads;
 pub mod visitors;
 
 use std::cell::Cell;

@@ -9,8 +9,6 @@ use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use nix::sys::signal::Signal;
-use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
-use nix::unistd::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -174,9 +172,8 @@ impl Machine {
         self.property(unit, "MainPID")
     }
 
-    /// Stops one thread of a unit's main process, found by the beginning of its name, while the others go on.
-    /// The calling thread traces it: it stays stopped until the calling thread ends.
-    pub fn freeze_thread(&self, unit: &str, name: &str) {
+    /// The process id of a unit's main process, outside the machine.
+    pub fn outer_main_pid(&self, unit: &str) -> i32 {
         let pid = self.main_pid(unit);
         let own_namespace = fs::read_link(format!("/proc/{}/ns/pid", self.leader)).unwrap();
         // Searches /proc outside the machine; the last entry of `NSpid` is the process id inside.
@@ -189,22 +186,7 @@ impl Machine {
         };
         let process =
             processes.into_iter().find(is_main_process).unwrap_or_else(|| panic!("{unit} has no process"));
-        let threads = fs::read_dir(process.join("task")).unwrap().flatten().map(|entry| entry.path());
-        let is_named = |thread: &PathBuf| {
-            fs::read_to_string(thread.join("comm")).is_ok_and(|thread_name| thread_name.starts_with(name))
-        };
-        let thread =
-            threads.into_iter().find(is_named).unwrap_or_else(|| panic!("{unit} has no thread {name}"));
-        let thread: i32 = thread.file_name().unwrap().to_str().unwrap().parse().unwrap();
-        let null = std::ptr::null_mut::<nix::libc::c_void>();
-        // SAFETY: attaching passes no memory to the kernel. nix has this call only behind a separate feature.
-        let attached = unsafe { nix::libc::ptrace(nix::libc::PTRACE_ATTACH, thread, null, null) };
-        assert_eq!(attached, 0, "{}", std::io::Error::last_os_error());
-        // The tracer has to reap a dead traced thread; until then the process does not end.
-        std::thread::spawn(move || {
-            let wait = || waitpid(Pid::from_raw(thread), Some(WaitPidFlag::__WALL));
-            while !matches!(wait(), Ok(WaitStatus::Exited(..) | WaitStatus::Signaled(..)) | Err(_)) {}
-        });
+        process.file_name().unwrap().to_str().unwrap().parse().unwrap()
     }
 
     /// The output of `adaptive-bridge status --json` in the machine; `None` if the bridge does not run.
