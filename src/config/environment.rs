@@ -1,4 +1,5 @@
-//! Reads the environment variables of ROS 2 that supply defaults for the file.
+//! Reads the environment variables of ROS 2: those that supply defaults for the file, and those that the
+//! bridge does not support.
 
 use std::net::Ipv4Addr;
 
@@ -14,6 +15,45 @@ pub(super) struct Environment {
     pub graph_gid_bytes: usize,
     localhost_only: bool,
 }
+
+/// A variable that makes the nodes of the robot communicate in a way that the bridge does not. If it is set,
+/// the bridge would find no node, or receive nothing, without an error.
+struct NotSupported {
+    name: &'static str,
+    /// Values with which nodes and the bridge find each other.
+    harmless: &'static [&'static str],
+    /// What is allowed, why, and what to do.
+    consequence: &'static str,
+}
+
+const NOT_SUPPORTED: [NotSupported; 4] = [
+    NotSupported {
+        name: "ROS_DISCOVERY_SERVER",
+        harmless: &[],
+        consequence: "must not be set: nodes that use a discovery server and the bridge do not find each other; \
+                      start the nodes without it, and the bridge too",
+    },
+    NotSupported {
+        name: "ROS_SECURITY_ENABLE",
+        harmless: &["false"],
+        consequence: "must not be true: the bridge has no DDS Security, and nodes that have it do not accept \
+                      the bridge; unset it for the bridge if the nodes that it serves run without",
+    },
+    NotSupported {
+        name: "RMW_IMPLEMENTATION",
+        harmless: &["rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds"],
+        consequence: "must be a DDS implementation, rmw_fastrtps_cpp, rmw_fastrtps_dynamic_cpp, \
+                      rmw_cyclonedds_cpp or rmw_connextdds: the bridge and other nodes do not find each other; \
+                      unset it for the bridge if the nodes that it serves use DDS",
+    },
+    NotSupported {
+        name: "FASTDDS_BUILTIN_TRANSPORTS",
+        harmless: &["DEFAULT", "UDPv4"],
+        consequence: "must be DEFAULT or UDPv4: the bridge receives and sends over UDP and IPv4 only, and with \
+                      other transports Fast DDS does not; unset it for the bridge if the nodes that it serves \
+                      run without",
+    },
+];
 
 impl Environment {
     /// Reads the variables through `env`. An empty one counts as not set, as in ROS 2.
@@ -67,6 +107,13 @@ impl Environment {
                 "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces \
                  with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
             );
+        }
+        for not_supported in &NOT_SUPPORTED {
+            if let Some(value) = variable(not_supported.name)
+                && !not_supported.harmless.contains(&value.as_str())
+            {
+                refuse(not_supported.name, &value, not_supported.consequence);
+            }
         }
         // The identifier shrank from 24 to 16 bytes in Iron.
         let graph_gid_bytes = match variable("ROS_DISTRO").as_deref() {

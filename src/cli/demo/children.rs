@@ -22,11 +22,15 @@ use crate::clock;
 const BRIDGE_GRACE_MS: u64 = 3_000;
 
 /// Environment variables that would change the behaviour of the demo's processes, and so are removed.
-const REMOVED_VARIABLES: [&str; 6] = [
+const REMOVED_VARIABLES: [&str; 10] = [
     "ROS_DOMAIN_ID",
     "ROS_LOCALHOST_ONLY",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
+    "ROS_DISCOVERY_SERVER",
+    "ROS_SECURITY_ENABLE",
+    "RMW_IMPLEMENTATION",
+    "FASTDDS_BUILTIN_TRANSPORTS",
     "ROS_DISTRO",
     "ADAPTIVE_BRIDGE_CONFIG",
 ];
