@@ -26,7 +26,7 @@ use crate::config::{Configuration, Settings};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError, root_of};
-use crate::telemetry::Snapshot;
+use crate::telemetry::{Snapshot, Threads};
 
 /// Interval at which the supervisor checks its children.
 const POLL_MS: u64 = 20;
@@ -285,6 +285,8 @@ struct Supervised {
     hang_ms: u64,
     hang_watch: HangWatch,
     start_watch: HangWatch,
+    /// Its threads at the last check, and when that was.
+    threads: Option<(Threads, MonotonicNs)>,
 }
 
 impl Supervised {
@@ -302,6 +304,7 @@ impl Supervised {
             hang_ms,
             hang_watch: HangWatch::new(hang_ms, now),
             start_watch: HangWatch::new(START_MS, now),
+            threads: None,
         }
     }
 
@@ -326,6 +329,7 @@ impl Supervised {
         let now = clock::monotonic();
         self.hang_watch = HangWatch::new(self.hang_ms, now);
         self.start_watch = HangWatch::new(START_MS, now);
+        self.threads = None;
         Ok(())
     }
 
@@ -367,16 +371,31 @@ impl Supervised {
 
     /// Kills the child if it has made no progress since `alive_at` for too long; `poll` then restarts it.
     fn check_progress(&mut self, alive_at: MonotonicNs, now: MonotonicNs) {
-        if self.hang_watch.has_hung(alive_at, now) {
+        let starved = self.hang_watch.is_stalled(alive_at) && self.is_starved(now);
+        if self.hang_watch.has_hung(alive_at, starved, now) {
             error!(child = self.name, "no progress for {} ms; killed, to be restarted", self.hang_ms);
             self.signal(Signal::SIGKILL);
         }
     }
 
+    /// Whether a thread of the child is ready to run, and the child got less than half of one CPU since the
+    /// last check: the machine is busy with other programs.
+    fn is_starved(&mut self, now: MonotonicNs) -> bool {
+        let Some(pid) = self.pid() else { return false };
+        let threads = Threads::of(pid);
+        let last = self.threads.replace((threads, now));
+        // A check before the present stall says nothing about it.
+        last.filter(|(_, at)| now.since(*at) < 2 * READ_BOARDS_MS * 1_000_000).is_some_and(|(last, at)| {
+            let cpu_ns = threads.cpu_ns.saturating_sub(last.cpu_ns);
+            last.ready && threads.ready && cpu_ns < now.since(at) / 2
+        })
+    }
+
     /// Kills the child if it runs and has not completed its first turn for too long.
     fn check_start(&mut self, now: MonotonicNs) {
+        let starved = self.is_starved(now);
         // It has made no progress at all.
-        if self.state == State::Running && self.start_watch.has_hung(MonotonicNs(0), now) {
+        if self.state == State::Running && self.start_watch.has_hung(MonotonicNs(0), starved, now) {
             error!(child = self.name, "no first turn within {START_MS} ms; killed, to be restarted");
             self.signal(Signal::SIGKILL);
         }

@@ -19,7 +19,7 @@ mod table;
 mod test_report;
 mod text;
 
-pub use cpu_time::CpuTime;
+pub use cpu_time::{CpuTime, Threads};
 pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, diagnostics_json, string_message};

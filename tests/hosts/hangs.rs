@@ -3,6 +3,8 @@
 
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
+use std::process::Command;
+
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
@@ -59,5 +61,67 @@ fn up_restarts_a_process_that_hangs_before_its_first_turn() {
     cause(Fault::Hang, process, thread(process, None));
     support::wait_until("another restart", || bed.pids(role).len() == 3);
     assert!(bed.up.log().contains("no first turn within 30000 ms"), "{}", bed.up.log());
+    bed.end();
+}
+
+/// Turns off the grouping of processes by session, in which a busy process leaves others their share; until
+/// it is dropped.
+struct NoAutogroup(String);
+
+const AUTOGROUP: &str = "/proc/sys/kernel/sched_autogroup_enabled";
+
+impl NoAutogroup {
+    fn set() -> Self {
+        let before = std::fs::read_to_string(AUTOGROUP).unwrap_or_default();
+        // A kernel without the file has no such groups.
+        let _ = std::fs::write(AUTOGROUP, "0");
+        Self(before)
+    }
+}
+
+impl Drop for NoAutogroup {
+    fn drop(&mut self) {
+        let _ = std::fs::write(AUTOGROUP, &self.0);
+    }
+}
+
+#[test]
+fn up_does_not_kill_a_process_that_gets_no_cpu_time() {
+    let test = "up_does_not_kill_a_process_that_gets_no_cpu_time";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(1000), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_last(1000).rate_hz(100.0), INPUT);
+    subscriber.wait_received(100);
+    let role = "egress-critical";
+    let pid = bed.pid(role).to_string();
+    let run = |program: &str, arguments: &[&str]| {
+        let output = Command::new(program).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{program} {arguments:?}: {output:?}");
+    };
+    let turns = || {
+        let status = bed.bridge.status();
+        let processes = status["processes"].as_array().unwrap();
+        processes.iter().find(|one| one["name"] == role).unwrap()["turns"].as_u64().unwrap()
+    };
+    {
+        let _no_autogroup = NoAutogroup::set();
+        run("taskset", &["-a", "-c", "-p", "0", &pid]);
+        run("chrt", &["-a", "-i", "-p", "0", &pid]);
+        let before = turns();
+        // Four times as long as the supervisor waits for a turn of a critical lane.
+        let busy = ["8", "nice", "-n", "-20", "taskset", "-c", "0", "sh", "-c", "while :; do :; done"];
+        let ended = Command::new("timeout").args(busy).status().unwrap();
+        assert_eq!(ended.code(), Some(124), "the busy program ended before its time");
+        let during = turns() - before;
+        // Without this, the lane was not starved, and the test shows nothing.
+        assert!(during < 40, "the lane made {during} turns in 8 s");
+        run("chrt", &["-a", "-o", "-p", "0", &pid]);
+    }
+    subscriber.wait_received(subscriber.received() + 100);
+    assert_eq!(bed.pids(role).len(), 1, "{}", bed.up.log());
+    let _: Sent = publisher.end();
+    let _: Received = subscriber.end();
+    bed.wait_accounted();
     bed.end();
 }

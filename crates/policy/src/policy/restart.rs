@@ -82,6 +82,11 @@ impl RestartBackoff {
 /// itself, which was stopped, and with it perhaps its children.
 const MAX_STEP_MS: u64 = 500;
 
+/// How many times its limit a child may make no progress while it waits for a CPU. On a machine that is
+/// busy with other programs a restart helps nothing and costs samples; but a thread in an endless loop waits
+/// for a CPU, too.
+const STARVED_LIMITS: u64 = 10;
+
 /// Finds a child process that runs but makes no progress.
 #[derive(Clone, Copy, Debug)]
 pub struct HangWatch {
@@ -89,26 +94,36 @@ pub struct HangWatch {
     alive_at: MonotonicNs,
     checked_at: MonotonicNs,
     stalled_ns: u64,
+    starved_ns: u64,
 }
 
 impl HangWatch {
     /// A watch of a child that was started at `now` and must show progress every `limit_ms`.
     pub const fn new(limit_ms: u64, now: MonotonicNs) -> Self {
-        Self { limit_ms, alive_at: MonotonicNs(0), checked_at: now, stalled_ns: 0 }
+        Self { limit_ms, alive_at: MonotonicNs(0), checked_at: now, stalled_ns: 0, starved_ns: 0 }
+    }
+
+    /// Whether the child has made no progress since the last check.
+    pub fn is_stalled(&self, alive_at: MonotonicNs) -> bool {
+        alive_at == self.alive_at
     }
 
     /// Compares when the child last made progress, by its own account, with the last check. Returns whether
-    /// it has made none for the limit, in the time that the supervisor itself was running.
-    pub fn has_hung(&mut self, alive_at: MonotonicNs, now: MonotonicNs) -> bool {
+    /// it has made none for the limit, in the time that the supervisor itself was running. While the child is
+    /// `starved`, a thread of it is ready to run and gets little CPU time, up to ten times the limit more.
+    pub fn has_hung(&mut self, alive_at: MonotonicNs, starved: bool, now: MonotonicNs) -> bool {
         let step_ns = now.since(self.checked_at).min(MAX_STEP_MS * 1_000_000);
         self.checked_at = now;
-        if alive_at == self.alive_at {
-            self.stalled_ns += step_ns;
-        } else {
+        let limit_ns = self.limit_ms * 1_000_000;
+        if !self.is_stalled(alive_at) {
             self.alive_at = alive_at;
-            self.stalled_ns = 0;
+            (self.stalled_ns, self.starved_ns) = (0, 0);
+        } else if starved && self.starved_ns < STARVED_LIMITS * limit_ns {
+            self.starved_ns += step_ns;
+        } else {
+            self.stalled_ns += step_ns;
         }
-        self.stalled_ns >= self.limit_ms * 1_000_000
+        self.stalled_ns >= limit_ns
     }
 }
 
@@ -178,20 +193,33 @@ mod tests {
         let at = |ms| MonotonicNs(1).plus_ms(ms);
         let mut watch = HangWatch::new(2_000, at(0));
         for ms in (250..60_000).step_by(250) {
-            assert!(!watch.has_hung(at(ms - 100), at(ms)), "a turn each 250 ms");
+            assert!(!watch.has_hung(at(ms - 100), false, at(ms)), "a turn each 250 ms");
         }
         for ms in (60_000..61_750).step_by(250) {
-            assert!(!watch.has_hung(at(59_650), at(ms)), "{ms}");
+            assert!(!watch.has_hung(at(59_650), false, at(ms)), "{ms}");
         }
-        assert!(watch.has_hung(at(59_650), at(61_750)));
+        assert!(watch.has_hung(at(59_650), false, at(61_750)));
     }
 
     #[test]
     fn a_pause_of_the_supervisor_is_not_a_hang_of_its_children() {
         let at = |ms| MonotonicNs(1).plus_ms(ms);
         let mut watch = HangWatch::new(2_000, at(0));
-        assert!(!watch.has_hung(at(200), at(250)));
-        assert!(!watch.has_hung(at(200), at(3_600_250)), "an hour in SIGSTOP counts as 500 ms");
-        assert!(!watch.has_hung(at(3_600_300), at(3_600_500)));
+        assert!(!watch.has_hung(at(200), false, at(250)));
+        assert!(!watch.has_hung(at(200), false, at(3_600_250)), "an hour in SIGSTOP counts as 500 ms");
+        assert!(!watch.has_hung(at(3_600_300), false, at(3_600_500)));
+    }
+
+    #[test]
+    fn a_child_that_waits_for_a_cpu_has_ten_times_the_limit_more() {
+        let at = |ms| MonotonicNs(1).plus_ms(ms);
+        let checks = |starved: fn(u64) -> bool| {
+            let mut watch = HangWatch::new(2_000, at(0));
+            assert!(!watch.has_hung(at(100), true, at(250)));
+            (500..).step_by(250).find(|ms| watch.has_hung(at(100), starved(*ms), at(*ms))).unwrap()
+        };
+        assert_eq!(checks(|_| false), 2_250);
+        assert_eq!(checks(|ms| ms <= 10_250), 12_250, "10 s of waiting for a CPU do not count");
+        assert_eq!(checks(|_| true), 22_250);
     }
 }
