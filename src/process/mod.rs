@@ -5,7 +5,6 @@
 //! process sleeps until it is woken or until its next housekeeping. Housekeeping is the work that is not
 //! needed for each sample: discovery, matching, logs, health.
 
-mod arena;
 mod control;
 mod count_log;
 mod egress;
