@@ -323,7 +323,6 @@ pub fn rtps_message(bytes: &[u8]) {
 pub fn rtps_arriving(bytes: &[u8]) {
     let whole = sample_arriving(bytes);
     if let Some((writer, _, left_bytes)) = whole {
-        let writer = writer.to_bytes();
         assert!(bytes.starts_with(b"RTPS") && writer[..12] == bytes[8..20]);
         // The two highest bits of an entity's kind are 0 for those of a user (RTPS 2.5, clause 9.3.1.2).
         assert_eq!(writer[15] & 0xc0, 0, "{writer:?}");

@@ -28,7 +28,7 @@ use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{ArrivalFlag, Discovery, Participant, ParticipantOptions};
-use crate::model::{LaneMode, MonotonicNs, TrafficClass};
+use crate::model::{Guid, LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::{ProcessRole, this_cpu};
 use early_waker::EarlyWaker;
 use input::Input;
@@ -118,7 +118,7 @@ impl Ingress {
         let on_arriving = {
             let receiving = Arc::clone(&receiving);
             move |writer, sequence, left_bytes| {
-                receiving.wake_early(writer, sequence, left_bytes, this_cpu());
+                receiving.wake_early(Guid(writer), sequence, left_bytes, this_cpu());
             }
         };
         let on_received = {
