@@ -9,7 +9,6 @@ mod control;
 mod count_log;
 mod egress;
 mod in_force;
-mod inbox;
 mod ingress;
 mod lane_override;
 mod notify;
