@@ -13,7 +13,7 @@ use adaptive_bridge::model::{
     DropReason, Encapsulation, Guid, InstanceName, LaneName, MAX_ID_BYTES, MAX_INTRUDERS, MAX_SUBSCRIBERS,
     MonotonicNs, ProbeRefusal, RouteId, TopicName, TrafficClass, TypeName,
 };
-use adaptive_bridge::policy::effective_mode;
+use adaptive_bridge::policy::mode_and_source;
 use adaptive_bridge::process::probes::{MAX_MESSAGE_BYTES, ProbeRequest, ProbeResponse};
 use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
 use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing, sample_arriving};
@@ -150,7 +150,7 @@ impl Foreign {
         let _ = TypeName::from_dds(info.dds_type.as_str());
 
         let policy = self.boards.policy(0).expect("nobody writes");
-        let _ = effective_mode(&policy, TrafficClass::Critical, MonotonicNs(1), 1);
+        let _ = mode_and_source(&policy, TrafficClass::Critical, MonotonicNs(1), 1);
         let policies = self.boards.policies().expect("the lock of a folder of our own");
         let set = policies.set(0, MonotonicNs(1), |mut policy| {
             policy.mode = 1;
@@ -323,7 +323,6 @@ pub fn rtps_message(bytes: &[u8]) {
 pub fn rtps_arriving(bytes: &[u8]) {
     let whole = sample_arriving(bytes);
     if let Some((writer, _, left_bytes)) = whole {
-        let writer = writer.to_bytes();
         assert!(bytes.starts_with(b"RTPS") && writer[..12] == bytes[8..20]);
         // The two highest bits of an entity's kind are 0 for those of a user (RTPS 2.5, clause 9.3.1.2).
         assert_eq!(writer[15] & 0xc0, 0, "{writer:?}");

@@ -103,5 +103,5 @@ fn peek_sample(socket: &UdpSocket) -> Option<Arrival> {
     // the datagram already.
     let length = socket.peek(&mut datagram).ok()?;
     let (writer, sequence, left_bytes) = sample_arriving(datagram.get(..length)?)?;
-    Some(Arrival::Sample { writer: Guid(writer.to_bytes()), sequence, left_bytes })
+    Some(Arrival::Sample { writer: Guid(writer), sequence, left_bytes })
 }

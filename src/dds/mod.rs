@@ -5,31 +5,29 @@
 //! another DDS library could replace RustDDS, except the two traits by which that borrows memory from the
 //! bridge.
 
-mod arrival_flag;
 mod arrivals;
 mod discovery;
 mod error;
 mod graph;
 mod graph_watch;
-mod lent;
 mod network;
 mod participant;
-mod payload;
 mod qos;
 mod reader;
 mod writer;
 
-pub use arrival_flag::ArrivalFlag;
 pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
-pub use lent::{AssemblyLimits, LentMemory, Payload, SampleMemory};
 pub use network::{AbsentInterface, absent_interfaces, host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
-pub use reader::{RawReader, ReaderEvent, SampleOrigin, Take, TakePayload};
+pub use reader::{
+    ArrivalFlag, AssemblyLimits, Inbox, LentMemory, Payload, RawReader, ReaderEvent, SampleMemory,
+    SampleOrigin, Take, TakePayload,
+};
 pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent, Written};
 
 /// RustDDS in the version that ros2-client uses, so that the program contains one version of it.

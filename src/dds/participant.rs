@@ -91,8 +91,8 @@ impl Participant {
     /// Like [`open`](Self::open), but the thread that receives calls `on_received` after each datagram,
     /// before it acknowledges it, and after [`ring`](Self::ring). Taking a sample there saves the wake-up of
     /// another thread. Some microseconds earlier, for a datagram with a sample or a fragment of one, the
-    /// thread calls `on_arriving` with the writer, the sequence number, and the bytes of the sample that are
-    /// still missing after this datagram, as the datagram claims.
+    /// thread calls `on_arriving` with the writer's GUID, the sequence number, and the bytes of the sample
+    /// that are still missing after this datagram, as the datagram claims.
     ///
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
     /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
@@ -102,12 +102,9 @@ impl Participant {
     /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
-        mut on_arriving: impl FnMut(Guid, i64, usize) + Send + 'static,
+        on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        let on_arriving = move |writer: GUID, sequence, left_bytes| {
-            on_arriving(Guid(writer.to_bytes()), sequence, left_bytes);
-        };
         Self::build(options, |builder| builder.on_sample_arriving(on_arriving).on_received(on_received))
     }
 

@@ -1,13 +1,46 @@
-//! A DDS reader of raw payloads that gives access to each payload in the receive buffer, without a copy.
+//! DDS readers of raw payloads that give access to each payload in the receive buffer, without a copy, and
+//! the flag that the DDS library raises when a sample arrives.
 
+use std::cell::Cell;
 use std::sync::Arc;
-use std::task::Waker;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Wake, Waker};
+use std::thread::{self, Thread};
 
-use super::lent::{Payload, SampleMemory, SmallSamples};
-use super::payload::{PayloadDecoder, RawAdapter, Received};
-use super::rustdds::no_key::SimpleDataReader;
-use super::rustdds::{DataReaderStatus, StatusEvented};
+use bytes::Bytes;
+
+use super::rustdds::no_key::{Decode, DeserializerAdapter, SimpleDataReader};
+use super::rustdds::{DataReaderStatus, RepresentationIdentifier, StatusEvented};
 use crate::model::{Encapsulation, Guid, SourceTimestamp};
+
+pub use super::rustdds::{AssemblyLimits, LentMemory, SampleMemory};
+
+/// One take in so many tries the last reader first, so that a flood of samples at the first reader cannot
+/// block it.
+const LAST_READER_FIRST_EVERY: u64 = 32;
+
+/// The payload of a sample that was taken from a reader.
+pub enum Payload {
+    /// In the library's receive buffer, which it keeps in memory until it is dropped.
+    Bytes(Bytes),
+    /// In memory that was [lent](RawReader::lend_memory) for it, in which the DDS library assembles a large
+    /// sample; that saves a copy.
+    Lent(Box<dyn LentMemory>),
+}
+
+/// Of topics with samples of at most some KiB: graph entries, probes and their responses. Anyone on the
+/// network can send fragments that claim more.
+struct SmallSamples;
+
+impl SampleMemory for SmallSamples {
+    fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
+        None
+    }
+
+    fn limits(&self) -> AssemblyLimits {
+        AssemblyLimits { max_sample_bytes: 1 << 20, max_total_bytes: 4 << 20 }
+    }
+}
 
 /// The writer of a sample, its sequence number there, and its source timestamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,11 +75,6 @@ pub enum TakePayload {
 }
 
 impl TakePayload {
-    /// Whether no sample was waiting.
-    pub fn is_empty(&self) -> bool {
-        matches!(self, Self::Empty)
-    }
-
     /// Calls `read` with the payload, if there is one.
     pub fn read(self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
         match self {
@@ -80,7 +108,7 @@ pub enum ReaderEvent {
 
 /// A DDS reader of raw payloads.
 pub struct RawReader {
-    pub(super) inner: SimpleDataReader<Received, RawAdapter>,
+    pub(super) inner: SimpleDataReader<Received, PayloadDecoder>,
     pub(super) guid: Guid,
 }
 
@@ -158,5 +186,211 @@ impl RawReader {
                 _ => {}
             }
         }
+    }
+}
+
+/// A flag that the DDS library raises when a sample has arrived, and the thread to wake then. As a waker it
+/// arms readers ([`RawReader::arm`]).
+#[derive(Debug)]
+pub struct ArrivalFlag {
+    raised: AtomicBool,
+    /// The thread to unpark; `None` where another thread checks the flag.
+    thread: Option<Thread>,
+}
+
+impl ArrivalFlag {
+    /// Creates a flag that wakes no thread.
+    pub fn passive() -> Arc<Self> {
+        Arc::new(Self { raised: AtomicBool::new(false), thread: None })
+    }
+
+    /// Creates a flag that unparks the calling thread.
+    pub fn of_this_thread() -> Arc<Self> {
+        Arc::new(Self { raised: AtomicBool::new(false), thread: Some(thread::current()) })
+    }
+
+    /// Raises the flag and unparks its thread.
+    pub fn raise(&self) {
+        self.raised.store(true, Ordering::Release);
+        if let Some(thread) = &self.thread {
+            thread.unpark();
+        }
+    }
+
+    /// Clears the flag, and returns whether it was raised.
+    pub fn clear(&self) -> bool {
+        self.raised.swap(false, Ordering::AcqRel)
+    }
+
+    /// Whether the flag is raised.
+    pub fn is_raised(&self) -> bool {
+        self.raised.load(Ordering::Acquire)
+    }
+}
+
+impl Wake for ArrivalFlag {
+    fn wake(self: Arc<Self>) {
+        self.raise();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        self.raise();
+    }
+}
+
+/// The one or two readers of a topic, and the flag that makes a poll nearly free while no sample has
+/// arrived.
+pub struct Inbox {
+    /// In the order in which samples are taken from them.
+    readers: Vec<RawReader>,
+    flag: Arc<ArrivalFlag>,
+    waker: Waker,
+    takes: Cell<u64>,
+}
+
+impl Inbox {
+    /// Creates an inbox with one reader; arrivals wake the calling thread.
+    pub fn new(reader: RawReader) -> Self {
+        let mut inbox = Self::with_flag(ArrivalFlag::of_this_thread());
+        inbox.add(reader);
+        inbox
+    }
+
+    /// Creates an inbox without readers; arrivals raise `flag`, which the caller checks.
+    pub fn with_flag(flag: Arc<ArrivalFlag>) -> Self {
+        Self { readers: Vec::new(), waker: Waker::from(Arc::clone(&flag)), flag, takes: Cell::new(0) }
+    }
+
+    /// Adds a reader, from which samples are taken after the others.
+    pub fn add(&mut self, reader: RawReader) {
+        self.readers.push(reader);
+        // A new reader is not armed yet, so the next take must poll it.
+        self.flag.raise();
+    }
+
+    /// Removes a reader and returns it.
+    pub fn remove(&mut self, reader: Guid) -> Option<RawReader> {
+        let place = self.readers.iter().position(|known| known.guid() == reader)?;
+        Some(self.readers.remove(place))
+    }
+
+    /// The readers.
+    pub fn readers(&self) -> &[RawReader] {
+        &self.readers
+    }
+
+    /// Takes the next sample, like [`RawReader::take`]. After [`Take::Empty`] the thread may `park`: a later
+    /// arrival unparks it.
+    pub fn take(&self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
+        self.take_from_any().read(read)
+    }
+
+    /// Takes the next sample of any reader, like [`RawReader::take_payload`].
+    pub fn take_from_any(&self) -> TakePayload {
+        if !self.flag.is_raised() {
+            return TakePayload::Empty;
+        }
+        // Once armed, the readers are polled again, for a sample that arrived before they were armed.
+        for is_armed in [false, true] {
+            let takes = self.takes.get().wrapping_add(1);
+            self.takes.set(takes);
+            let last_first = takes.is_multiple_of(LAST_READER_FIRST_EVERY);
+            for place in 0..self.readers.len() {
+                let place = if last_first { self.readers.len() - 1 - place } else { place };
+                let take = self.readers[place].take_payload();
+                if !matches!(take, TakePayload::Empty) {
+                    if is_armed {
+                        // Without a wake-up, because this thread checks the flag.
+                        self.flag.raised.store(true, Ordering::Release);
+                    }
+                    return take;
+                }
+            }
+            if !is_armed {
+                self.flag.clear();
+                self.readers.iter().for_each(|reader| reader.arm(&self.waker));
+            }
+        }
+        TakePayload::Empty
+    }
+}
+
+/// Every encapsulation that RTPS and XTypes define (RTPS 2.5 table 10.3, XTypes 1.3 table 60). RustDDS
+/// rejects any other, and the bridge counts such a sample as malformed.
+static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
+    RepresentationIdentifier::CDR_LE,
+    RepresentationIdentifier::CDR_BE,
+    RepresentationIdentifier::PL_CDR_LE,
+    RepresentationIdentifier::PL_CDR_BE,
+    RepresentationIdentifier::XCDR2_LE,
+    RepresentationIdentifier::XCDR2_BE,
+    RepresentationIdentifier::D_CDR2_LE,
+    RepresentationIdentifier::D_CDR2_BE,
+    RepresentationIdentifier::PL_XCDR2_LE,
+    RepresentationIdentifier::PL_XCDR2_BE,
+    RepresentationIdentifier::CDR2_LE,
+    RepresentationIdentifier::CDR2_BE,
+    RepresentationIdentifier::PL_CDR2_LE,
+    RepresentationIdentifier::PL_CDR2_BE,
+    RepresentationIdentifier::D_CDR_LE,
+    RepresentationIdentifier::D_CDR_BE,
+    RepresentationIdentifier::XML,
+];
+
+/// A received payload, with its encapsulation.
+type Received = (Payload, Encapsulation);
+
+/// Passes payloads through RustDDS' deserialization traits: returns the payload, either in the receive buffer
+/// or in the memory that was lent for it.
+#[derive(Clone, Copy)]
+pub(super) struct PayloadDecoder;
+
+/// Another reader of the topic has taken the memory in which the sample was.
+#[derive(Debug, thiserror::Error)]
+#[error("another reader has taken the payload")]
+pub(super) struct MemoryTaken;
+
+impl Decode<'_, Received> for PayloadDecoder {
+    type Error = MemoryTaken;
+
+    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> Result<Received, MemoryTaken> {
+        self.decode_encapsulated(&Bytes::copy_from_slice(bytes), encoding, [0, 0])
+    }
+
+    fn decode_encapsulated(
+        self,
+        bytes: &Bytes,
+        encoding: RepresentationIdentifier,
+        options: [u8; 2],
+    ) -> Result<Received, MemoryTaken> {
+        Ok((Payload::Bytes(bytes.clone()), encapsulation(encoding, options)))
+    }
+
+    fn decode_lent(
+        self,
+        memory: &mut Option<Box<dyn LentMemory>>,
+        encoding: RepresentationIdentifier,
+        options: [u8; 2],
+    ) -> Result<Received, MemoryTaken> {
+        let memory = memory.take().ok_or(MemoryTaken)?;
+        Ok((Payload::Lent(memory), encapsulation(encoding, options)))
+    }
+}
+
+fn encapsulation(encoding: RepresentationIdentifier, options: [u8; 2]) -> Encapsulation {
+    let [high, low] = encoding.to_bytes();
+    Encapsulation([high, low, options[0], options[1]])
+}
+
+impl DeserializerAdapter<Received> for PayloadDecoder {
+    type Error = MemoryTaken;
+    type Decoded = Received;
+
+    fn supported_encodings() -> &'static [RepresentationIdentifier] {
+        &ENCAPSULATIONS
+    }
+
+    fn transform_decoded(received: Received) -> Received {
+        received
     }
 }

@@ -1,14 +1,14 @@
 //! A DDS writer of raw payloads. A write does not wait for readers unless the writer was created as blocking.
 
+use std::convert::Infallible;
 use std::fmt;
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::payload::{RawAdapter, RawPayload};
-use super::rustdds::no_key::DataWriter;
+use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
-    DataWriterStatus, GUID, StatusEvented, Timestamp, WriteOptionsBuilder,
+    DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
 use crate::model::{Encapsulation, Guid, SourceTimestamp};
@@ -32,6 +32,15 @@ impl fmt::Display for WriteError {
 }
 
 impl std::error::Error for WriteError {}
+
+impl<T> From<DdsWriteError<T>> for WriteError {
+    fn from(error: DdsWriteError<T>) -> Self {
+        match error {
+            DdsWriteError::WouldBlock { .. } => Self::WindowFull,
+            _ => Self::Refused,
+        }
+    }
+}
 
 /// A change of the readers that a writer is matched with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,7 +87,7 @@ pub struct MatchedReader {
 
 /// A DDS writer of raw payloads.
 pub struct RawWriter {
-    pub(super) inner: DataWriter<RawPayload, RawAdapter>,
+    pub(super) inner: DataWriter<RawPayload, PayloadEncoder>,
     pub(super) guid: Guid,
 }
 
@@ -100,7 +109,9 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
     ) -> Result<Written, WriteError> {
-        self.write_with(payload, encapsulation, timestamp, None)
+        let payload = RawPayload { bytes: payload, encapsulation };
+        let (sample, readers) = self.inner.write_counting_readers(payload, stamped(timestamp).build())?;
+        Ok(Written { readers, sequence: i64::from(sample.sequence_number) })
     }
 
     /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, to
@@ -115,7 +126,10 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
     ) -> Result<(), WriteError> {
-        self.write_with(payload, encapsulation, timestamp, Some(reader)).map(|_| ())
+        let payload = RawPayload { bytes: payload, encapsulation };
+        let options = stamped(timestamp).to_single_reader(GUID::from_bytes(reader.0));
+        self.inner.write_counting_readers(payload, options.build())?;
+        Ok(())
     }
 
     /// The highest RTPS sequence number that was sent to every reader matched at that time; 0 for none. A
@@ -141,27 +155,6 @@ impl RawWriter {
         self.inner.wait_for_acknowledgments(timeout).unwrap_or(false)
     }
 
-    fn write_with(
-        &self,
-        bytes: Bytes,
-        encapsulation: Encapsulation,
-        timestamp: SourceTimestamp,
-        reader: Option<Guid>,
-    ) -> Result<Written, WriteError> {
-        let mut options = WriteOptionsBuilder::new();
-        if timestamp != SourceTimestamp::NONE {
-            options = options.source_timestamp(Timestamp::from_ticks(timestamp.0));
-        }
-        if let Some(reader) = reader {
-            options = options.to_single_reader(GUID::from_bytes(reader.0));
-        }
-        match self.inner.write_counting_readers(RawPayload { bytes, encapsulation }, options.build()) {
-            Ok((sample, readers)) => Ok(Written { readers, sequence: i64::from(sample.sequence_number) }),
-            Err(DdsWriteError::WouldBlock { .. }) => Err(WriteError::WindowFull),
-            Err(_) => Err(WriteError::Refused),
-        }
-    }
-
     /// Returns the next change of the matched readers, if there is one.
     pub fn poll_event(&self) -> Option<WriterEvent> {
         loop {
@@ -179,5 +172,44 @@ impl RawWriter {
                 _ => {}
             }
         }
+    }
+}
+
+/// A payload to be written, with its encapsulation.
+pub(super) struct RawPayload {
+    bytes: Bytes,
+    encapsulation: Encapsulation,
+}
+
+/// Passes payloads through RustDDS' serialization traits without encoding them.
+pub(super) struct PayloadEncoder;
+
+impl SerializerAdapter<RawPayload> for PayloadEncoder {
+    type Error = Infallible;
+
+    fn output_encoding() -> RepresentationIdentifier {
+        RepresentationIdentifier::CDR_LE
+    }
+
+    fn to_bytes(value: &RawPayload) -> Result<Bytes, Infallible> {
+        Ok(value.bytes.clone())
+    }
+
+    fn output_encapsulation(value: &RawPayload) -> (RepresentationIdentifier, [u8; 2]) {
+        let representation = value.encapsulation.representation();
+        // The conversion needs two bytes, so it cannot fail; CDR_LE is the most common encapsulation.
+        let encoding =
+            RepresentationIdentifier::from_bytes(&representation).unwrap_or(RepresentationIdentifier::CDR_LE);
+        (encoding, value.encapsulation.options())
+    }
+}
+
+/// The options of a sample with that source timestamp.
+fn stamped(timestamp: SourceTimestamp) -> WriteOptionsBuilder {
+    let options = WriteOptionsBuilder::new();
+    if timestamp == SourceTimestamp::NONE {
+        options
+    } else {
+        options.source_timestamp(Timestamp::from_ticks(timestamp.0))
     }
 }

@@ -5,12 +5,10 @@
 //! process sleeps until it is woken or until its next housekeeping. Housekeeping is the work that is not
 //! needed for each sample: discovery, matching, logs, health.
 
-mod arena;
 mod control;
 mod count_log;
 mod egress;
 mod in_force;
-mod inbox;
 mod ingress;
 mod lane_override;
 mod notify;

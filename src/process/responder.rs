@@ -10,7 +10,6 @@ use tracing::{debug, info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
-use super::inbox::Inbox;
 use super::notify::{Meter, Notifier};
 use super::probes::{
     MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RequestHandler, Trust,
@@ -19,7 +18,7 @@ use super::role::RoleError;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::DdsNetwork;
-use crate::dds::{Participant, ParticipantOptions, RawWriter, Take};
+use crate::dds::{Inbox, Participant, ParticipantOptions, RawWriter, Take};
 use crate::model::{Encapsulation, MonotonicNs, RefusalCounts, SourceTimestamp, TopicName};
 use crate::telemetry;
 

@@ -123,7 +123,7 @@ impl Role {
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
-        on_arriving: impl FnMut(Guid, i64, usize) + Send + 'static,
+        on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
         let participant = Participant::open_receiving(options, on_arriving, on_received)?;

@@ -43,13 +43,7 @@ pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
         encapsulation: Encapsulation([bytes[56], bytes[57], bytes[58], bytes[59]]),
         age_basis: AgeBasis::from_bits(u32::from_ne_bytes([bytes[60], bytes[61], bytes[62], bytes[63]])),
     };
-    check(&header)?;
-    Ok(header)
-}
-
-/// Validates a header.
-pub(super) fn check(header: &SampleHeader) -> Result<(), HeaderError> {
-    if header.sequence == 0 { Err(HeaderError::SequenceZero) } else { Ok(()) }
+    if header.sequence == 0 { Err(HeaderError::SequenceZero) } else { Ok(header) }
 }
 
 /// A [`SampleHeader`] as iceoryx2's user header.

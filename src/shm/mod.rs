@@ -20,24 +20,22 @@ mod in_force;
 mod lock;
 mod membership;
 mod node;
+mod publisher;
 mod roles;
 mod root;
-mod sample_error;
 mod segment;
 mod service;
-mod slot;
+mod subscriber;
 mod wake;
 
 pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage};
-pub use channel::{
-    PoolSize, QueueLimits, RouteChannel, SamplePublisher, SampleSubscriber, ShmSample, SubscriberRole,
-};
+pub use channel::{PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
 pub use in_force::{BridgeAddress, InForceFile, InForceShare};
 pub use node::{CleanUp, ShmNode};
+pub use publisher::{LentSlot, LoanError, PublishError, SamplePublisher, Slot};
 pub use roles::{RoleHolder, RoleLock, instance_files};
 pub use root::{default_root, root_of};
-pub use sample_error::{LoanError, PublishError, TakeError};
-pub use slot::{LentSlot, Slot};
+pub use subscriber::{SampleSubscriber, ShmSample, SubscriberRole, TakeError};
 pub use wake::{LaneSleeper, LaneWaker, Woken, this_cpu};

@@ -96,8 +96,8 @@ fn a_sample_is_told_of_before_it_is_there() {
     let expected = Arc::new(Mutex::new(None));
     let on_arriving = {
         let (arrived, expected) = (Arc::clone(&arrived), Arc::clone(&expected));
-        move |writer: Guid, sequence: i64, left_bytes: usize| {
-            let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == writer);
+        move |writer: [u8; 16], sequence: i64, left_bytes: usize| {
+            let is_expected = expected.lock().unwrap().is_some_and(|expected| expected == Guid(writer));
             if is_expected {
                 arrived.lock().unwrap().push((sequence, left_bytes));
             }

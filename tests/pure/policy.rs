@@ -11,7 +11,7 @@ use adaptive_bridge::model::{
 };
 use adaptive_bridge::policy::{
     Allowance, ByteBudget, Decision, LaneQueue, PollOrder, RouteShaper, SampleStamps, SequenceOutcome,
-    SequenceTracker, TokenBucket, burst_for, critical_drop, effective_mode,
+    SequenceTracker, TokenBucket, burst_for, critical_drop, mode_and_source,
 };
 use proptest::prelude::*;
 use proptest::test_runner::FileFailurePersistence;
@@ -791,7 +791,7 @@ proptest! {
         let cases =
             [(TrafficClass::Critical, LaneMode::Normal), (TrafficClass::Noncritical, LaneMode::Degraded)];
         for (class, safe) in cases {
-            let effective = effective_mode(&policy, class, now, hold_ms);
+            let (effective, _) = mode_and_source(&policy, class, now, hold_ms);
             let requested = if by_hand == 1 && (expires_at == 0 || now < policy.expires_at) {
                 mode_of(mode_by_hand)
             } else if confirmed {

@@ -2,7 +2,6 @@
 
 use std::collections::VecDeque;
 
-use super::super::inbox::Inbox;
 use super::super::probes::{
     MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse,
     Trust,
@@ -10,7 +9,7 @@ use super::super::probes::{
 use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
-use crate::dds::{Participant, RawWriter, ReaderQos, Take};
+use crate::dds::{Inbox, Participant, RawWriter, ReaderQos, Take};
 use crate::model::{
     Encapsulation, FixedText, Guid, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, RefusalCounts,
     SourceTimestamp,

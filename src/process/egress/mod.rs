@@ -2,10 +2,10 @@
 //! them with its own DDS writers.
 //!
 //! Each lane, critical or noncritical, is a process of this code; lanes are isolated because their processes
-//! are separate. [`critical`] and [`noncritical`] choose which samples to send and when; [`output`] writes
-//! samples and accounts for them.
+//! are separate. A critical lane sends every sample, in order, at once; [`noncritical`] chooses which samples
+//! to send and when; [`output`] writes samples and accounts for them.
 
-mod critical;
+mod arena;
 mod late_joiners;
 mod noncritical;
 mod output;
@@ -17,7 +17,6 @@ use std::time::Duration;
 use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
-use super::arena::CopyArena;
 use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
@@ -26,10 +25,14 @@ use crate::clock;
 use crate::config::{Configuration, Forwarding, Lane, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
-use crate::policy::effective_mode;
+use crate::policy::{critical_drop, mode_and_source};
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
+use arena::CopyArena;
 use noncritical::Noncritical;
 use output::Output;
+
+/// Samples that a critical lane takes from one route before it serves the next one.
+const SAMPLES_PER_TURN: usize = 32;
 
 /// At shutdown, how long a critical lane continues to forward samples that wait or still arrive.
 const LAST_SAMPLES_MS: u64 = 200;
@@ -170,14 +173,21 @@ impl Egress {
             }
             self.applied_mode = mode;
         }
-        match &mut self.forwarder {
-            Forwarder::Critical => {
-                critical::step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
-            }
-            Forwarder::Noncritical(lane) => {
-                lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode)
+        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
+            return lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode);
+        }
+        let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
+        for output in &mut self.outputs {
+            for _ in 0..SAMPLES_PER_TURN {
+                let Some(sample) = output.take() else { break };
+                turn = Turn::Busy;
+                match critical_drop(mode) {
+                    Some(reason) => output.drop_sample(&sample, reason),
+                    None => output.send(sample, &mut self.participant, &mut self.arena),
+                }
             }
         }
+        turn
     }
 
     fn sleep(&mut self, turn: &Turn) {
@@ -320,7 +330,7 @@ impl PolicyWatch {
             self.policy = policy;
             self.epoch = policy.epoch;
         }
-        let mode = effective_mode(&self.policy, self.class, now, self.policy_hold_ms);
+        let (mode, _) = mode_and_source(&self.policy, self.class, now, self.policy_hold_ms);
         if mode != self.mode {
             info!(
                 lane = self.name.as_str(),

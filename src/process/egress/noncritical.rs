@@ -1,7 +1,7 @@
 //! Noncritical lanes: forward as many samples as their tokens allow, chosen by the lane's drop policy.
 
-use super::super::arena::CopyArena;
 use super::Turn;
+use super::arena::CopyArena;
 use super::output::Output;
 use crate::clock;
 use crate::config::{DropPolicy, Lane, LaneRates};

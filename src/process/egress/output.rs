@@ -5,9 +5,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use tracing::{error, info, warn};
 
-use super::super::arena::CopyArena;
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
+use super::arena::CopyArena;
 use super::late_joiners::{KeptSample, LateJoiners};
 use super::unsent::{Unsent, UnsentSamples};
 use crate::clock;

@@ -5,19 +5,18 @@ use std::sync::Arc;
 use tracing::{error, info, warn};
 
 use super::super::count_log::DropLog;
-use super::super::inbox::Inbox;
 use super::super::role::{Role, RoleError};
-use super::clocks::Clocks;
 use super::pool::{Filled, PoolOwner};
-use super::publishers::{Publishers, SequenceCheck};
+use super::publishers::{HighWaterMarks, Publishers, SequenceCheck};
 use super::source::{ReaderPlan, Source, label};
-use super::writer_sequences::WriterSequences;
 use crate::clock;
 use crate::config::{Route, Settings};
-use crate::dds::{ArrivalFlag, Endpoint, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload};
+use crate::dds::{
+    ArrivalFlag, Endpoint, Inbox, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload,
+};
 use crate::model::{
-    DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability, RouteInfo,
-    SampleHeader, TopicName,
+    AgeBasis, DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability,
+    RouteInfo, SampleHeader, TopicName,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
@@ -44,12 +43,21 @@ pub(super) struct Input {
     counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
-    clocks: Clocks,
     publishers: Publishers,
     drop_log: DropLog,
     remind_at: MonotonicNs,
     /// The type conflict that was logged last.
     conflict: Option<(String, String)>,
+}
+
+/// The result of [`Input::step`].
+pub(super) enum Step {
+    /// A sample was published.
+    Published,
+    /// A sample was taken and not published: repeated, malformed or dropped.
+    Discarded,
+    /// No sample waited; the arrival flag is cleared until the next arrival.
+    Empty,
 }
 
 /// A DDS reader in the inbox.
@@ -88,7 +96,6 @@ impl Input {
             counters,
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
-            clocks: Clocks::new(route.id.as_str()),
             publishers,
             remind_at: MonotonicNs(0),
             conflict: None,
@@ -117,46 +124,42 @@ impl Input {
         &self.route.input_topic
     }
 
-    /// Takes one sample and publishes it; `wake` wakes the lanes. Returns whether there was a sample. If not,
-    /// the flag is cleared until the next arrival.
-    pub fn step(&mut self, wake: impl FnOnce()) -> bool {
-        match self.inbox.take_payload() {
-            TakePayload::Empty => return false,
-            TakePayload::Sample(origin, payload, encapsulation) => {
-                self.publish(self.pool.fill(payload), encapsulation, origin, wake);
-            }
-            TakePayload::Malformed => self.count_malformed(),
-        }
-        true
-    }
-
     /// The high-water marks of the publishers.
-    pub fn writer_sequences(&self) -> Arc<WriterSequences> {
-        self.publishers.writer_sequences()
+    pub fn marks(&self) -> Arc<HighWaterMarks> {
+        self.publishers.marks()
     }
 
-    fn publish(
-        &mut self,
-        filled: Filled,
-        encapsulation: Encapsulation,
-        origin: SampleOrigin,
-        wake: impl FnOnce(),
-    ) {
+    /// Takes one sample and publishes it to the lanes, which the caller has to wake then.
+    pub fn step(&mut self) -> Step {
+        match self.inbox.take_from_any() {
+            TakePayload::Empty => Step::Empty,
+            TakePayload::Sample(origin, payload, encapsulation) => {
+                self.publish(self.pool.fill(payload), encapsulation, &origin)
+            }
+            TakePayload::Malformed => {
+                self.counters.update(|counters| {
+                    counters.received += 1;
+                    counters.drops.add(DropReason::Malformed, 1);
+                });
+                Step::Discarded
+            }
+        }
+    }
+
+    fn publish(&mut self, filled: Filled, encapsulation: Encapsulation, origin: &SampleOrigin) -> Step {
         let taken_at = clock::monotonic();
         let taken_at_wall = clock::wall();
-        let place = match self.publishers.check(origin.writer, origin.sequence, taken_at) {
-            SequenceCheck::New(place) => Some(place),
-            SequenceCheck::Unmarked => None,
+        let (place, age_basis) = match self.publishers.check(origin, taken_at, taken_at_wall) {
+            SequenceCheck::New(place, age_basis) => (Some(place), age_basis),
+            SequenceCheck::Unmarked => (None, AgeBasis::SOURCE),
             SequenceCheck::Repeated(place) => {
                 self.publishers.update(place, &mut self.counters, |counters, account| {
                     counters.repeated += 1;
                     account.repeated += 1;
                 });
-                return;
+                return Step::Discarded;
             }
         };
-        let source = origin.source_timestamp;
-        let age_basis = self.clocks.observe(origin.writer, source, taken_at, taken_at_wall);
         let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
@@ -188,35 +191,26 @@ impl Input {
                 count(counters)
             }),
         };
-        if let Ok(slot) = filled.slot {
-            let header = SampleHeader {
-                sequence,
-                source_timestamp: origin.source_timestamp,
-                taken_at,
-                published_at: clock::monotonic(),
-                writer_sequence: origin.sequence,
-                writer_guid: origin.writer,
-                encapsulation,
-                age_basis,
-            };
-            let published = slot.publish(header);
-            wake();
-            if let Err(error) = published {
-                error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
-            }
-        }
-        match (age_basis.late_ns(), source.to_wall()) {
+        match (age_basis.late_ns(), origin.source_timestamp.to_wall()) {
             (Some(late_ns), _) => self.dds_in.record(late_ns),
             (None, Some(written)) => self.dds_in.record(taken_at_wall.since(written)),
             (None, None) => {}
         }
-    }
-
-    fn count_malformed(&mut self) {
-        self.counters.update(|counters| {
-            counters.received += 1;
-            counters.drops.add(DropReason::Malformed, 1);
-        });
+        let Ok(slot) = filled.slot else { return Step::Discarded };
+        let header = SampleHeader {
+            sequence,
+            source_timestamp: origin.source_timestamp,
+            taken_at,
+            published_at: clock::monotonic(),
+            writer_sequence: origin.sequence,
+            writer_guid: origin.writer,
+            encapsulation,
+            age_basis,
+        };
+        if let Err(error) = slot.publish(header) {
+            error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
+        }
+        Step::Published
     }
 
     /// Handles a discovered writer. Ignores writers of other topics.
@@ -258,7 +252,7 @@ impl Input {
         self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();
-        self.clocks.housekeeping(&mut counters, now);
+        self.publishers.report_clocks(&self.id, &mut counters, now);
         if counters != *self.counters.get() {
             self.counters.update(|current| *current = counters);
         }
@@ -359,7 +353,7 @@ impl Input {
         let topic = self.dds_topic.as_str();
         let reader = match qos.reliability {
             Reliability::Reliable => {
-                participant.create_reader_after(topic, dds_type, &qos, self.publishers.marks())?
+                participant.create_reader_after(topic, dds_type, &qos, self.publishers.last_sequences())?
             }
             // A BEST_EFFORT reader takes what arrives from now on; it cannot request earlier samples.
             Reliability::BestEffort if self.reliable.is_none() => {

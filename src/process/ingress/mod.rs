@@ -4,15 +4,12 @@
 //! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
 //! does the housekeeping; a third thread wakes critical lanes early ([`early_waker`]).
 
-mod clocks;
 mod early_waker;
 mod input;
-mod pending_wake;
 mod pool;
 mod publishers;
 mod receiving;
 mod source;
-mod writer_sequences;
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -29,7 +26,7 @@ use crate::clock;
 use crate::config::Settings;
 use crate::dds::{ArrivalFlag, Discovery, Participant, ParticipantOptions};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::{ProcessRole, this_cpu};
+use crate::shm::ProcessRole;
 use early_waker::EarlyWaker;
 use input::Input;
 use receiving::{Receiving, ServedLane};
@@ -66,7 +63,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
     ingress.role.stopping();
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
-    while ingress.receiving.turn_blocking() && clock::monotonic() < give_up_at {}
+    while ingress.receiving.turn(false) && clock::monotonic() < give_up_at {}
     info!("ingress is done");
     Ok(())
 }
@@ -115,16 +112,7 @@ impl Ingress {
             }
         }
         let receiving = Arc::new(Receiving::new(inputs, lanes));
-        let on_arriving = {
-            let receiving = Arc::clone(&receiving);
-            move |writer, sequence, left_bytes| {
-                receiving.wake_early(writer, sequence, left_bytes, this_cpu());
-            }
-        };
-        let on_received = {
-            let receiving = Arc::clone(&receiving);
-            move || receiving.turn()
-        };
+        let (on_arriving, on_received) = receiving.hooks();
         let options = ParticipantOptions {
             network: &settings.input,
             namespace: namespace(settings),

@@ -5,12 +5,11 @@
 //! that is not needed for each sample, and locks a route meanwhile. The receiving thread never waits for a
 //! lock: it skips a locked route, and is woken when the lock is free.
 
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
-use super::input::Input;
-use super::pending_wake::PendingWake;
-use super::writer_sequences::WriterSequences;
+use super::input::{Input, Step};
+use super::publishers::HighWaterMarks;
 use crate::dds::ArrivalFlag;
 use crate::model::{Guid, TrafficClass};
 use crate::shm::{LaneWaker, this_cpu};
@@ -18,13 +17,27 @@ use crate::shm::{LaneWaker, this_cpu};
 /// Samples taken from one route before the next route, and then the DDS library, is served.
 const SAMPLES_PER_TURN: usize = 32;
 
+/// The most bytes of a fragmented sample that may be missing when the lanes are woken. A fragment of 64 KiB
+/// takes some 30 µs, about as long as a lane takes to wake up; a woken lane does not stay awake for more.
+const LEFT_BYTES: usize = 64 << 10;
+/// Turns within which the missing fragments must arrive: one for each datagram, and the smallest fragments
+/// that publishers choose by default have 1.3 KB.
+const TURNS: u64 = 64;
+/// The same for a whole sample: its own turn, and one that was under way when the early waker woke the lanes.
+const TURNS_WHOLE: u64 = 1;
+
+const NONE: u64 = u64::MAX;
+const IN_VAIN: u64 = u64::MAX - 1;
+/// Below the route's number are the turns that are left.
+const ROUTE_SHIFT: u32 = 32;
+
 /// One route, as the receiving thread and the main thread share it.
 struct SharedRoute {
     input: Mutex<Input>,
     flag: Arc<ArrivalFlag>,
     /// Whether the receiving thread has skipped the route because the main thread had locked it.
     skipped: AtomicBool,
-    writer_sequences: Arc<WriterSequences>,
+    marks: Arc<HighWaterMarks>,
     /// Whether a critical lane serves the route.
     is_critical: bool,
 }
@@ -53,7 +66,7 @@ impl Receiving {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
         };
         let shared = |(route, (input, flag)): (usize, (Input, _))| SharedRoute {
-            writer_sequences: input.writer_sequences(),
+            marks: input.marks(),
             input: Mutex::new(input),
             flag,
             skipped: AtomicBool::new(false),
@@ -67,6 +80,19 @@ impl Receiving {
         }
     }
 
+    /// What the DDS library's receiving thread calls: when a datagram arrives that seems to hold a sample,
+    /// with its writer, its sequence number and the bytes that are missing; and after the datagram was
+    /// received.
+    pub fn hooks(
+        self: &Arc<Self>,
+    ) -> (impl FnMut([u8; 16], i64, usize) + use<>, impl FnMut() -> bool + use<>) {
+        let (arriving, received) = (Arc::clone(self), Arc::clone(self));
+        let on_arriving = move |writer, sequence, left_bytes| {
+            arriving.wake_early(Guid(writer), sequence, left_bytes, this_cpu());
+        };
+        (on_arriving, move || received.turn(true))
+    }
+
     /// Wakes the critical lanes of a route early. A datagram has arrived that seems to hold a sample of
     /// `writer`, or a part of one of which `left_bytes` are missing, and `cpu` receives it. A sample that was
     /// received before wakes no lane: many publishers send each one to all addresses of this host. Returns
@@ -76,8 +102,9 @@ impl Receiving {
         if !self.pending_wake.may_claim(left_bytes) {
             return false;
         }
-        let is_new =
-            |shared: &SharedRoute| shared.is_critical && shared.writer_sequences.is_new(writer, sequence);
+        let is_new = |shared: &SharedRoute| {
+            shared.is_critical && shared.marks.find(writer).is_some_and(|(_, last)| sequence > last)
+        };
         let Some(route) = self.routes.iter().position(is_new) else {
             return false;
         };
@@ -93,34 +120,37 @@ impl Receiving {
         self.cpu.load(Ordering::Relaxed)
     }
 
-    /// Takes and publishes the samples that have arrived; on the receiving thread. Returns whether more may
-    /// wait.
-    pub fn turn(&self) -> bool {
+    /// Takes and publishes the samples that have arrived, up to `SAMPLES_PER_TURN` of each route. On the
+    /// receiving thread (`is_receiving`) it skips a locked route and wakes critical lanes early; on any other
+    /// thread it waits for the locks. Returns whether more may wait.
+    pub fn turn(&self, is_receiving: bool) -> bool {
         let cpu = this_cpu();
-        self.cpu.store(cpu, Ordering::Relaxed);
+        if is_receiving {
+            self.cpu.store(cpu, Ordering::Relaxed);
+        }
         let mut more = false;
-        for (route, shared) in self.routes.iter().enumerate() {
-            if shared.flag.is_raised()
-                && let Some(mut input) = shared.try_lock()
-            {
-                if shared.is_critical && self.pending_wake.take_pending(route) {
-                    self.wake_critical(route, cpu);
+        for (route, shared) in self.routes.iter().enumerate().filter(|(_, shared)| shared.flag.is_raised()) {
+            let input = if is_receiving { shared.try_lock() } else { Some(shared.lock()) };
+            let Some(mut input) = input else { continue };
+            if is_receiving && shared.is_critical && self.pending_wake.take_pending(route) {
+                self.wake_critical(route, cpu);
+            }
+            let mut left = SAMPLES_PER_TURN;
+            while left > 0 {
+                match input.step() {
+                    Step::Published => self.wake(route),
+                    Step::Discarded => {}
+                    Step::Empty => break,
                 }
-                more |= self.drain(route, &mut input);
+                left -= 1;
+            }
+            more |= left == 0;
+            if is_receiving {
                 self.pending_wake.end_late_claim(route);
             }
         }
-        self.pending_wake.count_turn();
-        more
-    }
-
-    /// Like [`turn`](Self::turn), but on any thread: waits for the locks, and wakes no lane early.
-    pub fn turn_blocking(&self) -> bool {
-        let mut more = false;
-        for (route, shared) in self.routes.iter().enumerate() {
-            if shared.flag.is_raised() {
-                more |= self.drain(route, &mut shared.lock());
-            }
+        if is_receiving {
+            self.pending_wake.count_turn();
         }
         more
     }
@@ -138,16 +168,6 @@ impl Receiving {
             ring |= shared.take_skipped() || shared.flag.is_raised();
         }
         outcome.map(|()| ring)
-    }
-
-    /// Takes and publishes up to `SAMPLES_PER_TURN` samples. Returns whether more may wait.
-    fn drain(&self, route: usize, input: &mut Input) -> bool {
-        for _ in 0..SAMPLES_PER_TURN {
-            if !input.step(|| self.wake(route)) {
-                return false;
-            }
-        }
-        true
     }
 
     /// Wakes the critical lanes that serve the route while its sample is being taken on `cpu`. A noncritical
@@ -196,5 +216,126 @@ impl SharedRoute {
     fn take_skipped(&self) -> bool {
         fence(Ordering::SeqCst);
         self.skipped.swap(false, Ordering::SeqCst)
+    }
+}
+
+/// The route whose lanes were woken for a sample that is not taken yet.
+pub(super) struct PendingWake {
+    /// The route and the turns that are left; [`NONE`]; or [`IN_VAIN`] if the lanes were woken and no sample
+    /// followed. Any thread may replace `NONE` with a route; only the receiving thread changes a route.
+    state: AtomicU64,
+}
+
+impl PendingWake {
+    pub fn new() -> Self {
+        Self { state: AtomicU64::new(NONE) }
+    }
+
+    /// Whether [`claim`](Self::claim) would return true, unless another thread calls it first.
+    pub fn may_claim(&self, left_bytes: usize) -> bool {
+        left_bytes <= LEFT_BYTES && self.state.load(Ordering::Relaxed) == NONE
+    }
+
+    /// Claims the early wake-up of the lanes of `route`, for a sample of which `left_bytes` are missing.
+    /// Returns whether the caller may wake them. The next claim succeeds only after a sample of a critical
+    /// route was taken, so that datagrams that only look like samples do not wake lanes repeatedly.
+    pub fn claim(&self, route: usize, left_bytes: usize) -> bool {
+        if left_bytes > LEFT_BYTES {
+            return false;
+        }
+        let turns = if left_bytes == 0 { TURNS_WHOLE } else { TURNS };
+        let state = ((route as u64) << ROUTE_SHIFT) | turns;
+        self.state.compare_exchange(NONE, state, Ordering::AcqRel, Ordering::Relaxed).is_ok()
+    }
+
+    /// Ends the claim, as `route` has a sample to take. Returns whether its lanes still have to be woken.
+    pub fn take_pending(&self, route: usize) -> bool {
+        self.state.swap(NONE, Ordering::AcqRel) >> ROUTE_SHIFT != route as u64
+    }
+
+    /// Ends a claim that the early waker made after [`take_pending`](Self::take_pending) for a sample that
+    /// has been taken by now.
+    pub fn end_late_claim(&self, route: usize) {
+        if self.state.load(Ordering::Relaxed) >> ROUTE_SHIFT == route as u64 {
+            self.state.store(NONE, Ordering::Release);
+        }
+    }
+
+    /// Counts a turn. If the sample does not arrive within the allowed turns, it may never arrive; the lanes,
+    /// which sleep again by then, are woken when the next sample is taken.
+    pub fn count_turn(&self) {
+        let state = self.state.load(Ordering::Relaxed);
+        if state == NONE || state == IN_VAIN {
+            return;
+        }
+        let turns_left = state & ((1 << ROUTE_SHIFT) - 1);
+        let then = if turns_left > 0 { state - 1 } else { IN_VAIN };
+        self.state.store(then, Ordering::Release);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_claimed_wake_up_is_not_repeated() {
+        let pending = PendingWake::new();
+        for _ in 0..3 {
+            assert!(pending.claim(7, 0));
+            assert!(!pending.claim(7, 0), "claimed already");
+            assert!(!pending.take_pending(7));
+            pending.count_turn();
+        }
+        assert!(pending.take_pending(7), "no claim");
+        assert!(pending.claim(7, 0));
+        assert!(pending.take_pending(8), "the claim is of another route");
+        assert!(pending.claim(0, 0) && !pending.take_pending(0));
+    }
+
+    #[test]
+    fn a_datagram_that_becomes_no_sample_wakes_once() {
+        let pending = PendingWake::new();
+        assert!(pending.claim(7, 0));
+        for _ in 0..=TURNS_WHOLE {
+            pending.count_turn();
+        }
+        for _ in 0..100 {
+            assert!(!pending.claim(7, 0));
+            pending.count_turn();
+        }
+        assert!(pending.take_pending(7), "the lanes sleep again by then");
+        pending.count_turn();
+        assert!(pending.claim(7, 0));
+    }
+
+    #[test]
+    fn the_early_waker_may_claim_during_a_turn() {
+        let pending = PendingWake::new();
+        assert!(pending.claim(7, 0));
+        pending.count_turn();
+        assert!(!pending.take_pending(7), "claimed, and awake");
+        assert!(pending.claim(7, 0), "the same sample, while it is taken");
+        pending.end_late_claim(8);
+        assert!(!pending.claim(7, 0), "the claim is not of route 8");
+        pending.end_late_claim(7);
+        assert!(pending.may_claim(0) && pending.claim(7, 0) && !pending.may_claim(0));
+    }
+
+    #[test]
+    fn the_missing_fragments_may_take_64_turns() {
+        let pending = PendingWake::new();
+        assert!(!pending.may_claim(LEFT_BYTES + 1) && !pending.claim(7, LEFT_BYTES + 1));
+        assert!(pending.claim(7, LEFT_BYTES));
+        for _ in 0..TURNS {
+            pending.count_turn();
+            assert!(!pending.claim(7, LEFT_BYTES));
+        }
+        assert!(!pending.take_pending(7), "in time");
+        assert!(pending.claim(7, LEFT_BYTES));
+        for _ in 0..=TURNS {
+            pending.count_turn();
+        }
+        assert!(pending.take_pending(7), "too late");
     }
 }

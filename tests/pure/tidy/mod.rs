@@ -8,5 +8,6 @@
 mod dependencies;
 mod docs;
 mod layers;
+mod path;
 mod source;
 mod text;

@@ -19,7 +19,7 @@ use std::{
 
 use mio1::{Poll, Token, Waker};
 
-use crate::structure::guid::{EntityId, GUID};
+use crate::structure::guid::EntityId;
 
 /// One waker for one `Poll`. Share clones freely. `wake` before [`install`](Self::install)
 /// is a no-op; the event loop drains its queues once after installing so anything
@@ -87,7 +87,7 @@ pub(crate) struct Hooks {
   /// See `DomainParticipantBuilder::on_received`.
   pub on_received: Option<Box<dyn FnMut() -> bool + Send>>,
   /// See `DomainParticipantBuilder::on_sample_arriving`.
-  pub on_sample_arriving: Option<Box<dyn FnMut(GUID, i64, usize) + Send>>,
+  pub on_sample_arriving: Option<Box<dyn FnMut([u8; 16], i64, usize) + Send>>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

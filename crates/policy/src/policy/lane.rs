@@ -241,17 +241,6 @@ pub const fn mode_and_source(
     if confirmed && floor as u8 > mode as u8 { (floor, ModeSource::Safety) } else { (mode, source) }
 }
 
-/// The mode of [`mode_and_source`].
-#[inline]
-pub const fn effective_mode(
-    policy: &LanePolicy,
-    class: TrafficClass,
-    now: MonotonicNs,
-    policy_hold_ms: u64,
-) -> LaneMode {
-    mode_and_source(policy, class, now, policy_hold_ms).0
-}
-
 /// The mode with that number; an undefined number, which only a foreign process can write, counts as normal.
 const fn mode_of(number: u8) -> LaneMode {
     match LaneMode::from_u8(number) {
@@ -264,6 +253,15 @@ const fn mode_of(number: u8) -> LaneMode {
 mod tests {
     use super::*;
     use crate::model::{DropPolicy, SourceTimestamp};
+
+    fn effective_mode(
+        policy: &LanePolicy,
+        class: TrafficClass,
+        now: MonotonicNs,
+        policy_hold_ms: u64,
+    ) -> LaneMode {
+        mode_and_source(policy, class, now, policy_hold_ms).0
+    }
 
     const RATES: LaneRates = LaneRates {
         normal: RatePolicy {

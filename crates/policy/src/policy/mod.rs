@@ -7,7 +7,7 @@
 //! - [`ClockOffset`]: whether a publisher's clock disagrees with this host's.
 //! - [`LaneQueue`]: which samples wait in a noncritical lane, and which it drops.
 //! - [`RouteShaper`]: rate, queue and staleness of one route on a noncritical lane.
-//! - [`critical_drop`] and [`effective_mode`]: whether a critical lane drops a sample, and which mode
+//! - [`critical_drop`] and [`mode_and_source`]: whether a critical lane drops a sample, and which mode
 //!   applies.
 //! - [`SequenceTracker`]: missing samples, by their sequence numbers.
 //! - [`publisher_place`]: which account a new publisher replaces.
@@ -51,9 +51,7 @@ pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
     NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
-pub use lane::{
-    Decision, ModeSource, PollOrder, RouteShaper, critical_drop, effective_mode, mode_and_source,
-};
+pub use lane::{Decision, ModeSource, PollOrder, RouteShaper, critical_drop, mode_and_source};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
 pub use locality::{Locality, Location};

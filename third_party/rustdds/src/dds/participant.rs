@@ -206,13 +206,13 @@ impl DomainParticipantBuilder {
 
   /// Lets the participant's event loop call `hook` when it has a datagram that
   /// holds a sample of a user's writer or a part of one, before it looks who wants
-  /// it: some microseconds before that of [`Self::on_received`]. The writer, its
+  /// it: some microseconds before that of [`Self::on_received`]. The writer's GUID, its
   /// sequence number, and how many bytes of the sample come after this datagram,
   /// are what the datagram claims; nothing was checked. The rules for that hook
   /// hold.
   pub fn on_sample_arriving(
     mut self,
-    hook: impl FnMut(GUID, i64, usize) + Send + 'static,
+    hook: impl FnMut([u8; 16], i64, usize) + Send + 'static,
   ) -> Self {
     self.hooks.on_sample_arriving = Some(Box::new(hook));
     self

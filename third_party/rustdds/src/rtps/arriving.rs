@@ -7,10 +7,7 @@
 use crate::{
   messages::submessages::submessage_kind::SubmessageKind,
   rtps::message::{RTPS_MESSAGE_HEADER_SIZE, SUBMESSAGE_HEADER_SIZE},
-  structure::{
-    guid::{EntityKind, GUID},
-    sequence_number::SequenceNumber,
-  },
+  structure::{guid::EntityKind, sequence_number::SequenceNumber},
 };
 
 // RTPS 2.5, clause 9.4.4: the header ends with the prefix of the sender's GUID.
@@ -33,17 +30,18 @@ const FRAGMENTS_AT: usize = DATA_WRITER_AT + ENTITY_ID_BYTES + 8;
 /// What a datagram seems to hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Arriving {
-  pub writer: GUID,
+  // Its GUID.
+  pub writer: [u8; PREFIX_BYTES + ENTITY_ID_BYTES],
   pub number: SequenceNumber,
   // Bytes of the sample behind what this datagram has of it; of a whole one none.
   pub left_bytes: u32,
 }
 
-/// The writer of the first sample in a datagram, if it holds one of a user's
-/// writer or a part of one, the sample's sequence number, and how many of its
-/// bytes come after this datagram: what the datagram claims; nothing is checked.
-/// The datagram's first 256 bytes are enough, as a rule.
-pub fn sample_arriving(datagram: &[u8]) -> Option<(GUID, i64, usize)> {
+/// The GUID of the writer of the first sample in a datagram, if it holds one of a
+/// user's writer or a part of one, the sample's sequence number, and how many of
+/// its bytes come after this datagram: what the datagram claims; nothing is
+/// checked. The datagram's first 256 bytes are enough, as a rule.
+pub fn sample_arriving(datagram: &[u8]) -> Option<([u8; 16], i64, usize)> {
   let arriving = sample_in(datagram)?;
   Some((arriving.writer, arriving.number.into(), arriving.left_bytes as usize))
 }
@@ -77,7 +75,7 @@ pub(crate) fn sample_in(datagram: &[u8]) -> Option<Arriving> {
       let number = SequenceNumber::from((i64::from(high) << 32) | i64::from(low));
       let left_bytes = if is_fragment { words.left_bytes()? } else { 0 };
       return is_of_a_user.then(|| Arriving {
-        writer: GUID::from_bytes(guid),
+        writer: guid,
         number,
         left_bytes,
       });
@@ -201,9 +199,8 @@ mod tests {
   #[test]
   fn a_sample_is_found_behind_what_comes_before_it() {
     let writer = [&[9; PREFIX_BYTES][..], &[1, 2, 3, USER_WRITER]].concat();
-    let writer = GUID::from_bytes(writer.try_into().unwrap());
     let expected = Some(Arriving {
-      writer,
+      writer: writer.try_into().unwrap(),
       number: SequenceNumber::from((1_i64 << 32) + 5),
       left_bytes: 0,
     });

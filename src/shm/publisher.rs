@@ -1,0 +1,228 @@
+//! The publisher of a route's channel, and the slots of its pool that ingress loans: it writes a payload,
+//! then publishes the slot.
+
+use std::ptr::NonNull;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::{LoanError as IceoryxLoanError, update_connections::UpdateConnections};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy};
+use iceoryx2::sample_mut::SampleMut;
+
+use super::channel::{LENT_SLOTS, LOANED_SLOTS, RouteChannel};
+use super::error::ShmError;
+use super::header::WireHeader;
+use super::node::{NodeShared, ShmNode, StartLock, failed};
+use super::service::Service;
+use crate::model::SampleHeader;
+
+/// Why a sample could not be copied into shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum LoanError {
+    /// The payload is larger than the route allows.
+    #[error("the sample has {len} bytes, at most {max} are allowed")]
+    TooLarge {
+        /// The size of the payload in bytes.
+        len: usize,
+        /// The largest size that the route allows.
+        max: usize,
+    },
+    /// No slot is free: a process holds more slots than its limit.
+    #[error("no free slot in the route's pool")]
+    PoolExhausted,
+    /// iceoryx2 failed.
+    #[error("cannot get a slot: {0}")]
+    Failed(&'static str),
+}
+
+/// Why a sample could not be published.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PublishError {
+    /// iceoryx2 failed; the sample was delivered to some of the subscribers or to none.
+    #[error("not published to all subscribers: {0}")]
+    Failed(&'static str),
+}
+
+/// The publisher of a route's channel, which ingress holds.
+#[derive(Debug)]
+pub struct SamplePublisher {
+    // Declared first, so that the port is dropped before the membership that it needs.
+    port: Publisher<Service, [u8], WireHeader>,
+    max_sample_bytes: usize,
+    lent: Arc<AtomicUsize>,
+    node: Arc<NodeShared>,
+}
+
+impl SamplePublisher {
+    /// Allocates the whole pool and connects to the present subscribers.
+    pub fn create(node: &ShmNode, channel: &RouteChannel) -> Result<Self, ShmError> {
+        let shared = node.shared();
+        let pool = channel.pool_size();
+        let what = format!("the sample pool of route {} ({} slots)", channel.route, pool.slots);
+        let start = StartLock::take(shared.dir())?;
+        let factory = channel.open(shared, &start)?;
+        shared.require_free(pool.bytes, &what)?;
+        let create = || {
+            factory
+                .publisher_builder()
+                .initial_max_slice_len(channel.max_sample_bytes)
+                .allocation_strategy(AllocationStrategy::Static)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .max_loaned_samples(LOANED_SLOTS)
+                // By default iceoryx2 reserves the largest queue for every subscriber.
+                .override_sample_preallocation(move |_| pool.slots)
+                .create()
+        };
+        let port = match create() {
+            // A dead predecessor counts until it is cleaned up.
+            Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
+                shared.clean_up(&start);
+                create()
+            }
+            other => other,
+        };
+        let port = port.map_err(|error| match error {
+            PublisherCreateError::UnableToCreateDataSegment => ShmError::NoRoom {
+                what: what.clone(),
+                needed_bytes: pool.bytes,
+                free_bytes: super::segment::free_bytes(),
+                path: super::root::SHM_DIR.into(),
+            },
+            other => failed(shared.dir(), &format!("to create {what}"), &other),
+        })?;
+        shared.commit(&what)?;
+        Ok(Self {
+            port,
+            max_sample_bytes: channel.max_sample_bytes,
+            lent: Arc::default(),
+            node: shared.clone(),
+        })
+    }
+
+    /// The largest payload that the route allows, in bytes.
+    pub fn max_sample_bytes(&self) -> usize {
+        self.max_sample_bytes
+    }
+
+    /// Copies a payload into a free slot, which is the only copy in ingress. Neither allocates nor waits.
+    pub fn copy_in(&self, payload: &[u8]) -> Result<Slot, LoanError> {
+        let too_large = LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes };
+        if payload.len() > self.max_sample_bytes {
+            return Err(too_large);
+        }
+        match self.port.loan_slice_uninit(payload.len()) {
+            Ok(slot) => Ok(Slot { sample: slot.write_from_slice(payload) }),
+            Err(IceoryxLoanError::OutOfMemory) => Err(LoanError::PoolExhausted),
+            Err(IceoryxLoanError::ExceedsMaxLoanSize) => Err(too_large),
+            Err(IceoryxLoanError::ExceedsMaxLoans) => {
+                Err(LoanError::Failed("ingress holds too many unpublished slots"))
+            }
+            Err(IceoryxLoanError::InternalFailure) => Err(LoanError::Failed("internal failure of iceoryx2")),
+        }
+    }
+
+    /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot is free,
+    /// too many are lent, or the route does not allow that length. The slot contains bytes of an older
+    /// sample.
+    ///
+    /// May be called on any thread. It waits for no other process, but iceoryx2 takes a lock, so it waits for
+    /// a thread of this process that is in [`connect_subscribers`](Self::connect_subscribers).
+    pub fn lend(&self, len: usize) -> Option<LentSlot> {
+        if len > self.max_sample_bytes {
+            return None;
+        }
+        let permit = LentPermit::take(&self.lent)?;
+        let slot = self.port.loan_slice_uninit(len).ok()?;
+        // SAFETY: any byte is a valid `u8`, and the bytes of the pool, a mapped file with all its pages, are
+        // initialised: by the kernel with zeros, or by an older sample.
+        let sample = unsafe { slot.assume_init() };
+        Some(LentSlot::new(sample, permit, self.node.clone()))
+    }
+
+    /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
+    /// subscribers that have left. Publishing does the same; on a route where nothing is published, call this
+    /// periodically, for example 10 times a second. Cheap when nothing has changed.
+    pub fn connect_subscribers(&self) {
+        // iceoryx2 logs a failed connection to a subscriber, and still connects to the others.
+        let _ = self.port.update_connections();
+    }
+}
+
+/// A slot with a complete payload that is not published yet. Dropping it frees the slot.
+#[derive(Debug)]
+pub struct Slot {
+    sample: SampleMut<Service, [u8], WireHeader>,
+}
+
+impl Slot {
+    /// Publishes the payload and returns the number of subscribers that received it. Never waits: a full
+    /// queue drops its oldest sample.
+    pub fn publish(mut self, header: SampleHeader) -> Result<usize, PublishError> {
+        *self.sample.user_header_mut() = WireHeader(header);
+        self.sample.send().map_err(|_| PublishError::Failed("a connection of iceoryx2 is broken"))
+    }
+}
+
+/// A slot that is lent to the DDS library, which writes its payload. Dropping it frees the slot.
+#[derive(Debug)]
+pub struct LentSlot {
+    payload: NonNull<u8>,
+    length: usize,
+    slot: Slot,
+    // Declared after `slot`, so that the slot is free before the permit is returned.
+    _permit: LentPermit,
+    // Keeps the membership, because the slot may outlive the publisher.
+    _node: Arc<NodeShared>,
+}
+
+// SAFETY: the pointer is the only field that is not `Send` by itself; the bytes are in a mapping that `slot`
+// keeps, not in memory of a thread, and only the owner accesses them.
+unsafe impl Send for LentSlot {}
+
+impl LentSlot {
+    /// Stores the address of the payload, because iceoryx2 takes a lock for each access to it.
+    fn new(
+        mut sample: SampleMut<Service, [u8], WireHeader>,
+        permit: LentPermit,
+        node: Arc<NodeShared>,
+    ) -> Self {
+        let payload = sample.payload_mut();
+        let length = payload.len();
+        // For an empty payload this is a dangling address.
+        let payload = NonNull::from(payload).cast();
+        Self { payload, length, slot: Slot { sample }, _permit: permit, _node: node }
+    }
+
+    /// The payload, for writing.
+    pub fn payload_mut(&mut self) -> &mut [u8] {
+        // SAFETY: `length` bytes of the slot, which is mapped as long as `slot` lives, and which no other
+        // code accesses before it is published, which consumes `self`.
+        unsafe { std::slice::from_raw_parts_mut(self.payload.as_ptr(), self.length) }
+    }
+
+    /// Returns the slot, with its payload, for publishing.
+    pub fn into_slot(self) -> Slot {
+        self.slot
+    }
+}
+
+/// The permission to lend one of the [`LENT_SLOTS`]; returned when dropped.
+#[derive(Debug)]
+struct LentPermit(Arc<AtomicUsize>);
+
+impl LentPermit {
+    fn take(lent: &Arc<AtomicUsize>) -> Option<Self> {
+        if lent.fetch_add(1, Ordering::Acquire) >= LENT_SLOTS {
+            lent.fetch_sub(1, Ordering::Relaxed);
+            return None;
+        }
+        Some(Self(lent.clone()))
+    }
+}
+
+impl Drop for LentPermit {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Release);
+    }
+}
