@@ -325,6 +325,22 @@ mod tests {
         assert!(simulation.clock.offset_ns().is_some());
     }
 
+    #[test]
+    fn a_base_takes_both_a_number_of_samples_and_a_time() {
+        let mut simulation = Simulation::of(5_000);
+        for number in 0..i64::from(STEADY_SAMPLES) + 5 {
+            simulation.sample(number, 2);
+        }
+        assert_eq!(simulation.clock.offset_ns(), None, "many samples within milliseconds");
+        let mut simulation = Simulation::of(5_000);
+        let steady_ms = i64::try_from(STEADY_MS).unwrap();
+        simulation.sample(0, 2);
+        simulation.sample(steady_ms + 1, 2);
+        assert_eq!(simulation.clock.offset_ns(), None, "two samples");
+        let last = simulation.clock.last_at();
+        assert_eq!(last, Some(MonotonicNs((1_000 + STEADY_MS + 3) * 1_000_000)));
+    }
+
     proptest! {
         #[test]
         fn any_offset_with_jitter_is_found_and_any_late_sample_is_late(
