@@ -555,3 +555,24 @@ fn each_degraded_threshold_of_safety_is_below_its_emergency_threshold() {
         assert!(matches!(&found[..], [only] if only.ends_with(message)), "{found:?}");
     }
 }
+
+#[test]
+fn values_at_a_limit_are_accepted_and_converted() {
+    let settings = with("probes: {rate_hz: 20}\nsecurity: {max_probe_rate_hz: 20}\n");
+    assert_eq!((settings.probes.rate_hz, settings.security.max_probe_rate_hz), (20.0, 20));
+    assert_eq!(with("diagnostics: {publish_interval_s: 2.5}\n").diagnostics.publish_interval_ms, 2_500);
+    assert_eq!(with("classifier: {subscriber_id: ''}\n").classifier.subscriber_id, None);
+    assert_eq!(with("classifier: {subscriber_id: rviz}\n").classifier.subscriber_id.as_deref(), Some("rviz"));
+}
+
+#[test]
+fn the_variable_of_the_secret_has_the_name_of_a_variable() {
+    for name in ["PROBE_SECRET", "_a1"] {
+        let source = with(&format!("security: {{hmac_secret_env: {name}}}\n")).security.secret;
+        assert_eq!(source, Some(SecretSource::Environment(name.to_owned())));
+    }
+    for name in ["''", "1A", "A-B", "'A B'"] {
+        let found = messages(&format!("{TOPIC}security: {{hmac_secret_env: {name}}}\n"));
+        assert!(found.iter().any(|line| line.contains("the name of an environment variable")), "{found:?}");
+    }
+}

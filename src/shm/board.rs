@@ -427,3 +427,63 @@ impl HistogramWriter {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Where each record of each board is: its first word and its words.
+    fn records(layout: &Layout) -> Vec<(usize, usize)> {
+        fn place<T: Plain>(cell: Cell<T>) -> (usize, usize) {
+            (cell.at, Cell::<T>::WORDS)
+        }
+        let (lanes, routes) = (layout.lanes, layout.routes);
+        let mut found = vec![
+            place(layout.health(ProcessRole::Ingress)),
+            place(layout.health(ProcessRole::Control)),
+            place(layout.control()),
+        ];
+        for lane in 0..lanes {
+            found.push((layout.wake(lane), LINE));
+            found.push(place(layout.health(ProcessRole::Egress(lane))));
+            found.push(place(layout.policy(lane)));
+        }
+        found.extend((0..MAX_SUBSCRIBERS).map(|index| place(layout.subscriber(index))));
+        found.extend((0..MAX_INTRUDERS).map(|index| place(layout.intruder(index))));
+        found.extend((0..MAX_NAMED_ENDPOINTS).map(|index| place(layout.named_endpoint(index))));
+        found.extend((0..MAX_ABSENCES).map(|index| place(layout.absence(index))));
+        for route in 0..routes {
+            found.push(place(layout.route_info(route)));
+            found.push(place(layout.ingress(route)));
+            found.extend((0..MAX_PUBLISHERS).map(|index| place(layout.publisher(route, index))));
+            let mut stages = vec![Stage::DdsIn];
+            for lane in 0..lanes {
+                found.push(place(layout.lane(lane, route)));
+                found.push(place(layout.output_readers(lane, route)));
+                stages.extend([Stage::Shm(lane), Stage::DdsOut(lane), Stage::Age(lane)]);
+            }
+            let words = size_of::<LatencyHistogram>().div_ceil(8).next_multiple_of(LINE);
+            found.extend(stages.into_iter().map(|stage| (layout.histogram(stage, route), words)));
+        }
+        found.sort_unstable();
+        found
+    }
+
+    #[test]
+    fn the_boards_fill_the_segment_without_gap_or_overlap() {
+        for (lanes, routes) in [(2, 1), (2, 3), (5, 4)] {
+            let shape = BridgeShape {
+                lanes: (0..lanes).map(|n| LaneName::try_from(&*format!("l{n}")).unwrap()).collect(),
+                routes: (0..routes).map(|n| RouteId::try_from(&*format!("r{n}")).unwrap()).collect(),
+            };
+            let layout = Layout::of(&shape);
+            // The first line has the magic number and the fingerprint.
+            let mut next = LINE;
+            for (first, words) in records(&layout) {
+                assert_eq!(first, next, "{lanes} lanes, {routes} routes");
+                next = first + words;
+            }
+            assert_eq!(next, layout.words);
+        }
+    }
+}

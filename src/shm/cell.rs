@@ -81,7 +81,7 @@ const _: () = {
 /// lines.
 #[derive(Debug)]
 pub(super) struct Cell<T> {
-    at: usize,
+    pub(super) at: usize,
     _type: PhantomData<T>,
 }
 

@@ -25,14 +25,53 @@ const HOSTILE: &str = "x\"} 1\nadaptive_bridge_info{a=\"\\";
 /// A bridge of one route, its critical lane and one subscriber.
 fn report() -> Report {
     let at = MonotonicNs(100_000_000_000);
-    let health = ProcessHealth { pid: 7, alive_at: at, starts: 3, ..ProcessHealth::default() };
-    let mut ingress = IngressCounters { received: 103, published: 100, writers: 1, ..Default::default() };
+    // Each figure has a value of its own, so that no other one can stand for it.
+    let health = ProcessHealth {
+        pid: 7,
+        alive_at: at,
+        starts: 3,
+        turns: 4_000,
+        errors: 5,
+        refused_reloads: 6,
+        ..ProcessHealth::default()
+    };
+    let mut ingress = IngressCounters {
+        received: 103,
+        received_bytes: 10_300,
+        published: 100,
+        in_place: 41,
+        lost_upstream: 42,
+        repeated: 43,
+        unmarked: 44,
+        writers: 1,
+        ..Default::default()
+    };
     ingress.drops.add(DropReason::TooLarge, 3);
+    let mut lane = LaneCounters {
+        first_sequence: 1,
+        last_sequence: 100,
+        forwarded: 90,
+        forwarded_bytes: 9_000,
+        by_reference: 21,
+        caught_up: 22,
+        waiting: 4,
+        readers: 2,
+        reader_overrun: 23,
+        ..LaneCounters::default()
+    };
+    lane.drops.add(DropReason::LaneDown, 5);
     let mut latency = LatencyHistogram::default();
     for latency_us in 1..=100 {
         latency.record(latency_us * 10_000);
     }
-    let mut control = ControlRecord { probes_sent: 50, subscribers: 1, ..ControlRecord::default() };
+    let mut control = ControlRecord {
+        probes_sent: 50,
+        responses_accepted: 49,
+        safety_transitions: 8,
+        intruders_seen: 9,
+        subscribers: 1,
+        ..ControlRecord::default()
+    };
     control.refused.add(ProbeRefusal::Replayed, 1);
     let subscriber = SubscriberRecord {
         id: FixedText::new("laptop"),
@@ -73,7 +112,7 @@ fn report() -> Report {
                 lane: 0,
                 topic: TopicName::try_from("/critical/scan").unwrap(),
                 readers: Default::default(),
-                counters: LaneCounters { last_sequence: 100, forwarded: 100, ..LaneCounters::default() },
+                counters: lane,
                 shm: latency,
                 dds_out: LatencyHistogram::default(),
                 age: latency,
@@ -134,7 +173,36 @@ fn the_parser_of_prometheus_reads_the_page() {
         let sample = all.find(|one| one[0] == name && has(one));
         sample.unwrap_or_else(|| panic!("{name} {labels:?}"))[2].as_str().unwrap().parse().unwrap()
     };
-    assert_eq!(value("adaptive_bridge_route_received_samples_total", &[("route", "scan")]), 103.0);
+    for (name, expected) in [
+        ("process_starts_total", 3.0),
+        ("process_turns_total", 4_000.0),
+        ("process_errors_total", 5.0),
+        ("process_refused_reloads_total", 6.0),
+        ("route_publishers", 1.0),
+        ("route_received_samples_total", 103.0),
+        ("route_received_bytes_total", 10_300.0),
+        ("route_published_samples_total", 100.0),
+        ("route_in_place_samples_total", 41.0),
+        ("route_lost_upstream_samples_total", 42.0),
+        ("route_repeated_samples_total", 43.0),
+        ("route_unmarked_samples_total", 44.0),
+        ("lane_subscribers", 2.0),
+        ("lane_reader_overrun_samples_total", 23.0),
+        ("lane_offered_samples_total", 99.0),
+        ("lane_forwarded_samples_total", 90.0),
+        ("lane_forwarded_bytes_total", 9_000.0),
+        ("lane_by_reference_samples_total", 21.0),
+        ("lane_caught_up_samples_total", 22.0),
+        ("lane_waiting_samples", 4.0),
+        ("probes_sent_total", 50.0),
+        ("probe_responses_total", 49.0),
+        ("safety_changes_total", 8.0),
+        ("intruders_seen_total", 9.0),
+    ] {
+        assert_eq!(value(&format!("adaptive_bridge_{name}"), &[]), expected, "{name}");
+    }
+    let lane_down = [("lane", "critical"), ("route", "scan"), ("reason", "lane_down")];
+    assert_eq!(value("adaptive_bridge_lane_dropped_samples_total", &lane_down), 5.0);
     let too_large = [("route", "scan"), ("reason", "too_large")];
     assert_eq!(value("adaptive_bridge_route_dropped_samples_total", &too_large), 3.0);
     assert_eq!(value("adaptive_bridge_lane_mode", &[("lane", "critical"), ("mode", "degraded")]), 1.0);

@@ -10,6 +10,7 @@ use adaptive_bridge::clock;
 use adaptive_bridge::config::{DdsNetwork, SecretSource, Security, TrustMode};
 use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, Take, WriterEvent};
 use adaptive_bridge::model::{Encapsulation, SourceTimestamp, WallNs};
+use adaptive_bridge::policy::burst_for;
 use adaptive_bridge::process::probes::{
     PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse, Trust,
 };
@@ -310,6 +311,25 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     }
     responder.wait_for_log("reason=\"rate_limited\"");
     bad.assert_unanswered("bad");
+    // Nor is a sender with the secret answered beyond its rate of 20 a second.
+    let mut greedy = Asker::join(net.host("bridge"), "greedy");
+    let began = Instant::now();
+    for _ in 0..500 {
+        let mut request = greedy.request();
+        bridge.sign(&mut request);
+        greedy.send_payload(request.encode());
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    good.ask(|mut request| {
+        bridge.sign(&mut request);
+        request
+    });
+    let answers = greedy.decoded().iter().filter(|it| it.probe_id.to_string().starts_with("greedy")).count();
+    let bound = 20.0 * began.elapsed().as_secs_f64() + burst_for(20.0);
+    assert!(
+        answers > 0 && (answers as f64) <= bound,
+        "{answers} of 500 requests answered, at most {bound:.0}"
+    );
     let grown = memory_kib(responder.pid().as_raw(), "VmRSS") - before;
     assert!(grown < 32 << 10, "{grown} KiB more");
     // What was recorded was answered once.

@@ -1,7 +1,7 @@
 """The probing side of the original Python package, as it appears on the wire (rclpy): QoS depth 10, RELIABLE.
 
-`responder` answers each request. `bridge` sends ten requests a second. Both print the number of messages received
-after each one.
+`responder` answers each request. `bridge` sends ten requests a second. Both print the number of messages
+that are for them, and end at a message of another version.
 """
 
 import argparse
@@ -29,8 +29,12 @@ class Side(Node):
         self.create_subscription(String, reads, self.on_message, QOS)
 
     def on_message(self, message):
+        fields = json.loads(message.data)
+        if fields["v"] != 1:
+            raise ValueError(fields)
+        if not self.receive(fields):
+            return
         self.received += 1
-        self.receive(json.loads(message.data))
         sys.stdout.write(json.dumps({"received": self.received}) + "\n")
         sys.stdout.flush()
 
@@ -49,6 +53,7 @@ class Responder(Side):
             "v": 1, "seq": request["seq"], "probe_id": request["probe_id"], "recv_time_ns": now_ns,
             "reply_time_ns": now_ns, "response_send_time_ns": time.time_ns(), "responder_id": self.responder_id,
         })
+        return True
 
 
 class Bridge(Side):
@@ -65,7 +70,8 @@ class Bridge(Side):
         })
 
     def receive(self, response):
-        pass
+        # Responses to the bridge under test arrive, too.
+        return response["seq"] <= self.seq and response["probe_id"] == f"original-{response['seq']}"
 
 
 def main():

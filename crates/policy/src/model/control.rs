@@ -234,4 +234,43 @@ mod tests {
         subscriber.lost = u64::MAX;
         assert_eq!(subscriber.loss(), Some(1.0));
     }
+
+    #[test]
+    fn numbers_of_the_boards_are_read_as_modes_states_and_kinds() {
+        let mut control = ControlRecord { safety: SafetyMode::Emergency as u8, ..Default::default() };
+        assert_eq!(control.safety(), SafetyMode::Emergency);
+        control.safety = 200;
+        assert_eq!(control.safety(), SafetyMode::Normal, "an undefined number");
+        let state = SubscriberState::Noncritical;
+        let mut subscriber = SubscriberRecord { state: state as u8, ..Default::default() };
+        assert_eq!(subscriber.state(), state);
+        subscriber.state = 200;
+        assert_eq!(subscriber.state(), SubscriberState::Unknown, "an undefined number");
+        let mut absence = AbsenceRecord::default();
+        for (number, kind) in [(0, AbsenceKind::Interface), (1, AbsenceKind::Peer), (2, AbsenceKind::Peer)] {
+            absence.kind = number;
+            assert_eq!(absence.kind(), kind, "{number}");
+        }
+    }
+
+    #[test]
+    fn warnings_are_the_bits_of_the_record() {
+        let mut subscriber = SubscriberRecord::default();
+        assert_eq!(subscriber.warnings().count(), 0);
+        subscriber.warnings = 0b101;
+        let labels: Vec<_> = subscriber.warnings().map(SubscriberWarning::label).collect();
+        assert_eq!(labels, ["rtt", "jitter"]);
+        assert_eq!(SubscriberWarning::Loss.label(), "loss");
+    }
+
+    #[test]
+    fn an_absence_lasts_from_its_beginning_until_the_peer_is_back() {
+        let mut absence = AbsenceRecord::default();
+        assert!(!absence.is_away(), "a free record");
+        absence.since = MonotonicNs(1);
+        assert!(absence.is_away());
+        absence.back_at = MonotonicNs(2);
+        assert!(!absence.is_away());
+        assert_eq!((AbsenceKind::Interface.label(), AbsenceKind::Peer.label()), ("interface", "peer"));
+    }
 }

@@ -188,4 +188,23 @@ mod tests {
         let since: Vec<_> = now.since(&earlier).iter().collect();
         assert_eq!(since, [(DropReason::Stale, 3)]);
     }
+
+    #[test]
+    fn merged_counts_are_added_reason_by_reason() {
+        let (mut counts, mut more) = (DropCounts::default(), DropCounts::default());
+        counts.add(DropReason::Stale, 2);
+        more.add(DropReason::Stale, 3);
+        more.add(DropReason::NoReader, 4);
+        counts.merge(&more);
+        let merged: Vec<_> = counts.iter().collect();
+        assert_eq!(merged, [(DropReason::NoReader, 4), (DropReason::Stale, 5)]);
+    }
+
+    #[test]
+    fn without_an_earlier_reading_there_is_no_difference() {
+        let mut now = DropCounts::default();
+        now.add(DropReason::Stale, 5);
+        assert_eq!(now.since_reading(None), DropCounts::default());
+        assert_eq!(now.since_reading(Some(DropCounts::default())), now);
+    }
 }

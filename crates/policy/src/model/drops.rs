@@ -56,3 +56,21 @@ impl DropReason {
 
 /// Counts of dropped samples by reason.
 pub type DropCounts = Counts<DropReason, { DropReason::COUNT }>;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use DropReason::{NoReader, QueueFull, Stopped, Superseded, Suspended};
+
+    #[test]
+    fn a_critical_lane_expects_fewer_drops_than_a_noncritical_one() {
+        let expected = |class| -> Vec<DropReason> {
+            DropReason::ALL.iter().copied().filter(|reason| reason.is_expected(class)).collect()
+        };
+        assert_eq!(expected(TrafficClass::Critical), [NoReader, Stopped]);
+        assert_eq!(
+            expected(TrafficClass::Noncritical),
+            [NoReader, Superseded, QueueFull, Suspended, Stopped]
+        );
+    }
+}

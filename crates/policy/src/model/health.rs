@@ -458,4 +458,38 @@ mod tests {
         let long = "ä".repeat(100);
         assert_eq!(FixedText::new(&long).as_str(), "ä".repeat(63));
     }
+
+    #[test]
+    fn an_account_counts_the_sequence_numbers_that_its_publisher_skipped() {
+        let mut account = PublisherAccount::new(Guid([1; 16]), 5);
+        assert!(!account.is_vacant() && PublisherAccount::default().is_vacant());
+        let skipped = [5, 6, 10].map(|sequence| account.take(sequence, MonotonicNs(sequence.unsigned_abs())));
+        assert_eq!(skipped, [0, 0, 3]);
+        assert_eq!((account.received, account.lost_upstream), (3, 3));
+        assert_eq!((account.last_sequence, account.last_at), (10, MonotonicNs(10)));
+        account.take(i64::MAX, MonotonicNs(11));
+        assert_eq!(account.lost_upstream, 3 + i64::MAX.unsigned_abs() - 11);
+    }
+
+    #[test]
+    fn a_clock_that_is_ahead_has_a_positive_offset() {
+        let mut counters = IngressCounters::default();
+        assert_eq!(counters.clock_offset_s(), None);
+        counters.clock_offset_ns = -2_500_000_000;
+        assert_eq!(counters.clock_offset_s(), Some(2.5));
+        counters.clock_offset_ns = 500_000_000;
+        assert_eq!(counters.clock_offset_s(), Some(-0.5));
+    }
+
+    #[test]
+    fn a_difference_of_histograms_has_the_latencies_since_the_earlier_one() {
+        let mut histogram = LatencyHistogram::default();
+        histogram.record(5_000_000);
+        let earlier = histogram;
+        histogram.record(2_000_000);
+        histogram.record(2_000_000);
+        let since = histogram.since(&earlier);
+        let counts: Vec<_> = since.buckets().filter(|&(_, count)| count > 0).collect();
+        assert!(matches!(counts[..], [(edge, 2)] if (2_000_000..2_130_000).contains(&edge)), "{counts:?}");
+    }
 }

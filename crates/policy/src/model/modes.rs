@@ -119,4 +119,10 @@ mod tests {
         }
         assert_eq!(LaneMode::from_u8(4), None);
     }
+
+    #[test]
+    fn classes_are_shown_by_their_labels() {
+        let labels = [TrafficClass::Critical, TrafficClass::Noncritical].map(|class| class.to_string());
+        assert_eq!(labels, ["critical", "noncritical"]);
+    }
 }

@@ -228,4 +228,14 @@ mod tests {
         let error = LaneName::try_from("Rviz").unwrap_err().to_string();
         assert!(error.contains("lane name") && error.contains("a-z"), "{error}");
     }
+
+    #[test]
+    fn route_ids_have_1_to_64_letters_digits_and_three_signs() {
+        for right in ["a", "2", "scan_2-b.c", "A", &"x".repeat(64)] {
+            assert_eq!(RouteId::try_from(right).map(|id| id.to_string()), Ok(right.to_owned()));
+        }
+        for wrong in ["", "a b", "a/b", "ä", &"x".repeat(65)] {
+            assert!(RouteId::try_from(wrong).is_err(), "{wrong:?}");
+        }
+    }
 }

@@ -72,3 +72,20 @@ impl QosProfile {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_classes_have_the_qos_of_the_paper() {
+        let (critical, noncritical) = (QosProfile::CRITICAL, QosProfile::NONCRITICAL);
+        assert_eq!((critical.reliability, critical.depth()), (Reliability::Reliable, Some(10)));
+        assert_eq!((noncritical.reliability, noncritical.depth()), (Reliability::BestEffort, Some(5)));
+        assert_eq!(
+            (critical.durability, noncritical.durability),
+            (Durability::Volatile, Durability::Volatile)
+        );
+        assert_eq!(QosProfile { history: History::KeepAll, ..critical }.depth(), None);
+    }
+}

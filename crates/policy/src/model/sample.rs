@@ -133,3 +133,49 @@ impl AgeBasis {
         Self(bits)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::WallNs;
+
+    #[test]
+    fn parts_of_encapsulations_and_guids_are_their_bytes() {
+        let encapsulation = Encapsulation([1, 2, 3, 4]);
+        assert_eq!((encapsulation.representation(), encapsulation.options()), ([1, 2], [3, 4]));
+        let guid = Guid([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 0, 0, 1, 3]);
+        assert_eq!(guid.prefix(), [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
+        assert_eq!(guid.to_string(), "0102030405060708090a0b0c:00000103");
+    }
+
+    #[test]
+    fn a_delay_is_kept_in_microseconds_up_to_71_minutes() {
+        for (late_ns, kept_ns) in [(0, 0), (999, 0), (1_000, 1_000), (2_345_678, 2_345_000)] {
+            let basis = AgeBasis::arrival(late_ns);
+            assert_eq!(basis.late_ns(), Some(kept_ns), "{late_ns}");
+            assert_eq!(AgeBasis::from_bits(basis.bits()), basis);
+        }
+        assert_eq!(AgeBasis::arrival(u64::MAX).late_ns(), Some(u64::from(u32::MAX - 1) * 1_000));
+        let largest = u64::from(u32::MAX - 2) * 1_000;
+        assert_eq!(AgeBasis::arrival(largest).late_ns(), Some(largest));
+        assert_eq!((AgeBasis::SOURCE.late_ns(), AgeBasis::SOURCE.bits()), (None, 0));
+    }
+
+    #[test]
+    fn the_age_is_measured_from_the_source_timestamp_or_before_the_arrival() {
+        let source = SourceTimestamp::from_wall(WallNs(1_763_000_000_000_000_000));
+        let mut header = SampleHeader {
+            sequence: 1,
+            source_timestamp: source,
+            taken_at: MonotonicNs(10_000_000),
+            published_at: MonotonicNs(11_000_000),
+            writer_sequence: 1,
+            writer_guid: Guid::default(),
+            encapsulation: Encapsulation::CDR_LE,
+            age_basis: AgeBasis::SOURCE,
+        };
+        assert_eq!((header.age_source(), header.age_from()), (source, MonotonicNs(10_000_000)));
+        header.age_basis = AgeBasis::arrival(4_000_000);
+        assert_eq!((header.age_source(), header.age_from()), (SourceTimestamp::NONE, MonotonicNs(6_000_000)));
+    }
+}

@@ -486,6 +486,77 @@ mod tests {
     }
 
     #[test]
+    fn an_absence_is_shown_until_it_expires_and_its_peer_is_watched_on() {
+        let mut watch = AbsenceWatch::new([]);
+        let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.update_interfaces(&[eth(true)], at(0));
+        watch.update_interfaces(&[eth(true)], at(500));
+        watch.participant_lost(0, [1; 12], Some(10_000), at(20_000));
+        watch.update_interfaces(&[eth(false)], at(20_000));
+        watch.update_interfaces(&[eth(false)], at(21_000));
+        assert_eq!(absences(&watch), ["away eth0 has no link", "away  subscribes to /scan"]);
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(22_000));
+        watch.update_interfaces(&[eth(true)], at(22_000));
+        let expired = 22_000 + REMEMBER_ABSENCE_MS;
+        watch.update_interfaces(&[eth(true)], at(expired));
+        assert_eq!(absences(&watch), [""; 0]);
+        watch.participant_lost(0, [1; 12], Some(10_000), at(expired + 20_000));
+        assert_eq!(absences(&watch), ["away  subscribes to /scan"], "still watched");
+    }
+
+    #[test]
+    fn an_interface_is_watched_once_whether_it_is_configured_by_name_or_by_address() {
+        let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);
+        for (configured, expected) in [
+            (vec!["eth0"], vec!["away eth0 has no link"]),
+            (vec!["10.0.0.1"], vec!["away 10.0.0.1 has no link"]),
+            (vec!["lo"], vec!["away lo is not on this host", "away eth0 has no link"]),
+        ] {
+            let mut watch = AbsenceWatch::new(configured.iter().map(|&name| name.to_owned()));
+            watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+            watch.update_interfaces(&[eth(true)], at(0));
+            watch.update_interfaces(&[eth(false)], at(1_000));
+            assert_eq!(absences(&watch), expected);
+        }
+    }
+
+    #[test]
+    fn interfaces_that_reach_peers_are_limited_and_configured_ones_do_not_count() {
+        let mut watch = AbsenceWatch::new((0..MAX_FOUND_INTERFACES).map(|number| format!("can{number}")));
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        let found = |number: usize| interface(&format!("eth{number}"), Some([10, 0, 0, number as u8]), true);
+        let present: Vec<_> = (10..11 + MAX_FOUND_INTERFACES).map(found).collect();
+        watch.update_interfaces(&present, at(0));
+        let names: Vec<_> = watch.interfaces.iter().filter(|one| !one.is_configured).collect();
+        assert_eq!(names.len(), MAX_FOUND_INTERFACES);
+    }
+
+    #[test]
+    fn a_program_that_does_something_else_replaces_no_peer() {
+        let mut watch = AbsenceWatch::new([]);
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.participant_lost(0, [1; 12], Some(10_000), at(20_000));
+        watch.endpoint_discovered(0, guid(2, 3), "/scan", true, LAPTOP, at(30_000));
+        watch.endpoint_discovered(0, guid(3, 4), "/odom", false, LAPTOP, at(30_000));
+        watch.endpoint_discovered(1, guid(4, 4), "/scan", false, LAPTOP, at(30_000));
+        assert_eq!(absences(&watch), ["away  subscribes to /scan"]);
+    }
+
+    #[test]
+    fn a_peer_keeps_its_node_and_the_nodes_of_another_network_are_not_its() {
+        let mut watch = AbsenceWatch::new([]);
+        watch.endpoint_discovered(0, guid(1, 4), "/scan", false, LAPTOP, at(0));
+        watch.name_nodes(1, |_| Some("/other"));
+        watch.name_nodes(0, |_| Some("/rviz"));
+        watch.name_nodes(1, |_| Some("/other"));
+        watch.name_nodes(0, |_| None);
+        watch.participant_lost(0, [1; 12], Some(10_000), at(20_000));
+        watch.name_nodes(0, |_| Some("/another"));
+        assert_eq!(absences(&watch), ["away /rviz subscribes to /scan"]);
+    }
+
+    #[test]
     fn memory_is_bounded() {
         let mut watch = AbsenceWatch::new([]);
         for participant in 0..=255 {

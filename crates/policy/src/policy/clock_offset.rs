@@ -325,6 +325,33 @@ mod tests {
         assert!(simulation.clock.offset_ns().is_some());
     }
 
+    #[test]
+    fn a_base_takes_both_a_number_of_samples_and_a_time() {
+        let mut simulation = Simulation::of(5_000);
+        for number in 0..i64::from(STEADY_SAMPLES) + 5 {
+            simulation.sample(number, 2);
+        }
+        assert_eq!(simulation.clock.offset_ns(), None, "many samples within milliseconds");
+        let mut simulation = Simulation::of(5_000);
+        let steady_ms = i64::try_from(STEADY_MS).unwrap();
+        simulation.sample(0, 2);
+        simulation.sample(steady_ms + 1, 2);
+        assert_eq!(simulation.clock.offset_ns(), None, "two samples");
+        let last = simulation.clock.last_at();
+        assert_eq!(last, Some(MonotonicNs((1_000 + STEADY_MS + 3) * 1_000_000)));
+    }
+
+    #[test]
+    fn after_a_disagreement_the_clocks_agree_again_within_half_the_bounds_only() {
+        for (after_ms, is_off) in [(40, true), (10, false), (-80, true), (-30, false)] {
+            let mut simulation = Simulation::of(5_000);
+            simulation.run(0, 5_000, |_| 2);
+            simulation.publisher_ms = after_ms;
+            simulation.run(5_000, 9_000, |_| 2);
+            assert_eq!(simulation.clock.offset_ns().is_some(), is_off, "{after_ms}");
+        }
+    }
+
     proptest! {
         #[test]
         fn any_offset_with_jitter_is_found_and_any_late_sample_is_late(

@@ -119,3 +119,21 @@ pub const fn safety_floor(
         _ => LaneMode::Normal,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reasons_have_the_labels_of_the_diagnostics() {
+        let reasons = [
+            LaneReason::CriticalLane,
+            LaneReason::ClassifierOff,
+            LaneReason::DegradeForbidden,
+            LaneReason::NoSubscribers,
+            LaneReason::Subscriber { worst: "laptop", impaired: 1 },
+        ];
+        let labels = ["critical_lane", "classifier_off", "degrade_forbidden", "no_subscribers", "subscriber"];
+        assert_eq!(reasons.map(|reason| reason.label()), labels);
+    }
+}

@@ -323,6 +323,7 @@ mod tests {
     fn drop_latest_is_first_in_first_out_and_drops_the_new_sample_of_a_full_queue() {
         let mut bench = Bench::new(DropPolicy::DropLatest, &[90, 60, 30, 20]);
         assert_eq!(bench.dropped, [(4, QueueFull)]);
+        assert!(!bench.queue.is_empty());
         assert_eq!(bench.take(&allowance(1)), Some(1));
         assert_eq!(bench.take(&allowance(9)), Some(2));
     }

@@ -218,3 +218,21 @@ impl<K: PartialEq> SenderLimits<K> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_window_applies_to_the_next_message() {
+        let mut guard = ReplayGuard::new(1_000, 8);
+        assert!(guard.is_empty());
+        let now = WallNs(100_000_000_000);
+        let sent = WallNs(now.0 - 5_000_000_000);
+        assert_eq!(guard.admit([1; 16], sent, now), Admission::TooOld);
+        assert!(guard.is_empty());
+        guard.set_window(10_000);
+        assert_eq!(guard.admit([2; 16], sent, now), Admission::Fresh);
+        assert!(!guard.is_empty());
+    }
+}
