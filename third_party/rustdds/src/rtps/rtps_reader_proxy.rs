@@ -708,6 +708,15 @@ impl RtpsReaderProxy {
     self.unsent_changes.insert(sequence_number);
   }
 
+  /// These samples are to be sent to the reader.
+  pub fn request_changes(&mut self, range: std::ops::Range<SequenceNumber>) {
+    let mut next = range.start;
+    while next < range.end {
+      self.unsent_changes.insert(next);
+      next = next.plus_1();
+    }
+  }
+
   /// Whether everything for this reader goes over loopback.
   pub fn is_reached_over_loopback(&self) -> bool {
     !self.send_route.fallback
