@@ -6,12 +6,13 @@ use std::time::Duration;
 use bytes::Bytes;
 
 use super::payload::{RawAdapter, RawPayload};
+use super::qos;
 use super::rustdds::no_key::DataWriter;
 use super::rustdds::{
     DataWriterStatus, GUID, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, SourceTimestamp, UnmatchedPolicy};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,6 +50,8 @@ pub enum WriterEvent {
     Incompatible {
         /// The reader.
         reader: Guid,
+        /// The first policy for which it does not match.
+        policy: UnmatchedPolicy,
     },
 }
 
@@ -179,8 +182,11 @@ impl RawWriter {
                         readers: u64::try_from(current.count()).unwrap_or(0),
                     });
                 }
-                DataWriterStatus::OfferedIncompatibleQos { reader, .. } => {
-                    return Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()) });
+                DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {
+                    return Some(WriterEvent::Incompatible {
+                        reader: Guid(reader.to_bytes()),
+                        policy: qos::unmatched_policy(last_policy_id),
+                    });
                 }
                 _ => {}
             }
