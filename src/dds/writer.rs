@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::qos;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
     DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, SourceTimestamp, UnmatchedPolicy};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,6 +59,8 @@ pub enum WriterEvent {
     Incompatible {
         /// The reader.
         reader: Guid,
+        /// The first policy for which it does not match.
+        policy: UnmatchedPolicy,
     },
 }
 
@@ -138,6 +141,12 @@ impl RawWriter {
         self.inner.sent_through().into()
     }
 
+    /// Makes readers skip samples that were evicted from the history, instead of requesting them: for samples
+    /// that the next ones supersede. Those that a reader has not acknowledged count as its overrun.
+    pub fn skip_evicted(&self) {
+        self.inner.offer_only_retained();
+    }
+
     /// Lists the matched readers.
     pub fn matched_readers(&self) -> impl Iterator<Item = MatchedReader> {
         self.inner.matched_readers().into_iter().map(|reader| MatchedReader {
@@ -166,8 +175,11 @@ impl RawWriter {
                         readers: u64::try_from(current.count()).unwrap_or(0),
                     });
                 }
-                DataWriterStatus::OfferedIncompatibleQos { reader, .. } => {
-                    return Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()) });
+                DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {
+                    return Some(WriterEvent::Incompatible {
+                        reader: Guid(reader.to_bytes()),
+                        policy: qos::unmatched_policy(last_policy_id),
+                    });
                 }
                 _ => {}
             }
