@@ -113,7 +113,7 @@ thread_local! {
 /// The machine for one test alone, among all test programs of this source tree.
 pub struct Exclusive(#[allow(dead_code, reason = "holds the lock")] Flock<File>);
 
-/// A part of the machine: [`SHARED_TESTS`] tests have one at the same time.
+/// A part of the machine: three tests have one at the same time.
 pub struct Shared(#[allow(dead_code, reason = "holds the locks")] [Flock<File>; 2]);
 
 fn lock_file(name: &str) -> File {
