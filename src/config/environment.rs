@@ -131,31 +131,3 @@ impl Environment {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use crate::config::parse;
-
-    const TOPIC: &str = "topics: [{id: scan, input_topic: /scan}]\n";
-
-    #[test]
-    fn a_variable_with_which_nodes_do_not_find_the_bridge_is_refused_with_what_to_do() {
-        for (name, refused, accepted) in [
-            ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", ""),
-            ("ROS_SECURITY_ENABLE", "true", "false"),
-            ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw_cyclonedds_cpp"),
-            ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA", "UDPv4"),
-            ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA?max_msg_size=1MB", "DEFAULT"),
-        ] {
-            let with = |value: &'static str| {
-                parse(TOPIC, "f.yaml", &|asked: &str| (asked == name).then(|| value.to_owned()))
-            };
-            let found: Vec<String> =
-                with(refused).unwrap_err().to_string().lines().map(str::to_owned).collect();
-            assert_eq!(found.len(), 1, "{found:?}");
-            assert!(found[0].starts_with(&format!("environment: {name} = {refused}: must ")), "{found:?}");
-            assert!(found[0].contains("the bridge") && found[0].contains(';'), "{found:?}");
-            assert!(with(accepted).is_ok());
-        }
-    }
-}

@@ -5,9 +5,7 @@ use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
 use super::rates::{self, RoutingPolicy};
-use super::settings::{
-    DEFAULT_WINDOW_SAMPLES, DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy,
-};
+use super::settings::{DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
 use crate::model::{LaneName, TrafficClass};
 
 /// The most lanes. Each is a process with its own DDS participant, and a domain allows 120 participants on a
@@ -101,9 +99,9 @@ impl LaneReader<'_> {
             true => TrafficClass::Critical,
             false => TrafficClass::Noncritical,
         };
-        let (queue_depth, window_samples) = match class {
-            TrafficClass::Critical => (64, Some(DEFAULT_WINDOW_SAMPLES)),
-            TrafficClass::Noncritical => (4, None),
+        let queue_depth = match class {
+            TrafficClass::Critical => 64,
+            TrafficClass::Noncritical => 4,
         };
         let qos = field.get("qos");
         let lane = Lane {
@@ -120,7 +118,7 @@ impl LaneReader<'_> {
             queue_depth: field.get("queue_depth").count().unwrap_or(queue_depth),
             max_borrowed: field.get("max_borrowed").count_or_default(),
             by_reference_min_bytes: field.get("by_reference_min_bytes").count_or_default(),
-            window_samples: field.get("window_samples").count().or(window_samples),
+            window_samples: field.get("window_samples").count_or_default(),
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
         };
         let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };

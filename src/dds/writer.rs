@@ -6,13 +6,12 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::qos;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
     DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, SourceTimestamp, UnmatchedPolicy};
+use crate::model::{Encapsulation, Guid, SourceTimestamp};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,8 +58,6 @@ pub enum WriterEvent {
     Incompatible {
         /// The reader.
         reader: Guid,
-        /// The first policy for which it does not match.
-        policy: UnmatchedPolicy,
     },
 }
 
@@ -141,12 +138,6 @@ impl RawWriter {
         self.inner.sent_through().into()
     }
 
-    /// Makes readers skip samples that were evicted from the history, instead of requesting them: for samples
-    /// that the next ones supersede. Those that a reader has not acknowledged count as its overrun.
-    pub fn skip_evicted(&self) {
-        self.inner.offer_only_retained();
-    }
-
     /// Lists the matched readers.
     pub fn matched_readers(&self) -> impl Iterator<Item = MatchedReader> {
         self.inner.matched_readers().into_iter().map(|reader| MatchedReader {
@@ -175,11 +166,8 @@ impl RawWriter {
                         readers: u64::try_from(current.count()).unwrap_or(0),
                     });
                 }
-                DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {
-                    return Some(WriterEvent::Incompatible {
-                        reader: Guid(reader.to_bytes()),
-                        policy: qos::unmatched_policy(last_policy_id),
-                    });
+                DataWriterStatus::OfferedIncompatibleQos { reader, .. } => {
+                    return Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()) });
                 }
                 _ => {}
             }

@@ -46,7 +46,7 @@ unsafe impl Plain for IngressCounters {}
 unsafe impl Plain for PublisherAccount {}
 // SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
 unsafe impl Plain for LaneCounters {}
-// SAFETY: `repr(C)`; records of a GUID of 16 bytes and one or four 64-bit integers.
+// SAFETY: `repr(C)`; records of a GUID of 16 bytes and four 64-bit integers.
 unsafe impl Plain for OutputReaders {}
 // SAFETY: `repr(C)`; a GUID of 16 bytes, then twice 128 bytes of text, which its reader validates.
 unsafe impl Plain for NamedEndpoint {}

@@ -5,7 +5,6 @@ use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
     ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
-    UnmatchedReport,
 };
 use crate::model::{Counts, Reason};
 
@@ -37,12 +36,6 @@ pub(super) fn wide_report() -> Report {
             offered: u64::MAX,
             unacknowledged: u64::MAX,
             overrun: u64::MAX,
-        }],
-        unmatched_readers: vec![UnmatchedReport {
-            guid: "0".repeat(33),
-            node: Some("/a_node".into()),
-            host: None,
-            policy: "DATA_REPRESENTATION",
         }],
         reader_overrun: u64::MAX,
         received: u64::MAX,

@@ -216,7 +216,7 @@ pub(super) const ROWS: &[Row] = &[
     Row::new(
         &["lanes.<lane>.window_samples"],
         Whole(1, 100_000),
-        "256; on a noncritical lane the depth of a VOLATILE KEEP_LAST output",
+        "256",
         "Samples that a RELIABLE writer of the lane retains for subscribers that have not acknowledged \
          them, 32 MiB at most. Beyond that it evicts the oldest sample; a subscriber that has not \
          acknowledged that one misses it, which counts as its `reader_overrun`.",

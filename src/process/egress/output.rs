@@ -14,8 +14,8 @@ use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs, OutputReaders,
-    QosProfile, ReaderRecord, Reliability, SampleHeader, TrafficClass, UnmatchedPolicy, UnmatchedReader,
+    DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
+    ReaderRecord, Reliability, SampleHeader, TrafficClass,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -48,8 +48,6 @@ pub(super) struct Output {
     dds_topic: String,
     qos: QosProfile,
     window_samples: usize,
-    /// Whether a reader skips the samples that it lacks when fresher ones have evicted them.
-    supersedes: bool,
     by_reference_min_bytes: usize,
     /// The drop reason of a gap while the lane forwards.
     overwrite_reason: DropReason,
@@ -68,8 +66,6 @@ pub(super) struct Output {
     /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
     /// receive the samples written until they match.
     former_readers: Vec<Guid>,
-    /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
-    unmatched: Vec<(Guid, UnmatchedPolicy)>,
     /// When this process opened the output. Samples published before were missed by its predecessor.
     started_at: MonotonicNs,
     /// Whether a sample published since `started_at` has been taken.
@@ -115,7 +111,6 @@ impl Output {
             SubscriberRole::Lane(QueueLimits::of(lane)),
             true,
         )?;
-        let window_samples = lane.window_samples_of(&output.qos);
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
@@ -123,15 +118,14 @@ impl Output {
             route: output.route,
             dds_topic: output.topic.to_dds(),
             qos: output.qos,
-            window_samples,
-            supersedes: lane.supersedes(&output.qos),
+            window_samples: lane.window_samples,
             by_reference_min_bytes: lane.by_reference_min_bytes,
             overwrite_reason: overwrite_reason(&lane.forwarding),
             gap_reason: overwrite_reason(&lane.forwarding),
             mode: LaneMode::Normal,
             subscriber,
             writer: None,
-            unsent: UnsentSamples::new(window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
+            unsent: UnsentSamples::new(lane.window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
             queued: 0,
             late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
@@ -139,7 +133,6 @@ impl Output {
             counters,
             readers,
             former_readers,
-            unmatched: Vec::new(),
             started_at: clock::monotonic(),
             caught_up: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
@@ -366,11 +359,6 @@ impl Output {
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
     }
 
-    /// Forgets the readers without a match for which `is_gone` holds.
-    pub fn forget_unmatched(&mut self, is_gone: impl Fn(Guid) -> bool) {
-        self.unmatched.retain(|(reader, _)| !is_gone(*reader));
-    }
-
     /// Waits until all RELIABLE readers have acknowledged all samples, at most for `timeout`. Returns whether
     /// they have.
     pub fn wait_acknowledged(&mut self, timeout: Duration) -> bool {
@@ -387,7 +375,6 @@ impl Output {
                     self.counters.update(|counters| counters.readers = readers);
                     if joined {
                         self.former_readers.retain(|former| *former != reader);
-                        self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
                     if let Some(late_joiners) = &mut self.late_joiners {
@@ -406,21 +393,12 @@ impl Output {
                         }
                     }
                 }
-                WriterEvent::Incompatible { reader, policy } => {
-                    // The DDS library repeats the event with each announcement of the reader.
-                    if self.unmatched.contains(&(reader, policy)) {
-                        continue;
-                    }
-                    self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
-                    if self.unmatched.len() < MAX_UNMATCHED_READERS {
-                        self.unmatched.push((reader, policy));
-                    }
+                WriterEvent::Incompatible { reader } => {
                     warn!(
                         route = self.id,
                         lane = self.lane,
                         topic = self.dds_topic,
                         ?reader,
-                        %policy,
                         "a reader requests a stricter QoS than this lane offers and receives nothing: change \
                          its QoS or the lane's"
                     );
@@ -449,9 +427,6 @@ impl Output {
                 overrun: reader.overrun,
                 reliable: u64::from(reader.reliable),
             };
-        }
-        for (place, (reader, policy)) in current.unmatched.iter_mut().zip(&self.unmatched) {
-            *place = UnmatchedReader { reader: *reader, policy: *policy as u64 };
         }
         if current != *self.readers.get() {
             self.readers.update(|readers| *readers = current);
@@ -507,9 +482,6 @@ impl Output {
             durability = ?self.qos.durability,
             "DDS writer created"
         );
-        if self.supersedes {
-            writer.skip_evicted();
-        }
         self.writer = Some(writer);
         Ok(())
     }

@@ -3,7 +3,6 @@
 mod control;
 mod processes;
 mod publishers;
-mod readers;
 
 use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
@@ -46,7 +45,6 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         dropped(route, now, before, &mut problems);
     }
     for (route, output) in outputs(now) {
-        problems.extend(readers::unmatched(route, output, now));
         slow_readers(route, output, now, before, &mut problems);
     }
     problems.extend(control::settings(now, before));
@@ -227,9 +225,8 @@ fn slow_readers(
         let is_silent = offered >= SILENT_READER_SAMPLES
             && record.unacknowledged.saturating_sub(earlier.unacknowledged) == offered
             && earlier.unacknowledged > 0;
-        let reader = now.reader_name(record.reader);
-        // On a noncritical lane fresher samples supersede those that are not acknowledged, by design.
-        let text = if missed > 0 && lane.class == TrafficClass::Critical {
+        let reader = now.reader_name(record);
+        let text = if missed > 0 {
             format!(
                 "lane {}, {}: {reader} missed {} in the last {}: it acknowledges too slowly \
                  (reader_overrun); the other subscribers have them; raise window_samples, or move it to a slower lane",

@@ -14,7 +14,6 @@ use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, 
 use super::text::printable;
 use crate::model::{
     DropCounts, FixedText, Guid, LaneMode, MonotonicNs, NetworkRefusals, PublisherAccount, ReaderRecord,
-    UnmatchedPolicy,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
@@ -185,8 +184,6 @@ pub struct OutputReport {
     pub readers: u64,
     /// The matched readers, 32 at most.
     pub matched_readers: Vec<ReaderReport>,
-    /// Readers of the topic that request a stricter QoS than the lane offers, 8 at most.
-    pub unmatched_readers: Vec<UnmatchedReport>,
     /// Samples that left the history before single readers acknowledged them; the other readers have them.
     pub reader_overrun: u64,
     /// Samples offered to the lane since it first started.
@@ -221,19 +218,6 @@ pub struct OutputReport {
     pub dds_out: Latency,
     /// Age of the samples when the DDS writer gets them, by their source timestamp.
     pub age: Latency,
-}
-
-/// A reader of an output's topic that gets nothing, because it requests a stricter QoS than the lane offers.
-#[derive(Clone, Debug, serde::Serialize)]
-pub struct UnmatchedReport {
-    /// Its GUID, in hexadecimal.
-    pub guid: String,
-    /// Its ROS 2 node; null while it is unknown.
-    pub node: Option<String>,
-    /// The address of its host; null while it is unknown.
-    pub host: Option<String>,
-    /// The QoS policy for which it does not match.
-    pub policy: &'static str,
 }
 
 /// One reader of an output.
@@ -378,11 +362,6 @@ impl Snapshot {
             topic: now.topic.to_string(),
             readers: counters.readers,
             matched_readers: now.readers.iter().map(|record| self.reader_report(record)).collect(),
-            unmatched_readers: now
-                .readers
-                .unmatched()
-                .map(|unmatched| self.unmatched_report(unmatched))
-                .collect(),
             reader_overrun: counters.reader_overrun,
             received: counters.received(),
             forwarded: counters.forwarded,
@@ -418,11 +397,6 @@ impl Snapshot {
         }
     }
 
-    fn unmatched_report(&self, (reader, policy): (Guid, UnmatchedPolicy)) -> UnmatchedReport {
-        let (node, host) = self.node_and_host(reader);
-        UnmatchedReport { guid: reader.to_string(), node, host, policy: policy.label() }
-    }
-
     /// The ROS 2 node of an endpoint and the address of its host, if they are known.
     fn node_and_host(&self, endpoint: Guid) -> (Option<String>, Option<String>) {
         let Some(named) = self.named_endpoints.iter().find(|named| named.endpoint == endpoint) else {
@@ -440,10 +414,10 @@ impl Snapshot {
     }
 
     /// A name for a reader: its node, or its GUID if the node is unknown, and its host if it is known.
-    pub(super) fn reader_name(&self, reader: Guid) -> String {
-        let (node, host) = self.node_and_host(reader);
-        let node = node.unwrap_or_else(|| format!("reader {reader}"));
-        match host {
+    pub(super) fn reader_name(&self, record: &ReaderRecord) -> String {
+        let report = self.reader_report(record);
+        let node = report.node.unwrap_or_else(|| format!("reader {}", report.guid));
+        match report.host {
             Some(host) => format!("{node} on {host}"),
             None => node,
         }
@@ -515,14 +489,11 @@ mod tests {
         let report = serde_json::to_value(crate::telemetry::test_report::wide_report()).unwrap();
         let page = include_str!("../../../docs/status-json.md");
         let publisher = &report["routes"][0]["publishers"][0];
-        let lanes = report["routes"][0]["lanes"].as_array().unwrap();
-        let unmatched = lanes.iter().find_map(|lane| lane["unmatched_readers"].get(0)).unwrap();
         for (list, item) in [
             ("subscribers", &report["subscribers"][0]),
             ("intruders", &report["intruders"][0]),
             ("absences", &report["absences"][0]),
             ("routes[].publishers", publisher),
-            ("routes[].lanes[].unmatched_readers", unmatched),
         ] {
             let item = item.as_object().unwrap();
             let documented = page.matches(&format!("\n| `{list}[].")).count();

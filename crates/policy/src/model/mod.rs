@@ -27,10 +27,9 @@ pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS,
-    MAX_PUBLISHERS, MAX_UNMATCHED_READERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord,
-    RouteInfo, UnmatchedReader,
+    MAX_PUBLISHERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord, RouteInfo,
 };
-pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
+pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
