@@ -67,6 +67,8 @@ fn shared_memory_of(instance: &str) -> Vec<String> {
 #[test]
 fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample() {
     let test = "a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_critical_sample";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start_without_watchdog(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let slow = bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL);
@@ -94,6 +96,8 @@ fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_c
 #[test]
 fn remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample() {
     let test = "remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let reader = || Peer::cyclone().best_effort().keep_all();
@@ -159,6 +163,8 @@ fn samples_flow_again_after_a_link_was_down_for_longer_than_the_lease() {
 #[test]
 fn a_killed_critical_egress_is_restarted_and_counts_the_lost_samples() {
     let test = "a_killed_critical_egress_is_restarted_and_counts_the_lost_samples";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     for restarts in 1..=3 {
@@ -188,6 +194,8 @@ fn a_killed_critical_egress_is_restarted_and_counts_the_lost_samples() {
 #[test]
 fn a_killed_ingress_is_restarted_and_continues_its_counts() {
     let test = "a_killed_ingress_is_restarted_and_continues_its_counts";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     for restarts in 1..=3 {
@@ -336,6 +344,8 @@ fn killed_critical_subscribers_cost_the_others_no_sample() {
 #[test]
 fn manual_modes_take_effect_and_rates_are_kept() {
     let test = "manual_modes_take_effect_and_rates_are_kept";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let slow = bed.subscribe("slow", Peer::cyclone().best_effort(), NONCRITICAL);
@@ -376,6 +386,8 @@ fn manual_modes_take_effect_and_rates_are_kept() {
 #[test]
 fn two_bridges_run_side_by_side_and_the_end_of_one_does_not_affect_the_other() {
     let test = "two_bridges_run_side_by_side_and_the_end_of_one_does_not_affect_the_other";
+    // It asserts the rate of the flow.
+    let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let flow = Flow::start(&bed);
     let other = Bridge::new(&format!(
