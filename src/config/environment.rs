@@ -20,35 +20,44 @@ pub(super) struct Environment {
 /// the bridge would find no node, or receive nothing, without an error.
 struct NotSupported {
     name: &'static str,
-    /// Values with which nodes and the bridge find each other.
-    harmless: &'static [&'static str],
+    /// Whether nodes with this value and the bridge do not find each other.
+    hides: fn(&str) -> bool,
     /// What is allowed, why, and what to do.
     consequence: &'static str,
 }
 
+const DDS_IMPLEMENTATIONS: [&str; 5] = [
+    "rmw_fastrtps_cpp",
+    "rmw_fastrtps_dynamic_cpp",
+    "rmw_cyclonedds_cpp",
+    "rmw_connextdds",
+    "rmw_gurumdds_cpp",
+];
+
 const NOT_SUPPORTED: [NotSupported; 4] = [
     NotSupported {
         name: "ROS_DISCOVERY_SERVER",
-        harmless: &[],
+        hides: |_| true,
         consequence: "must not be set: nodes that use a discovery server and the bridge do not find each other; \
                       start the nodes without it, and the bridge too",
     },
     NotSupported {
         name: "ROS_SECURITY_ENABLE",
-        harmless: &["false"],
+        // rcl takes any other value for false.
+        hides: |value| value == "true",
         consequence: "must not be true: the bridge has no DDS Security, and nodes that have it do not accept \
                       the bridge; unset it for the bridge if the nodes that it serves run without",
     },
     NotSupported {
         name: "RMW_IMPLEMENTATION",
-        harmless: &["rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds"],
+        hides: |value| !DDS_IMPLEMENTATIONS.contains(&value),
         consequence: "must be a DDS implementation, rmw_fastrtps_cpp, rmw_fastrtps_dynamic_cpp, \
-                      rmw_cyclonedds_cpp or rmw_connextdds: the bridge and other nodes do not find each other; \
-                      unset it for the bridge if the nodes that it serves use DDS",
+                      rmw_cyclonedds_cpp, rmw_connextdds or rmw_gurumdds_cpp: nodes of others and the bridge do \
+                      not find each other; unset it for the bridge if the nodes that it serves use DDS",
     },
     NotSupported {
         name: "FASTDDS_BUILTIN_TRANSPORTS",
-        harmless: &["DEFAULT", "UDPv4"],
+        hides: |value| !["DEFAULT", "UDPv4"].contains(&value),
         consequence: "must be DEFAULT or UDPv4: the bridge receives and sends over UDP and IPv4 only, and with \
                       other transports Fast DDS does not; unset it for the bridge if the nodes that it serves \
                       run without",
@@ -110,7 +119,7 @@ impl Environment {
         }
         for not_supported in &NOT_SUPPORTED {
             if let Some(value) = variable(not_supported.name)
-                && !not_supported.harmless.contains(&value.as_str())
+                && (not_supported.hides)(&value)
             {
                 refuse(not_supported.name, &value, not_supported.consequence);
             }
