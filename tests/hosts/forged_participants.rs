@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
-use support::netns::udp_ports;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
 use support::rtps::{LEASE_S, Message, Prefix};
@@ -65,12 +64,7 @@ fn a_million_forged_participants_take_little_memory_and_cost_no_critical_sample(
     let pids = ROLES.map(|role| bed.pid(role));
     let resident_kib = |pid| memory_kib(pid, "VmRSS");
     let before = pids.map(resident_kib);
-    let bridge = bed.host("bridge").address();
-    // Unicast discovery traffic of domain 0 goes to 7410 + 2 * participant number (RTPS 2.5, clause 9.6.1.1).
-    let is_discovery = |port: &u16| (7410..7440).contains(port) && port.is_multiple_of(2);
-    let ports = udp_ports(pids[0]).into_iter().filter(is_discovery);
-    let processes: Vec<_> = ports.map(|port| SocketAddrV4::new(bridge, port)).collect();
-    assert!(processes.len() >= ROLES.len(), "{processes:?}");
+    let processes = bed.discovery_addresses();
 
     let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
     let attack = std::thread::spawn({

@@ -5,7 +5,6 @@ use std::net::{SocketAddrV4, UdpSocket};
 
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
-use support::netns::udp_ports;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
 use support::rtps::{Fragment, Message, Prefix, SEDP_PUBLICATIONS, SEDP_SUBSCRIPTIONS};
@@ -55,11 +54,7 @@ fn samples_that_never_become_complete_or_are_too_large_take_little_memory() {
     let resident_kib = |pid| memory_kib(pid, "VmRSS");
     let before = pids.map(resident_kib);
 
-    let address = bed.host("bridge").address();
-    let is_discovery = |port: &u16| (7410..7440).contains(port) && port.is_multiple_of(2);
-    let ports = udp_ports(pids[0]).into_iter().filter(is_discovery);
-    let processes: Vec<_> = ports.map(|port| SocketAddrV4::new(address, port)).collect();
-    assert!(processes.len() >= ROLES.len(), "{processes:?}");
+    let processes = bed.discovery_addresses();
     attack(&bed.host("slow").udp_socket(), &processes);
     // The largest sample of the route has 64 KiB.
     let too_large = bed.publish(Peer::fast().keep_all().rate_hz(2.0).size(20 << 20).count(10), INPUT);

@@ -1,9 +1,11 @@
 //! A test bed: a bridge on a separate host, between a host with the publisher and hosts with the subscribers.
 
+use std::net::SocketAddrV4;
+
 use serde_json::Value;
 
 use super::bridge::Bridge;
-use super::netns::{Host, Net};
+use super::netns::{Host, Net, udp_ports};
 use super::peer::{Peer, Received, RunningPeer};
 use super::process::Process;
 
@@ -121,6 +123,17 @@ impl Bed {
     /// The current process id of a child of `up`.
     pub fn pid(&self, child: &str) -> i32 {
         *self.pids(child).last().unwrap_or_else(|| panic!("{child} was never started\n{}", self.up.log()))
+    }
+
+    /// The addresses at which the bridge's processes in domain 0 receive unicast discovery traffic: ports
+    /// 7410, 7412 and so on (RTPS 2.5, clause 9.6.1.1).
+    pub fn discovery_addresses(&self) -> Vec<SocketAddrV4> {
+        let address = self.host("bridge").address();
+        let is_discovery = |port: &u16| (7410..7440).contains(port) && port.is_multiple_of(2);
+        let ports = udp_ports(self.pid("ingress")).into_iter().filter(is_discovery);
+        let addresses: Vec<_> = ports.map(|port| SocketAddrV4::new(address, port)).collect();
+        assert!(addresses.len() >= 4, "one for each process: {addresses:?}");
+        addresses
     }
 
     /// Terminates the bridge and asserts that it ends successfully.
