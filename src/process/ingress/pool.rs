@@ -105,6 +105,7 @@ impl SampleMemory for Pool {
         // With the encapsulation header.
         let max_sample_bytes = self.publisher.max_sample_bytes() + 4;
         let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
+        // Three, because the library counts some KiB more for each: two always have room.
         AssemblyLimits { max_sample_bytes, max_total_bytes: max_total_bytes.max(3 * max_sample_bytes) }
     }
 }

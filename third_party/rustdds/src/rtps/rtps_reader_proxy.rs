@@ -268,13 +268,10 @@ impl RtpsReaderProxy {
   /// ACKNACK before: both repeat it until they have a HEARTBEAT. A reader that sends
   /// nothing else is served after `JOINING_MAX_ACKNACKS`.
   pub fn ends_joining(&mut self, acknack: &AckNack) -> bool {
+    let first_offered = self.first_offered();
     let Some(acknacks) = &mut self.acknacks_while_joining else {
       return false;
     };
-    let first_offered = self
-      .progress
-      .as_ref()
-      .map_or_else(SequenceNumber::zero, |progress| progress.first_offered());
     let one = SequenceNumber::from(1);
     let base = acknack.reader_sn_state.base();
     let has_heartbeat = base > first_offered.max(one)
