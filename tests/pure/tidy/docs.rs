@@ -78,6 +78,15 @@ fn every_relative_link_leads_to_a_file() {
 }
 
 #[test]
+fn no_page_has_the_markers_of_an_unresolved_merge() {
+    let is_marker = |line: &str| line.starts_with("<<<<<<< ") || line.starts_with(">>>>>>> ");
+    assert!(is_marker("<<<<<<< HEAD") && is_marker(">>>>>>> main") && !is_marker("# Merge"));
+    for page in files("", "md") {
+        assert!(!page.text.lines().any(is_marker), "{}", page.path);
+    }
+}
+
+#[test]
 fn every_page_that_the_source_names_is_there() {
     let mut named = 0;
     for source in ["src", "crates", "tests", "benches"].iter().flat_map(|folder| files(folder, "rs")) {
