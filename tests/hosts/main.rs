@@ -19,4 +19,5 @@ mod original_probes;
 mod readers;
 mod responder;
 mod restarts;
+mod ros2;
 mod visits;

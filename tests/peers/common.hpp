@@ -124,11 +124,12 @@ class Publisher {
     finish_sending();
   }
 
-  // Call it until it says no: waits for acknowledgements (10 s at most) with `acknowledged(timeout_ns)`, then lingers.
+  // Waits until all samples are acknowledged, 10 s at most, also after SIGTERM: a publisher that ends at once takes
+  // the last samples with it, of which a reader may still miss fragments. Then lingers.
   template <typename Acknowledged>
   void linger(Acknowledged acknowledged) {
     const int64_t deadline_ns = monotonic_ns() + 10'000'000'000;
-    while (!stop_requested && !acknowledged_ && monotonic_ns() < deadline_ns) {
+    while (!acknowledged_ && monotonic_ns() < deadline_ns) {
       acknowledged_ = acknowledged(int64_t{100'000'000});
     }
     emit(std::string("{\"event\":\"sent\",\"acknowledged\":") + (acknowledged_ ? "true}" : "false}"));

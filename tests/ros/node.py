@@ -64,6 +64,7 @@ def parse():
     option("--hold", action="store_true", help="publish from SIGUSR1 on")
     option("--prime", action="store_true")
     option("--linger", type=float, default=0.0, help="s")
+    option("--keep-alive", type=float, help="s; a publisher ends so long after the last sample, acknowledged or not")
     option("--stall-every", type=float, default=0.0, help="s")
     option("--stall-for", type=float, default=0.0, help="s")
     option("--summary", action="store_true")
@@ -196,9 +197,12 @@ class Publisher:
                 pass
 
         elapsed = self.publish_all()
+        if options.keep_alive is not None:
+            time.sleep(options.keep_alive)
+            return
         acknowledged = self.acknowledged(0)
-        # A publisher that is asked to end still waits 2 s.
-        deadline = time.monotonic() + (2 if signals.stop else ACKNOWLEDGEMENT_S)
+        # Also after SIGTERM: a publisher that ends at once takes the last samples with it.
+        deadline = time.monotonic() + ACKNOWLEDGEMENT_S
         while not acknowledged and time.monotonic() < deadline:
             acknowledged = self.acknowledged(0.1)
         emit("sent", acknowledged=acknowledged)

@@ -157,12 +157,13 @@ impl Publisher<'_> {
         }
     }
 
-    /// Waits for acknowledgement of everything, then stays as long as it was told; whether all is
-    /// acknowledged.
+    /// Waits until all samples are acknowledged, 10 s at most, also after SIGTERM: a publisher that ends at
+    /// once takes the last samples with it, of which a reader may still miss fragments. Then lingers.
+    /// Returns whether all are acknowledged.
     fn linger(&mut self) -> bool {
         let deadline_ns = clock::monotonic().0 + ACKNOWLEDGEMENT_NS;
         let mut acknowledged = false;
-        while !self.signals.stop() && !acknowledged && clock::monotonic().0 < deadline_ns {
+        while !acknowledged && clock::monotonic().0 < deadline_ns {
             acknowledged = self.acknowledged();
         }
         emit(&json!({"event": "sent", "acknowledged": acknowledged}));
