@@ -6,6 +6,7 @@ use std::fmt::{self, Display, Formatter};
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde::Deserialize;
@@ -139,6 +140,12 @@ impl Peer {
     pub fn env(mut self, name: &str, value: &str) -> Peer {
         self.environment.push((name.to_owned(), value.to_owned()));
         self
+    }
+
+    /// Gives a node on rclpy socket buffers as large as those of the other peers.
+    pub fn large_socket_buffers(self) -> Peer {
+        let profile = super::root().join("tests/ros/large_buffers.xml");
+        self.env("FASTRTPS_DEFAULT_PROFILES_FILE", profile.to_str().unwrap())
     }
 
     /// Sets the DDS domain.
@@ -455,10 +462,20 @@ impl Display for MissingSamples<'_> {
             .filter(|event| event["event"] == "sample")
             .filter_map(|event| event["seq"].as_u64())
             .collect();
-        // With --summary no sample is listed.
+        // With --summary no sample is listed before the peer ends.
         if !received.is_empty() {
             let missing: Vec<u64> = (0..*samples).filter(|sequence| !received.contains(sequence)).collect();
             write!(formatter, ", without {missing:?}")?;
+        } else {
+            // It may have ended already.
+            let _ = nix::sys::signal::kill(peer.process.pid(), Signal::SIGTERM);
+            let summary = (0..100).find_map(|_| {
+                std::thread::sleep(Duration::from_millis(100));
+                peer.events().into_iter().find(|event| event["event"] == "summary")
+            });
+            let summary = summary.unwrap_or_default();
+            write!(formatter, ", from {} to {}", summary["first"], summary["last"])?;
+            write!(formatter, ", without {}", summary["missing"])?;
         }
         Ok(())
     }
