@@ -23,6 +23,9 @@ const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
 
 const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";
 
+/// A message of a reload that does not apply a change.
+const WAITS: &str = "waits for a restart of the whole bridge";
+
 /// Tenths: `systemd-analyze security` shows 2.0 for 20.
 const MAX_EXPOSURE: &str = "--threshold=20";
 
@@ -216,8 +219,13 @@ fn a_restart_of_the_target_applies_the_edited_file_and_that_of_a_service_does_no
         bed.machine.wait_property(EGRESS_CRITICAL, "ActiveState", "active");
         assert_eq!(support::wait_for("all processes to agree", agreed), in_force);
         // A reload of which all waits leaves the unit active.
+        // `systemctl reload` only sends SIGHUP: it can return before the process reports that it reloads.
+        let reloads = || bed.machine.run(&["journalctl", "--unit", CONTROL]).matches(WAITS).count();
+        let before = reloads();
         bed.machine.run(&["systemctl", "reload", CONTROL]);
-        assert_eq!(bed.machine.property(CONTROL, "ActiveState"), "active");
+        support::wait_until("the reload of control", || reloads() > before);
+        bed.machine.wait_property(CONTROL, "ActiveState", "active");
+        assert_eq!(bed.machine.property(CONTROL, "NRestarts"), "0");
 
         bed.machine.run(&["systemctl", "restart", TARGET]);
         in_force =
