@@ -1,4 +1,4 @@
-# The commands of this project. `make test` must pass before a change is merged.
+# The commands of this project. `make test` must pass before a change is proposed; CI runs `make test-long` too.
 FUZZ_SECONDS ?= 10
 # Test programs that run no bridge and open no network: files of the project, and policy in virtual time.
 PURE_TESTS = performance pure report
@@ -14,9 +14,13 @@ peers:
 	$(MAKE) --no-print-directory -C tests/peers
 	cargo build --locked --workspace --bins --example rust_peer
 
-# Sets up, builds and runs everything: lints, unit, property and integration tests, and a bounded fuzz run.
+# Sets up, builds and runs lints, unit, property and integration tests, in at most half an hour on two CPUs.
 test:
-	FUZZ_SECONDS=$(FUZZ_SECONDS) scripts/test.sh
+	scripts/test.sh
+
+# The tests that take a minute or more each, and a bounded fuzz run. CI runs both.
+test-long:
+	FUZZ_SECONDS=$(FUZZ_SECONDS) scripts/test.sh long
 
 # The checks to run after each edit, within a minute of a build. They need no root and no network namespaces.
 quick:
@@ -62,4 +66,4 @@ clean:
 	cargo clean
 	$(MAKE) --no-print-directory -C tests/peers clean
 
-.PHONY: build setup peers test quick lint demo package bench fuzz soak clean
+.PHONY: build setup peers test test-long quick lint demo package bench fuzz soak clean

@@ -1,8 +1,13 @@
 #!/bin/sh
-# Runs all checks that must pass before a change is merged: set-up, lints, tests, fuzzing.
+# Runs the checks that must pass before a change is merged: scripts/test.sh [long]
 #
-# FUZZ_SECONDS: how long each fuzz target runs (default 10). With CI set, skipped tests are failures.
+# Without an argument: set-up, lints and all tests but the long ones. With `long`: the long tests, and each fuzz target for
+# FUZZ_SECONDS (default 10). With CI set, skipped tests are failures.
 set -eu
+case "${1-}" in
+"" | long) what="test${1:+-$1}" ;;
+*) echo "usage: scripts/test.sh [long]" >&2; exit 2 ;;
+esac
 cd "$(dirname "$0")/.."
 PATH="$PATH:${CARGO_HOME:-$HOME/.cargo}/bin"
 
@@ -17,7 +22,7 @@ list_skipped() {
         sort "$skipped"
         echo "********"
     fi
-    if [ "$result" -eq 0 ]; then echo "test: passed"; else echo "test: FAILED"; fi
+    if [ "$result" -eq 0 ]; then echo "$what: passed"; else echo "$what: FAILED"; fi
 }
 trap list_skipped EXIT
 
@@ -30,11 +35,16 @@ begin=$(date +%s)
 
 step scripts/setup.sh
 step make --no-print-directory peers
-step make --no-print-directory lint
 # Most tests wait for DDS and for leases to run out. Those that load the machine run alone (tests/support), and of the
 # others with network namespaces three at a time.
-step env RUST_TEST_THREADS="${RUST_TEST_THREADS:-4}" cargo test --locked --workspace --no-fail-fast
+export RUST_TEST_THREADS="${RUST_TEST_THREADS:-4}"
+if [ "$what" = test-long ]; then
+    step cargo test --locked --test hosts -- ::long::
+    step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"
+    exit
+fi
+step make --no-print-directory lint
+step cargo test --locked --workspace --no-fail-fast -- --skip ::long::
 # The tests of the patched DDS library, a separate package with its own development dependencies.
 export CARGO_PROFILE_DEV_DEBUG=line-tables-only
 step cargo test --locked --manifest-path third_party/rustdds/Cargo.toml --lib --target-dir target/rustdds
-step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"

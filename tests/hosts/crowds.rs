@@ -188,20 +188,6 @@ fn crowd(test: &str, flow: &Flow) {
 }
 
 #[test]
-fn a_crowd_at_30_hz_costs_the_others_no_sample() {
-    let flow = Flow {
-        rate_hz: 30.0,
-        bytes: 2_948,
-        max_sample_bytes: 65_536,
-        depth: 1_000,
-        lag: 100,
-        on_robot: false,
-        bad: BadLibraries::All,
-    };
-    crowd("a_crowd_at_30_hz_costs_the_others_no_sample", &flow);
-}
-
-#[test]
 fn a_crowd_at_200_hz_costs_the_others_no_sample() {
     let flow = Flow {
         rate_hz: 200.0,
@@ -229,16 +215,35 @@ fn a_crowd_at_1_khz_costs_the_others_no_sample() {
     crowd("a_crowd_at_1_khz_costs_the_others_no_sample", &flow);
 }
 
-#[test]
-fn a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample() {
-    let flow = Flow {
-        rate_hz: 30.0,
-        bytes: 1 << 20,
-        max_sample_bytes: 2 << 20,
-        depth: 60,
-        lag: 12,
-        on_robot: true,
-        bad: BadLibraries::Rotated(2),
-    };
-    crowd("a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample", &flow);
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
+
+    #[test]
+    fn a_crowd_at_30_hz_costs_the_others_no_sample() {
+        let flow = Flow {
+            rate_hz: 30.0,
+            bytes: 2_948,
+            max_sample_bytes: 65_536,
+            depth: 1_000,
+            lag: 100,
+            on_robot: false,
+            bad: BadLibraries::All,
+        };
+        crowd("a_crowd_at_30_hz_costs_the_others_no_sample", &flow);
+    }
+
+    #[test]
+    fn a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample() {
+        let flow = Flow {
+            rate_hz: 30.0,
+            bytes: 1 << 20,
+            max_sample_bytes: 2 << 20,
+            depth: 60,
+            lag: 12,
+            on_robot: true,
+            bad: BadLibraries::Rotated(2),
+        };
+        crowd("a_crowd_at_30_hz_of_1_mib_costs_the_others_no_sample", &flow);
+    }
 }

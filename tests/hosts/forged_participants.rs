@@ -53,53 +53,58 @@ fn refused(status: &Value, process: &str, cause: &str) -> u64 {
     process["network_refusals"][cause].as_u64().unwrap()
 }
 
-#[test]
-fn a_million_forged_participants_take_little_memory_and_cost_no_critical_sample() {
-    let test = "a_million_forged_participants_take_little_memory_and_cost_no_critical_sample";
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
-    critical.wait_received(500);
-    let pids = ROLES.map(|role| bed.pid(role));
-    let resident_kib = |pid| memory_kib(pid, "VmRSS");
-    let before = pids.map(resident_kib);
-    let processes = bed.discovery_addresses();
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-    let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
-    let attack = std::thread::spawn({
-        let stop = Arc::clone(&stop);
-        move || announce(&socket, &processes, &stop)
-    });
-    let too_many = "too_many_participants";
-    support::wait_until("refused announcements", || {
-        refused(&bed.bridge.status(), "egress-critical", too_many) > 1_000
-    });
-    // The limit is for each address, so that a subscriber on another host joins during the attack.
-    let late = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    late.wait_received(100);
-    stop.store(true, Ordering::Relaxed);
-    attack.join().unwrap();
+    #[test]
+    fn a_million_forged_participants_take_little_memory_and_cost_no_critical_sample() {
+        let test = "a_million_forged_participants_take_little_memory_and_cost_no_critical_sample";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, SCAN) else { return };
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+        critical.wait_received(500);
+        let pids = ROLES.map(|role| bed.pid(role));
+        let resident_kib = |pid| memory_kib(pid, "VmRSS");
+        let before = pids.map(resident_kib);
+        let processes = bed.discovery_addresses();
 
-    let status = bed.bridge.status();
-    let after = pids.map(resident_kib);
-    let [many, malformed, evicted] = [too_many, "malformed_datagram", "evicted_participant"]
-        .map(|cause| ROLES.map(|role| refused(&status, role, cause)));
-    println!("resident memory {before:?} KiB, then {after:?} KiB");
-    println!("refused {many:?}, malformed {malformed:?}, evicted {evicted:?}");
-    for (index, role) in ROLES.into_iter().enumerate() {
-        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
-        let growth = after[index] - before[index];
-        assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
-        // A full socket buffer discards the others.
-        assert!(many[index] > 10_000, "{role} refused {}", many[index]);
-        assert!(malformed[index] > 1_000, "{role} took {} of another sender", malformed[index]);
-        assert!(evicted[index] < MAX_EVICTED, "{role} evicted {}", evicted[index]);
+        let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
+        let attack = std::thread::spawn({
+            let stop = Arc::clone(&stop);
+            move || announce(&socket, &processes, &stop)
+        });
+        let too_many = "too_many_participants";
+        support::wait_until("refused announcements", || {
+            refused(&bed.bridge.status(), "egress-critical", too_many) > 1_000
+        });
+        // The limit is for each address, so that a subscriber on another host joins during the attack.
+        let late = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        late.wait_received(100);
+        stop.store(true, Ordering::Relaxed);
+        attack.join().unwrap();
+
+        let status = bed.bridge.status();
+        let after = pids.map(resident_kib);
+        let [many, malformed, evicted] = [too_many, "malformed_datagram", "evicted_participant"]
+            .map(|cause| ROLES.map(|role| refused(&status, role, cause)));
+        println!("resident memory {before:?} KiB, then {after:?} KiB");
+        println!("refused {many:?}, malformed {malformed:?}, evicted {evicted:?}");
+        for (index, role) in ROLES.into_iter().enumerate() {
+            assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+            let growth = after[index] - before[index];
+            assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
+            // A full socket buffer discards the others.
+            assert!(many[index] > 10_000, "{role} refused {}", many[index]);
+            assert!(malformed[index] > 1_000, "{role} took {} of another sender", malformed[index]);
+            assert!(evicted[index] < MAX_EVICTED, "{role} evicted {}", evicted[index]);
+        }
+        let sent: Sent = publisher.end();
+        critical.wait_received(sent.ok);
+        critical.end::<Received>().assert_all_of(&sent);
+        late.end::<Received>().assert_sound();
+        bed.wait_accounted();
+        bed.end();
     }
-    let sent: Sent = publisher.end();
-    critical.wait_received(sent.ok);
-    critical.end::<Received>().assert_all_of(&sent);
-    late.end::<Received>().assert_sound();
-    bed.wait_accounted();
-    bed.end();
 }

@@ -42,38 +42,43 @@ fn attack(socket: &UdpSocket, processes: &[SocketAddrV4]) {
     }
 }
 
-#[test]
-fn samples_that_never_become_complete_or_are_too_large_take_little_memory() {
-    let test = "samples_that_never_become_complete_or_are_too_large_take_little_memory";
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
-    critical.wait_received(500);
-    let pids = ROLES.map(|role| bed.pid(role));
-    let resident_kib = |pid| memory_kib(pid, "VmRSS");
-    let before = pids.map(resident_kib);
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-    let processes = bed.discovery_addresses();
-    attack(&bed.host("slow").udp_socket(), &processes);
-    // The largest sample of the route has 64 KiB.
-    let too_large = bed.publish(Peer::fast().keep_all().rate_hz(2.0).size(20 << 20).count(10), INPUT);
-    let too_large: Sent = too_large.finish();
-    let after = pids.map(resident_kib);
+    #[test]
+    fn samples_that_never_become_complete_or_are_too_large_take_little_memory() {
+        let test = "samples_that_never_become_complete_or_are_too_large_take_little_memory";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, SCAN) else { return };
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+        critical.wait_received(500);
+        let pids = ROLES.map(|role| bed.pid(role));
+        let resident_kib = |pid| memory_kib(pid, "VmRSS");
+        let before = pids.map(resident_kib);
 
-    println!("resident memory {before:?} KiB, then {after:?} KiB");
-    for (index, role) in ROLES.into_iter().enumerate() {
-        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
-        let growth = after[index] - before[index];
-        assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
+        let processes = bed.discovery_addresses();
+        attack(&bed.host("slow").udp_socket(), &processes);
+        // The largest sample of the route has 64 KiB.
+        let too_large = bed.publish(Peer::fast().keep_all().rate_hz(2.0).size(20 << 20).count(10), INPUT);
+        let too_large: Sent = too_large.finish();
+        let after = pids.map(resident_kib);
+
+        println!("resident memory {before:?} KiB, then {after:?} KiB");
+        for (index, role) in ROLES.into_iter().enumerate() {
+            assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+            let growth = after[index] - before[index];
+            assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
+        }
+        let sent: Sent = publisher.end();
+        critical.wait_received(sent.ok);
+        critical.end::<Received>().assert_all_of(&sent);
+        let status = bed.wait_accounted();
+        let route: &Value = &status["routes"][0];
+        assert_eq!(route["drops"]["too_large"].as_u64(), Some(too_large.ok), "{route}");
+        assert_eq!(route["lost_upstream"].as_u64(), Some(0), "{route}");
+        assert!(route["received_bytes"].as_u64().unwrap() > too_large.ok * (20 << 20), "{route}");
+        bed.end();
     }
-    let sent: Sent = publisher.end();
-    critical.wait_received(sent.ok);
-    critical.end::<Received>().assert_all_of(&sent);
-    let status = bed.wait_accounted();
-    let route: &Value = &status["routes"][0];
-    assert_eq!(route["drops"]["too_large"].as_u64(), Some(too_large.ok), "{route}");
-    assert_eq!(route["lost_upstream"].as_u64(), Some(0), "{route}");
-    assert!(route["received_bytes"].as_u64().unwrap() > too_large.ok * (20 << 20), "{route}");
-    bed.end();
 }

@@ -178,28 +178,33 @@ fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no
     bed.end();
 }
 
-#[test]
-fn malformed_datagrams_in_the_names_of_all_participants_restart_no_process() {
-    let test = "malformed_datagrams_in_the_names_of_all_participants_restart_no_process";
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    let publisher = bed.publish(Peer::cyclone().rate_hz(100.0), INPUT);
-    critical.wait_received(50);
-    let status = bed.bridge.status();
-    let publishers = status["routes"][0]["publishers"].as_array().unwrap();
-    let known = prefixes(readers(&status).chain(publishers.iter().map(|one| &one["writer"])));
-    assert_eq!(known.len(), 2, "{status}");
-    attack(&bed, 20, &known);
-    // What they send in these names may end the flow between them, so the next one is between others.
-    drop((critical, publisher));
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
-    critical.wait_received(200);
-    let sent: Sent = publisher.end();
-    critical.wait_received(sent.ok);
-    critical.end::<Received>().assert_all_of(&sent);
-    bed.wait_accounted();
-    bed.end();
+    #[test]
+    fn malformed_datagrams_in_the_names_of_all_participants_restart_no_process() {
+        let test = "malformed_datagrams_in_the_names_of_all_participants_restart_no_process";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, SCAN) else { return };
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().rate_hz(100.0), INPUT);
+        critical.wait_received(50);
+        let status = bed.bridge.status();
+        let publishers = status["routes"][0]["publishers"].as_array().unwrap();
+        let known = prefixes(readers(&status).chain(publishers.iter().map(|one| &one["writer"])));
+        assert_eq!(known.len(), 2, "{status}");
+        attack(&bed, 20, &known);
+        // What they send in these names may end the flow between them, so the next one is between others.
+        drop((critical, publisher));
+
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+        critical.wait_received(200);
+        let sent: Sent = publisher.end();
+        critical.wait_received(sent.ok);
+        critical.end::<Received>().assert_all_of(&sent);
+        bed.wait_accounted();
+        bed.end();
+    }
 }

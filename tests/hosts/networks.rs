@@ -326,32 +326,6 @@ fn all_flows_recover_from_an_outage_of_17_s() {
     outage("all_flows_recover_from_an_outage_of_17_s", 17);
 }
 
-/// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`.
-#[test]
-fn all_flows_recover_from_a_long_outage() {
-    let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());
-    outage("all_flows_recover_from_a_long_outage", seconds.unwrap_or(60));
-}
-
-/// A laptop is suspended for longer than every lease: its programs stop, and its link is down. The programs
-/// run again before the link is up.
-#[test]
-fn all_flows_recover_from_a_suspended_laptop() {
-    let Some(bed) = bed("all_flows_recover_from_a_suspended_laptop") else { return };
-    let laptop = bed.host("slow").clone();
-    let scene = Scene::start(&bed, "slow", &LIBRARIES);
-    laptop.signal_all(Signal::SIGSTOP);
-    laptop.set_link(false);
-    std::thread::sleep(Duration::from_secs(25));
-    scene.wait_more_local(15);
-    laptop.signal_all(Signal::SIGCONT);
-    std::thread::sleep(Duration::from_secs(1));
-    scene.wait_recovered(&bed, "25 s of suspend", || laptop.set_link(true));
-    wait_absences_ended(&bed);
-    scene.end(&bed);
-    bed.end();
-}
-
 #[test]
 fn a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_sample() {
     let test = "a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_sample";
@@ -437,4 +411,35 @@ fn an_address_that_is_assigned_after_the_start_is_used() {
     wait_absences_ended(&bed);
     scene.end(&bed);
     bed.end();
+}
+
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
+
+    /// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`.
+    #[test]
+    fn all_flows_recover_from_a_long_outage() {
+        let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());
+        outage("all_flows_recover_from_a_long_outage", seconds.unwrap_or(60));
+    }
+
+    /// A laptop is suspended for longer than every lease: its programs stop, and its link is down. The
+    /// programs run again before the link is up.
+    #[test]
+    fn all_flows_recover_from_a_suspended_laptop() {
+        let Some(bed) = bed("all_flows_recover_from_a_suspended_laptop") else { return };
+        let laptop = bed.host("slow").clone();
+        let scene = Scene::start(&bed, "slow", &LIBRARIES);
+        laptop.signal_all(Signal::SIGSTOP);
+        laptop.set_link(false);
+        std::thread::sleep(Duration::from_secs(25));
+        scene.wait_more_local(15);
+        laptop.signal_all(Signal::SIGCONT);
+        std::thread::sleep(Duration::from_secs(1));
+        scene.wait_recovered(&bed, "25 s of suspend", || laptop.set_link(true));
+        wait_absences_ended(&bed);
+        scene.end(&bed);
+        bed.end();
+    }
 }

@@ -138,20 +138,25 @@ fn a_hundred_visits_at_1_khz_cost_the_others_no_sample() {
     visits(test, Durability::Volatile, None);
 }
 
-#[test]
-fn a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample";
-    visits(test, Durability::Volatile, Some(DELAY));
-}
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-#[test]
-fn a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample";
-    visits(test, Durability::TransientLocal, None);
-}
+    #[test]
+    fn a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample() {
+        let test = "a_hundred_visits_with_100_ms_delay_cost_the_others_no_sample";
+        visits(test, Durability::Volatile, Some(DELAY));
+    }
 
-#[test]
-fn a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample() {
-    let test = "a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample";
-    visits(test, Durability::TransientLocal, Some(DELAY));
+    #[test]
+    fn a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample() {
+        let test = "a_hundred_visits_to_a_transient_local_lane_at_1_khz_cost_the_others_no_sample";
+        visits(test, Durability::TransientLocal, None);
+    }
+
+    #[test]
+    fn a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample() {
+        let test = "a_hundred_visits_to_a_transient_local_lane_with_100_ms_delay_cost_the_others_no_sample";
+        visits(test, Durability::TransientLocal, Some(DELAY));
+    }
 }
