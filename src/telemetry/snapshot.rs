@@ -252,11 +252,18 @@ fn read_subscribers(
 ) -> Result<Vec<SubscriberReading>, ShmError> {
     let places = places(control.subscribers, MAX_SUBSCRIBERS);
     let records = records(places, |place| boards.subscriber(place), |one| !one.id.as_str().is_empty())?;
+    let records = without_moved(records);
     let reading = |record: SubscriberRecord| {
         let lane = usize::try_from(record.lane).ok().filter(|lane| *lane < lanes);
         SubscriberReading { lane, record }
     };
     Ok(records.into_iter().map(reading).collect())
+}
+
+/// Drops records that control has just moved one place down, and not yet overwritten in their old place.
+fn without_moved(mut records: Vec<SubscriberRecord>) -> Vec<SubscriberRecord> {
+    records.dedup_by(|old, moved| old.id == moved.id);
+    records
 }
 
 /// Reads the records in use at these places of a table.
@@ -385,9 +392,19 @@ fn consistent<T>(value: Option<T>) -> Result<T, ShmError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::FixedText;
 
     fn at(ms: u64) -> MonotonicNs {
         MonotonicNs(0).plus_ms(ms)
+    }
+
+    #[test]
+    fn a_subscriber_that_moves_in_the_table_is_read_once() {
+        let record = |id: &str, lane| SubscriberRecord { id: FixedText::new(id), lane, ..Default::default() };
+        let table = vec![record("desk", 1), record("laptop", 2), record("laptop", 3), record("tablet", 4)];
+        let read = without_moved(table);
+        let read: Vec<_> = read.iter().map(|one| (one.id.as_str(), one.lane)).collect();
+        assert_eq!(read, [("desk", 1), ("laptop", 2), ("tablet", 4)]);
     }
 
     #[test]
