@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::model::{DropCounts, DropReason};
 use adaptive_bridge::shm::{Boards, ShmNode, Stage};
+use adaptive_bridge_measure::hop::Loss;
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -118,6 +119,29 @@ pub struct Run {
 }
 
 impl Run {
+    /// The row of this run in the loss table: received, lost, disordered and damaged samples.
+    pub fn loss(&self, case: &Case, scheduling: Scheduling) -> Loss {
+        let mut numbers: Vec<u64> = self.records.iter().map(|record| record.number).collect();
+        let disordered = numbers.windows(2).filter(|pair| pair[1] <= pair[0]).count() as u64;
+        numbers.sort_unstable();
+        numbers.dedup();
+        let received = numbers.len() as u64;
+        Loss {
+            scheduling: scheduling.label().to_owned(),
+            rate_hz: case.rate_hz,
+            bytes: case.bytes,
+            program: self.kind.label().to_owned(),
+            accepted: self.accepted,
+            refused: self.refused,
+            received,
+            lost: self.accepted.saturating_sub(received),
+            disordered,
+            damaged: self.damaged,
+            drops: self.drops(),
+            whole: self.bridge.as_ref().map(|bridge| bridge.whole),
+        }
+    }
+
     /// The number of samples that were sent and not received.
     pub fn missing(&self) -> u64 {
         (self.accepted + self.refused).saturating_sub(self.records.len() as u64)

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use adaptive_bridge_measure::hop::{Latency, Loss, Quantiles, targets};
+use adaptive_bridge_measure::hop::{Latency, Quantiles, targets};
 use adaptive_bridge_measure::statistics::median;
 
 use super::beds::{Beds, Kind, Run, add_up};
@@ -76,7 +76,7 @@ fn measure_limits(
         for bed in &mut beds.0 {
             eprintln!("loss: {} {}, {}", case.name(), bed.name(), scheduling.label());
             let run = bed.measure(&case)?;
-            output.summary.loss.push(loss(&case, scheduling, &run));
+            output.summary.loss.push(run.loss(&case, scheduling));
         }
     }
     for bytes in searches {
@@ -225,28 +225,5 @@ fn row(case: &Case, scheduling: Scheduling, name: &str, program: &Program, direc
         // A sample is copied into shared memory unless ingress assembled it there, and copied out of it
         // unless the lane forwarded it by reference.
         copies: program.copies.map(|(forwarded, avoided)| 2.0 - avoided as f64 / forwarded.max(1) as f64),
-    }
-}
-
-/// The row of a run in the loss table: received, lost, disordered and damaged samples.
-pub fn loss(case: &Case, scheduling: Scheduling, run: &Run) -> Loss {
-    let mut numbers: Vec<u64> = run.records.iter().map(|record| record.number).collect();
-    let disordered = numbers.windows(2).filter(|pair| pair[1] <= pair[0]).count() as u64;
-    numbers.sort_unstable();
-    numbers.dedup();
-    let received = numbers.len() as u64;
-    Loss {
-        scheduling: scheduling.label().to_owned(),
-        rate_hz: case.rate_hz,
-        bytes: case.bytes,
-        program: run.kind.label().to_owned(),
-        accepted: run.accepted,
-        refused: run.refused,
-        received,
-        lost: run.accepted.saturating_sub(received),
-        disordered,
-        damaged: run.damaged,
-        drops: run.drops(),
-        whole: run.bridge.as_ref().map(|bridge| bridge.whole),
     }
 }

@@ -15,8 +15,6 @@ use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::time::{ClockId, ClockNanosleepFlags, clock_nanosleep};
 use nix::unistd::Pid;
 
-use super::options::Options;
-
 /// The placement of the programs on CPUs. Stages are the processes that a sample passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Placement {
@@ -77,8 +75,8 @@ pub struct Place {
 
 impl Place {
     /// The place of one end (0 or 1) of the eventfd: the CPU with that number, unless the placement is free.
-    pub fn of(options: &Options, scheduling: Scheduling, end: usize) -> Self {
-        let cpu = (options.placement != Placement::Free).then_some(end);
+    pub fn of(placement: Placement, scheduling: Scheduling, end: usize) -> Self {
+        let cpu = (placement != Placement::Free).then_some(end);
         Self { cpu, scheduling }
     }
 

@@ -5,7 +5,6 @@
 use adaptive_bridge_measure::hop::{Attempt, Throughput, payload};
 
 use super::beds::{Bed, Beds, Run};
-use super::latency::loss;
 use super::options::{Case, Options, PAYLOADS};
 use super::out::{Output, RowKey};
 use super::system::Scheduling;
@@ -127,7 +126,7 @@ fn search_in(
 
 /// The reason why a run failed; `None` when it passed.
 fn failure(case: &Case, scheduling: Scheduling, run: &Run) -> Option<String> {
-    let account = loss(case, scheduling, run);
+    let account = run.loss(case, scheduling);
     let last = run.records.iter().max_by_key(|record| record.number);
     let behind_ns = last.map_or(0, |last| last.written_at.saturating_sub(last.due_at));
     let run_ns = case.samples as u64 * 1_000_000_000 / case.rate_hz;

@@ -19,7 +19,7 @@ pub fn eventfd(case: &Case, options: &Options, scheduling: Scheduling) -> Result
     let written_at: Arc<[AtomicU64]> = (0..samples).map(|_| AtomicU64::new(0)).collect();
     let sleeper = {
         let (event, written_at) = (Arc::clone(&event), Arc::clone(&written_at));
-        let place = Place::of(options, scheduling, 1);
+        let place = Place::of(options.placement, scheduling, 1);
         std::thread::spawn(move || {
             place.apply();
             let mut latencies = Vec::with_capacity(samples);
@@ -33,7 +33,7 @@ pub fn eventfd(case: &Case, options: &Options, scheduling: Scheduling) -> Result
             latencies
         })
     };
-    let place = Place::of(options, scheduling, 0);
+    let place = Place::of(options.placement, scheduling, 0);
     let waker = std::thread::spawn(move || {
         place.apply();
         let start = clock::monotonic().0 + 10_000_000;

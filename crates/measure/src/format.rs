@@ -51,6 +51,16 @@ pub fn count(value: u64) -> String {
     number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()
 }
 
+/// The size of a payload with a unit: `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.
+pub fn payload(bytes: usize) -> String {
+    match bytes {
+        bytes if bytes >= 1 << 20 && bytes.is_multiple_of(1 << 20) => format!("{} MiB", bytes >> 20),
+        bytes if bytes >= 1 << 10 && bytes.is_multiple_of(1 << 10) => format!("{} KiB", bytes >> 10),
+        bytes if bytes >= 1_000_000 && bytes.is_multiple_of(1_000_000) => format!("{} MB", bytes / 1_000_000),
+        bytes => format!("{} B", count(bytes as u64)),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

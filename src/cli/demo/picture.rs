@@ -4,23 +4,10 @@
 //! background of its own, because a page may have another scheme than the reader's system. Pure.
 
 use std::fmt::Write;
-use std::ops::Range;
 
 use super::outcome::Outcome;
-use super::tally::Figures;
+use super::tally::{BIN_MS, Figures};
 use super::{HISTORY_SCANS, RATE_HZ, STALL_EVERY_MS, STALL_MS};
-
-/// What a phase of the picture shows, in times from the start of the measurement.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Timeline {
-    /// The number of scans that arrived at the critical subscriber in each [`BIN_MS`].
-    pub critical: Vec<usize>,
-    /// The stalls of the remote subscriber, in seconds.
-    pub stalls_s: Vec<Range<f64>>,
-}
-
-/// The time that a step of the curve covers: half a second, 15 scans.
-pub(super) const BIN_MS: u64 = 500;
 
 const WIDTH: f64 = 800.0;
 const HEIGHT: f64 = 484.0;

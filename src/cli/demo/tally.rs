@@ -6,12 +6,22 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::children::Role;
-use super::picture::{BIN_MS, Timeline};
 use super::report::Report;
 use super::{RATE_HZ, STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, due_at};
 use crate::model::{DropCounts, MonotonicNs};
 
-/// The arrival of a scan at a subscriber.
+/// What the picture shows of a phase, in times from the start of the measurement.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Timeline {
+    /// The number of scans that arrived at the critical subscriber in each [`BIN_MS`].
+    pub critical: Vec<usize>,
+    /// The stalls of the remote subscriber, in seconds.
+    pub stalls_s: Vec<Range<f64>>,
+}
+
+/// The time that a step of the curve covers: half a second, 15 scans.
+pub(super) const BIN_MS: u64 = 500;
+
 #[derive(Clone, Copy, Debug)]
 struct Arrival {
     taken_at: MonotonicNs,

@@ -53,7 +53,7 @@ struct Remover;
 impl Drop for Remover {
     fn drop(&mut self) {
         let prefix = stale::name("");
-        leftovers().iter().filter(|name| name.starts_with(&prefix)).for_each(|name| remove(name));
+        names().iter().filter(|name| name.starts_with(&prefix)).for_each(|name| remove(name));
     }
 }
 
@@ -126,8 +126,15 @@ fn port(network: &Network) -> Result<Option<String>, EvalError> {
     Ok(found.and_then(|link| link["ifname"].as_str()).map(str::to_owned))
 }
 
+/// Removes containers and networks of harness processes that no longer run; returns a description of each.
+pub(super) fn remove_leftovers() -> Vec<String> {
+    let leftovers = names().into_iter().filter(|name| stale::is_leftover(name));
+    let removed = leftovers.inspect(|name| remove(name)).map(|name| format!("container or network {name}"));
+    removed.collect()
+}
+
 /// Lists containers and networks of all harness processes, including this one; empty without docker.
-pub(super) fn leftovers() -> Vec<String> {
+fn names() -> Vec<String> {
     let containers = docker("ps --all --filter name=^abe- --format {{.Names}}").unwrap_or_default();
     let networks = docker("network ls --filter name=^abe- --format {{.Name}}").unwrap_or_default();
     // Containers first: a network that is in use can't be removed.
@@ -135,7 +142,7 @@ pub(super) fn leftovers() -> Vec<String> {
 }
 
 /// Removes the container or network of that name.
-pub(super) fn remove(name: &str) {
+fn remove(name: &str) {
     let what = if name.ends_with(NETWORK) { "network rm" } else { "rm --force" };
     let _ = docker(&format!("{what} {name}"));
 }

@@ -18,6 +18,13 @@ use super::scenario::Switch;
 pub use docker::switch as docker_switch;
 pub use network::Network;
 
+/// Removes the leftovers of harness processes that no longer run; returns a description of each.
+pub fn remove_leftovers() -> Vec<String> {
+    let mut removed = docker::remove_leftovers();
+    removed.extend(stale::remove_all());
+    removed
+}
+
 /// The kind of a test bed's hosts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]

@@ -40,16 +40,12 @@ pub(super) fn scratch(what: &str) -> PathBuf {
     std::env::temp_dir().join(name(what))
 }
 
-/// Removes the leftovers of harness processes that no longer run; returns a description of each.
-pub fn remove_all() -> Vec<String> {
+/// Removes namespaces and files of harness processes that no longer run; returns a description of each.
+pub(super) fn remove_all() -> Vec<String> {
     let mut removed = Vec::new();
     for name in names(NAMESPACES).into_iter().filter(|name| is_stale(name, PREFIX)) {
         remove_namespace(&name);
         removed.push(format!("host {name}"));
-    }
-    for name in super::docker::leftovers().into_iter().filter(|name| is_stale(name, PREFIX)) {
-        super::docker::remove(&name);
-        removed.push(format!("container or network {name}"));
     }
     let folders = std::env::temp_dir();
     for name in names(&folders).into_iter().filter(|name| is_stale(name, PREFIX)) {
@@ -88,6 +84,11 @@ pub(super) fn remove_namespace(name: &str) {
         let _ = kill(Pid::from_raw(pid), Signal::SIGKILL);
     }
     let _ = system::run(&line("del"));
+}
+
+/// Whether this is the name of a namespace, container or folder of a process that no longer runs.
+pub(super) fn is_leftover(name: &str) -> bool {
+    is_stale(name, PREFIX)
 }
 
 /// Whether a name with that prefix contains the id of a process that no longer runs.

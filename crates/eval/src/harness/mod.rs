@@ -30,7 +30,7 @@ pub use plan::{Dimensions, Plan};
 use progress::Progress;
 pub use settings::{Library, Settings};
 
-use super::bed::{Host, stale};
+use super::bed::{self, Host};
 use super::error::EvalError;
 
 /// Environment variables that are removed, as they would change the behaviour of a run's programs.
@@ -89,7 +89,7 @@ pub fn run_all(plans: &[Plan], settings: &Settings) -> Result<Outcome, EvalError
         signal_hook::flag::register(signal, Arc::clone(&interrupted))
             .map_err(|error| EvalError::new(format!("signal handlers: {error}")))?;
     }
-    for removed in stale::remove_all() {
+    for removed in bed::remove_leftovers() {
         eprintln!("removed the leftovers of a harness that no longer runs: {removed}");
     }
     for plan in plans {

@@ -1,17 +1,13 @@
-//! The interface of the two back ends that impair real packets, and the choice between them.
+//! The interface of the two back ends that impair real packets.
 
-use std::net::Ipv4Addr;
 use std::os::fd::BorrowedFd;
 
 use adaptive_bridge::model::MonotonicNs;
-use clap::ValueEnum;
 
 use super::delay::NormalDelay;
 use super::error::ImpairmentError;
 use super::gilbert_elliott::GilbertElliott;
-use super::link::{Counters, Impairment, LinkState};
-use super::netem::Netem;
-use super::nfqueue::Nfqueue;
+use super::link::{Counters, LinkState};
 
 /// Impairs the packets that this network namespace receives from one source, until it is dropped.
 pub trait Backend {
@@ -60,58 +56,4 @@ pub trait Backend {
     /// # Errors
     /// The operating system's counters cannot be read.
     fn kernel_dropped(&self) -> Result<u64, ImpairmentError>;
-}
-
-/// The back end that the user requests.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum BackendChoice {
-    /// netem where the kernel has it, otherwise NFQUEUE
-    Auto,
-    /// The model in user space over NFQUEUE: seeded, needs iptables
-    Nfqueue,
-    /// tc netem: not seeded, needs the kernel's netem and ifb
-    Netem,
-}
-
-/// The result of [`open`].
-pub struct Opened {
-    /// The back end, with the link on.
-    pub backend: Box<dyn Backend>,
-    /// Why this back end was chosen.
-    pub reason: String,
-}
-
-/// Starts to impair the packets that the current network namespace receives from `source`; with a
-/// `destination`, only the packets that the namespace forwards to it. No other program in the namespace may
-/// use the number `queue`.
-///
-/// # Errors
-/// The machine lacks what the back end needs, or the queue is in use.
-pub fn open(
-    choice: BackendChoice,
-    source: Ipv4Addr,
-    destination: Option<Ipv4Addr>,
-    queue: u16,
-    impairment: &Impairment,
-) -> Result<Opened, ImpairmentError> {
-    let lacks_netem = match choice {
-        BackendChoice::Nfqueue => None,
-        _ if destination.is_some() => Some("it does not support --destination".to_owned()),
-        BackendChoice::Netem | BackendChoice::Auto => super::netem::missing(queue),
-    };
-    let (netem, reason) = match (choice, lacks_netem) {
-        (BackendChoice::Nfqueue, _) => (false, "chosen by --backend".to_owned()),
-        (BackendChoice::Netem, None) => (true, "chosen by --backend".to_owned()),
-        (BackendChoice::Netem, Some(reason)) => {
-            return Err(ImpairmentError::NoBackend { backend: "netem", reason });
-        }
-        (BackendChoice::Auto, None) => (true, "the kernel has netem".to_owned()),
-        (BackendChoice::Auto, Some(reason)) => (false, format!("no netem: {reason}")),
-    };
-    let backend: Box<dyn Backend> = if netem {
-        Box::new(Netem::open(source, queue, impairment)?)
-    } else {
-        Box::new(Nfqueue::open(source, destination, queue, impairment)?)
-    };
-    Ok(Opened { backend, reason })
 }

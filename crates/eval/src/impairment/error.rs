@@ -3,7 +3,14 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use super::trace::TraceProblem;
+/// A mistake in a line of a trace file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TraceProblem {
+    /// The number of the line, from 1.
+    pub line: usize,
+    /// The message for the user.
+    pub what: String,
+}
 
 /// Why a link could not be impaired.
 #[derive(Debug)]

@@ -6,6 +6,7 @@
 //! kernel has it, otherwise the same model in user space over NFQUEUE.
 
 mod backend;
+mod choice;
 mod delay;
 mod error;
 mod gilbert_elliott;
@@ -18,13 +19,14 @@ mod replay;
 pub(super) mod system;
 mod trace;
 
-pub use backend::{Backend, BackendChoice, Opened, open};
+pub use backend::Backend;
+pub use choice::{BackendChoice, Opened, open};
 pub use delay::{DelayLine, NormalDelay};
-pub use error::ImpairmentError;
+pub use error::{ImpairmentError, TraceProblem};
 pub use gilbert_elliott::{Chain, GilbertElliott};
 pub use levels::{Level, Reading};
 pub use link::{Arrival, Counters, Fate, HELD_MAX, Impairment, Link, LinkState};
 pub use netem::Netem;
 pub use nfqueue::Nfqueue;
 pub use replay::{Replay, RowCounts};
-pub use trace::{Trace, TraceProblem, TraceRow};
+pub use trace::{Trace, TraceRow};

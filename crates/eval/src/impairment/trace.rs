@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::Path;
 
 use super::delay::NormalDelay;
-use super::error::ImpairmentError;
+use super::error::{ImpairmentError, TraceProblem};
 use super::gilbert_elliott::GilbertElliott;
 
 /// The largest file, in bytes: a day with a row for each second is 2 MB.
@@ -39,15 +39,6 @@ pub struct TraceRow {
 pub struct Trace {
     rows: Vec<TraceRow>,
     length_ns: u64,
-}
-
-/// A mistake in a line of a trace file.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct TraceProblem {
-    /// The number of the line, from 1.
-    pub line: usize,
-    /// The message for the user.
-    pub what: String,
 }
 
 impl Trace {

@@ -2,8 +2,8 @@
 
 use super::plot::{Bars, Line, Panel, Series, lines};
 use super::summary::{Isolation, Summary};
-use super::tables::{PROGRAMS, payload, payloads};
-use crate::format::number;
+use super::tables::{PROGRAMS, payloads};
+use crate::format::{number, payload};
 
 const CLASSES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
 

@@ -8,11 +8,12 @@ mod summary;
 mod tables;
 pub mod targets;
 
+pub use crate::format::payload;
 pub use figures::figures;
 pub use page::{fill, readme, runs_named};
 pub use summary::{
     Attempt, Call, Isolation, Latency, Loss, Lossy, Machine, Quantiles, Resource, Scale, Soak, SoakSeries,
     Summary, Throughput,
 };
-pub use tables::{payload, soak_failures};
+pub use tables::soak_failures;
 pub use targets::TARGET_HZ;

@@ -5,22 +5,12 @@ use std::fmt::Write as _;
 
 use super::summary::{Call, Latency, Resource, Soak, Summary};
 use super::targets;
-use crate::format::{count, number, range};
+use crate::format::{count, number, payload, range};
 use crate::statistics::median;
 use crate::table::Table;
 
 /// The programs that are compared, in the order of the tables.
 pub const PROGRAMS: [&str; 4] = ["wake-up", "direct", "relay", "bridge"];
-
-/// The size of a payload with a unit: `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.
-pub fn payload(bytes: usize) -> String {
-    match bytes {
-        bytes if bytes >= 1 << 20 && bytes.is_multiple_of(1 << 20) => format!("{} MiB", bytes >> 20),
-        bytes if bytes >= 1 << 10 && bytes.is_multiple_of(1 << 10) => format!("{} KiB", bytes >> 10),
-        bytes if bytes >= 1_000_000 && bytes.is_multiple_of(1_000_000) => format!("{} MB", bytes / 1_000_000),
-        bytes => format!("{} B", count(bytes as u64)),
-    }
-}
 
 /// Counts by name, such as `critical queue_overflow 7, relay window_full 2`.
 fn by_name(counts: &BTreeMap<String, u64>) -> String {

@@ -1,8 +1,7 @@
 //! The targets for the bridge's overhead, and whether a run meets them.
 
 use super::summary::{Isolation, Latency, SoakSeries, Summary};
-use super::tables::payload;
-use crate::format::number;
+use crate::format::{number, payload};
 use crate::statistics::{growth, median, median_interval};
 use crate::table::Table;
 
