@@ -117,7 +117,7 @@ impl Tap {
         Self {
             format,
             left: arguments.count,
-            tracker: SequenceTracker::new(),
+            tracker: SequenceTracker::default(),
             output: BufWriter::new(io::stdout().lock()),
         }
     }

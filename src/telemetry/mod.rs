@@ -32,9 +32,7 @@ pub use report::{
     IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
     PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
-pub use snapshot::{
-    LaneReading, ModeReason, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
-};
+pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
 pub use text::bytes_text;
 
 impl Snapshot {

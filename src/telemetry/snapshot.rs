@@ -11,10 +11,10 @@ use crate::config::Settings;
 use crate::model::{
     AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
     LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
-    MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
+    MAX_PUBLISHERS, MAX_SUBSCRIBERS, ModeReason, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
     PublisherAccount, RouteId, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
 };
-use crate::policy::{ModeSource, mode_and_source};
+use crate::policy::mode_and_source;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 
 /// Attempts to read counts of a lane that add up. In the middle of a turn, a lane has updated only some of
@@ -95,37 +95,6 @@ pub struct LaneReading {
     pub health: ProcessHealth,
     /// Whether it has an output; else it has no process and is not shown.
     pub is_used: bool,
-}
-
-/// The reason of a lane's mode.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ModeReason {
-    /// No mode was ever set.
-    Default,
-    /// An operator has set the mode.
-    ByHand,
-    /// The control process has set the mode and runs.
-    Control,
-    /// The safety supervisor requires this mode at least.
-    Safety,
-    /// The control process has set the mode and no longer runs; the mode holds for `policy_hold_s`.
-    Held,
-    /// The control process has not run for longer than `policy_hold_s`.
-    Expired,
-}
-
-impl ModeReason {
-    /// The name that `status` shows.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Default => "default",
-            Self::ByHand => "by_hand",
-            Self::Control => "control",
-            Self::Safety => "safety",
-            Self::Held => "held",
-            Self::Expired => "expired",
-        }
-    }
 }
 
 /// The counters and latencies of one route.
@@ -299,15 +268,14 @@ fn mode_of(
     now: MonotonicNs,
     policy_hold_ms: u64,
 ) -> (LaneMode, ModeReason, Option<MonotonicNs>) {
-    let (mode, source) = mode_and_source(policy, class, now, policy_hold_ms);
-    let holds_until = Some(policy.written_at.plus_ms(policy_hold_ms));
-    let (reason, ends_at) = match source {
-        ModeSource::Default => (ModeReason::Default, None),
-        ModeSource::ByHand => (ModeReason::ByHand, Some(policy.expires_at).filter(|at| at.0 != 0)),
-        ModeSource::Safety => (ModeReason::Safety, holds_until),
-        ModeSource::Control if control_runs => (ModeReason::Control, holds_until),
-        ModeSource::Control => (ModeReason::Held, holds_until),
-        ModeSource::Expired => (ModeReason::Expired, None),
+    let (mode, reason) = mode_and_source(policy, class, now, policy_hold_ms);
+    let reason = if reason == ModeReason::Control && !control_runs { ModeReason::Held } else { reason };
+    let ends_at = match reason {
+        ModeReason::Default | ModeReason::Expired => None,
+        ModeReason::ByHand => Some(policy.expires_at).filter(|at| at.0 != 0),
+        ModeReason::Safety | ModeReason::Control | ModeReason::Held => {
+            Some(policy.written_at.plus_ms(policy_hold_ms))
+        }
     };
     (mode, reason, ends_at)
 }

@@ -8,13 +8,13 @@ use std::time::Duration;
 use adaptive_bridge::config::MetricsListener;
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, SubscriberRecord,
-    SubscriberState, TopicName, TrafficClass, WallNs,
+    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId,
+    SubscriberRecord, SubscriberState, TopicName, TrafficClass, WallNs,
 };
 use adaptive_bridge::shm::ProcessRole;
 use adaptive_bridge::telemetry::{
-    LaneReading, MetricsServer, ModeReason, OutputReading, ProcessReading, ProcessState, Report,
-    RouteReading, Snapshot, SubscriberReading,
+    LaneReading, MetricsServer, OutputReading, ProcessReading, ProcessState, Report, RouteReading, Snapshot,
+    SubscriberReading,
 };
 use serde_json::Value;
 use support::prometheus::{parse, python};

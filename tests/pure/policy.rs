@@ -816,7 +816,7 @@ proptest! {
         begin in 1..1_000_u64,
         restart_at in 0..200_usize,
     ) {
-        let mut tracker = SequenceTracker::new();
+        let mut tracker = SequenceTracker::default();
         let (mut sequence, mut seen, mut missing) = (begin, 0, 0);
         let mut highest = 0;
         for (index, jump) in jumps.into_iter().enumerate() {

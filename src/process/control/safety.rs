@@ -4,9 +4,7 @@ use tracing::{info, warn};
 
 use crate::config::{Lane, Settings};
 use crate::model::{DropReason, LaneCounters, LatencyHistogram, MonotonicNs, SafetyMode, TrafficClass};
-use crate::policy::{
-    ErrorCounts, ProcessLoad, SafetyCause, SafetyInputs, SafetySupervisor, SafetyTrouble, SourceLag,
-};
+use crate::policy::{ErrorCounts, ProcessLoad, SafetyCause, SafetySupervisor, SafetyTrouble, SourceLag};
 use crate::shm::{Boards, ProcessRole, Stage};
 
 /// The counters of one process at the previous evaluation.
@@ -38,13 +36,13 @@ impl Supervision {
     pub fn new(boards: &Boards, settings: &Settings, now: MonotonicNs) -> Self {
         let routes = settings.routes.len();
         let mut supervision = Self {
-            supervisor: SafetySupervisor::new(),
+            supervisor: SafetySupervisor::default(),
             since: now,
             reason: String::new(),
             critical_trouble: false,
             ingress: PreviousCounters::default(),
             lanes: settings.lanes.iter().map(|_| PreviousCounters::default()).collect(),
-            source_lags: vec![SourceLag::new(); routes],
+            source_lags: vec![SourceLag::default(); routes],
             dds_in: vec![LatencyHistogram::default(); routes],
             lane_latencies: vec![vec![Default::default(); routes]; settings.lanes.len()],
         };
@@ -80,8 +78,7 @@ impl Supervision {
     /// Reads the boards, evaluates the safety mode and logs a change.
     pub fn evaluate(&mut self, boards: &Boards, settings: &Settings, now: MonotonicNs) {
         let loads = self.read_loads(boards, settings, now);
-        let inputs = SafetyInputs { processes: &loads };
-        let decision = self.supervisor.evaluate(&inputs, &settings.safety.rules, now);
+        let decision = self.supervisor.evaluate(&loads, &settings.safety.rules, now);
         self.critical_trouble = decision.critical_trouble;
         let cause = decision.cause.as_ref().filter(|_| decision.mode != SafetyMode::Normal);
         self.reason = cause.map(cause_text).unwrap_or_default();

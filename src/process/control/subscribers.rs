@@ -336,7 +336,7 @@ impl Subscriber {
             link,
             listed,
             window: ProbeWindow::new(settings.probes.window_size, settings.probes.timeout_ms),
-            classifier: SubscriberClassifier::new(),
+            classifier: SubscriberClassifier::default(),
             reading: LinkReading::default(),
             previous: None,
             since: now,

@@ -1,10 +1,12 @@
 //! Problems that control found, and problems of control itself and of the settings.
 
 use super::{Level, Problem};
-use crate::model::{AbsenceKind, MAX_INTRUDERS, NetworkRefusal, ProbeRefusal, SafetyMode, SubscriberState};
+use crate::model::{
+    AbsenceKind, MAX_INTRUDERS, ModeReason, NetworkRefusal, ProbeRefusal, SafetyMode, SubscriberState,
+};
 use crate::shm::ProcessRole;
 use crate::telemetry::report::SubscriberReport;
-use crate::telemetry::snapshot::{ModeReason, Snapshot};
+use crate::telemetry::snapshot::Snapshot;
 use crate::telemetry::text::{counted, printable};
 
 /// The problem of a NONCRITICAL subscriber shows the age of the last probe response when it is above this

@@ -259,11 +259,11 @@ fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::snapshot::{ModeReason, ProcessReading};
+    use super::super::snapshot::ProcessReading;
     use super::*;
     use crate::model::{
         ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
-        MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
+        ModeReason, MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
     };
 
     /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.

@@ -2,10 +2,10 @@
 
 use super::age_ms;
 use crate::model::{
-    AbsenceRecord, IntruderRecord, LaneMode, MonotonicNs, RefusalCounts, SubscriberState, SubscriberWarning,
-    TrafficClass,
+    AbsenceRecord, IntruderRecord, LaneMode, ModeReason, MonotonicNs, RefusalCounts, SubscriberState,
+    SubscriberWarning, TrafficClass,
 };
-use crate::telemetry::snapshot::{LaneReading, ModeReason, Snapshot, SubscriberReading};
+use crate::telemetry::snapshot::{LaneReading, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
 
 /// The state of the safety supervisor.

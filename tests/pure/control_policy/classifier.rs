@@ -40,7 +40,7 @@ fn run(classifier: &mut SubscriberClassifier, readings: &[LinkReading]) -> Vec<S
 #[test]
 fn three_readings_in_a_row_decide() {
     for bad in [SLOW, LOSSY] {
-        let mut classifier = SubscriberClassifier::new();
+        let mut classifier = SubscriberClassifier::default();
         assert_eq!(run(&mut classifier, &[full(GOOD); 3]), [Unknown, Unknown, Critical]);
         assert_eq!(run(&mut classifier, &[full(bad); 3]), [Critical, Critical, Noncritical]);
         assert_eq!(run(&mut classifier, &[full(GOOD); 3]), [Noncritical, Noncritical, Critical]);
@@ -52,7 +52,7 @@ fn three_readings_in_a_row_decide() {
 fn a_reading_on_a_threshold_or_between_them_resets_the_count() {
     // On a threshold, between, or one within and one between.
     for between in [(0.015, 34.0), (0.0, 50.0), (0.005, 34.0), (0.0, 35.0), (0.01, 40.0), (0.0, 42.0)] {
-        let mut classifier = SubscriberClassifier::new();
+        let mut classifier = SubscriberClassifier::default();
         run(&mut classifier, &[full(GOOD); 3]);
         let states = run(&mut classifier, &[SLOW, SLOW, between, SLOW, LOSSY, between].map(full));
         assert_eq!(states, [Critical; 6], "{between:?}");
@@ -65,7 +65,7 @@ fn a_reading_on_a_threshold_or_between_them_resets_the_count() {
 #[test]
 fn the_reason_has_the_numbers_that_decided() {
     let thresholds = ClassifierThresholds { hysteresis_count: 1, ..ClassifierThresholds::default() };
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     let transition = classifier.evaluate(&full((0.5, 80.0)), &thresholds, None).unwrap();
     assert_eq!((transition.from, transition.to), (Unknown, Noncritical));
     assert_eq!(transition.reason.label(), "loss_and_rtt");
@@ -77,12 +77,12 @@ fn the_reason_has_the_numbers_that_decided() {
 
 #[test]
 fn a_silent_responder_is_demoted_and_too_little_data_decides_nothing() {
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     let few = reading(MIN_SETTLED - 1, 1.0, 0.0);
     assert_eq!(run(&mut classifier, &[few; 5]), [Unknown; 5]);
     assert_eq!(run(&mut classifier, &[reading(50, 1.0, 0.0); 3])[2], Noncritical);
     // A window that holds fewer is enough when it is full.
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     let small = LinkReading { full: true, ..reading(5, 0.0, 1.0) };
     assert_eq!(run(&mut classifier, &[small; 3])[2], Critical);
 }
@@ -90,7 +90,7 @@ fn a_silent_responder_is_demoted_and_too_little_data_decides_nothing() {
 #[test]
 fn unknown_is_critical_where_it_is_not_allowed() {
     let thresholds = ClassifierThresholds { allow_unknown_state: false, ..ClassifierThresholds::default() };
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     assert_eq!(classifier.state(&thresholds), Critical);
     for _ in 0..5 {
         assert_eq!(classifier.evaluate(&full(GOOD), &thresholds, None), None);
@@ -105,7 +105,7 @@ fn unknown_is_critical_where_it_is_not_allowed() {
 #[test]
 fn an_override_applies_at_once_and_the_classifier_continues_from_it() {
     let thresholds = ClassifierThresholds::default();
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     run(&mut classifier, &[full(GOOD); 3]);
     let forced = classifier.evaluate(&full(GOOD), &thresholds, Some(Noncritical)).unwrap();
     assert_eq!((forced.to, forced.reason), (Noncritical, TransitionReason::Override));
@@ -117,7 +117,7 @@ fn an_override_applies_at_once_and_the_classifier_continues_from_it() {
 #[test]
 fn an_unclassified_subscriber_keeps_no_state_and_no_override() {
     let thresholds = ClassifierThresholds::default();
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     assert_eq!(classifier.unclassified(&thresholds), None);
     run(&mut classifier, &[full(SLOW); 5]);
     let change = classifier.unclassified(&thresholds).unwrap();
@@ -182,7 +182,7 @@ proptest! {
         let thresholds =
             ClassifierThresholds { hysteresis_count, allow_unknown_state, ..ClassifierThresholds::default() };
         let needed = hysteresis_count.max(1) as usize;
-        let mut classifier = SubscriberClassifier::new();
+        let mut classifier = SubscriberClassifier::default();
         // The readings since the last that was forced.
         let mut kinds: Vec<Kind> = Vec::new();
         let mut changes = 0;

@@ -2,7 +2,7 @@
 
 use adaptive_bridge::model::{SafetyMode, SafetyRules, TrafficClass};
 use adaptive_bridge::policy::{
-    ErrorCounts, ProcessLoad, SafetyDecision, SafetyInputs, SafetySupervisor, SafetyTrouble, SourceLag,
+    ErrorCounts, ProcessLoad, SafetyDecision, SafetySupervisor, SafetyTrouble, SourceLag,
 };
 use proptest::prelude::*;
 
@@ -27,14 +27,14 @@ struct Bench {
 
 impl Bench {
     fn new(rules: SafetyRules) -> Self {
-        let mut bench = Self { supervisor: SafetySupervisor::new(), rules, now_ms: 0 };
+        let mut bench = Self { supervisor: SafetySupervisor::default(), rules, now_ms: 0 };
         bench.next(&[]);
         bench
     }
 
     fn next(&mut self, processes: &[ProcessLoad<'_>]) -> SafetyDecision {
         self.now_ms += 500;
-        self.supervisor.evaluate(&SafetyInputs { processes }, &self.rules, at_ms(self.now_ms))
+        self.supervisor.evaluate(processes, &self.rules, at_ms(self.now_ms))
     }
 
     /// The modes after each of `times` evaluations of the same.
@@ -203,7 +203,7 @@ fn a_control_process_that_was_stopped_changes_nothing() {
 
 #[test]
 fn a_constant_difference_between_clocks_is_no_lag_and_growth_is() {
-    let mut lag = SourceLag::new();
+    let mut lag = SourceLag::default();
     for second in 0..600 {
         assert_eq!(lag.excess_ms(7_000.0, at_ms(second * 1_000)), Some(0.0));
     }
@@ -215,7 +215,7 @@ fn a_constant_difference_between_clocks_is_no_lag_and_growth_is() {
     assert_eq!(lag.excess_ms(10_001.0, at_ms(903_000)), None);
     assert_eq!(lag.excess_ms(-1.0, at_ms(903_000)), None);
     assert_eq!(lag.excess_ms(f64::NAN, at_ms(903_000)), None);
-    assert_eq!(SourceLag::new().excess_ms(800.0, at_ms(500)), Some(0.0));
+    assert_eq!(SourceLag::default().excess_ms(800.0, at_ms(500)), Some(0.0));
 }
 
 fn load(class: TrafficClass) -> impl Strategy<Value = ProcessLoad<'static>> {

@@ -97,7 +97,7 @@ fn link(level: Level, length_s: u64, seed: u64, impaired: impl Fn(u64) -> bool) 
 /// What the classifier makes of the probes, evaluated at 2 Hz: each transition with its time.
 fn replay(probes: &[Probe], thresholds: &ClassifierThresholds) -> Vec<(u64, Transition)> {
     let mut window = ProbeWindow::new(50, 500);
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     // Sending, answers and evaluations by their time; what happens at the same time, in this order.
     let mut events: Vec<(u64, u8, u64)> = Vec::new();
     for (seq, probe) in probes.iter().enumerate() {

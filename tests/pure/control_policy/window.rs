@@ -151,7 +151,7 @@ fn new_limits_apply_to_pending_probes_and_keep_the_newest_results() {
 fn a_stopped_control_process_demotes_no_subscriber() {
     let thresholds = ClassifierThresholds::default();
     let mut window = ProbeWindow::new(50, 500);
-    let mut classifier = SubscriberClassifier::new();
+    let mut classifier = SubscriberClassifier::default();
     let mut now_ms = 0;
     for seq in 0..2_000 {
         let before_ms = now_ms;

@@ -1,7 +1,7 @@
 //! Records that the control process writes to its board, of fixed size as in [`health`](super::health).
 
 use super::health::FixedText;
-use super::modes::{SafetyMode, SubscriberState};
+use super::modes::{SafetyMode, SubscriberState, numbered};
 use super::probe::RefusalCounts;
 use super::sample::Guid;
 use super::time::MonotonicNs;
@@ -108,31 +108,16 @@ impl SubscriberRecord {
     }
 }
 
-/// A figure of a subscriber above its configured warning threshold (`probes.*_threshold`). A warning has no
-/// influence on any mode.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum SubscriberWarning {
+numbered! {
+    /// A figure of a subscriber above its configured warning threshold (`probes.*_threshold`). A warning has
+    /// no influence on any mode.
+    SubscriberWarning:
     /// The mean round trip.
-    Rtt = 1,
+    Rtt = 1, "rtt",
     /// The share of probes lost.
-    Loss = 2,
+    Loss = 2, "loss",
     /// The jitter.
-    Jitter = 4,
-}
-
-impl SubscriberWarning {
-    /// Every warning.
-    pub const ALL: [Self; 3] = [Self::Rtt, Self::Loss, Self::Jitter];
-
-    /// `rtt`, `loss` or `jitter`.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Rtt => "rtt",
-            Self::Loss => "loss",
-            Self::Jitter => "jitter",
-        }
-    }
+    Jitter = 4, "jitter",
 }
 
 /// A remote subscriber that bypasses the bridge.
@@ -151,29 +136,18 @@ pub struct IntruderRecord {
     pub since: MonotonicNs,
 }
 
-/// The most absences on the board at once, of interfaces and peers that are away or back; those that are away
-/// come first.
+/// The most absences on the board at once; those of interfaces and peers that are still away come first.
 pub const MAX_ABSENCES: usize = 32;
 
-/// What an absence is of: a network interface or a peer.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(u8)]
-pub enum AbsenceKind {
+numbered! {
+    /// What an absence is of: a network interface or a peer.
+    #[derive(Default)]
+    AbsenceKind:
     /// A network interface of this host.
     #[default]
-    Interface = 0,
+    Interface = 0, "interface",
     /// A participant on another host.
-    Peer = 1,
-}
-
-impl AbsenceKind {
-    /// `interface` or `peer`.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Interface => "interface",
-            Self::Peer => "peer",
-        }
-    }
+    Peer = 1, "peer",
 }
 
 /// The absence of a network interface of this host or of a peer on another host, current or past.

@@ -5,30 +5,24 @@ use core::marker::PhantomData;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-/// A closed list of reasons, each with an index, a label and a text for users.
+/// A closed list of reasons, whose text form is the label in logs, `status` and metrics.
 pub trait Reason: Copy + fmt::Display + 'static {
     /// Every reason, in the order of its index.
     const ALL: &'static [Self];
 
     /// The index in [`Reason::ALL`].
     fn index(self) -> usize;
-
-    /// The label in logs, `status` and metrics.
-    fn label(self) -> &'static str;
-
-    /// A text for users: the cause and, where there is one, the remedy.
-    fn meaning(self) -> &'static str;
 }
 
-/// Declares an enum of reasons: each variant with its label and its text for users.
+/// Declares an enum of reasons: each variant with its label and its text for users, which begins its comment.
 macro_rules! reasons {
     ($(#[$attribute:meta])* $name:ident:
-     $($(#[doc = $doc:literal])+ $variant:ident = $label:literal, $meaning:literal,)+) => {
+     $($(#[doc = $doc:literal])* $variant:ident = $label:literal, $meaning:literal,)+) => {
         $(#[$attribute])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[repr(u8)]
         pub enum $name {
-            $($(#[doc = $doc])+ $variant,)+
+            $(#[doc = $meaning] #[doc = ""] $(#[doc = $doc])* $variant,)+
         }
 
         impl $name {
@@ -58,14 +52,6 @@ macro_rules! reasons {
 
             fn index(self) -> usize {
                 self as usize
-            }
-
-            fn label(self) -> &'static str {
-                self.label()
-            }
-
-            fn meaning(self) -> &'static str {
-                self.meaning()
             }
         }
 
@@ -139,7 +125,7 @@ impl<R: Reason, const N: usize> Serialize for Counts<R, N> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(Some(N))?;
         for reason in R::ALL {
-            map.serialize_entry(reason.label(), &self.get(*reason))?;
+            map.serialize_entry(&format_args!("{reason}"), &self.get(*reason))?;
         }
         map.end()
     }
@@ -155,7 +141,7 @@ mod tests {
         fn check<R: Reason>() {
             for (index, reason) in R::ALL.iter().enumerate() {
                 assert_eq!(reason.index(), index);
-                let same = R::ALL.iter().filter(|other| other.label() == reason.label());
+                let same = R::ALL.iter().filter(|other| other.to_string() == reason.to_string());
                 assert_eq!(same.count(), 1, "{reason}");
             }
         }

@@ -9,8 +9,7 @@ use super::time::MonotonicNs;
 /// The most publishers of one route that have an account each.
 pub const MAX_PUBLISHERS: usize = 64;
 
-/// The account of one publisher: which of its samples ingress has taken, by the sequence numbers of its DDS
-/// writer.
+/// The account of one publisher: which samples of its DDS writer ingress has taken, by sequence numbers.
 ///
 /// `last_sequence - first_sequence + 1 = received + lost_upstream`, always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -21,8 +20,7 @@ pub struct PublisherAccount {
     /// The sequence number of the first sample taken. Samples with lower numbers were written before ingress
     /// first read from the writer.
     pub first_sequence: i64,
-    /// The highest sequence number taken, which is the high-water mark: ingress discards samples with this
-    /// number or a lower one.
+    /// The highest sequence number taken, the high-water mark: ingress discards samples up to this number.
     pub last_sequence: i64,
     /// Samples taken.
     pub received: u64,
@@ -32,8 +30,7 @@ pub struct PublisherAccount {
     pub repeated: u64,
     /// When the last sample was taken.
     pub last_at: MonotonicNs,
-    /// The reliability that the writer offers according to discovery: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT`
-    /// or `OFFERS_RELIABLE`.
+    /// The reliability that discovery found: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT` or `OFFERS_RELIABLE`.
     pub offered_reliability: u64,
 }
 
@@ -46,17 +43,9 @@ impl PublisherAccount {
     pub const OFFERS_RELIABLE: u64 = 2;
 
     /// The account of a writer before its first sample, which has this sequence number, is taken.
-    pub const fn new(writer: Guid, first_sequence: i64) -> Self {
-        Self {
-            writer,
-            first_sequence,
-            last_sequence: first_sequence.saturating_sub(1),
-            received: 0,
-            lost_upstream: 0,
-            repeated: 0,
-            last_at: MonotonicNs(0),
-            offered_reliability: Self::OFFER_UNKNOWN,
-        }
+    pub fn new(writer: Guid, first_sequence: i64) -> Self {
+        let last_sequence = first_sequence.saturating_sub(1);
+        Self { writer, first_sequence, last_sequence, ..Self::default() }
     }
 
     /// Whether no publisher has this account.
@@ -87,8 +76,7 @@ pub struct IngressCounters {
     pub received: u64,
     /// Payload bytes of those.
     pub received_bytes: u64,
-    /// Samples published to the lanes; also the sequence number of the last one, because ingress numbers
-    /// without gaps.
+    /// Samples published to the lanes; also the number of the last one, as ingress numbers without gaps.
     pub published: u64,
     /// Of the published, those that the DDS library assembled in the pool, without a copy.
     pub in_place: u64,
@@ -118,8 +106,7 @@ pub struct IngressCounters {
 }
 
 impl IngressCounters {
-    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `None` while all
-    /// agree.
+    /// How far a publisher's clock is ahead of this computer's; `None` while all agree.
     pub fn clock_offset_s(&self) -> Option<f64> {
         (self.clock_offset_ns != 0).then(|| -(self.clock_offset_ns as f64) / 1e9)
     }
@@ -217,8 +204,7 @@ pub struct ProcessHealth {
     pub pid: u64,
     /// When the process started.
     pub started_at: MonotonicNs,
-    /// When its main loop last completed a turn: one that handled samples, or an idle one that checked its
-    /// wake-up source.
+    /// When its main loop last completed a turn: handled samples, or checked its wake-up source.
     pub alive_at: MonotonicNs,
     /// Turns of its main loop.
     pub turns: u64,
@@ -235,8 +221,7 @@ pub struct ProcessHealth {
     /// The process' DDS participant. If the process is killed, its successor announces to remote participants
     /// that this one has left.
     pub participant: Guid,
-    /// Failures in the process other than of samples: housekeeping, a board, a policy that it could not
-    /// write.
+    /// Failures other than of samples: housekeeping, a board, a policy that it could not write.
     pub errors: u64,
     /// The fingerprint of the configuration that the process applies.
     pub settings_fingerprint: u64,
@@ -327,8 +312,7 @@ pub struct RouteInfo {
     pub dds_type: FixedText,
 }
 
-/// Buckets of each octave. The relative width of a bucket is at most 1/16, so that a quantile is at most
-/// 6.3 % too large.
+/// Buckets of each octave: each is at most 1/16 wide, so that a quantile is at most 6.3 % too large.
 const SUB_BUCKETS: usize = 16;
 /// Octaves, from 2^10 ns (1 µs) to 2^37 ns (137 s).
 const OCTAVES: usize = 27;
@@ -382,8 +366,7 @@ impl LatencyHistogram {
         Some(self.max_ns)
     }
 
-    /// The latencies counted since `earlier`, an earlier reading of the same histogram. The maximum remains
-    /// that of all latencies.
+    /// The latencies counted since an earlier reading; the maximum remains that of all latencies.
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
         for (count, before) in difference.counts.iter_mut().zip(earlier.counts.iter()) {

@@ -29,7 +29,7 @@ pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS,
     MAX_PUBLISHERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord, RouteInfo,
 };
-pub use modes::{LaneMode, SafetyMode, SubscriberState, TrafficClass};
+pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};

@@ -1,40 +1,13 @@
 //! The class and mode of a lane, the state of a subscriber and the safety mode of the bridge.
 
-use core::fmt;
-
 use serde::{Deserialize, Serialize};
 
-/// The class of a lane: which samples it forwards, and when. It does not set how the process is scheduled.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub enum TrafficClass {
-    /// Every sample, at the publisher's rate, RELIABLE by default.
-    Critical,
-    /// Rate-limited, the freshest first, BEST_EFFORT by default.
-    Noncritical,
-}
-
-impl TrafficClass {
-    /// `critical` or `noncritical`.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Critical => "critical",
-            Self::Noncritical => "noncritical",
-        }
-    }
-}
-
-impl fmt::Display for TrafficClass {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.label())
-    }
-}
-
-/// Declares an enum whose values are numbers in shared memory and have labels.
+/// Declares an enum whose values have labels, and numbers in shared memory.
 macro_rules! numbered {
     ($(#[$attribute:meta])* $name:ident:
      $($(#[$of_variant:meta])+ $variant:ident = $number:literal, $label:literal,)+) => {
         $(#[$attribute])*
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
         #[repr(u8)]
         pub enum $name {
             $($(#[$of_variant])+ $variant = $number,)+
@@ -61,16 +34,28 @@ macro_rules! numbered {
             }
         }
 
-        impl fmt::Display for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        impl core::fmt::Display for $name {
+            fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
                 f.write_str(self.label())
             }
         }
     };
 }
+pub(super) use numbered;
+
+numbered! {
+    /// The class of a lane: which samples it forwards, and when; not how its process is scheduled.
+    #[derive(Serialize, Deserialize)]
+    TrafficClass:
+    /// Every sample, at the publisher's rate, RELIABLE by default.
+    Critical = 0, "critical",
+    /// Rate-limited, the freshest first, BEST_EFFORT by default.
+    Noncritical = 1, "noncritical",
+}
 
 numbered! {
     /// The mode of a lane: how much it forwards.
+    #[derive(Default)]
     LaneMode:
     /// The configured rate; 10 Hz by default on a noncritical lane.
     #[default]
@@ -84,8 +69,25 @@ numbered! {
 }
 
 numbered! {
+    /// The reason of a lane's mode.
+    ModeReason:
+    /// No mode was ever set.
+    Default = 0, "default",
+    /// An operator has set the mode.
+    ByHand = 1, "by_hand",
+    /// The control process has set the mode, and its confirmation has not expired.
+    Control = 2, "control",
+    /// The safety supervisor requires this mode at least.
+    Safety = 3, "safety",
+    /// The control process has set the mode and no longer runs; the mode holds for `policy_hold_s`.
+    Held = 4, "held",
+    /// The control process has not confirmed its policy for `policy_hold_s`: the safe default.
+    Expired = 5, "expired",
+}
+
+numbered! {
     /// The classifier's state of one subscriber.
-    #[derive(Serialize, Deserialize)]
+    #[derive(Default, Serialize, Deserialize)]
     SubscriberState:
     /// Not enough probe data yet.
     #[default]
@@ -98,6 +100,7 @@ numbered! {
 
 numbered! {
     /// The safety supervisor's mode of the whole bridge.
+    #[derive(Default)]
     SafetyMode:
     /// No overload.
     #[default]

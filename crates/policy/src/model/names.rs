@@ -3,10 +3,9 @@
 use alloc::borrow::ToOwned;
 use alloc::format;
 use alloc::string::String;
-use alloc::vec::Vec;
 use core::fmt;
 
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// The error for a string that is not a valid name.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,28 +24,10 @@ impl fmt::Display for NameError {
 
 impl core::error::Error for NameError {}
 
-/// Serializes a type as its text, and checks the text when it deserializes it.
-macro_rules! text_in_serde {
-    ($name:ident) => {
-        impl Serialize for $name {
-            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-                serializer.collect_str(self)
-            }
-        }
-
-        impl<'de> Deserialize<'de> for $name {
-            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                let text = String::deserialize(deserializer)?;
-                Self::try_from(text.as_str()).map_err(serde::de::Error::custom)
-            }
-        }
-    };
-}
-
 macro_rules! checked_name {
-    ($(#[doc = $doc:literal])+ $name:ident, $kind:literal, $allowed:literal, $check:path) => {
+    ($(#[doc = $doc:literal])+ $name:ident, $kind:literal, $allowed:literal, $parse:path) => {
         $(#[doc = $doc])+
-        #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
         pub struct $name(String);
 
         impl $name {
@@ -63,11 +44,7 @@ macro_rules! checked_name {
             type Error = NameError;
 
             fn try_from(text: &str) -> Result<Self, NameError> {
-                if $check(text) {
-                    Ok(Self(text.to_owned()))
-                } else {
-                    Err(NameError { kind: $kind, allowed: $allowed })
-                }
+                $parse(text).map(Self).ok_or(NameError { kind: $kind, allowed: $allowed })
             }
         }
 
@@ -77,25 +54,30 @@ macro_rules! checked_name {
             }
         }
 
-        text_in_serde!($name);
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                let text = String::deserialize(deserializer)?;
+                Self::try_from(text.as_str()).map_err(serde::de::Error::custom)
+            }
+        }
     };
 }
 
 checked_name! {
     /// The name of a lane: `critical`, `noncritical`, `rviz`, … It is part of file, unit and node names.
-    LaneName, "lane name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", is_short_name
+    LaneName, "lane name", "1 to 24 characters of a-z, 0-9 and _, beginning with a letter", short_name
 }
 
 checked_name! {
     /// The name of one bridge among several on a host; the namespace of its shared memory.
     InstanceName, "instance name",
     "1 to 24 characters of a-z, 0-9 and _, beginning with a letter",
-    is_short_name
+    short_name
 }
 
 checked_name! {
     /// The user's name for a route, unique in a configuration.
-    RouteId, "route id", "1 to 64 characters of A-Z, a-z, 0-9, _, - and .", is_route_id
+    RouteId, "route id", "1 to 64 characters of A-Z, a-z, 0-9, _, - and .", route_id
 }
 
 checked_name! {
@@ -103,7 +85,7 @@ checked_name! {
     TopicName, "topic name",
     "an absolute ROS 2 topic name of at most 246 characters: /tokens of A-Z, a-z, 0-9 and _, none beginning \
      with a digit",
-    is_topic_name
+    topic_name
 }
 
 impl LaneName {
@@ -125,20 +107,17 @@ impl TopicName {
     }
 }
 
-/// A ROS 2 message type, such as `sensor_msgs/msg/LaserScan`.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct TypeName {
-    package: String,
-    name: String,
+checked_name! {
+    /// A ROS 2 message type, such as `sensor_msgs/msg/LaserScan`.
+    TypeName, "message type",
+    "package/msg/Name or package/Name, such as sensor_msgs/msg/LaserScan",
+    type_name
 }
 
 impl TypeName {
-    /// The allowed texts, as a phrase that completes "must be …".
-    pub const ALLOWED: &'static str = "package/msg/Name or package/Name, such as sensor_msgs/msg/LaserScan";
-
     /// The DDS type name: `sensor_msgs::msg::dds_::LaserScan_`.
     pub fn to_dds(&self) -> String {
-        format!("{}::msg::dds_::{}_", self.package, self.name)
+        format!("{}_", self.0.replacen("/msg/", "::msg::dds_::", 1))
     }
 
     /// The ROS 2 type of a DDS type name; `None` when it is not that of a ROS 2 message.
@@ -148,50 +127,35 @@ impl TypeName {
     }
 }
 
-impl TryFrom<&str> for TypeName {
-    type Error = NameError;
-
-    fn try_from(text: &str) -> Result<Self, NameError> {
-        let parts: Vec<&str> = text.split('/').collect();
-        let (package, name) = match parts[..] {
-            [package, name] | [package, "msg", name] => (package, name),
-            _ => ("", ""),
-        };
-        if is_token(package) && is_token(name) {
-            Ok(Self { package: package.to_owned(), name: name.to_owned() })
-        } else {
-            Err(NameError { kind: "message type", allowed: Self::ALLOWED })
-        }
-    }
-}
-
-impl fmt::Display for TypeName {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}/msg/{}", self.package, self.name)
-    }
-}
-
-text_in_serde!(TypeName);
-
-fn is_short_name(text: &str) -> bool {
-    text.len() <= 24
+fn short_name(text: &str) -> Option<String> {
+    let is_valid = text.len() <= 24
         && text.starts_with(|c: char| c.is_ascii_lowercase())
-        && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
+        && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+    is_valid.then(|| text.to_owned())
 }
 
-fn is_route_id(text: &str) -> bool {
-    (1..=64).contains(&text.len())
-        && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.'))
+fn route_id(text: &str) -> Option<String> {
+    let is_valid = (1..=64).contains(&text.len())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.'));
+    is_valid.then(|| text.to_owned())
+}
+
+/// DDS limits a topic name to 255 characters; 246 leaves room for every prefix that ROS 2 uses.
+fn topic_name(text: &str) -> Option<String> {
+    let is_valid =
+        text.len() <= 246 && text.strip_prefix('/').is_some_and(|rest| rest.split('/').all(is_token));
+    is_valid.then(|| text.to_owned())
+}
+
+/// The name with `msg`, which a user may omit.
+fn type_name(text: &str) -> Option<String> {
+    let (package, name) = text.split_once("/msg/").or_else(|| text.split_once('/'))?;
+    (is_token(package) && is_token(name)).then(|| format!("{package}/msg/{name}"))
 }
 
 fn is_token(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
         && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-}
-
-/// DDS limits a topic name to 255 characters; 246 leaves room for every prefix that ROS 2 uses.
-fn is_topic_name(text: &str) -> bool {
-    text.len() <= 246 && text.strip_prefix('/').is_some_and(|rest| rest.split('/').all(is_token))
 }
 
 #[cfg(test)]

@@ -5,39 +5,26 @@ use super::counts::{Counts, reasons};
 /// The longest id of a sender, a responder or a probe, in bytes.
 pub const MAX_ID_BYTES: usize = 127;
 
-/// Whether a text may be the id of a sender, a responder or a probe: 1 to [`MAX_ID_BYTES`] bytes without
-/// control characters.
+/// Whether a text may be such an id: 1 to [`MAX_ID_BYTES`] bytes without control characters.
 pub fn is_probe_id(text: &str) -> bool {
     (1..=MAX_ID_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 
 reasons! {
-    /// Why a probe request or a probe response was refused. A refused message is counted and has no other
-    /// effect.
+    /// Why a probe message was refused. A refused message is counted and has no other effect.
     ProbeRefusal:
     /// Not a `std_msgs/String` with the JSON that the protocol defines.
     Malformed = "malformed", "not a probe message; something else publishes on the topic",
-    /// Larger than a probe message may be.
     Oversized = "oversized", "larger than 4 KiB; something else publishes on the topic",
-    /// Of another version of the protocol.
     UnsupportedVersion = "unsupported_version", "not version 1 of the protocol; update the older side",
-    /// Without a signature where one is required.
     Unsigned = "unsigned", "carries no nonce and hmac; give its sender the secret (security.enable_probe_hmac)",
-    /// The signature is not that of the shared secret.
     BadSignature = "bad_signature", "signed with another secret, or changed in transit",
-    /// Signed, and its time is too far in the past or in the future.
     Expired = "expired", "its time is off by more than replay_window_ms; are the clocks synchronized?",
-    /// Signed, and received before.
     Replayed = "replayed", "received before; a program on the network repeats recorded messages",
-    /// A response to a probe that this bridge did not send.
     Unsolicited = "unsolicited", "answers no probe of this bridge",
-    /// A response to a probe that timed out.
     Late = "late", "arrived after timeout_ms, when its probe had been counted as lost",
-    /// More messages of one sender than `max_probe_rate_hz`, or more senders than the process tracks.
     RateLimited = "rate_limited", "more than max_probe_rate_hz of one sender, or too many senders",
-    /// A response of a responder beyond the largest number that control follows.
     TooManySubscribers = "too_many_subscribers", "more responders than the bridge follows",
-    /// A response of a responder other than `classifier.subscriber_id`.
     NotTheSubscriber = "not_the_subscriber", "not the responder that classifier.subscriber_id names",
 }
 

@@ -48,8 +48,7 @@ pub enum DropPolicy {
     DropOldest,
     /// The oldest sample is sent; a new one is dropped when the queue is full.
     DropLatest,
-    /// Stale samples are dropped, then the oldest of the others is sent; when the queue is full, the oldest
-    /// one is dropped.
+    /// Stale samples are dropped, then the oldest other one is sent; a full queue drops the oldest one.
     DropStale,
 }
 

@@ -7,7 +7,7 @@ use super::time::{MonotonicNs, SourceTimestamp};
 /// The RTPS encapsulation header of a serialized payload (RTPS 2.5 clause 10.2): two bytes of representation
 /// identifier (CDR_LE, PL_CDR2_BE, …) and two bytes of options, whose two lowest bits count the padding bytes
 /// at the end (XTypes 1.3 clause 7.6.3.1.2). Forwarded unchanged.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[repr(transparent)]
 pub struct Encapsulation(pub [u8; 4]);
 
@@ -53,7 +53,7 @@ impl fmt::Display for Guid {
 }
 
 /// The header of one sample in shared memory, of fixed size.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct SampleHeader {
     /// The sample's number in its route. Ingress assigns 1, 2, 3, … without gaps, also across its restarts,

@@ -2,8 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The thresholds of the classifier (paper, section III-C): one set for demotion and one for promotion, with
-/// a gap between them.
+/// The thresholds of the classifier (paper, section III-C) for demotion and promotion, with a gap between.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClassifierThresholds {
     /// Loss, 0 to 1, above which a reading calls for demotion.
@@ -38,8 +37,7 @@ impl Default for ClassifierThresholds {
 /// `policy::SafetySupervisor` explains these defaults.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SafetyRules {
-    /// Whether critical lanes forward in DEGRADED; otherwise DEGRADED stops them too, unless only noncritical
-    /// lanes have trouble.
+    /// Whether critical lanes forward in DEGRADED even if they themselves have trouble.
     pub preserve_critical_path: bool,
     /// Whether noncritical lanes may be degraded or suspended; EMERGENCY stops them in any case.
     pub allow_noncritical_degrade: bool,

@@ -66,26 +66,24 @@ pub enum AbsenceEvent {
     Back(Absence),
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Presence {
-    Present,
-    Away { since: MonotonicNs },
-    Back { since: MonotonicNs, at: MonotonicNs },
+/// When an absence began, and when it ended.
+#[derive(Clone, Copy, Debug)]
+struct Span {
+    since: MonotonicNs,
+    back_at: Option<MonotonicNs>,
 }
 
-impl Presence {
-    /// When the absence began, and when it ended.
-    fn absence(self) -> Option<(MonotonicNs, Option<MonotonicNs>)> {
-        match self {
-            Self::Present => None,
-            Self::Away { since } => Some((since, None)),
-            Self::Back { since, at } => Some((since, Some(at))),
+impl Span {
+    fn is_expired(self, is_configured: bool, now: MonotonicNs) -> bool {
+        match self.back_at {
+            None => !is_configured && now >= self.since.plus_ms(REMEMBER_ABSENCE_MS),
+            Some(at) => now >= at.plus_ms(REMEMBER_ABSENCE_MS),
         }
     }
+}
 
-    fn is_away(self) -> bool {
-        matches!(self, Self::Away { .. })
-    }
+fn is_away(span: Option<Span>) -> bool {
+    span.is_some_and(|span| span.back_at.is_none())
 }
 
 #[derive(Clone, Debug)]
@@ -95,12 +93,13 @@ struct Interface {
     is_configured: bool,
     address: Option<Ipv4Addr>,
     detail: &'static str,
-    presence: Presence,
+    /// The absence, current or past.
+    span: Option<Span>,
 }
 
 impl Interface {
     fn absence(&self) -> Option<Absence> {
-        let (since, back_at) = self.presence.absence()?;
+        let Span { since, back_at } = self.span?;
         Some(Absence {
             kind: AbsenceKind::Interface,
             name: self.name.clone(),
@@ -126,12 +125,13 @@ struct Peer {
     node: Option<String>,
     host: IpAddr,
     endpoints: Vec<Endpoint>,
-    presence: Presence,
+    /// The absence, current or past.
+    span: Option<Span>,
 }
 
 impl Peer {
     fn absence(&self) -> Option<Absence> {
-        let (since, back_at) = self.presence.absence()?;
+        let Span { since, back_at } = self.span?;
         let topics = |publishes: bool| {
             let topics = self.endpoints.iter().filter(move |endpoint| endpoint.publishes == publishes);
             topics.map(|endpoint| endpoint.topic.as_str()).collect::<Vec<_>>().join(", ")
@@ -170,7 +170,7 @@ impl AbsenceWatch {
                     is_configured: true,
                     address: None,
                     detail: "",
-                    presence: Presence::Present,
+                    span: None,
                 });
             }
         }
@@ -179,47 +179,40 @@ impl AbsenceWatch {
 
     /// Compares with the interfaces that this host has now, and removes expired absences.
     pub fn update_interfaces(&mut self, present: &[HostInterface], now: MonotonicNs) {
-        let is_expired = |presence: Presence, is_configured: bool| match presence {
-            Presence::Present => false,
-            Presence::Away { since } => !is_configured && now >= since.plus_ms(REMEMBER_ABSENCE_MS),
-            Presence::Back { at, .. } => now >= at.plus_ms(REMEMBER_ABSENCE_MS),
-        };
-        self.interfaces.retain(|interface| {
-            interface.is_configured || !is_expired(interface.presence, interface.is_configured)
+        self.interfaces.retain_mut(|interface| {
+            let is_configured = interface.is_configured;
+            let kept = interface.span.filter(|span| !span.is_expired(is_configured, now));
+            let is_expired = interface.span.is_some() && kept.is_none();
+            interface.span = kept;
+            is_configured || !is_expired
         });
-        for interface in &mut self.interfaces {
-            if is_expired(interface.presence, interface.is_configured) {
-                interface.presence = Presence::Present;
-            }
-        }
-        self.peers.retain(|peer| !(peer.presence.is_away() && is_expired(peer.presence, false)));
-        for peer in &mut self.peers {
-            if is_expired(peer.presence, false) {
-                peer.presence = Presence::Present;
-            }
-        }
+        self.peers.retain_mut(|peer| {
+            let was_away = is_away(peer.span);
+            peer.span = peer.span.filter(|span| !span.is_expired(false, now));
+            peer.span.is_some() || !was_away
+        });
         self.find_interfaces(present);
         for interface in &mut self.interfaces {
-            match (usable_address(&interface.name, present), interface.presence) {
-                (Ok(address), presence) => {
+            match usable_address(&interface.name, present) {
+                Ok(address) => {
                     interface.address = Some(address);
-                    if let Presence::Away { since } = presence {
-                        interface.presence = Presence::Back { since, at: now };
+                    if let Some(span) = interface.span.as_mut().filter(|span| span.back_at.is_none()) {
+                        span.back_at = Some(now);
                         self.events.extend(interface.absence().map(AbsenceEvent::Back));
                     }
                 }
-                (Err(detail), Presence::Away { .. }) => interface.detail = detail,
-                (Err(detail), _) => {
+                Err(detail) => {
                     interface.detail = detail;
-                    interface.presence = Presence::Away { since: now };
-                    self.events.extend(interface.absence().map(AbsenceEvent::Away));
+                    if !is_away(interface.span) {
+                        interface.span = Some(Span { since: now, back_at: None });
+                        self.events.extend(interface.absence().map(AbsenceEvent::Away));
+                    }
                 }
             }
         }
     }
 
-    /// Adds the interfaces by which a peer is reached. Others appear and disappear with containers and
-    /// tunnels.
+    /// Adds the interfaces by which a peer is reached. Others come and go with containers and tunnels.
     fn find_interfaces(&mut self, present: &[HostInterface]) {
         for found in present.iter().filter(|found| found.has_link) {
             let Some((address, _)) = found.address else { continue };
@@ -231,20 +224,19 @@ impl AbsenceWatch {
             if is_known || count >= MAX_FOUND_INTERFACES {
                 continue;
             }
-            if self.peers.iter().any(|peer| !peer.presence.is_away() && found.reaches(peer.host)) {
+            if self.peers.iter().any(|peer| !is_away(peer.span) && found.reaches(peer.host)) {
                 self.interfaces.push(Interface {
                     name: found.name.clone(),
                     is_configured: false,
                     address: Some(address),
                     detail: "",
-                    presence: Presence::Present,
+                    span: None,
                 });
             }
         }
     }
 
-    /// Records a reader or writer, new or changed, that discovery found on another host in network number
-    /// `network`.
+    /// Records a reader or writer, new or changed, that discovery found on another host.
     pub fn endpoint_discovered(
         &mut self,
         network: usize,
@@ -256,49 +248,36 @@ impl AbsenceWatch {
     ) {
         let prefix = guid.prefix();
         let is_same = |peer: &Peer| peer.network == network && peer.prefix == prefix;
-        let index = match self.peers.iter().position(is_same) {
-            Some(index) => index,
+        // A restarted program replaces a peer that is away if one of its topics is the same.
+        let has = |endpoint: &Endpoint| endpoint.topic == topic && endpoint.publishes == publishes;
+        let is_replaced = |peer: &Peer| {
+            is_away(peer.span)
+                && peer.network == network
+                && peer.host == host
+                && peer.endpoints.iter().any(has)
+        };
+        let peers = &mut self.peers;
+        let place = match peers.iter().position(is_same).or_else(|| peers.iter().position(is_replaced)) {
+            Some(place) => place,
+            None if peers.len() == MAX_WATCHED_PEERS => return,
             None => {
-                // A restarted program replaces a peer that is away if one of its topics is the same.
-                let is_replaced = |peer: &Peer| {
-                    let has =
-                        |endpoint: &Endpoint| endpoint.topic == topic && endpoint.publishes == publishes;
-                    peer.presence.is_away()
-                        && peer.network == network
-                        && peer.host == host
-                        && peer.endpoints.iter().any(has)
-                };
-                match self.peers.iter().position(is_replaced) {
-                    Some(index) => {
-                        let peer = &mut self.peers[index];
-                        peer.prefix = prefix;
-                        peer.endpoints.clear();
-                        index
-                    }
-                    None if self.peers.len() == MAX_WATCHED_PEERS => return,
-                    None => {
-                        self.peers.push(Peer {
-                            network,
-                            prefix,
-                            node: None,
-                            host,
-                            endpoints: Vec::new(),
-                            presence: Presence::Present,
-                        });
-                        self.peers.len() - 1
-                    }
-                }
+                peers.push(Peer { network, prefix, node: None, host, endpoints: Vec::new(), span: None });
+                peers.len() - 1
             }
         };
-        let peer = &mut self.peers[index];
+        let peer = &mut peers[place];
+        if peer.prefix != prefix {
+            peer.prefix = prefix;
+            peer.endpoints.clear();
+        }
         peer.host = host;
         if !peer.endpoints.iter().any(|endpoint| endpoint.guid == guid)
             && peer.endpoints.len() < MAX_PEER_ENDPOINTS
         {
             peer.endpoints.push(Endpoint { guid, topic: topic.to_owned(), publishes });
         }
-        if let Presence::Away { since } = peer.presence {
-            peer.presence = Presence::Back { since, at: now };
+        if let Some(span) = peer.span.as_mut().filter(|span| span.back_at.is_none()) {
+            span.back_at = Some(now);
             self.events.extend(peer.absence().map(AbsenceEvent::Back));
         }
     }
@@ -322,17 +301,18 @@ impl AbsenceWatch {
         let is_same = |peer: &Peer| peer.network == network && peer.prefix == prefix;
         let Some(silent_ms) = silent_ms else { return self.peers.retain(|peer| !is_same(peer)) };
         if let Some(peer) = self.peers.iter_mut().find(|peer| is_same(peer))
-            && !peer.presence.is_away()
+            && !is_away(peer.span)
         {
             let silent_ns = silent_ms.saturating_mul(1_000_000);
-            peer.presence = Presence::Away { since: MonotonicNs(now.0.saturating_sub(silent_ns)) };
+            let since = MonotonicNs(now.0.saturating_sub(silent_ns));
+            peer.span = Some(Span { since, back_at: None });
             self.events.extend(peer.absence().map(AbsenceEvent::Away));
         }
     }
 
     /// Updates the nodes of the peers in a network; `node_of` returns the node of a reader or writer.
     pub fn name_nodes<'graph>(&mut self, network: usize, node_of: impl Fn(Guid) -> Option<&'graph str>) {
-        let peers = self.peers.iter_mut().filter(|peer| peer.network == network && !peer.presence.is_away());
+        let peers = self.peers.iter_mut().filter(|peer| peer.network == network && !is_away(peer.span));
         for peer in peers {
             let node = peer.endpoints.iter().find_map(|endpoint| node_of(endpoint.guid));
             if node.is_some() && node != peer.node.as_deref() {

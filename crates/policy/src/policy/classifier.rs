@@ -62,18 +62,6 @@ pub struct Transition {
     pub reason: TransitionReason,
 }
 
-/// The change that one reading calls for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Verdict {
-    Demotion {
-        by_loss: bool,
-        by_rtt: bool,
-    },
-    Promotion,
-    /// The reading is between the thresholds, or has too little data.
-    Neither,
-}
-
 /// The classifier of one subscriber.
 ///
 /// - The state is UNKNOWN until there is enough data; then the same thresholds lead to CRITICAL or
@@ -97,11 +85,6 @@ pub struct SubscriberClassifier {
 }
 
 impl SubscriberClassifier {
-    /// The classifier of a new subscriber, in state UNKNOWN.
-    pub const fn new() -> Self {
-        Self { state: SubscriberState::Unknown, forced: false, demotions: 0, promotions: 0, transitions: 0 }
-    }
-
     /// The state as shown and treated: CRITICAL instead of UNKNOWN where UNKNOWN is not allowed.
     pub const fn state(&self, thresholds: &ClassifierThresholds) -> SubscriberState {
         match self.state {
@@ -129,44 +112,33 @@ impl SubscriberClassifier {
     ) -> Option<Transition> {
         self.forced = forced.is_some();
         if let Some(forced) = forced {
-            self.demotions = 0;
-            self.promotions = 0;
+            (self.demotions, self.promotions) = (0, 0);
             return self.change(forced, TransitionReason::Override, thresholds);
         }
+        let is_sufficient = reading.settled >= MIN_SETTLED || reading.full;
+        let by_loss = reading.loss > thresholds.demote_loss;
+        let by_rtt = reading.rtt_mean_ms.is_some_and(|rtt_ms| rtt_ms > thresholds.demote_rtt_ms);
+        let is_quick = reading.rtt_mean_ms.is_some_and(|rtt_ms| rtt_ms < thresholds.promote_rtt_ms);
+        let demotes = is_sufficient && (by_loss || by_rtt);
+        let promotes = is_sufficient && !demotes && is_quick && reading.loss < thresholds.promote_loss;
+        self.demotions = if demotes { self.demotions.saturating_add(1) } else { 0 };
+        self.promotions = if promotes { self.promotions.saturating_add(1) } else { 0 };
         let needed = thresholds.hysteresis_count.max(1);
-        match verdict(reading, thresholds) {
-            Verdict::Demotion { by_loss, by_rtt } => {
-                self.promotions = 0;
-                self.demotions = self.demotions.saturating_add(1);
-                if self.demotions < needed {
-                    return None;
-                }
-                let reason = TransitionReason::Demoted { reading: *reading, by_loss, by_rtt };
-                self.change(SubscriberState::Noncritical, reason, thresholds)
-            }
-            Verdict::Promotion => {
-                self.demotions = 0;
-                self.promotions = self.promotions.saturating_add(1);
-                if self.promotions < needed {
-                    return None;
-                }
-                let reason = TransitionReason::Promoted { reading: *reading };
-                self.change(SubscriberState::Critical, reason, thresholds)
-            }
-            Verdict::Neither => {
-                self.demotions = 0;
-                self.promotions = 0;
-                None
-            }
+        if self.demotions >= needed {
+            let reason = TransitionReason::Demoted { reading: *reading, by_loss, by_rtt };
+            self.change(SubscriberState::Noncritical, reason, thresholds)
+        } else if self.promotions >= needed {
+            let reason = TransitionReason::Promoted { reading: *reading };
+            self.change(SubscriberState::Critical, reason, thresholds)
+        } else {
+            None
         }
     }
 
-    /// Resets the state to UNKNOWN, because the classifier is off and no state is forced: the last state
-    /// would become outdated.
+    /// Resets the state to UNKNOWN: the classifier is off, and the last state would become outdated.
     pub fn unclassified(&mut self, thresholds: &ClassifierThresholds) -> Option<Transition> {
         self.forced = false;
-        self.demotions = 0;
-        self.promotions = 0;
+        (self.demotions, self.promotions) = (0, 0);
         self.change(SubscriberState::Unknown, TransitionReason::Unclassified, thresholds)
     }
 
@@ -186,26 +158,6 @@ impl SubscriberClassifier {
         self.transitions += 1;
         Some(Transition { from, to, reason })
     }
-}
-
-fn verdict(reading: &LinkReading, thresholds: &ClassifierThresholds) -> Verdict {
-    let by_loss = reading.loss > thresholds.demote_loss;
-    let by_rtt = reading.rtt_mean_ms.is_some_and(|rtt_ms| rtt_ms > thresholds.demote_rtt_ms);
-    let is_quick = reading.rtt_mean_ms.is_some_and(|rtt_ms| rtt_ms < thresholds.promote_rtt_ms);
-    if !is_sufficient(reading) {
-        Verdict::Neither
-    } else if by_loss || by_rtt {
-        Verdict::Demotion { by_loss, by_rtt }
-    } else if is_quick && reading.loss < thresholds.promote_loss {
-        Verdict::Promotion
-    } else {
-        Verdict::Neither
-    }
-}
-
-/// Whether a reading has enough data for a decision.
-const fn is_sufficient(reading: &LinkReading) -> bool {
-    reading.settled >= MIN_SETTLED || reading.full
 }
 
 /// Whether to remove a subscriber that the configuration does not list; `last_response_at` is its last

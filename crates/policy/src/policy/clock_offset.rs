@@ -1,5 +1,4 @@
-//! Detects whether a publisher's clock disagrees with this host's, and measures the age of its samples in
-//! spite of that.
+//! Measures the age of samples also where the publisher's clock disagrees with this host's.
 //!
 //! A single one-way delay cannot distinguish a clock that is behind from a slow link. The change of the delay
 //! can: in a queue that keeps the order, source timestamps increase, so that the delay grows no faster than
@@ -32,7 +31,8 @@ const DRIFT_NS: i64 = 5 * MS;
 /// Compares the clock of one publisher with this host's, sample by sample. It neither waits nor allocates.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ClockOffset {
-    last: Option<LastSample>,
+    /// The source timestamp and the arrival of the last sample.
+    last: Option<(i64, MonotonicNs)>,
     /// The minimum delay, from the source timestamp to this host's monotonic clock. Only its changes have a
     /// meaning; setting this host's wall clock does not change it.
     base_ns: Option<i64>,
@@ -44,12 +44,6 @@ pub struct ClockOffset {
     was_set: bool,
     is_off: bool,
     offset_ns: i64,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct LastSample {
-    source_ns: i64,
-    at: MonotonicNs,
 }
 
 /// The minimum delay of the current drift window.
@@ -69,15 +63,14 @@ struct Candidate {
 }
 
 impl ClockOffset {
-    /// Processes the source timestamp of a sample that arrives at `now`, and returns from which instant to
-    /// measure its age.
+    /// Returns from which instant to measure the age of a sample that arrives at `now`.
     pub fn observe(&mut self, source: WallNs, now: MonotonicNs, now_wall: WallNs) -> AgeBasis {
         let (source_ns, now_ns) = (signed(source.0), signed(now.0));
         let delay_ns = now_ns.saturating_sub(source_ns);
         let wall_ns = signed(now_wall.0).saturating_sub(now_ns);
         let first = self.last.is_none();
-        self.was_set |= self.last.is_some_and(|last| last.source_ns.saturating_sub(source_ns) > STEP_NS);
-        self.last = Some(LastSample { source_ns, at: now });
+        self.was_set |= self.last.is_some_and(|(last_ns, _)| last_ns.saturating_sub(source_ns) > STEP_NS);
+        self.last = Some((source_ns, now));
         if first && agrees(delay_ns.saturating_add(wall_ns), 1) {
             self.set_base(delay_ns, wall_ns, now);
         }
@@ -100,7 +93,7 @@ impl ClockOffset {
 
     /// When the last sample arrived.
     pub fn last_at(&self) -> Option<MonotonicNs> {
-        self.last.map(|last| last.at)
+        self.last.map(|(_, at)| at)
     }
 
     /// Updates the base, or the candidate for a new one, with the delay of a sample.

@@ -3,7 +3,7 @@
 use super::lane_queue::{Allowance, LaneQueue, SampleStamps};
 use super::token_bucket::{ByteBudget, TokenBucket, burst_for};
 use crate::model::{
-    DropReason, LaneMode, LanePolicy, LaneRates, MonotonicNs, RatePolicy, TrafficClass, WallNs,
+    DropReason, LaneMode, LanePolicy, LaneRates, ModeReason, MonotonicNs, RatePolicy, TrafficClass, WallNs,
 };
 
 /// What a noncritical lane does next on one route.
@@ -16,8 +16,7 @@ pub enum Decision<T> {
     SleepUntil(MonotonicNs),
     /// Wait: none is queued, and the next sample can be sent as soon as it arrives.
     WaitForSample,
-    /// The mode forwards nothing. Offered samples are dropped; there is no hurry to take them out of shared
-    /// memory.
+    /// The mode forwards nothing. Offered samples are dropped; they may wait in shared memory until then.
     Closed,
 }
 
@@ -162,9 +161,8 @@ fn capacity_for(rates: &LaneRates) -> usize {
     rates.normal.queue_samples.max(rates.degraded.queue_samples)
 }
 
-/// The order in which to poll the routes of a lane that share a [`ByteBudget`]. It starts with the route
-/// after the one that sent last: in a fixed order the first route would take all bytes when they do not
-/// suffice.
+/// The order in which to poll the routes of a lane that share a [`ByteBudget`]. It starts after the route
+/// that sent last: in a fixed order the first route would take all bytes when they do not suffice.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PollOrder {
     first: usize,
@@ -193,22 +191,8 @@ pub const fn critical_drop(mode: LaneMode) -> Option<DropReason> {
     }
 }
 
-/// What sets the mode of a lane.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ModeSource {
-    /// No mode was ever set.
-    Default,
-    /// An operator has set it.
-    ByHand,
-    /// Control has set it, and its confirmation has not expired.
-    Control,
-    /// The safety supervisor requires this mode at least.
-    Safety,
-    /// Control no longer confirms its policy: the safe default.
-    Expired,
-}
-
-/// The mode that a lane applies, from its policy on the policy board, and what sets it:
+/// The mode that a lane applies, from its policy on the policy board, and its reason, which is never
+/// [`ModeReason::Held`]:
 ///
 /// - the override by hand, until it expires;
 /// - else control's mode, while control confirms it at least every `policy_hold_ms`;
@@ -218,35 +202,28 @@ pub enum ModeSource {
 ///
 /// A stop by control therefore ends when control dies, and an override cannot lift an emergency.
 #[inline]
-pub const fn mode_and_source(
+pub fn mode_and_source(
     policy: &LanePolicy,
     class: TrafficClass,
     now: MonotonicNs,
     policy_hold_ms: u64,
-) -> (LaneMode, ModeSource) {
+) -> (LaneMode, ModeReason) {
+    // An undefined number, which only a foreign process can write, counts as normal.
+    let mode_of = |number| LaneMode::from_u8(number).unwrap_or_default();
     let confirmed = policy.is_confirmed(now, policy_hold_ms);
     let (mode, source) = if policy.is_overridden(now) {
-        (mode_of(policy.mode_by_hand), ModeSource::ByHand)
+        (mode_of(policy.mode_by_hand), ModeReason::ByHand)
     } else if policy.written_at.0 == 0 {
-        (LaneMode::Normal, ModeSource::Default)
+        (LaneMode::Normal, ModeReason::Default)
     } else if confirmed {
-        (mode_of(policy.mode), ModeSource::Control)
+        (mode_of(policy.mode), ModeReason::Control)
+    } else if class == TrafficClass::Critical {
+        (LaneMode::Normal, ModeReason::Expired)
     } else {
-        match class {
-            TrafficClass::Critical => (LaneMode::Normal, ModeSource::Expired),
-            TrafficClass::Noncritical => (LaneMode::Degraded, ModeSource::Expired),
-        }
+        (LaneMode::Degraded, ModeReason::Expired)
     };
     let floor = mode_of(policy.safety_floor);
-    if confirmed && floor as u8 > mode as u8 { (floor, ModeSource::Safety) } else { (mode, source) }
-}
-
-/// The mode with that number; an undefined number, which only a foreign process can write, counts as normal.
-const fn mode_of(number: u8) -> LaneMode {
-    match LaneMode::from_u8(number) {
-        Some(mode) => mode,
-        None => LaneMode::Normal,
-    }
+    if confirmed && floor as u8 > mode as u8 { (floor, ModeReason::Safety) } else { (mode, source) }
 }
 
 #[cfg(test)]

@@ -1,5 +1,4 @@
-//! Decides the mode of a lane (paper, section III-D) by its worst subscriber, and the floor that the safety
-//! mode sets.
+//! Decides the mode of a lane by its worst subscriber (paper, section III-D), and the safety mode's floor.
 
 use crate::model::{LaneMode, SafetyMode, SafetyRules, SubscriberState, TrafficClass};
 
@@ -54,8 +53,7 @@ pub struct LaneDecision<'a> {
     pub reason: LaneReason<'a>,
 }
 
-/// The mode that control sets for a lane of that class; `subscribers` are the ids and states of the lane's
-/// subscribers.
+/// The mode that control sets for a lane; `subscribers` are the ids and states of its subscribers.
 pub fn lane_mode<'a>(
     class: TrafficClass,
     classifier_enabled: bool,
@@ -96,8 +94,7 @@ pub fn lane_mode<'a>(
 
 /// The mildest mode that a safety mode allows a lane (paper, section III-E): DEGRADED suspends the
 /// noncritical lanes, EMERGENCY stops all. `critical_trouble` is [`SafetyDecision::critical_trouble`]: where
-/// the configuration does not preserve the critical path, only trouble of that path itself stops it in
-/// DEGRADED.
+/// the configuration does not preserve the critical path, only its own trouble stops it in DEGRADED.
 ///
 /// [`SafetyDecision::critical_trouble`]: super::SafetyDecision::critical_trouble
 pub const fn safety_floor(

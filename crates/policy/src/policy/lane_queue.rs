@@ -186,8 +186,7 @@ impl<T> LaneQueue<T> {
             if allowance.is_stale(stamps) {
                 continue;
             }
-            // The newest is sent last and may make debt, so only the bytes of those before it must be
-            // available.
+            // The newest is sent last and may make debt, so only those before it need their bytes.
             if kept > 0 {
                 older_bytes = older_bytes.saturating_add(stamps.bytes);
                 if older_bytes > allowance.bytes {
@@ -208,8 +207,7 @@ impl<T> LaneQueue<T> {
         }
     }
 
-    /// Drops all stale samples. One may wait behind a fresh one, because each publisher of a topic has its
-    /// own clock.
+    /// Drops all stale samples, also behind a fresh one: each publisher of a topic has its own clock.
     fn drop_stale(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
         for _ in 0..self.waiting.len() {
             let Some((item, stamps)) = self.waiting.pop_front() else { return };

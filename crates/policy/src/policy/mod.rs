@@ -1,26 +1,6 @@
 //! Decisions without side effects: no IO, no clock, no threads, no logs; the time is an argument.
 //!
 //! The types of the data plane allocate only on construction and when their configuration changes.
-//!
-//! - [`TokenBucket`] and [`ByteBudget`]: rate limits for samples and bytes.
-//! - [`age_ns`] and [`is_stale`]: the age of a sample.
-//! - [`ClockOffset`]: whether a publisher's clock disagrees with this host's.
-//! - [`LaneQueue`]: which samples wait in a noncritical lane, and which it drops.
-//! - [`RouteShaper`]: rate, queue and staleness of one route on a noncritical lane.
-//! - [`critical_drop`] and [`mode_and_source`]: whether a critical lane drops a sample, and which mode
-//!   applies.
-//! - [`SequenceTracker`]: missing samples, by their sequence numbers.
-//! - [`publisher_place`]: which account a new publisher replaces.
-//! - [`ProbeWindow`]: the state of the link to one subscriber, measured with probes.
-//! - [`SubscriberClassifier`]: the state of one subscriber.
-//! - [`lane_mode()`] and [`safety_floor`]: the mode of a lane, with the reason, and the mildest mode allowed.
-//! - [`SafetySupervisor`]: the safety mode of the whole bridge.
-//! - [`ReplayGuard`] and [`SenderLimits`]: which probe messages are accepted.
-//! - [`SubscriberWarnings`]: warnings about figures of a subscriber.
-//! - [`IntruderWatch`]: remote subscribers that bypass the bridge.
-//! - [`AbsenceWatch`]: network interfaces and peers that are away.
-//! - [`Location`]: whether a DDS endpoint is on this host.
-//! - [`RestartBackoff`]: when to restart a child process.
 
 mod absences;
 mod classifier;
@@ -51,7 +31,7 @@ pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
     NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
-pub use lane::{Decision, ModeSource, PollOrder, RouteShaper, critical_drop, mode_and_source};
+pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, mode_and_source};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
 pub use locality::{Locality, Location};
@@ -63,7 +43,7 @@ pub use restart::{
     RestartDecision,
 };
 pub use safety::{
-    ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetyInputs, SafetySupervisor,
+    ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetySupervisor,
     SafetyTrouble, SourceLag,
 };
 pub use sequence::{SequenceOutcome, SequenceTracker};

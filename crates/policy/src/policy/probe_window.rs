@@ -10,8 +10,7 @@ use crate::model::MonotonicNs;
 /// timeout of 60 s it is 300. Beyond the limit the oldest counts as lost.
 pub const MAX_OUTSTANDING: usize = 4_096;
 
-/// Probes that the window remembers after they were answered, lost or excused, to recognize late and repeated
-/// responses.
+/// Settled and excused probes that the window remembers, to recognize late and repeated responses.
 const REMEMBERED: usize = 64;
 
 /// A control process that wakes this much later than planned was stopped, or got no CPU time: round trips
@@ -227,25 +226,21 @@ impl ProbeWindow {
 
     /// Times out outstanding probes: they are lost, or excused before the subscriber's first response.
     fn settle(&mut self, now: MonotonicNs) {
-        let heard = self.last_response_at.is_some();
-        let mut lost = 0;
+        let outcome = if self.last_response_at.is_some() { Outcome::Lost } else { Outcome::Excused };
+        let mut timed_out = 0;
         for probe in &mut self.probes {
             if now.since(probe.sent_at) <= self.timeout_ns {
                 break;
             }
-            match probe.outcome {
-                Outcome::Outstanding if heard => {
-                    probe.outcome = Outcome::Lost;
-                    lost += 1;
-                }
-                Outcome::Outstanding => {
-                    probe.outcome = Outcome::Excused;
-                    self.totals.excused += 1;
-                }
-                Outcome::Answered | Outcome::Lost | Outcome::Excused => {}
+            if probe.outcome == Outcome::Outstanding {
+                probe.outcome = outcome;
+                timed_out += 1;
             }
         }
-        self.count_lost(lost);
+        match outcome {
+            Outcome::Lost => self.count_lost(timed_out),
+            _ => self.totals.excused += timed_out,
+        }
         self.trim();
     }
 

@@ -5,8 +5,7 @@ use crate::model::{MonotonicNs, PublisherAccount};
 /// The silence after which the account of a matched publisher may be replaced.
 pub const PUBLISHER_SILENT_MS: u64 = 60_000;
 
-/// The index of the account that a new publisher replaces. `accounts` has each account and whether its
-/// publisher is gone.
+/// The index of the account that a new publisher replaces, of `accounts` with whether the publisher is gone.
 ///
 /// A vacant account comes first, then that of the gone publisher that has been silent longest, then that of
 /// the publisher that has been silent longest if its silence is at least [`PUBLISHER_SILENT_MS`]. `None` when

@@ -137,14 +137,14 @@ struct Sender<K> {
 impl<K: PartialEq> SenderLimits<K> {
     /// A limit of `rate_hz` for each of at most `capacity` senders.
     pub fn new(rate_hz: f64, capacity: usize, now: MonotonicNs) -> Self {
-        let others = TokenBucket::new(rate_hz, burst_for(rate_hz), now);
-        Self { rate_hz, burst_s: 0.0, capacity, senders: Vec::with_capacity(capacity), others, refused: 0 }
+        Self::with_burst(rate_hz, 0.0, capacity, now)
     }
 
-    /// Like [`new`](Self::new), but the messages of `burst_s` seconds may arrive at once, as after an outage
-    /// of the sender's link.
+    /// As [`new`](Self::new), but the messages of `burst_s` may arrive at once, as after an outage of a link.
     pub fn with_burst(rate_hz: f64, burst_s: f64, capacity: usize, now: MonotonicNs) -> Self {
-        let mut limits = Self { burst_s, ..Self::new(rate_hz, capacity, now) };
+        let others = TokenBucket::new(rate_hz, burst_for(rate_hz), now);
+        let senders = Vec::with_capacity(capacity);
+        let mut limits = Self { rate_hz, burst_s, capacity, senders, others, refused: 0 };
         limits.others = limits.bucket(now);
         limits
     }
@@ -173,14 +173,14 @@ impl<K: PartialEq> SenderLimits<K> {
 
     /// Whether the rate allows a message of `key`.
     pub fn allow(&mut self, key: K, now: MonotonicNs) -> bool {
-        let allowed = match self.senders.iter().position(|sender| sender.key == key) {
-            Some(index) => {
-                let sender = &mut self.senders[index];
-                sender.last_request_at = now;
-                sender.bucket.try_take(now)
+        let bucket = match self.place_of(key, now) {
+            Some(place) => {
+                self.senders[place].last_request_at = now;
+                &mut self.senders[place].bucket
             }
-            None => self.allow_new(key, now),
+            None => &mut self.others,
         };
+        let allowed = bucket.try_take(now);
         self.refused = self.refused.saturating_add(u64::from(!allowed));
         allowed
     }
@@ -200,22 +200,20 @@ impl<K: PartialEq> SenderLimits<K> {
         self.senders.is_empty()
     }
 
-    fn allow_new(&mut self, key: K, now: MonotonicNs) -> bool {
-        let mut bucket = self.bucket(now);
-        let idle_ns = IDLE_SENDER_MS * 1_000_000;
+    /// The place of a sender in the table; a new one may replace a sender that is idle.
+    fn place_of(&mut self, key: K, now: MonotonicNs) -> Option<usize> {
+        if let Some(place) = self.senders.iter().position(|sender| sender.key == key) {
+            return Some(place);
+        }
+        let is_idle = |sender: &Sender<K>| now.since(sender.last_request_at) > IDLE_SENDER_MS * 1_000_000;
+        let sender = Sender { key, bucket: self.bucket(now), last_request_at: now };
         if self.senders.len() < self.capacity {
-            let allowed = bucket.try_take(now);
-            self.senders.push(Sender { key, bucket, last_request_at: now });
-            return allowed;
+            self.senders.push(sender);
+            return Some(self.senders.len() - 1);
         }
-        match self.senders.iter_mut().find(|sender| now.since(sender.last_request_at) > idle_ns) {
-            Some(idle) => {
-                let allowed = bucket.try_take(now);
-                *idle = Sender { key, bucket, last_request_at: now };
-                allowed
-            }
-            None => self.others.try_take(now),
-        }
+        let place = self.senders.iter().position(is_idle)?;
+        self.senders[place] = sender;
+        Some(place)
     }
 }
 

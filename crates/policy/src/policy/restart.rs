@@ -41,8 +41,7 @@ pub enum RestartDecision {
     GiveUp(GiveUpReason),
 }
 
-/// The restart waits of one child: 0, 100, 200, 400, … 5,000 ms, and from the beginning after a run of
-/// [`HEALTHY_RUN_MS`].
+/// The restart waits of one child: 0, 100, 200, … 5,000 ms, and again after a run of [`HEALTHY_RUN_MS`].
 #[derive(Clone, Copy, Debug)]
 pub struct RestartBackoff {
     started_at: MonotonicNs,

@@ -27,8 +27,7 @@ const BASELINE_MS: u64 = 60_000;
 /// takes 2 s: stopping the other lanes, and then the restarted one, would only prolong the gap.
 const STALLED_MS: u64 = 500;
 
-/// The smallest queue capacity at which the occupancy is meaningful: a single sample could fill a smaller
-/// one.
+/// The smallest queue whose occupancy is meaningful: a single sample could fill a smaller one.
 const MIN_QUEUE: u64 = 8;
 
 /// The increase of the source lag of one route.
@@ -45,11 +44,6 @@ pub struct SourceLag {
 }
 
 impl SourceLag {
-    /// The lag of a route without measurements.
-    pub const fn new() -> Self {
-        Self { since: MonotonicNs(0), min_ms: None, previous_min_ms: None }
-    }
-
     /// Applies the p99 lag of one evaluation, from a `LatencyHistogram`, and returns its increase above the
     /// minimum; `None` for a difference between clocks.
     pub fn excess_ms(&mut self, p99_ms: f64, now: MonotonicNs) -> Option<f64> {
@@ -125,13 +119,6 @@ impl<'a> ProcessLoad<'a> {
             writer_lag_ms: None,
         }
     }
-}
-
-/// The inputs of one evaluation.
-#[derive(Clone, Copy, Debug)]
-pub struct SafetyInputs<'a> {
-    /// Every process of the data plane that runs or should run.
-    pub processes: &'a [ProcessLoad<'a>],
 }
 
 /// What is wrong with a process, with the measured value and the threshold that it reached.
@@ -215,8 +202,7 @@ pub struct SafetyDecision {
     pub mode: SafetyMode,
     /// The former mode, if this evaluation changed it.
     pub changed_from: Option<SafetyMode>,
-    /// The worst trouble of this reading; after a reading without trouble the last one, until the bridge is
-    /// in NORMAL again.
+    /// The worst trouble of this reading, or else of an earlier one, until the bridge is in NORMAL again.
     pub cause: Option<SafetyCause>,
     /// Whether this reading had no trouble.
     pub clean: bool,
@@ -249,21 +235,6 @@ pub struct SafetySupervisor {
 }
 
 impl SafetySupervisor {
-    /// A supervisor in NORMAL.
-    pub const fn new() -> Self {
-        Self {
-            mode: SafetyMode::Normal,
-            degraded_run: 0,
-            emergency_run: 0,
-            recovery_run: 0,
-            critical_run: 0,
-            critical_trouble: false,
-            cause: None,
-            evaluated_at: None,
-            transitions: 0,
-        }
-    }
-
     /// The mode.
     pub const fn mode(&self) -> SafetyMode {
         self.mode
@@ -274,17 +245,18 @@ impl SafetySupervisor {
         self.transitions
     }
 
-    /// Evaluates one reading. A caller that was stopped does not repeat missed evaluations.
+    /// Evaluates one reading of `processes`: every process of the data plane that runs or should run. A
+    /// caller that was stopped does not repeat missed evaluations.
     pub fn evaluate(
         &mut self,
-        inputs: &SafetyInputs<'_>,
+        processes: &[ProcessLoad<'_>],
         rules: &SafetyRules,
         now: MonotonicNs,
     ) -> SafetyDecision {
         // The first reading has no errors per second: the time in which its errors occurred is unknown.
         let elapsed_s = self.evaluated_at.map(|last| now.since(last) as f64 / 1e9);
         self.evaluated_at = Some(now);
-        let reading = Reading::of(inputs, rules, elapsed_s.filter(|&elapsed_s| elapsed_s > 0.0));
+        let reading = Reading::of(processes, rules, elapsed_s.filter(|&elapsed_s| elapsed_s > 0.0));
         let level = reading.worst.map_or(SafetyMode::Normal, |worst| worst.speaks_for);
         let up = rules.hysteresis_count.max(1);
         let back = rules.recovery_count.max(1);
@@ -351,9 +323,9 @@ struct Reading {
 }
 
 impl Reading {
-    fn of(inputs: &SafetyInputs<'_>, rules: &SafetyRules, elapsed_s: Option<f64>) -> Self {
+    fn of(processes: &[ProcessLoad<'_>], rules: &SafetyRules, elapsed_s: Option<f64>) -> Self {
         let mut reading = Self::default();
-        for process in inputs.processes {
+        for process in processes {
             match process.class {
                 TrafficClass::Critical => reading.critical_path(process, rules, elapsed_s),
                 TrafficClass::Noncritical => reading.noncritical_lane(process, rules, elapsed_s),
@@ -437,8 +409,7 @@ impl Reading {
         }
     }
 
-    /// Keeps the worst trouble: EMERGENCY before DEGRADED, then the critical path before noncritical lanes,
-    /// then the first one.
+    /// Keeps the worst trouble: EMERGENCY before DEGRADED, then the critical path first, then the first one.
     fn add(&mut self, process: &ProcessLoad<'_>, trouble: SafetyTrouble, is_extreme: bool) {
         let class = process.class;
         let is_critical = class == TrafficClass::Critical;

@@ -15,7 +15,8 @@ pub enum SequenceOutcome {
     Duplicate,
 }
 
-/// The account of one route on one lane: every number in `first()+1 ..= last()` was taken or is missing.
+/// The account of one route on one lane: every number in `first()+1 ..= last()` was taken or is missing. It
+/// begins at the first sample, so that those published before the lane existed do not count as missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SequenceTracker {
     first: u64,
@@ -24,16 +25,9 @@ pub struct SequenceTracker {
 }
 
 impl SequenceTracker {
-    /// The account of a lane that has taken no sample of the route. It begins at the first sample, so that
-    /// those published before the lane existed do not count as missing.
-    pub const fn new() -> Self {
-        Self { first: 0, last: 0, begun: false }
-    }
-
     /// Continues the account of a former process with its `first()` and `last()` (`first_sequence` and
-    /// `last_sequence` of the lane's counters). Samples published since are missing until the lane takes
-    /// them. Both are 0 if the process took no sample. If `last` is below `first`, the account is damaged and
-    /// restarts at `first`.
+    /// `last_sequence` of the lane's counters; both 0 if it took no sample). Samples published since are
+    /// missing until the lane takes them. If `last` is below `first`, the account restarts at `first`.
     pub const fn resume(first: u64, last: u64) -> Self {
         let last = if last < first { first } else { last };
         Self { first, last, begun: last > 0 }
@@ -51,8 +45,7 @@ impl SequenceTracker {
         self.last
     }
 
-    /// Accounts for `sequence` and the numbers missing before it. 0, which ingress never assigns, counts as a
-    /// duplicate.
+    /// Accounts for `sequence` and the numbers missing before it. 0, never assigned, counts as a duplicate.
     #[inline]
     pub const fn record(&mut self, sequence: u64) -> SequenceOutcome {
         if sequence <= self.last || sequence == 0 {
@@ -76,7 +69,7 @@ mod tests {
 
     #[test]
     fn the_account_begins_at_the_first_sample() {
-        let mut tracker = SequenceTracker::new();
+        let mut tracker = SequenceTracker::default();
         assert_eq!(tracker.record(500), SequenceOutcome::InOrder);
         assert_eq!((tracker.first(), tracker.last()), (499, 500));
         assert_eq!(tracker.record(501), SequenceOutcome::InOrder);
@@ -84,7 +77,7 @@ mod tests {
 
     #[test]
     fn a_gap_counts_only_the_missing_samples() {
-        let mut tracker = SequenceTracker::new();
+        let mut tracker = SequenceTracker::default();
         tracker.record(1);
         assert_eq!(tracker.record(5), SequenceOutcome::AfterGap(3));
         assert_eq!(tracker.record(6), SequenceOutcome::InOrder);
@@ -92,14 +85,14 @@ mod tests {
 
     #[test]
     fn repeated_and_older_numbers_are_duplicates_and_change_nothing() {
-        let mut tracker = SequenceTracker::new();
+        let mut tracker = SequenceTracker::default();
         tracker.record(3);
         let before = tracker;
         for sequence in [3, 2, 1, 0] {
             assert_eq!(tracker.record(sequence), SequenceOutcome::Duplicate);
         }
         assert_eq!(tracker, before);
-        assert_eq!(SequenceTracker::new().record(0), SequenceOutcome::Duplicate);
+        assert_eq!(SequenceTracker::default().record(0), SequenceOutcome::Duplicate);
     }
 
     #[test]
@@ -114,7 +107,7 @@ mod tests {
 
     #[test]
     fn the_largest_number_does_not_overflow() {
-        let mut tracker = SequenceTracker::new();
+        let mut tracker = SequenceTracker::default();
         tracker.record(1);
         assert_eq!(tracker.record(u64::MAX), SequenceOutcome::AfterGap(u64::MAX - 2));
         assert_eq!(tracker.record(u64::MAX), SequenceOutcome::Duplicate);

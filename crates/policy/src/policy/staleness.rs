@@ -2,9 +2,8 @@
 
 use crate::model::{MonotonicNs, SourceTimestamp, WallNs};
 
-/// The age of a sample in nanoseconds: since its source timestamp, or, without one, since ingress took it at
-/// `taken_at`. 0 when that instant is in the future, because a clock stepped back or the publisher's clock is
-/// ahead.
+/// The age of a sample in nanoseconds: since its source timestamp, or, without one, since `taken_at`. 0 when
+/// that instant is in the future, because a clock stepped back or the publisher's clock is ahead.
 #[inline]
 pub fn age_ns(
     source_timestamp: SourceTimestamp,

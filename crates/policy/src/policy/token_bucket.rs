@@ -4,16 +4,14 @@
 //! so that nothing drifts, however often or late the caller polls. The bucket admits the same samples as the
 //! generic cell rate algorithm (ITU-T I.371): at most `rate × t + burst` tokens in any window of `t` seconds.
 //!
-//! docs/decisions/0003-token-bucket.md has the measurements that show why the bucket must hold more than one
-//! token.
+//! Why the bucket must hold more than one token, with measurements: docs/decisions/0003-token-bucket.md.
 
 use crate::model::{LaneMode, LaneRates, MonotonicNs};
 
 /// The highest rate of a [`TokenBucket`], in hertz.
 pub const MAX_RATE_HZ: f64 = 100_000.0;
 
-/// Every burst includes the credit that accrues in this time, so that late wake-ups do not lower the rate:
-/// 50 ms.
+/// Every burst includes the credit of this time, 50 ms, so that late wake-ups do not lower the rate.
 ///
 /// Two consecutive wake-ups may be late, that for the token and that for a sample, so this covers 25 ms each.
 /// The latest on an idle machine without real-time scheduling was 2.3 ms; ten times that leaves room for a
@@ -110,13 +108,9 @@ impl TokenBucket {
     #[inline]
     pub fn try_take(&mut self, now: MonotonicNs) -> bool {
         self.settle(now);
-        match self.credit.checked_sub(TOKEN) {
-            Some(rest) => {
-                self.credit = rest;
-                true
-            }
-            None => false,
-        }
+        let rest = self.credit.checked_sub(TOKEN);
+        self.credit = rest.unwrap_or(self.credit);
+        rest.is_some()
     }
 
     fn credit_at(&self, now: MonotonicNs) -> u128 {
@@ -124,8 +118,7 @@ impl TokenBucket {
         (self.credit + accrued).min(self.cap)
     }
 
-    /// Updates the credit to `now`. After a clock has stepped back, none accrues until it reaches
-    /// `updated_at`.
+    /// Updates the credit to `now`; none accrues before `updated_at`, after a clock has stepped back.
     fn settle(&mut self, now: MonotonicNs) {
         self.credit = self.credit_at(now);
         self.updated_at = self.updated_at.max(now);
@@ -165,8 +158,7 @@ impl ByteBudget {
         self.balance = if bytes_per_s.is_some() { self.balance.min(self.cap()) } else { 0 };
     }
 
-    /// Accrues at the rate of `mode`. In a mode that forwards nothing the former rate applies, so that debt
-    /// is still paid off.
+    /// Accrues at the rate of `mode`; in one that forwards nothing at the former rate, to pay off debt.
     pub fn set_mode(&mut self, rates: &LaneRates, mode: LaneMode, now: MonotonicNs) {
         if let Some(rate) = rates.in_mode(mode) {
             self.set_rate(rate.max_bytes_per_s, now);
