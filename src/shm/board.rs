@@ -46,14 +46,9 @@ impl BridgeShape {
 
     /// A hash of the lanes, the routes and the layout, by which processes detect that theirs differ.
     fn fingerprint(&self) -> u64 {
-        let mut text = format!("{LAYOUT_VERSION} {}", Layout::of(self).words);
-        for lane in &self.lanes {
-            text.push_str(&format!(" lane {lane}"));
-        }
-        for route in &self.routes {
-            text.push_str(&format!(" route {route}"));
-        }
-        fnv1a(text.as_bytes())
+        let lanes: String = self.lanes.iter().map(|lane| format!(" lane {lane}")).collect();
+        let routes: String = self.routes.iter().map(|route| format!(" route {route}")).collect();
+        fnv1a(format!("{LAYOUT_VERSION} {}{lanes}{routes}", Layout::of(self).words).as_bytes())
     }
 }
 
@@ -112,39 +107,30 @@ struct Layout {
 impl Layout {
     fn of(shape: &BridgeShape) -> Self {
         let (lanes, routes) = (shape.lanes.len(), shape.routes.len());
-        let wake = LINE;
-        let health = wake + lanes * LINE;
-        let policy = health + (2 + lanes) * Cell::<ProcessHealth>::WORDS;
-        let control = policy + lanes * Cell::<LanePolicy>::WORDS;
-        let subscriber = control + Cell::<ControlRecord>::WORDS;
-        let intruder = subscriber + MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS;
-        let named_endpoint = intruder + MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS;
-        let absence = named_endpoint + MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS;
-        let route_info = absence + MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS;
-        let ingress = route_info + routes * Cell::<RouteInfo>::WORDS;
-        let publisher = ingress + routes * Cell::<IngressCounters>::WORDS;
-        let lane = publisher + routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS;
-        let output_readers = lane + lanes * routes * Cell::<LaneCounters>::WORDS;
-        let histograms = output_readers + lanes * routes * Cell::<OutputReaders>::WORDS;
-        let words = histograms + routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE);
+        let mut end = LINE;
+        let mut next = |words: usize| {
+            end += words;
+            end - words
+        };
+        // In the order of their places.
         Self {
             lanes,
             routes,
-            wake,
-            health,
-            policy,
-            control,
-            subscriber,
-            intruder,
-            named_endpoint,
-            absence,
-            route_info,
-            ingress,
-            publisher,
-            lane,
-            output_readers,
-            histograms,
-            words,
+            wake: next(lanes * LINE),
+            health: next((2 + lanes) * Cell::<ProcessHealth>::WORDS),
+            policy: next(lanes * Cell::<LanePolicy>::WORDS),
+            control: next(Cell::<ControlRecord>::WORDS),
+            subscriber: next(MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS),
+            intruder: next(MAX_INTRUDERS * Cell::<IntruderRecord>::WORDS),
+            named_endpoint: next(MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS),
+            absence: next(MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS),
+            route_info: next(routes * Cell::<RouteInfo>::WORDS),
+            ingress: next(routes * Cell::<IngressCounters>::WORDS),
+            publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
+            lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
+            output_readers: next(lanes * routes * Cell::<OutputReaders>::WORDS),
+            histograms: next(routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE)),
+            words: end,
         }
     }
 
@@ -396,12 +382,29 @@ impl<T: Plain> BoardWriter<T> {
         &self.value
     }
 
+    /// Publishes the value, unless it is the one that was last written.
+    pub fn set(&mut self, value: T)
+    where
+        T: PartialEq,
+    {
+        if value != self.value {
+            self.update(|written| *written = value);
+        }
+    }
+
     /// Changes the value and publishes it. If the process dies during the call, the previous value stays.
     pub fn update<R>(&mut self, change: impl FnOnce(&mut T) -> R) -> R {
         let result = change(&mut self.value);
         self.cell.write(&self.segment, &self.value);
         result
     }
+}
+
+/// Writes the rows of a table, and zeroes to the writers that are left.
+#[expect(private_bounds, reason = "only the types of the boards are written")]
+pub fn write_rows<T: Plain + PartialEq>(writers: &mut [BoardWriter<T>], rows: impl Iterator<Item = T>) {
+    let rows = rows.chain(std::iter::repeat_with(T::default));
+    writers.iter_mut().zip(rows).for_each(|(writer, row)| writer.set(row));
 }
 
 /// The only writer of a histogram.

@@ -11,9 +11,9 @@ use std::sync::atomic::{Ordering, fence};
 
 use super::segment::Segment;
 use crate::model::{
-    AbsenceRecord, ControlRecord, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
-    LatencyHistogram, NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo,
-    SubscriberRecord,
+    AbsenceRecord, ControlRecord, DropReason, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
+    LatencyHistogram, MAX_OUTPUT_READERS, NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth,
+    PublisherAccount, RouteInfo, SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -37,61 +37,42 @@ pub(super) unsafe trait Plain: Copy + Default {
     };
 }
 
-// SAFETY: `repr(C)`; words of 8 bytes, one of them `mode`, `ended` and 6 reserved bytes; a GUID of 16 bytes
-// at a multiple of 8; an array of words. Integers only.
-unsafe impl Plain for ProcessHealth {}
-// SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
-unsafe impl Plain for IngressCounters {}
-// SAFETY: `repr(C)`, a GUID of 16 bytes, then 64-bit integers only.
-unsafe impl Plain for PublisherAccount {}
-// SAFETY: `repr(C)`, 64-bit integers and a GUID of 16 bytes at a multiple of 8.
-unsafe impl Plain for LaneCounters {}
-// SAFETY: `repr(C)`; records of a GUID of 16 bytes and four 64-bit integers.
-unsafe impl Plain for OutputReaders {}
-// SAFETY: `repr(C)`; a GUID of 16 bytes, then twice 128 bytes of text, which its reader validates.
-unsafe impl Plain for NamedEndpoint {}
-// SAFETY: `repr(C)`; four words, then 8 single bytes; integers only.
-unsafe impl Plain for LanePolicy {}
-// SAFETY: `repr(C)`; words, 8 single bytes, 128 bytes of text, which its reader validates.
-unsafe impl Plain for ControlRecord {}
-// SAFETY: `repr(C)`; 128 bytes of text, nine words, 8 single bytes, 128 bytes of text.
-unsafe impl Plain for SubscriberRecord {}
-// SAFETY: `repr(C)`; four times 128 bytes of text, then a word.
-unsafe impl Plain for IntruderRecord {}
-// SAFETY: `repr(C)`; three words, then three times 128 bytes of text.
-unsafe impl Plain for AbsenceRecord {}
-// SAFETY: `repr(C)`, 128 bytes of text, which its reader validates.
-unsafe impl Plain for RouteInfo {}
-// SAFETY: `repr(C)`, 64-bit integers only.
-unsafe impl Plain for LatencyHistogram {}
+/// Implements [`Plain`] for the types of the boards, with the size in words that the layout relies on.
+macro_rules! plain {
+    ($($type:ident: $words:expr,)+) => {
+        $(
+            // SAFETY: `repr(C)`; integers, arrays of them, GUIDs of 16 bytes at a multiple of 8, single bytes
+            // in groups of 8, and 128 bytes of text, which its reader validates. The assertion excludes
+            // padding at the end.
+            unsafe impl Plain for $type {}
+            const _: () = assert!(size_of::<$type>() == ($words) * 8);
+        )+
+    };
+}
 
-const _: () = {
-    assert!(size_of::<ProcessHealth>() == 16 * 8);
-    assert!(size_of::<ControlRecord>() == (7 + ProbeRefusal::COUNT + 1 + 16) * 8);
-    assert!(size_of::<SubscriberRecord>() == (16 + 9 + 1 + 16) * 8);
-    assert!(size_of::<IntruderRecord>() == (4 * 16 + 1) * 8);
-    assert!(size_of::<AbsenceRecord>() == (3 + 3 * 16) * 8);
-    assert!(size_of::<NamedEndpoint>() == (2 + 2 * 16) * 8);
-    assert!(size_of::<PublisherAccount>() == 9 * 8);
-    assert!(size_of::<LanePolicy>() == 5 * 8);
-    assert!(size_of::<RouteInfo>() == 16 * 8);
-};
+plain! {
+    ProcessHealth: 16,
+    ControlRecord: 7 + ProbeRefusal::COUNT + 1 + 16,
+    SubscriberRecord: 16 + 9 + 1 + 16,
+    IntruderRecord: 4 * 16 + 1,
+    AbsenceRecord: 3 + 3 * 16,
+    NamedEndpoint: 2 + 2 * 16,
+    PublisherAccount: 9,
+    LanePolicy: 5,
+    RouteInfo: 16,
+    IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
+    LaneCounters: 6 + DropReason::COUNT + 3 + 2 + 3,
+    OutputReaders: MAX_OUTPUT_READERS * 6,
+    LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
+}
 
 /// The location of a value in a segment: a cache line for the version, then the copies, each on its own
 /// lines.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Cell<T> {
     pub(super) at: usize,
     _type: PhantomData<T>,
 }
-
-impl<T> Clone for Cell<T> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<T> Copy for Cell<T> {}
 
 impl<T: Plain> Cell<T> {
     /// The size in words, with version and copies.

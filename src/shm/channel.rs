@@ -1,6 +1,5 @@
 //! The channel of a route: one publisher (ingress), the lanes and taps as subscribers, a pool of fixed size.
 
-use std::fmt;
 use std::thread;
 use std::time::Duration;
 
@@ -14,7 +13,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::error::ShmError;
 use super::header::WireHeader;
-use super::node::{NodeShared, StartLock, failed};
+use super::node::{NodeShared, StartLock};
 use super::service::Service;
 use crate::config::{Lane, Settings};
 use crate::model::{RouteId, fnv1a};
@@ -114,8 +113,7 @@ impl RouteChannel {
         PoolSize { slots, slot_bytes, bytes }
     }
 
-    /// The depth of a queue; it must have room for the retained samples, which a new subscriber receives
-    /// first.
+    /// The depth of a queue, with room for the retained samples that a new subscriber receives first.
     pub(super) fn depth(&self, queue: QueueLimits) -> usize {
         queue.queue_depth.max(self.retained_samples).max(1)
     }
@@ -127,37 +125,30 @@ impl RouteChannel {
 
     /// All parameters as text. iceoryx2 refuses to open the service with another text.
     fn parameters(&self) -> String {
-        let mut text = format!(
-            "bytes={} taps={} retained={}",
-            self.max_sample_bytes, self.max_taps, self.retained_samples
-        );
-        for lane in &self.lanes {
-            text.push_str(&format!(" {}+{}", lane.queue_depth, lane.max_borrowed));
-        }
-        text
+        let lanes = self.lanes.iter().map(|lane| format!(" {}+{}", lane.queue_depth, lane.max_borrowed));
+        let (bytes, taps, retained) = (self.max_sample_bytes, self.max_taps, self.retained_samples);
+        format!("bytes={bytes} taps={taps} retained={retained}{}", lanes.collect::<String>())
     }
 
     /// Opens the route's service; the first process creates it.
     pub(super) fn open(&self, shared: &NodeShared, start: &StartLock) -> Result<Factory, ShmError> {
         let what = format!("to open route {}", self.route);
-        let failure = |error: &dyn fmt::Display| failed(shared.dir(), &what, error);
+        let failure = |reason: String| ShmError::failed(&*what, shared.folder(), reason);
         let name = format!("ab1/samples/{}", self.route);
-        let name = name.as_str().try_into().map_err(|error| failure(&error))?;
+        let name = name.as_str().try_into().map_err(|error| failure(format!("{error}")))?;
         // A hash, because an attribute has at most 255 bytes and the text of many lanes is longer.
         let parameters = format!("{:016x}", fnv1a(self.parameters().as_bytes()));
-        let key = "ab1".try_into().map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;
-        let value = parameters.as_str().try_into();
-        let value = value.map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;
-        let verifier = AttributeVerifier::new()
-            .require(&key, &value)
-            .map_err(|error| failed(shared.dir(), &what, &format!("{error:?}")))?;
+        let key = "ab1".try_into().map_err(|error| failure(format!("{error:?}")))?;
+        let value = parameters.as_str().try_into().map_err(|error| failure(format!("{error:?}")))?;
+        let verifier = AttributeVerifier::new().require(&key, &value);
+        let verifier = verifier.map_err(|error| failure(format!("{error:?}")))?;
         let subscribers = (self.lanes.len() + self.max_taps).max(1);
         let mut attempt = 0;
         loop {
             attempt += 1;
             shared.require_free(0, &format!("route {}", self.route))?;
             let opened = shared
-                .node()
+                .node
                 .service_builder(&name)
                 .publish_subscribe::<[u8]>()
                 .user_header::<WireHeader>()
@@ -185,31 +176,21 @@ impl RouteChannel {
             return Err(match error {
                 OpenOrCreateError::PublishSubscribeOpenError(OpenError::InsufficientPermissions)
                 | OpenOrCreateError::PublishSubscribeCreateError(CreateError::InsufficientPermissions) => {
-                    ShmError::Permission { what, path: shared.dir().path.clone() }
+                    ShmError::Permission { what, path: shared.folder().to_owned() }
                 }
                 OpenOrCreateError::PublishSubscribeOpenError(OpenError::ExceedsMaxNumberOfNodes) => {
                     ShmError::TooManySubscribers { route: self.route.clone(), max: subscribers }
                 }
-                OpenOrCreateError::PublishSubscribeOpenError(
-                    OpenError::IncompatibleAttributes
-                    | OpenError::IncompatibleTypes
-                    | OpenError::IncompatibleMessagingPattern
-                    | OpenError::IncompatibleOverflowBehavior
-                    | OpenError::VersionMismatch
-                    | OpenError::DoesNotSupportRequestedAmountOfNodes
-                    | OpenError::DoesNotSupportRequestedAmountOfPublishers
-                    | OpenError::DoesNotSupportRequestedAmountOfSubscribers
-                    | OpenError::DoesNotSupportRequestedMinBufferSize
-                    | OpenError::DoesNotSupportRequestedMinHistorySize
-                    | OpenError::DoesNotSupportRequestedMinSubscriberBorrowedSamples,
-                ) => ShmError::Incompatible {
-                    what: format!(
-                        "route {} is in use with other sizes or by another version ({error})",
-                        self.route
-                    ),
-                    path: shared.dir().path.clone(),
-                },
-                other => failure(&other),
+                OpenOrCreateError::PublishSubscribeOpenError(_) if !is_transient(error) => {
+                    ShmError::Incompatible {
+                        what: format!(
+                            "route {} is in use with other sizes or by another version ({error})",
+                            self.route
+                        ),
+                        path: shared.folder().to_owned(),
+                    }
+                }
+                other => failure(other.to_string()),
             });
         }
     }

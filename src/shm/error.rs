@@ -1,6 +1,8 @@
 //! Errors when shared memory is set up.
 
-use std::path::PathBuf;
+use std::fmt::Display;
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
 
 use crate::model::{InstanceName, RouteId};
 
@@ -13,7 +15,7 @@ pub enum ShmError {
         /// The folder.
         path: PathBuf,
         /// The error of the operating system.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The folder belongs to another user, or other users may write to it.
     #[error(
@@ -116,4 +118,19 @@ pub enum ShmError {
         /// The error that was reported.
         reason: String,
     },
+}
+
+impl ShmError {
+    /// An operation, as `to` and a verb, that failed.
+    pub(crate) fn failed(what: impl Into<String>, path: &Path, reason: impl Display) -> Self {
+        Self::Failed { what: what.into(), path: path.to_owned(), reason: reason.to_string() }
+    }
+
+    /// An operation that the operating system did not permit, or that failed.
+    pub(super) fn os(what: &str, path: &Path, error: &io::Error) -> Self {
+        match error.kind() {
+            ErrorKind::PermissionDenied => Self::Permission { what: what.to_owned(), path: path.to_owned() },
+            _ => Self::failed(what, path, error),
+        }
+    }
 }

@@ -47,7 +47,7 @@ pub fn decode_header(bytes: &[u8]) -> Result<SampleHeader, HeaderError> {
 }
 
 /// A [`SampleHeader`] as iceoryx2's user header.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(transparent)]
 pub(super) struct WireHeader(pub(super) SampleHeader);
 
@@ -60,21 +60,6 @@ const _: () = assert!(HEADER_BYTES == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 && align_of
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "ab1::SampleHeader"
-    }
-}
-
-impl Default for WireHeader {
-    fn default() -> Self {
-        Self(SampleHeader {
-            sequence: 0,
-            source_timestamp: SourceTimestamp::NONE,
-            taken_at: MonotonicNs(0),
-            published_at: MonotonicNs(0),
-            writer_sequence: 0,
-            writer_guid: Guid::default(),
-            encapsulation: Encapsulation([0; 4]),
-            age_basis: AgeBasis::SOURCE,
-        })
     }
 }
 

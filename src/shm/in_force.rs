@@ -15,7 +15,7 @@ use nix::fcntl::FlockArg;
 use serde::{Deserialize, Serialize};
 
 use super::error::ShmError;
-use super::lock::{FileLock, lock_is_current, read_pid};
+use super::lock::{FileLock, read_pid};
 use super::roles::{RoleHolder, RoleLock};
 use super::root::{InstanceDir, make_private};
 use crate::clock;
@@ -46,10 +46,9 @@ impl InForceShare {
     pub fn join_running(root: &Path, instance: &InstanceName) -> Result<Option<(Self, Vec<u8>)>, ShmError> {
         let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(None) };
         match Self::attempt(&dir, None) {
-            Ok(Attempt::Joined { share, bytes, .. }) => Ok(Some((share, bytes))),
-            Ok(Attempt::NoneRunning) => Ok(None),
+            Ok(joined) => Ok(joined.map(|(share, bytes, _)| (share, bytes))),
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(failed("to join the running bridge", &dir.path, &error)),
+            Err(error) => Err(ShmError::failed("to join the running bridge", &dir.path, error)),
         }
     }
 
@@ -84,20 +83,10 @@ impl InForceShare {
         instance: &InstanceName,
         first: &[u8],
     ) -> Result<(Self, Vec<u8>, bool), ShmError> {
-        // A process that leaves as the last one may remove the folder at the same time; then retry.
-        for _ in 0..100 {
-            let dir = InstanceDir::prepare(root, instance)?;
-            match Self::attempt(&dir, Some(first)) {
-                Ok(Attempt::Joined { share, bytes, is_first }) => return Ok((share, bytes, is_first)),
-                Ok(Attempt::NoneRunning) => {}
-                Err(error) if error.kind() == ErrorKind::NotFound => {}
-                Err(error) => return Err(failed("to put a configuration in force", &dir.path, &error)),
-            }
-        }
-        Err(ShmError::Failed {
-            what: "to put a configuration in force".to_owned(),
-            path: root.to_owned(),
-            reason: "other processes removed the folder in 100 attempts".to_owned(),
+        let what = "to put a configuration in force";
+        InstanceDir::prepare_until(root, instance, what, |dir| match Self::attempt(&dir, Some(first)) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            joined => joined.map_err(|error| ShmError::failed(what, &dir.path, error)),
         })
     }
 
@@ -106,13 +95,13 @@ impl InForceShare {
         InForceFile { dir: self.dir.clone() }
     }
 
-    /// Joins once. `first` is `None` if the caller does not start a bridge.
-    fn attempt(dir: &InstanceDir, first: Option<&[u8]>) -> io::Result<Attempt> {
+    /// Joins once; also returns the content of the file, and whether this is the first process. `first` is
+    /// `None` if the caller does not start a bridge; then the result is `None` if no process is running.
+    fn attempt(dir: &InstanceDir, first: Option<&[u8]>) -> io::Result<Option<(Self, Vec<u8>, bool)>> {
         let path = dir.path.join(LOCK);
         let file = InForceFile { dir: dir.path.clone() };
         let joined = |lock, bytes, is_first| {
-            let share = Self { lock: Some(lock), dir: dir.path.clone() };
-            Ok(Attempt::Joined { share, bytes, is_first })
+            Ok(Some((Self { lock: Some(lock), dir: dir.path.clone() }, bytes, is_first)))
         };
         let give_up_at = clock::monotonic().plus_ms(JOIN_TIMEOUT_MS);
         loop {
@@ -120,14 +109,14 @@ impl InForceShare {
                 let Some(first) = first else {
                     file.remove();
                     lock.remove();
-                    return Ok(Attempt::NoneRunning);
+                    return Ok(None);
                 };
                 file.write(first)?;
                 lock.write_pid()?;
                 // The kernel may give the lock to another process during the change from exclusive to shared.
                 // That process is then the first one, and has removed or overwritten the file.
                 if lock.relock(FlockArg::LockSharedNonblock).is_ok()
-                    && lock_is_current(&lock)
+                    && lock.is_current().unwrap_or(false)
                     && let Some(bytes) = file.read()?
                 {
                     return joined(lock, bytes, true);
@@ -149,27 +138,12 @@ impl InForceShare {
     }
 }
 
-/// The result of [`InForceShare::attempt`].
-enum Attempt {
-    Joined {
-        share: InForceShare,
-        bytes: Vec<u8>,
-        is_first: bool,
-    },
-    /// No process is running, and the caller does not start a bridge.
-    NoneRunning,
-}
-
-fn failed(what: &str, path: &Path, error: &io::Error) -> ShmError {
-    ShmError::Failed { what: what.to_owned(), path: path.to_owned(), reason: error.to_string() }
-}
-
 impl Drop for InForceShare {
     /// The last process that leaves removes the file.
     fn drop(&mut self) {
         if let Some(lock) = self.lock.take()
             && lock.relock(FlockArg::LockExclusiveNonblock).is_ok()
-            && lock_is_current(&lock)
+            && lock.is_current().unwrap_or(false)
         {
             self.file().remove();
             lock.remove();
@@ -299,7 +273,8 @@ impl BridgeAddress {
                 let _ = fs::remove_file(path);
             }
         }
-        let failed = |error: io::Error| failed("to write the address of the bridge", &folder, &error);
+        let failed =
+            |error: io::Error| ShmError::failed("to write the address of the bridge", &folder, error);
         let bytes = serde_json::to_vec(self).map_err(|error| failed(error.into()))?;
         write_privately(&address_path(default_root, &self.file), &bytes).map_err(failed)
     }

@@ -13,7 +13,6 @@ use nix::fcntl::{Flock, FlockArg};
 use super::error::ShmError;
 use crate::clock;
 
-/// The ending of the names of lock files.
 pub(super) const LOCK_SUFFIX: &str = ".lock";
 
 /// How long a start waits for another start of the same instance, which takes a few milliseconds.
@@ -23,7 +22,7 @@ const START_TIMEOUT_MS: u64 = 5_000;
 #[derive(Debug)]
 pub(super) struct FileLock {
     lock: Flock<File>,
-    path: PathBuf,
+    pub(super) path: PathBuf,
 }
 
 impl FileLock {
@@ -46,14 +45,9 @@ impl FileLock {
                 Err((_, Errno::EINTR)) => continue,
                 Err((_, errno)) => return Err(errno.into()),
             };
-            let locked = lock.metadata()?;
-            match fs::symlink_metadata(path) {
-                Ok(named) if named.ino() == locked.ino() && named.dev() == locked.dev() => {
-                    return Ok(Some(Self { lock, path: path.to_owned() }));
-                }
-                Ok(_) => {}
-                Err(error) if error.kind() == ErrorKind::NotFound => {}
-                Err(error) => return Err(error),
+            let taken = Self { lock, path: path.to_owned() };
+            if taken.is_current()? {
+                return Ok(Some(taken));
             }
         }
     }
@@ -65,7 +59,7 @@ impl FileLock {
             match Self::take(path, how) {
                 Ok(Some(lock)) => return Ok(lock),
                 Ok(None) => {}
-                Err(error) => return Err(lock_failed(path, &error)),
+                Err(error) => return Err(ShmError::os("to lock", path, &error)),
             }
             if clock::monotonic() > start.plus_ms(START_TIMEOUT_MS) {
                 return Err(ShmError::Busy { path: path.to_owned(), pid: read_pid(path) });
@@ -75,14 +69,19 @@ impl FileLock {
         }
     }
 
-    /// The path of the file.
-    pub(super) fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Changes the lock between shared and exclusive.
     pub(super) fn relock(&self, how: FlockArg) -> Result<(), Errno> {
         self.lock.relock(how)
+    }
+
+    /// Whether the path still names the locked file, which another process may have removed while the lock
+    /// changed.
+    pub(super) fn is_current(&self) -> io::Result<bool> {
+        let locked = self.lock.metadata()?;
+        match fs::symlink_metadata(&self.path) {
+            Ok(named) => Ok(named.ino() == locked.ino() && named.dev() == locked.dev()),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(error),
+        }
     }
 
     /// Writes the id of this process to the file, for messages of other processes.
@@ -93,22 +92,10 @@ impl FileLock {
         writeln!(file, "{}", std::process::id())
     }
 
-    /// Removes the file and releases the lock, which must be exclusive.
-    pub(super) fn remove(self) {
+    /// Removes the file of a lock that is exclusive and about to be dropped.
+    pub(super) fn remove(&self) {
         // The next process creates a new file; one that waits for this lock detects that the file is removed.
         let _ = fs::remove_file(&self.path);
-    }
-}
-
-/// The error of a lock that could not be taken.
-pub(super) fn lock_failed(path: &Path, error: &io::Error) -> ShmError {
-    match error.kind() {
-        ErrorKind::PermissionDenied => {
-            ShmError::Permission { what: "to lock".to_owned(), path: path.to_owned() }
-        }
-        _ => {
-            ShmError::Failed { what: "to lock".to_owned(), path: path.to_owned(), reason: error.to_string() }
-        }
     }
 }
 
@@ -117,13 +104,4 @@ pub(super) fn read_pid(path: &Path) -> u32 {
     let mut text = String::new();
     let read = File::open(path).and_then(|file| file.take(16).read_to_string(&mut text));
     read.ok().and_then(|_| text.trim().parse().ok()).unwrap_or(0)
-}
-
-/// Whether the path still names the locked file, which another process may have removed while the lock
-/// changed.
-pub(super) fn lock_is_current(lock: &FileLock) -> bool {
-    match (lock.lock.metadata(), fs::symlink_metadata(&lock.path)) {
-        (Ok(locked), Ok(named)) => locked.ino() == named.ino() && locked.dev() == named.dev(),
-        _ => false,
-    }
 }

@@ -8,7 +8,7 @@ use nix::fcntl::FlockArg;
 
 use super::error::ShmError;
 use super::in_force;
-use super::lock::{FileLock, LOCK_SUFFIX, lock_failed, lock_is_current};
+use super::lock::{FileLock, LOCK_SUFFIX};
 use super::root::InstanceDir;
 use crate::model::InstanceName;
 
@@ -18,60 +18,46 @@ const INSTANCE_LOCK: &str = "instance.lock";
 /// no other process of the instance is alive, and that all its files are left over.
 #[derive(Debug)]
 pub(super) struct Membership {
-    dir: InstanceDir,
-    lock: Option<FileLock>,
+    pub(super) dir: InstanceDir,
+    lock: FileLock,
 }
 
 impl Membership {
     /// Joins the instance. The first process removes left-over files, and their number is returned.
     pub(super) fn join(root: &Path, instance: &InstanceName) -> Result<(Self, usize), ShmError> {
-        // A process that leaves as the last one may remove the folder at the same time; then retry.
-        for _ in 0..100 {
-            let dir = InstanceDir::prepare(root, instance)?;
+        InstanceDir::prepare_until(root, instance, "to join the instance", |dir| {
             let path = dir.path.join(INSTANCE_LOCK);
-            let exclusive = FileLock::take(&path, FlockArg::LockExclusiveNonblock);
-            let (lock, swept) = match exclusive {
+            let join_others = || FileLock::take_soon(&path, FlockArg::LockSharedNonblock);
+            let (lock, swept) = match FileLock::take(&path, FlockArg::LockExclusiveNonblock) {
                 Ok(Some(lock)) => {
                     let swept = sweep(&dir);
                     // This may release the lock for an instant, in which another process may remove all
                     // files; this process has none yet.
-                    match lock.relock(FlockArg::LockSharedNonblock) {
-                        Ok(()) => (lock, swept),
-                        Err(_) => {
-                            drop(lock);
-                            (FileLock::take_soon(&path, FlockArg::LockSharedNonblock)?, swept)
-                        }
+                    if lock.relock(FlockArg::LockSharedNonblock).is_ok() {
+                        (lock, swept)
+                    } else {
+                        drop(lock);
+                        (join_others()?, swept)
                     }
                 }
-                Ok(None) => (FileLock::take_soon(&path, FlockArg::LockSharedNonblock)?, 0),
-                Err(error) if error.kind() == ErrorKind::NotFound => continue,
-                Err(error) => return Err(lock_failed(&path, &error)),
+                Ok(None) => (join_others()?, 0),
+                Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+                Err(error) => return Err(ShmError::os("to lock", &path, &error)),
             };
-            if lock_is_current(&lock) {
-                return Ok((Self { dir, lock: Some(lock) }, swept));
-            }
-        }
-        Err(ShmError::Failed {
-            what: "to join the instance".to_owned(),
-            path: root.to_owned(),
-            reason: "other processes removed its folder in 100 attempts".to_owned(),
+            let is_current = lock.is_current().unwrap_or(false);
+            Ok(is_current.then(|| (Self { dir, lock }, swept)))
         })
-    }
-
-    pub(super) fn dir(&self) -> &InstanceDir {
-        &self.dir
     }
 }
 
 impl Drop for Membership {
     /// The last process that leaves removes all files of the instance.
     fn drop(&mut self) {
-        if let Some(lock) = self.lock.take()
-            && lock.relock(FlockArg::LockExclusiveNonblock).is_ok()
-            && lock_is_current(&lock)
+        if self.lock.relock(FlockArg::LockExclusiveNonblock).is_ok()
+            && self.lock.is_current().unwrap_or(false)
         {
             sweep(&self.dir);
-            lock.remove();
+            self.lock.remove();
             // Fails while a role lock is held there; its release retries.
             let _ = fs::remove_dir(&self.dir.path);
         }

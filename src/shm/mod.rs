@@ -28,7 +28,9 @@ mod service;
 mod subscriber;
 mod wake;
 
-pub use board::{BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage};
+pub use board::{
+    BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
+};
 pub use channel::{PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};

@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 use std::fs;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use super::board::{Boards, BridgeShape};
 use super::error::ShmError;
 use super::lock::FileLock;
 use super::membership::Membership;
-use super::root::InstanceDir;
+use super::root::{InstanceDir, make_private};
 use super::segment::{commit_files, require_free};
 use super::service::Service;
 use crate::model::InstanceName;
@@ -47,7 +47,7 @@ pub struct ShmNode {
 /// order: first the node with its files, then the membership.
 #[derive(Debug)]
 pub(super) struct NodeShared {
-    node: Node<Service>,
+    pub(super) node: Node<Service>,
     membership: Membership,
 }
 
@@ -59,25 +59,26 @@ impl ShmNode {
     pub fn open(root: &Path, instance: &InstanceName, process: &str) -> Result<Self, ShmError> {
         limit_iceoryx_log();
         let (membership, stray_files) = Membership::join(root, instance)?;
-        let dir = membership.dir();
+        let dir = &membership.dir;
         require_free(SMALL_BYTES, "joining the bridge")?;
         let start = StartLock::take(dir)?;
         for folder in ["nodes", "services"] {
             // Created here because iceoryx2 creates them with mode 0755.
-            create_private_folder(&dir.path.join(folder))?;
+            make_private(&dir.path.join(folder))?;
         }
         let config = config_of(dir)?;
         let mut cleaned_up = clean_up_dead(dir, &config, &start);
         cleaned_up.stray_files += stray_files;
-        let name = process.try_into().map_err(|error| failed(dir, "to name the process", &error))?;
+        let name =
+            process.try_into().map_err(|error| ShmError::failed("to name the process", &dir.path, error))?;
         let node = NodeBuilder::new()
             .name(&name)
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
-            .map_err(|error| failed(dir, "to join the bridge", &error))?;
+            .map_err(|error| ShmError::failed("to join the bridge", &dir.path, error))?;
         // iceoryx2 creates its count of nodes with mode 0666.
-        make_private(&dir.shm_files());
+        restrict(&dir.shm_files());
         drop(start);
         Ok(Self { shared: Arc::new(NodeShared { node, membership }), cleaned_up })
     }
@@ -110,15 +111,15 @@ impl ShmNode {
 
 impl NodeShared {
     pub(super) fn dir(&self) -> &InstanceDir {
-        self.membership.dir()
+        &self.membership.dir
+    }
+
+    pub(super) fn folder(&self) -> &Path {
+        &self.dir().path
     }
 
     pub(super) fn clean_up(&self, start: &StartLock) -> CleanUp {
         clean_up_dead(self.dir(), self.node.config(), start)
-    }
-
-    pub(super) fn node(&self) -> &Node<Service> {
-        &self.node
     }
 
     /// Allocates all pages of the instance's files in shared memory.
@@ -142,9 +143,9 @@ fn limit_iceoryx_log() {
 /// The configuration of iceoryx2 for an instance.
 fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
     let path = iceoryx2::prelude::Path::new(dir.path.as_os_str().as_encoded_bytes())
-        .map_err(|error| failed(dir, "to use the folder's path", &format!("{error:?}")))?;
+        .map_err(|error| ShmError::failed("to use the folder's path", &dir.path, format!("{error:?}")))?;
     let prefix = FileName::new(dir.prefix.as_bytes())
-        .map_err(|error| failed(dir, "to use the instance's name", &format!("{error:?}")))?;
+        .map_err(|error| ShmError::failed("to use the instance's name", &dir.path, format!("{error:?}")))?;
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
@@ -252,7 +253,7 @@ fn remove_unknown_nodes(dir: &InstanceDir, known: &HashSet<String>) -> usize {
 }
 
 /// Removes the permissions of other users on files in shared memory.
-fn make_private(files: &[PathBuf]) {
+fn restrict(files: &[PathBuf]) {
     for path in files {
         // A missing file belonged to a process that is ending.
         if let Ok(metadata) = fs::symlink_metadata(path)
@@ -261,15 +262,4 @@ fn make_private(files: &[PathBuf]) {
             let _ = fs::set_permissions(path, fs::Permissions::from_mode(0o600));
         }
     }
-}
-
-fn create_private_folder(path: &Path) -> Result<(), ShmError> {
-    match fs::DirBuilder::new().recursive(true).mode(0o700).create(path) {
-        Ok(()) => Ok(()),
-        Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),
-    }
-}
-
-pub(super) fn failed(dir: &InstanceDir, what: &str, error: &dyn std::fmt::Display) -> ShmError {
-    ShmError::Failed { what: what.to_owned(), path: dir.path.clone(), reason: error.to_string() }
 }

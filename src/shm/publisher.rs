@@ -13,7 +13,8 @@ use iceoryx2::sample_mut::SampleMut;
 use super::channel::{LENT_SLOTS, LOANED_SLOTS, RouteChannel};
 use super::error::ShmError;
 use super::header::WireHeader;
-use super::node::{NodeShared, ShmNode, StartLock, failed};
+use super::node::{NodeShared, ShmNode, StartLock};
+use super::segment::{free_bytes, no_room};
 use super::service::Service;
 use crate::model::SampleHeader;
 
@@ -83,13 +84,8 @@ impl SamplePublisher {
             other => other,
         };
         let port = port.map_err(|error| match error {
-            PublisherCreateError::UnableToCreateDataSegment => ShmError::NoRoom {
-                what: what.clone(),
-                needed_bytes: pool.bytes,
-                free_bytes: super::segment::free_bytes(),
-                path: super::root::SHM_DIR.into(),
-            },
-            other => failed(shared.dir(), &format!("to create {what}"), &other),
+            PublisherCreateError::UnableToCreateDataSegment => no_room(&what, pool.bytes, free_bytes()),
+            other => ShmError::failed(format!("to create {what}"), shared.folder(), other),
         })?;
         shared.commit(&what)?;
         Ok(Self {
@@ -136,8 +132,14 @@ impl SamplePublisher {
         let slot = self.port.loan_slice_uninit(len).ok()?;
         // SAFETY: any byte is a valid `u8`, and the bytes of the pool, a mapped file with all its pages, are
         // initialised: by the kernel with zeros, or by an older sample.
-        let sample = unsafe { slot.assume_init() };
-        Some(LentSlot::new(sample, permit, self.node.clone()))
+        let mut sample = unsafe { slot.assume_init() };
+        // The address is stored, because iceoryx2 takes a lock for each access to the payload.
+        let payload = sample.payload_mut();
+        let length = payload.len();
+        // For an empty payload this is a dangling address.
+        let payload = NonNull::from(payload).cast();
+        let slot = Slot { sample };
+        Some(LentSlot { payload, length, slot, _permit: permit, _node: self.node.clone() })
     }
 
     /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
@@ -181,19 +183,6 @@ pub struct LentSlot {
 unsafe impl Send for LentSlot {}
 
 impl LentSlot {
-    /// Stores the address of the payload, because iceoryx2 takes a lock for each access to it.
-    fn new(
-        mut sample: SampleMut<Service, [u8], WireHeader>,
-        permit: LentPermit,
-        node: Arc<NodeShared>,
-    ) -> Self {
-        let payload = sample.payload_mut();
-        let length = payload.len();
-        // For an empty payload this is a dangling address.
-        let payload = NonNull::from(payload).cast();
-        Self { payload, length, slot: Slot { sample }, _permit: permit, _node: node }
-    }
-
     /// The payload, for writing.
     pub fn payload_mut(&mut self) -> &mut [u8] {
         // SAFETY: `length` bytes of the slot, which is mapped as long as `slot` lives, and which no other

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use nix::fcntl::FlockArg;
 
 use super::error::ShmError;
-use super::lock::{FileLock, LOCK_SUFFIX, lock_failed, read_pid};
+use super::lock::{FileLock, LOCK_SUFFIX, read_pid};
 use super::root::InstanceDir;
 use crate::model::InstanceName;
 
@@ -21,35 +21,28 @@ const ROLE_PREFIX: &str = "role-";
 /// dropped; the kernel releases it when the process ends, in any way.
 #[derive(Debug)]
 pub struct RoleLock {
-    lock: Option<FileLock>,
+    lock: FileLock,
 }
 
 impl RoleLock {
     /// Takes the role; if another process has it, the error names that process.
     pub fn acquire(root: &Path, instance: &InstanceName, role: &str) -> Result<Self, ShmError> {
-        for _ in 0..100 {
-            let dir = InstanceDir::prepare(root, instance)?;
+        let what = format!("to lock the role {role}");
+        InstanceDir::prepare_until(root, instance, &what, |dir| {
+            let path = Self::path(&dir, role);
             match Self::try_acquire(&dir, role) {
-                Ok(Some(lock)) => return Ok(lock),
-                Ok(None) => {
-                    let pid = read_pid(&Self::path(&dir, role));
-                    return Err(ShmError::AlreadyServed { role: role.to_owned(), pid });
-                }
-                Err(error) if error.kind() == ErrorKind::NotFound => continue,
-                Err(error) => return Err(lock_failed(&Self::path(&dir, role), &error)),
+                Ok(Some(lock)) => Ok(Some(lock)),
+                Ok(None) => Err(ShmError::AlreadyServed { role: role.to_owned(), pid: read_pid(&path) }),
+                Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+                Err(error) => Err(ShmError::os("to lock", &path, &error)),
             }
-        }
-        Err(ShmError::Failed {
-            what: format!("to lock the role {role}"),
-            path: root.to_owned(),
-            reason: "other processes removed the folder in 100 attempts".to_owned(),
         })
     }
 
     /// The path of a file beside the lock, in which the holder reports the result of its last reload
     /// ([`RoleHolder`]). The file is removed with the instance.
     pub fn note_path(&self) -> Option<PathBuf> {
-        self.lock.as_ref().map(|lock| note_path(lock.path()))
+        Some(note_path(&self.lock.path))
     }
 
     /// The id of the process that holds the role; `None` when no process does. Takes no lock.
@@ -57,18 +50,16 @@ impl RoleLock {
         let path = Self::path(&InstanceDir::find(root, instance).ok()??, role);
         let inode = fs::metadata(&path).ok()?.ino();
         let pid = read_pid(&path);
-        is_locked_by(pid, inode).then_some(pid)
+        let locks = fs::read_to_string(LOCKS).ok()?;
+        holds(&locks, pid, inode).then_some(pid)
     }
 
     /// Takes the role; `None` when another process has it.
     pub(super) fn try_acquire(dir: &InstanceDir, role: &str) -> io::Result<Option<Self>> {
         let taken = FileLock::take(&Self::path(dir, role), FlockArg::LockExclusiveNonblock)?;
-        taken
-            .map(|mut lock| {
-                lock.write_pid()?;
-                Ok(Self { lock: Some(lock) })
-            })
-            .transpose()
+        let Some(mut lock) = taken else { return Ok(None) };
+        lock.write_pid()?;
+        Ok(Some(Self { lock }))
     }
 
     fn path(dir: &InstanceDir, role: &str) -> PathBuf {
@@ -85,13 +76,10 @@ fn note_path(lock: &Path) -> PathBuf {
 
 impl Drop for RoleLock {
     fn drop(&mut self) {
-        if let Some(lock) = self.lock.take() {
-            let folder = lock.path().parent().map(Path::to_owned);
-            lock.remove();
-            if let Some(folder) = folder {
-                // Succeeds only for the last process of the instance.
-                let _ = fs::remove_dir(folder);
-            }
+        self.lock.remove();
+        if let Some(folder) = self.lock.path.parent() {
+            // Succeeds only for the last process of the instance.
+            let _ = fs::remove_dir(folder);
         }
     }
 }
@@ -116,13 +104,10 @@ impl RoleHolder {
     /// The folder of the instance belongs to another user, or the list of locks cannot be read.
     pub fn all(root: &Path, instance: &InstanceName) -> Result<Vec<Self>, ShmError> {
         let Some(dir) = InstanceDir::find(root, instance)? else { return Ok(Vec::new()) };
-        let failed = |path: &Path, error: io::Error| ShmError::Failed {
-            what: "to find the processes of the bridge".to_owned(),
-            path: path.to_owned(),
-            reason: error.to_string(),
-        };
-        let locks = fs::read_to_string(LOCKS).map_err(|error| failed(Path::new(LOCKS), error))?;
-        let entries = fs::read_dir(&dir.path).map_err(|error| failed(&dir.path, error))?;
+        let what = "to find the processes of the bridge";
+        let locks =
+            fs::read_to_string(LOCKS).map_err(|error| ShmError::failed(what, Path::new(LOCKS), error))?;
+        let entries = fs::read_dir(&dir.path).map_err(|error| ShmError::failed(what, &dir.path, error))?;
         let mut holders: Vec<Self> = entries
             .flatten()
             .filter_map(|entry| {
@@ -142,11 +127,6 @@ impl RoleHolder {
         holders.sort_by(|one, other| one.role.cmp(&other.role));
         Ok(holders)
     }
-}
-
-/// Whether the process holds a lock on the file with that inode number.
-fn is_locked_by(pid: u32, inode: u64) -> bool {
-    fs::read_to_string(LOCKS).is_ok_and(|locks| holds(&locks, pid, inode))
 }
 
 /// Lists the files of an instance in the shared-memory file system.

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder};
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -72,31 +72,43 @@ impl InstanceDir {
             });
         }
         make_private(root)?;
-        let real = fs::canonicalize(root)
-            .map_err(|source| ShmError::CannotCreateRoot { path: root.to_owned(), source })?;
+        let real = fs::canonicalize(root).map_err(cannot_create(root))?;
         let found = Self::at(&real, instance)?;
         make_private(&found.path)?;
         // Other users may list the root, but not the instance's folder.
         fs::set_permissions(&found.path, fs::Permissions::from_mode(0o700))
-            .map_err(|source| ShmError::CannotCreateRoot { path: found.path.clone(), source })?;
+            .map_err(cannot_create(&found.path))?;
         Ok(found)
     }
 
     /// Finds the folder; `None` if it does not exist.
     pub(super) fn find(root: &Path, instance: &InstanceName) -> Result<Option<Self>, ShmError> {
-        match fs::canonicalize(root) {
-            Ok(real) => {
-                let found = Self::at(&real, instance)?;
-                if found.path.is_dir() {
-                    check_owner(&found.path)?;
-                    Ok(Some(found))
-                } else {
-                    Ok(None)
-                }
-            }
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            Err(source) => Err(ShmError::CannotCreateRoot { path: root.to_owned(), source }),
+        let real = match fs::canonicalize(root) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            real => real.map_err(cannot_create(root))?,
+        };
+        let found = Self::at(&real, instance)?;
+        if !found.path.is_dir() {
+            return Ok(None);
         }
+        check_owner(&found.path)?;
+        Ok(Some(found))
+    }
+
+    /// Prepares the folder and calls `attempt`, again while that returns `None`, because another process that
+    /// left as the last one has removed the folder. `what` is `to` and a verb.
+    pub(super) fn prepare_until<T>(
+        root: &Path,
+        instance: &InstanceName,
+        what: &str,
+        mut attempt: impl FnMut(Self) -> Result<Option<T>, ShmError>,
+    ) -> Result<T, ShmError> {
+        for _ in 0..100 {
+            if let Some(done) = attempt(Self::prepare(root, instance)?)? {
+                return Ok(done);
+            }
+        }
+        Err(ShmError::failed(what, root, "other processes removed the folder in 100 attempts"))
     }
 
     fn at(real_root: &Path, instance: &InstanceName) -> Result<Self, ShmError> {
@@ -115,11 +127,8 @@ impl InstanceDir {
     pub(super) fn shm_files(&self) -> Vec<PathBuf> {
         let Ok(entries) = fs::read_dir(SHM_DIR) else { return Vec::new() };
         let ours = |name: &OsString| name.as_encoded_bytes().starts_with(self.prefix.as_bytes());
-        entries
-            .flatten()
-            .filter(|entry| ours(&entry.file_name()))
-            .map(|entry| Path::new(SHM_DIR).join(entry.file_name()))
-            .collect()
+        let names = entries.flatten().map(|entry| entry.file_name()).filter(ours);
+        names.map(|name| Path::new(SHM_DIR).join(name)).collect()
     }
 }
 
@@ -130,14 +139,17 @@ pub(super) fn make_private(path: &Path) -> Result<(), ShmError> {
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
             Err(ShmError::RootNotOurs { path: path.to_owned(), reason: "it is not a folder".to_owned() })
         }
-        Err(source) => Err(ShmError::CannotCreateRoot { path: path.to_owned(), source }),
+        Err(error) => Err(cannot_create(path)(error)),
     }
+}
+
+fn cannot_create(path: &Path) -> impl FnOnce(io::Error) -> ShmError {
+    |source| ShmError::CannotCreateRoot { path: path.to_owned(), source }
 }
 
 fn check_owner(path: &Path) -> Result<(), ShmError> {
     let refuse = |reason: String| Err(ShmError::RootNotOurs { path: path.to_owned(), reason });
-    let metadata = fs::symlink_metadata(path)
-        .map_err(|source| ShmError::CannotCreateRoot { path: path.to_owned(), source })?;
+    let metadata = fs::symlink_metadata(path).map_err(cannot_create(path))?;
     let ours = geteuid().as_raw();
     if !metadata.is_dir() {
         refuse("it is not a folder".to_owned())

@@ -35,10 +35,11 @@ impl Segment {
         let file = match OpenOptions::new().read(true).write(true).open(path) {
             Ok(file) => file,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(failed("to open shared memory", path, &error)),
+            Err(error) => return Err(ShmError::os("to open shared memory", path, &error)),
         };
-        let metadata =
-            file.metadata().map_err(|error| failed("to get the size of shared memory", path, &error))?;
+        let metadata = file
+            .metadata()
+            .map_err(|error| ShmError::os("to get the size of shared memory", path, &error))?;
         if metadata.len() != words as u64 * 8 {
             return Err(ShmError::Incompatible {
                 what: format!("the boards have {} bytes, not {}", metadata.len(), words * 8),
@@ -56,15 +57,13 @@ impl Segment {
             Self::create_at(&draft, words, first).and_then(|segment| match fs::hard_link(&draft, path) {
                 Ok(()) => Ok(Some(segment)),
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(None),
-                Err(error) => Err(failed("to name shared memory", path, &error)),
+                Err(error) => Err(ShmError::os("to name shared memory", path, &error)),
             });
         let _ = fs::remove_file(&draft);
         match made? {
             Some(segment) => Ok(segment),
-            None => Self::open(path, words)?.ok_or_else(|| ShmError::Failed {
-                what: "to open shared memory".to_owned(),
-                path: path.to_owned(),
-                reason: "another process removed it at the same time".to_owned(),
+            None => Self::open(path, words)?.ok_or_else(|| {
+                ShmError::failed("to open shared memory", path, "another process removed it at the same time")
             }),
         }
     }
@@ -77,7 +76,7 @@ impl Segment {
             .truncate(true)
             .mode(0o600)
             .open(path)
-            .map_err(|error| failed("to create shared memory", path, &error))?;
+            .map_err(|error| ShmError::os("to create shared memory", path, &error))?;
         commit(&file, words as u64 * 8, "the boards of the bridge")?;
         let segment = Self::map(&file, path, words)?;
         for (at, &word) in first.iter().enumerate() {
@@ -87,15 +86,12 @@ impl Segment {
     }
 
     fn map(file: &File, path: &Path, words: usize) -> Result<Self, ShmError> {
-        let length = NonZeroUsize::new(words * 8).ok_or_else(|| ShmError::Failed {
-            what: "to map shared memory".to_owned(),
-            path: path.to_owned(),
-            reason: "it is empty".to_owned(),
-        })?;
+        let length = NonZeroUsize::new(words * 8)
+            .ok_or_else(|| ShmError::failed("to map shared memory", path, "it is empty"))?;
         let protection = ProtFlags::PROT_READ | ProtFlags::PROT_WRITE;
         // SAFETY: a new mapping at an address that the kernel chooses, of a file that has that length.
         let start = unsafe { mmap(None, length, protection, MapFlags::MAP_SHARED, file, 0) }
-            .map_err(|errno| failed("to map shared memory", path, &errno.into()))?;
+            .map_err(|errno| ShmError::os("to map shared memory", path, &errno.into()))?;
         Ok(Self { start: start.cast(), words })
     }
 
@@ -123,13 +119,6 @@ impl Drop for Segment {
     }
 }
 
-fn failed(what: &str, path: &Path, error: &std::io::Error) -> ShmError {
-    match error.kind() {
-        ErrorKind::PermissionDenied => ShmError::Permission { what: what.to_owned(), path: path.to_owned() },
-        _ => ShmError::Failed { what: what.to_owned(), path: path.to_owned(), reason: error.to_string() },
-    }
-}
-
 /// The free bytes in [`SHM_DIR`]; 0 when the file system does not report them.
 pub(super) fn free_bytes() -> u64 {
     statvfs(SHM_DIR).map_or(0, |stat| stat.blocks_available() * stat.fragment_size())
@@ -139,15 +128,12 @@ pub(super) fn free_bytes() -> u64 {
 /// no memory is killed by SIGBUS.
 pub(super) fn require_free(needed_bytes: u64, what: &str) -> Result<(), ShmError> {
     let free_bytes = free_bytes();
-    if free_bytes < needed_bytes {
-        return Err(ShmError::NoRoom {
-            what: what.to_owned(),
-            needed_bytes,
-            free_bytes,
-            path: SHM_DIR.into(),
-        });
-    }
-    Ok(())
+    if free_bytes < needed_bytes { Err(no_room(what, needed_bytes, free_bytes)) } else { Ok(()) }
+}
+
+/// The error of shared memory that has fewer free bytes than `what` needs.
+pub(super) fn no_room(what: &str, needed_bytes: u64, free_bytes: u64) -> ShmError {
+    ShmError::NoRoom { what: what.to_owned(), needed_bytes, free_bytes, path: SHM_DIR.into() }
 }
 
 /// Allocates all pages of a file in shared memory.
@@ -156,13 +142,8 @@ fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
         return match posix_fallocate(file, 0, bytes.cast_signed()) {
             Ok(()) => Ok(()),
             Err(Errno::EINTR) => continue,
-            Err(Errno::ENOSPC) => Err(ShmError::NoRoom {
-                what: what.to_owned(),
-                needed_bytes: bytes,
-                free_bytes: free_bytes(),
-                path: SHM_DIR.into(),
-            }),
-            Err(errno) => Err(failed("to reserve shared memory", Path::new(SHM_DIR), &errno.into())),
+            Err(Errno::ENOSPC) => Err(no_room(what, bytes, free_bytes())),
+            Err(errno) => Err(ShmError::os("to reserve shared memory", Path::new(SHM_DIR), &errno.into())),
         };
     }
 }

@@ -5,7 +5,7 @@
 //! sample. This variant keeps the memory of such an `Arc` and reuses it for the next sample.
 
 use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
-use std::fmt::{self, Debug};
+use std::fmt::Debug;
 use std::ops::Deref;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicUsize, Ordering, fence};
@@ -116,6 +116,7 @@ struct Shared<T: Debug> {
 }
 
 /// A value behind a mutex that threads share, like `Arc<Mutex<T>>`, in reused memory.
+#[derive(Debug)]
 pub(super) struct RecycledArc<T: Send + Debug + Abandonable> {
     shared: NonNull<Shared<T>>,
 }
@@ -135,12 +136,6 @@ impl<T: Send + Debug + Abandonable> RecycledArc<T> {
     fn mutex(&self) -> Mutex<'_, '_, T> {
         // SAFETY: `new` initialised the handle, and it does not move while there are handles.
         unsafe { Mutex::from_handle(&self.shared().mutex) }
-    }
-}
-
-impl<T: Send + Debug + Abandonable> Debug for RecycledArc<T> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("RecycledArc").finish_non_exhaustive()
     }
 }
 

@@ -11,7 +11,7 @@ use iceoryx2::sample::Sample;
 use super::channel::{QueueLimits, RouteChannel, TAP};
 use super::error::ShmError;
 use super::header::{HeaderError, WireHeader};
-use super::node::{NodeShared, ShmNode, StartLock, failed};
+use super::node::{NodeShared, ShmNode, StartLock};
 use super::roles::RoleLock;
 use super::service::Service;
 use crate::model::SampleHeader;
@@ -107,7 +107,7 @@ impl SampleSubscriber {
                 route: channel.route.clone(),
                 max: channel.lanes.len() + channel.max_taps,
             },
-            other => failed(shared.dir(), &format!("to create {what}"), &other),
+            other => ShmError::failed(format!("to create {what}"), shared.folder(), other),
         })?;
         shared.commit(&what)?;
         Ok(Self {
@@ -172,7 +172,7 @@ fn acquire_tap_lock(shared: &NodeShared, channel: &RouteChannel) -> Result<RoleL
         match RoleLock::try_acquire(shared.dir(), &name) {
             Ok(Some(lock)) => return Ok(lock),
             Ok(None) => {}
-            Err(error) => return Err(failed(shared.dir(), "to take a tap's lock", &error)),
+            Err(error) => return Err(ShmError::failed("to take a tap's lock", shared.folder(), error)),
         }
     }
     Err(ShmError::TooManySubscribers { route: channel.route.clone(), max: channel.max_taps })

@@ -51,14 +51,19 @@ pub enum Woken {
     TimedOut,
 }
 
-/// The wake count and the sleep flag of a lane, on their own cache line.
+/// Wakes a lane by its wake count and sleep flag, which have a cache line of their own. Any process or thread
+/// may hold any number of wakers.
 #[derive(Clone, Debug)]
-struct WakeWords {
+pub struct LaneWaker {
     segment: Arc<Segment>,
     at: usize,
 }
 
-impl WakeWords {
+impl LaneWaker {
+    pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
+        Self { segment, at }
+    }
+
     /// The number of wakes so far; the futex.
     fn wake_count(&self) -> &AtomicU32 {
         self.segment.half(self.at)
@@ -68,35 +73,23 @@ impl WakeWords {
     fn sleeping_cpu(&self) -> &AtomicU32 {
         self.segment.half(self.at + 1)
     }
-}
-
-/// Wakes one lane. Any process or thread may hold any number of wakers.
-#[derive(Clone, Debug)]
-pub struct LaneWaker {
-    words: WakeWords,
-}
-
-impl LaneWaker {
-    pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
-        Self { words: WakeWords { segment, at } }
-    }
 
     /// Announces that a wake will follow from `cpu`, a number from [`this_cpu`], so that a lane that sleeps
     /// on another CPU leaves its sleep early. A lane on the same CPU is not affected, because it would only
     /// delay the wake. A wake need not follow.
     pub fn announce(&self, cpu: u32) {
-        let sleeping_cpu = self.words.sleeping_cpu().load(Ordering::Relaxed);
+        let sleeping_cpu = self.sleeping_cpu().load(Ordering::Relaxed);
         if sleeping_cpu != 0 && sleeping_cpu != cpu {
-            futex_wake(self.words.wake_count());
+            futex_wake(self.wake_count());
         }
     }
 
     /// Wakes the lane. Never blocks, even while the lane's process is stopped. Several wakes before the lane
     /// checks for them are one. Calls the kernel only if the lane sleeps.
     pub fn wake(&self) {
-        self.words.wake_count().fetch_add(1, Ordering::SeqCst);
-        if self.words.sleeping_cpu().load(Ordering::SeqCst) != 0 {
-            futex_wake(self.words.wake_count());
+        self.wake_count().fetch_add(1, Ordering::SeqCst);
+        if self.sleeping_cpu().load(Ordering::SeqCst) != 0 {
+            futex_wake(self.wake_count());
         }
     }
 }
@@ -104,7 +97,7 @@ impl LaneWaker {
 /// Sleeps until its lane is woken. Each lane has one.
 #[derive(Debug)]
 pub struct LaneSleeper {
-    words: WakeWords,
+    words: LaneWaker,
     /// The wake count at the last check.
     seen_count: u32,
     /// Whether the last announcement was followed by a wake in time. After one that was not, the lane ignores
@@ -117,7 +110,7 @@ pub struct LaneSleeper {
 
 impl LaneSleeper {
     pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
-        let words = WakeWords { segment, at };
+        let words = LaneWaker::new(segment, at);
         // There may have been wakes for an earlier process, so the first sleep returns at once.
         let seen_count = words.wake_count().load(Ordering::SeqCst).wrapping_sub(1);
         Self { words, seen_count, trusts_announcements: true, spin_until: None }
