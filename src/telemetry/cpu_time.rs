@@ -41,8 +41,7 @@ pub struct Threads {
 }
 
 impl Threads {
-    /// Reads them from `/proc`; without threads if the process does not exist or its threads are not
-    /// readable.
+    /// Reads them from `/proc`; none if the process does not exist or is not readable.
     pub fn of(pid: u64) -> Self {
         let mut threads = Self::default();
         for thread in std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {

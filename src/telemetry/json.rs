@@ -56,7 +56,7 @@ pub struct Decision<'a> {
     /// Share of lost probes, 0 to 1; null while no probe has been answered or has timed out.
     pub loss: Option<f64>,
     /// The time of the decision, in nanoseconds since the Unix epoch.
-    #[serde(rename = "time_ns", serialize_with = "wall_ns")]
+    #[serde(rename = "time_ns")]
     pub time: WallNs,
 }
 
@@ -74,10 +74,6 @@ impl Decision<'_> {
 
 fn state_label<S: serde::Serializer>(state: &SubscriberState, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(state.label())
-}
-
-fn wall_ns<S: serde::Serializer>(time: &WallNs, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_u64(time.0)
 }
 
 fn message(r#type: &'static str, body: &impl Serialize) -> Bytes {

@@ -43,8 +43,7 @@ pub fn start_logs() {
     }
 }
 
-/// Applies `diagnostics.verbosity` of the configuration to the log. Does nothing when `RUST_LOG` sets the
-/// filter.
+/// Applies `diagnostics.verbosity` to the log. Does nothing when `RUST_LOG` sets the filter.
 pub fn set_verbosity(verbosity: Verbosity) {
     if let Some(handle) = CONFIGURED.get()
         && let Err(error) = handle.reload(filter(verbosity))
@@ -53,9 +52,8 @@ pub fn set_verbosity(verbosity: Verbosity) {
     }
 }
 
-/// The filter for a verbosity: it applies to the bridge, while libraries log errors only. A RELIABLE writer
-/// of RustDDS would warn about each sample that its full window refuses; the bridge counts and reports those
-/// itself.
+/// The filter for a verbosity of the bridge; libraries log errors only. A RELIABLE writer of RustDDS would
+/// warn about each sample that its full window refuses, which the bridge counts and reports itself.
 fn filter(verbosity: Verbosity) -> EnvFilter {
     let own = match verbosity {
         Verbosity::Error => "error",

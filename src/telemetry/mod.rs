@@ -1,5 +1,4 @@
-//! Observes a running bridge: snapshots of its boards, the report with its problems, its output formats, and
-//! logging.
+//! Observes a running bridge: snapshots of its boards, the report with its problems, its formats, and logs.
 
 mod cpu_time;
 mod diagnostics;
@@ -28,10 +27,7 @@ pub use log_limit::log_left_out;
 pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problem::{Level, Problem};
-pub use report::{
-    IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport, ProcessReport,
-    PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
-};
+pub use report::{Report, SubscriberReport};
 pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
 pub use text::bytes_text;
 

@@ -27,25 +27,21 @@ impl Level {
 
     /// The more severe of two levels. `Error` is above `Stale`, because missing data only suggests a fault.
     pub const fn worse(self, other: Self) -> Self {
-        const fn rank(level: Level) -> u8 {
-            match level {
-                Level::Ok => 0,
-                Level::Warn => 1,
-                Level::Stale => 2,
-                Level::Error => 3,
-            }
-        }
-        if rank(other) > rank(self) { other } else { self }
+        const RANKS: [u8; 4] = [0, 1, 3, 2];
+        if RANKS[other as usize] > RANKS[self as usize] { other } else { self }
     }
 }
 
 /// An entry of `problems` in the report. Its JSON is the text alone.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(transparent)]
 pub struct Problem {
     /// The part of the bridge: `bridge`, `ingress`, `control`, `safety`, `probes`, `network`, `intruders`,
     /// `lane NAME`, `route ID` or `subscriber ID`.
+    #[serde(skip)]
     pub about: String,
     /// The severity.
+    #[serde(skip)]
     pub level: Level,
     /// A sentence for users: what is wrong, with which part or peer, and what to do next.
     pub text: String,
@@ -55,11 +51,5 @@ impl Problem {
     /// Creates a problem of a part.
     pub(super) fn new(about: impl Into<String>, level: Level, text: String) -> Self {
         Self { about: about.into(), level, text }
-    }
-}
-
-impl serde::Serialize for Problem {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(&self.text)
     }
 }

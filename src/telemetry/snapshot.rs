@@ -18,8 +18,7 @@ use crate::policy::mode_and_source;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 
 /// Attempts to read counts of a lane that add up. In the middle of a turn, a lane has updated only some of
-/// its counts; with [`WHOLE_PAUSE`] between the attempts they take 20 ms, and every turn ends within that
-/// time.
+/// its counts; with [`WHOLE_PAUSE`] between the attempts they take 20 ms, longer than any turn.
 const WHOLE_ATTEMPTS: usize = 100;
 /// See [`WHOLE_ATTEMPTS`].
 const WHOLE_PAUSE: Duration = Duration::from_micros(200);
@@ -64,13 +63,15 @@ pub struct SubscriberReading {
 }
 
 /// The health and the state of one process.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, serde::Serialize)]
 pub struct ProcessReading {
     /// Its name: `ingress`, `control`, `egress-critical`, …
     pub name: String,
     /// Its role.
+    #[serde(skip)]
     pub role: ProcessRole,
     /// Its health record.
+    #[serde(flatten)]
     pub health: ProcessHealth,
     /// Its state.
     pub state: ProcessState,
@@ -321,8 +322,7 @@ fn read_publishers(
     let mut accounts = Vec::new();
     for place in 0..MAX_PUBLISHERS {
         let account = consistent(boards.publisher(route, place))?;
-        // While ingress counts a sample, and after it died at that point, the new account is only in the
-        // counters.
+        // While ingress counts a sample, and if it died then, the new account is only in the counters.
         let changed = &counters.changed_account;
         let is_behind = counters.changed_place == place as u64
             && !changed.is_vacant()

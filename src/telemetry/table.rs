@@ -6,11 +6,12 @@ use comfy_table::{CellAlignment, ColumnConstraint, Table, Width, presets};
 
 use super::liveness::ProcessState;
 use super::report::{
-    AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport,
-    PublisherReport, Report, RouteReport, SafetyReport, SubscriberReport,
+    AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, Report,
+    RouteReport, SafetyReport, SubscriberReport,
 };
+use super::snapshot::ProcessReading;
 use super::text::{bytes_text, counted};
-use crate::model::DropCounts;
+use crate::model::{DropCounts, PublisherAccount};
 
 /// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
 const COLUMNS: usize = 100;
@@ -26,15 +27,14 @@ impl fmt::Display for Report {
             self.lanes.len(),
             latency_text(self.window_ms * 1e3)
         )?;
-        match self.problems.len() {
+        match self.problems.len() as u64 {
             0 => writeln!(f, "no problems")?,
-            1 => writeln!(f, "1 problem:")?,
-            count => writeln!(f, "{count} problems:")?,
+            count => writeln!(f, "{}:", counted(count, "problem"))?,
         }
         for problem in &self.problems {
             f.write_str(&wrapped("  ! ", "    ", problem.text.split(' '), " "))?;
         }
-        let process = |name: &str| self.processes.iter().find(|process| process.name == name);
+        let process = |name: &str| self.processes.iter().find(|process| process.reading.name == name);
         if let Some(control) = process("control") {
             write!(f, "\n{}", process_line("control", control))?;
             f.write_str(&safety_text(&self.safety))?;
@@ -47,7 +47,7 @@ impl fmt::Display for Report {
             write!(f, "\n{}", process_line("ingress", ingress))?;
         }
         let heads = ["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST UPSTREAM"];
-        f.write_str(&table(TOPIC_TABLE, heads, self.routes.iter().map(route_row)))?;
+        f.write_str(&table(1, TOPIC_TABLE, heads, self.routes.iter().map(route_row)))?;
         for lane in &self.lanes {
             let process = process(&format!("egress-{}", lane.name));
             let title = format!("lane {}: {};", lane.name, mode_text(lane));
@@ -60,44 +60,29 @@ impl fmt::Display for Report {
             let heads = ["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"];
             let outputs = self.routes.iter().flat_map(|route| &route.lanes);
             let rows = outputs.filter(|output| output.lane == lane.name).map(output_row);
-            f.write_str(&table(TOPIC_TABLE, heads, rows))?;
+            f.write_str(&table(1, TOPIC_TABLE, heads, rows))?;
         }
         Ok(())
     }
 }
 
-/// The alignment and the minimum width of each column.
-type Columns = [(CellAlignment, u16); 7];
+/// The minimum width of each column.
+type Widths = [u16; 7];
 /// The cells of a row, and the lines that follow it.
 type Row = ([String; 7], String);
 
-/// The columns of the tables of ingress and the lanes, which line up with each other.
-const TOPIC_TABLE: Columns = [
-    (CellAlignment::Left, TOPIC_COLUMNS as u16),
-    (CellAlignment::Right, 5),
-    (CellAlignment::Right, 7),
-    (CellAlignment::Right, 7),
-    (CellAlignment::Right, 13),
-    (CellAlignment::Right, 13),
-    (CellAlignment::Right, 13),
-];
-const SUBSCRIBER_TABLE: Columns = [
-    (CellAlignment::Left, 24),
-    (CellAlignment::Left, 13),
-    (CellAlignment::Left, 12),
-    (CellAlignment::Right, 13),
-    (CellAlignment::Right, 7),
-    (CellAlignment::Right, 7),
-    (CellAlignment::Right, 15),
-];
+/// The tables of ingress and the lanes line up with each other.
+const TOPIC_TABLE: Widths = [TOPIC_COLUMNS as u16, 5, 7, 7, 13, 13, 13];
+const SUBSCRIBER_TABLE: Widths = [24, 13, 12, 13, 7, 7, 15];
 
-/// A table without borders, indented by two columns.
-fn table(columns: Columns, heads: [&str; 7], rows: impl Iterator<Item = Row>) -> String {
+/// A table without borders, indented by two columns; all but the first `left` are aligned to the right.
+fn table(left: usize, widths: Widths, heads: [&str; 7], rows: impl Iterator<Item = Row>) -> String {
     let (cells, notes): (Vec<_>, Vec<_>) = rows.unzip();
     let mut table = Table::new();
     table.load_preset(presets::NOTHING).set_header(heads).add_rows(cells);
-    for (index, (column, (alignment, width))) in table.column_iter_mut().zip(columns).enumerate() {
+    for (index, (column, width)) in table.column_iter_mut().zip(widths).enumerate() {
         let padding = if index == 0 { 2 } else { 1 };
+        let alignment = if index < left { CellAlignment::Left } else { CellAlignment::Right };
         column.set_padding((padding, 0)).set_cell_alignment(alignment);
         column.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(padding + width)));
     }
@@ -114,23 +99,20 @@ fn route_row(route: &RouteReport) -> Row {
     let bytes = route.bytes_per_s.map_or("-".to_owned(), |rate| format!("{}/s", bytes_text(rate)));
     let cells = [
         topic_text(&route.input_topic),
-        route.writers.to_string(),
+        route.counters.writers.to_string(),
         rate_text(route.rate_hz),
         String::new(),
         bytes,
         latencies_text(&route.dds_in),
-        route.lost_upstream.to_string(),
+        route.counters.lost_upstream.to_string(),
     ];
-    let mut notes = drops_text(&route.drops, &route.drops_in_window);
-    for publisher in route.publishers.iter().filter(|of| of.lost_upstream > 0 || of.repeated > 0) {
-        let PublisherReport { writer, received, lost_upstream, repeated, .. } = publisher;
-        let counts = [
-            format!("{received} received, "),
-            format!("{lost_upstream} lost upstream, "),
-            format!("{repeated} repeated"),
-        ];
+    let mut notes = drops_text(&route.counters.drops, &route.drops_in_window);
+    let accounts = route.publishers.iter().map(|publisher| &publisher.account);
+    for account in accounts.filter(|account| account.lost_upstream > 0 || account.repeated > 0) {
+        let PublisherAccount { writer, received, lost_upstream, repeated, .. } = account;
+        let counts = format!("{received} received, {lost_upstream} lost upstream, {repeated} repeated");
         let first = format!("    publisher {writer}: ");
-        notes.push_str(&wrapped(&first, "      ", counts.iter().map(String::as_str), ""));
+        notes.push_str(&wrapped(&first, "      ", counts.split_inclusive(", "), ""));
     }
     (cells, notes)
 }
@@ -138,14 +120,14 @@ fn route_row(route: &RouteReport) -> Row {
 fn output_row(output: &OutputReport) -> Row {
     let cells = [
         topic_text(&output.topic),
-        output.readers.to_string(),
+        output.counters.readers.to_string(),
         rate_text(output.received_hz),
         rate_text(output.rate_hz),
         latencies_text(&output.shm),
         latencies_text(&output.dds_out),
         latencies_text(&output.age),
     ];
-    (cells, drops_text(&output.drops, &output.drops_in_window))
+    (cells, drops_text(&output.counters.drops, &output.drops_in_window))
 }
 
 fn safety_text(safety: &SafetyReport) -> String {
@@ -169,7 +151,7 @@ fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
         return String::new();
     }
     let heads = ["SUBSCRIBER", "LANE", "STATE", "RTT MEAN/P95", "JITTER", "LOSS", "LAST RESPONSE"];
-    table(SUBSCRIBER_TABLE, heads, subscribers.iter().map(subscriber_row))
+    table(3, SUBSCRIBER_TABLE, heads, subscribers.iter().map(subscriber_row))
 }
 
 fn subscriber_row(subscriber: &SubscriberReport) -> Row {
@@ -233,21 +215,15 @@ fn intruders_text(intruders: &[IntruderReport], seen: u64) -> String {
 }
 
 fn drops_text(drops: &DropCounts, in_window: &DropCounts) -> String {
-    let entries: Vec<String> = drops
-        .iter()
-        .enumerate()
-        .map(|(index, (reason, count))| {
-            let comma = if index == 0 { "" } else { ", " };
-            match in_window.get(reason) {
-                0 => format!("{comma}{reason} {count}"),
-                new => format!("{comma}{reason} {count} (+{new})"),
-            }
-        })
-        .collect();
+    let entries = drops.iter().map(|(reason, count)| match in_window.get(reason) {
+        0 => format!("{reason} {count}"),
+        new => format!("{reason} {count} (+{new})"),
+    });
+    let entries: Vec<String> = entries.collect();
     if entries.is_empty() {
         return String::new();
     }
-    wrapped("    dropped: ", "      ", entries.iter().map(String::as_str), "")
+    wrapped("    dropped: ", "      ", entries.iter().map(String::as_str), ", ")
 }
 
 /// Joins parts into lines of at most [`COLUMNS`]. A part that is longer gets a line of its own.
@@ -259,8 +235,7 @@ fn wrapped<'a>(first: &str, next: &str, parts: impl Iterator<Item = &'a str>, be
         let length = line.chars().count() + between.len() + part.trim_end().chars().count();
         if !empty && length > COLUMNS {
             let _ = writeln!(text, "{}", line.trim_end());
-            line = next.to_owned();
-            line.push_str(part.trim_start_matches([',', ' ']));
+            line = format!("{next}{part}");
         } else {
             if !empty {
                 line.push_str(between);
@@ -291,22 +266,23 @@ fn process_line(name: &str, process: &ProcessReport) -> String {
 }
 
 fn process_text(process: &ProcessReport) -> String {
-    if process.state == ProcessState::NotStarted {
-        return process.state.label().to_owned();
+    let ProcessReading { health, state, .. } = &process.reading;
+    if *state == ProcessState::NotStarted {
+        return state.label().to_owned();
     }
-    let restarts = counted(process.starts.saturating_sub(1), "restart");
+    let restarts = counted(health.starts.saturating_sub(1), "restart");
     let mut failures = String::new();
-    if process.errors > 0 {
-        let _ = write!(failures, ", {}", counted(process.errors, "error"));
+    if health.errors > 0 {
+        let _ = write!(failures, ", {}", counted(health.errors, "error"));
     }
-    if process.refused_reloads > 0 {
-        let _ = write!(failures, ", {} refused", counted(process.refused_reloads, "reload"));
+    if health.refused_reloads > 0 {
+        let _ = write!(failures, ", {} refused", counted(health.refused_reloads, "reload"));
     }
-    for (reason, count) in process.network_refusals.iter() {
+    for (reason, count) in health.network_refusals.iter() {
         let _ = write!(failures, ", {count} {reason}");
     }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
-    format!("process {} {}{up}, {restarts}{failures}", process.pid, process.state.label())
+    format!("process {} {}{up}, {restarts}{failures}", health.pid, state.label())
 }
 
 fn topic_text(topic: &str) -> String {

@@ -3,10 +3,15 @@
 use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
 use super::report::{
-    AbsenceReport, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport, ProbesReport,
-    ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport, SubscriberReport,
+    AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
+    ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport,
+    SubscriberReport,
 };
-use crate::model::{Counts, Reason};
+use super::snapshot::ProcessReading;
+use crate::model::{
+    Counts, Guid, IngressCounters, LaneCounters, ProcessHealth, PublisherAccount, ReaderRecord, Reason,
+};
+use crate::shm::ProcessRole;
 
 fn counts<R: Reason, const N: usize>(each: u64) -> Counts<R, N> {
     let mut counts = Counts::default();
@@ -27,24 +32,26 @@ pub(super) fn wide_report() -> Report {
     let output = OutputReport {
         lane: "a_lane_of_24_characters_".into(),
         topic: topic.clone(),
-        readers: 99_999,
         matched_readers: vec![ReaderReport {
-            guid: "0".repeat(33),
-            node: Some("/a_node".into()),
-            host: None,
+            record: ReaderRecord {
+                reader: Guid::default(),
+                offered: u64::MAX,
+                unacknowledged: u64::MAX,
+                overrun: u64::MAX,
+                reliable: 0,
+            },
+            origin: EndpointOrigin { node: Some("/a_node".into()), host: None },
             reliability: "BEST_EFFORT",
-            offered: u64::MAX,
-            unacknowledged: u64::MAX,
-            overrun: u64::MAX,
         }],
-        reader_overrun: u64::MAX,
         received: u64::MAX,
-        forwarded: u64::MAX,
-        forwarded_bytes: u64::MAX,
-        by_reference: 0,
-        caught_up: 0,
-        waiting: 0,
-        drops: counts(u64::MAX / 100),
+        counters: LaneCounters {
+            readers: 99_999,
+            reader_overrun: u64::MAX,
+            forwarded: u64::MAX,
+            forwarded_bytes: u64::MAX,
+            drops: counts(u64::MAX / 100),
+            ..LaneCounters::default()
+        },
         drops_in_window: counts(u64::MAX / 100),
         whole: true,
         received_hz: Some(99_999.9),
@@ -86,27 +93,26 @@ pub(super) fn wide_report() -> Report {
             id: "scan".into(),
             input_topic: topic,
             message_type: None,
-            writers: 99_999,
-            received: 0,
-            received_bytes: 0,
-            published: 0,
-            in_place: 0,
-            lost_upstream: 9_999_999_999_999,
-            repeated: 0,
-            unmarked: 0,
+            counters: IngressCounters {
+                writers: 99_999,
+                lost_upstream: 9_999_999_999_999,
+                drops: counts(u64::MAX / 100),
+                ..IngressCounters::default()
+            },
             publishers: vec![PublisherReport {
-                writer: "0102030405060708090a0b0c:00000103".into(),
-                node: Some("/laser".into()),
-                host: Some("10.0.0.7".into()),
+                account: PublisherAccount {
+                    writer: Guid([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 0, 0, 1, 3]),
+                    first_sequence: 1,
+                    last_sequence: i64::MAX,
+                    received: u64::MAX,
+                    lost_upstream: u64::MAX,
+                    repeated: u64::MAX,
+                    ..PublisherAccount::default()
+                },
+                origin: EndpointOrigin { node: Some("/laser".into()), host: Some("10.0.0.7".into()) },
                 reliability: Some("RELIABLE"),
-                first_sequence: 1,
-                last_sequence: i64::MAX,
-                received: u64::MAX,
-                lost_upstream: u64::MAX,
-                repeated: u64::MAX,
                 last_received_age_ms: Some(1.0),
             }],
-            drops: counts(u64::MAX / 100),
             drops_in_window: counts(0),
             whole: true,
             rate_hz: Some(99_999.9),
@@ -162,16 +168,21 @@ pub(super) fn wide_report() -> Report {
 
 fn process(name: &str) -> ProcessReport {
     ProcessReport {
-        name: name.into(),
-        pid: 4_194_304,
-        state: ProcessState::Running,
+        reading: ProcessReading {
+            name: name.into(),
+            role: ProcessRole::Control,
+            health: ProcessHealth {
+                pid: 4_194_304,
+                starts: 100_001,
+                errors: 99_999,
+                refused_reloads: 99_999,
+                network_refusals: counts(99_999),
+                ..ProcessHealth::default()
+            },
+            state: ProcessState::Running,
+        },
         uptime_s: Some(86_399.0),
-        starts: 100_001,
-        turns: 0,
         last_turn_age_ms: Some(99_999.0),
-        errors: 99_999,
-        refused_reloads: 99_999,
-        network_refusals: counts(99_999),
         settings_fingerprint: None,
     }
 }

@@ -1,5 +1,4 @@
-//! Text helpers. Names of nodes and hosts come from the network, so they are made safe for terminals and
-//! logs.
+//! Text helpers. Names come from the network, so they are made safe for terminals and logs.
 
 /// Replaces each control character, so that the text cannot control a terminal or end a line or a string.
 pub(super) fn printable(text: &str) -> String {

@@ -29,8 +29,7 @@ pub const MAX_ARRAY_BYTES: usize = 48 * 1024;
 const NODE: &str = "adaptive_bridge";
 const DEFAULT_INSTANCE: &str = "default";
 
-/// The maximum length of names, messages, keys and values in bytes, and the maximum number of values of a
-/// status.
+/// The maximum lengths of texts in bytes, and the maximum number of values of a status.
 const MAX_NAME_BYTES: usize = 256;
 const MAX_MESSAGE_BYTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 96;

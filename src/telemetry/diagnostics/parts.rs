@@ -1,5 +1,4 @@
-//! The parts of the bridge that have a status of their own, with the message and level of each without
-//! problems.
+//! The parts of the bridge that have a status of their own, with message and level without problems.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -25,7 +24,7 @@ pub(super) struct Part {
 pub(super) fn of(report: &Report) -> Vec<Part> {
     let mut parts = vec![bridge(report)];
     for name in ["ingress", "control"] {
-        parts.extend(report.processes.iter().find(|process| process.name == name).map(process));
+        parts.extend(report.processes.iter().find(|process| process.reading.name == name).map(process));
     }
     parts.push(safety(report));
     parts.extend(report.lanes.iter().map(|one| lane(one, report)));
@@ -52,7 +51,7 @@ fn bridge(report: &Report) -> Part {
 }
 
 fn process(process: &ProcessReport) -> Part {
-    part(&*process.name, process.state.label().to_owned(), flat(process))
+    part(&*process.reading.name, process.reading.state.label().to_owned(), flat(process))
 }
 
 fn safety(report: &Report) -> Part {
@@ -61,8 +60,9 @@ fn safety(report: &Report) -> Part {
 
 fn lane(lane: &LaneReport, report: &Report) -> Part {
     let mut values = flat(lane);
-    let process = report.processes.iter().find(|process| process.name == format!("egress-{}", lane.name));
-    let is_up = process.is_some_and(|process| process.state == ProcessState::Running);
+    let name = format!("egress-{}", lane.name);
+    let process = report.processes.iter().find(|process| process.reading.name == name);
+    let is_up = process.is_some_and(|process| process.reading.state == ProcessState::Running);
     if let Some(process) = process {
         put(&mut values, "process", process, &[]);
     }
@@ -74,14 +74,14 @@ fn lane(lane: &LaneReport, report: &Report) -> Part {
 fn route(route: &RouteReport) -> Part {
     let mut values = Vec::new();
     put(&mut values, "", route, &["lanes", "drops", "drops_in_window"]);
-    put_counts(&mut values, "drops", &route.drops);
+    put_counts(&mut values, "drops", &route.counters.drops);
     for output in &route.lanes {
         put(&mut values, &output.lane, output, &["drops", "drops_in_window"]);
-        put_counts(&mut values, &format!("{}.drops", output.lane), &output.drops);
+        put_counts(&mut values, &format!("{}.drops", output.lane), &output.counters.drops);
     }
     let message = match route.rate_hz {
-        Some(rate_hz) => format!("{} Hz from {} publishers", number(rate_hz), route.writers),
-        None => format!("{} publishers", route.writers),
+        Some(rate_hz) => format!("{} Hz from {} publishers", number(rate_hz), route.counters.writers),
+        None => format!("{} publishers", route.counters.writers),
     };
     part(format!("route {}", route.id), message, values)
 }
@@ -138,8 +138,7 @@ fn put(values: &mut Vec<(String, String)>, path: &str, value: &impl Serialize, o
     }
 }
 
-/// Adds the counts other than 0. Those of the window are left out, because a monitor sees the change from one
-/// message to the next.
+/// Adds the counts other than 0, but not those of the window: a monitor sees the change between messages.
 fn put_counts<R: Reason, const N: usize>(
     values: &mut Vec<(String, String)>,
     path: &str,

@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use crate::model::{Counts, Reason};
 use crate::telemetry::report::LatencyTotal;
 
 /// The media type of the format.
@@ -16,6 +17,8 @@ pub(super) struct Page {
     text: String,
     /// The head of the current family until its first sample is written. A family without samples is omitted.
     head: Option<String>,
+    /// Of the names of all families.
+    prefix: &'static str,
     name: &'static str,
 }
 
@@ -46,13 +49,11 @@ impl From<f64> for Value {
     }
 }
 
-impl From<bool> for Value {
-    fn from(flag: bool) -> Self {
-        Self::Count(u64::from(flag))
-    }
-}
-
 impl Page {
+    pub(super) fn with_prefix(prefix: &'static str) -> Self {
+        Self { prefix, ..Self::default() }
+    }
+
     /// Begins a family; its samples follow. `help` must not contain line breaks or backslashes.
     pub(super) fn family(&mut self, name: &'static str, kind: Kind, help: &str) {
         let kind = match kind {
@@ -60,7 +61,8 @@ impl Page {
             Kind::Gauge => "gauge",
             Kind::Histogram => "histogram",
         };
-        self.head = Some(format!("# HELP {name} {help}\n# TYPE {name} {kind}\n"));
+        let prefix = self.prefix;
+        self.head = Some(format!("# HELP {prefix}{name} {help}\n# TYPE {prefix}{name} {kind}\n"));
         self.name = name;
     }
 
@@ -71,12 +73,17 @@ impl Page {
         }
     }
 
+    /// Adds one sample for each reason of the counts.
+    pub(super) fn counts<R: Reason, const N: usize>(&mut self, labels: Labels<'_>, counts: &Counts<R, N>) {
+        for &reason in R::ALL {
+            self.put("", labels, Some(("reason", &reason.to_string())), counts.get(reason).into());
+        }
+    }
+
     /// Adds one sample for each possible state: 1 for the present state, 0 for the others.
     pub(super) fn states(&mut self, labels: Labels<'_>, name: &'static str, all: &[&str], present: &str) {
         for state in all {
-            let mut labels = labels.to_vec();
-            labels.push((name, state));
-            self.put("", &labels, None, (*state == present).into());
+            self.put("", labels, Some((name, state)), u64::from(*state == present).into());
         }
     }
 
@@ -84,9 +91,9 @@ impl Page {
     pub(super) fn histogram(&mut self, labels: Labels<'_>, total: &LatencyTotal) {
         for (edge_ns, below) in LatencyTotal::EDGES_NS.iter().zip(total.below) {
             let edge = (*edge_ns as f64 / 1e9).to_string();
-            self.put("_bucket", labels, Some(&edge), below.into());
+            self.put("_bucket", labels, Some(("le", &edge)), below.into());
         }
-        self.put("_bucket", labels, Some("+Inf"), total.count.into());
+        self.put("_bucket", labels, Some(("le", "+Inf")), total.count.into());
         self.put("_sum", labels, None, (total.sum_ns as f64 / 1e9).into());
         self.put("_count", labels, None, total.count.into());
     }
@@ -95,43 +102,22 @@ impl Page {
         self.text
     }
 
-    fn put(&mut self, suffix: &str, labels: Labels<'_>, edge: Option<&str>, value: Value) {
+    /// Adds a line; `last` is the label after the others.
+    fn put(&mut self, suffix: &str, labels: Labels<'_>, last: Option<(&str, &str)>, value: Value) {
         self.text.push_str(&self.head.take().unwrap_or_default());
-        self.text.push_str(self.name);
-        self.text.push_str(suffix);
-        let labels = labels.iter().copied().chain(edge.map(|edge| ("le", edge)));
-        let mut open = '{';
-        for (name, value) in labels {
-            self.text.push(open);
-            open = ',';
-            self.text.push_str(name);
-            self.text.push_str("=\"");
-            escape(value, &mut self.text);
-            self.text.push('"');
-        }
-        if open == ',' {
-            self.text.push('}');
-        }
-        // Writing to a string does not fail.
-        let _ = match value {
-            Value::Count(count) => writeln!(self.text, " {count}"),
-            Value::Float(float) if float.is_nan() => writeln!(self.text, " NaN"),
-            Value::Float(f64::INFINITY) => writeln!(self.text, " +Inf"),
-            Value::Float(f64::NEG_INFINITY) => writeln!(self.text, " -Inf"),
-            Value::Float(float) => writeln!(self.text, " {float}"),
+        let escaped = |value: &str| value.replace('\\', r"\\").replace('"', r#"\""#).replace('\n', r"\n");
+        let labels = labels.iter().copied().chain(last);
+        let labels: Vec<String> =
+            labels.map(|(name, value)| format!("{name}=\"{}\"", escaped(value))).collect();
+        let labels = if labels.is_empty() { String::new() } else { format!("{{{}}}", labels.join(",")) };
+        let value = match value {
+            Value::Count(count) => count.to_string(),
+            Value::Float(f64::INFINITY) => "+Inf".to_owned(),
+            Value::Float(f64::NEG_INFINITY) => "-Inf".to_owned(),
+            Value::Float(float) => float.to_string(),
         };
-    }
-}
-
-/// Appends the value of a label with backslash, quote and line feed escaped.
-fn escape(value: &str, text: &mut String) {
-    for char in value.chars() {
-        match char {
-            '\\' => text.push_str("\\\\"),
-            '"' => text.push_str("\\\""),
-            '\n' => text.push_str("\\n"),
-            other => text.push(other),
-        }
+        // Writing to a string does not fail.
+        let _ = writeln!(self.text, "{}{}{suffix}{labels} {value}", self.prefix, self.name);
     }
 }
 

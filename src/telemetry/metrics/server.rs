@@ -28,7 +28,7 @@ use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr, bin
 use nix::sys::stat::{Mode, fchmod};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, UnixListener};
-use tokio::runtime::{self, Runtime};
+use tokio::runtime;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use super::metrics_page;
@@ -82,10 +82,17 @@ impl MetricsServer {
     fn try_start(listener: &MetricsListener) -> io::Result<Self> {
         let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
         let listening = runtime.block_on(Listener::open(listener))?;
-        let (stop, stopped) = oneshot::channel();
+        let (stop, stopped) = oneshot::channel::<Infallible>();
         let latest = Latest::default();
         let reports = latest.clone();
-        let serve = move || run(&runtime, listening, stopped, reports);
+        let serve = move || {
+            runtime.block_on(async {
+                // Ends when the runtime is dropped, as the tasks of the clients do.
+                tokio::spawn(serve(listening, reports));
+                // Until the other end is dropped.
+                let _ = stopped.await;
+            });
+        };
         let thread = thread::Builder::new().name("metrics".to_owned()).spawn(serve)?;
         Ok(Self { latest, stop: Some(stop), thread: Some(thread) })
     }
@@ -148,8 +155,7 @@ impl SocketFile {
         Self::remove_stale(path)?;
         let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
         let fd = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
-        // The file gets the mode of the socket, less the umask, so no other user can connect before the mode
-        // is set below.
+        // The file gets the socket's mode, less the umask: no other user can connect before it is set below.
         fchmod(&fd, Mode::S_IRUSR | Mode::S_IWUSR)?;
         bind(fd.as_raw_fd(), &UnixAddr::new(path)?)?;
         listen(&fd, Backlog::new(MAX_CLIENTS as i32)?)?;
@@ -186,15 +192,6 @@ impl Drop for SocketFile {
             let _ = fs::remove_file(&self.path);
         }
     }
-}
-
-/// Serves until the other end of `stopped` is dropped.
-fn run(runtime: &Runtime, listener: Listener, stopped: oneshot::Receiver<Infallible>, latest: Latest) {
-    runtime.block_on(async {
-        // Ends when the runtime is dropped, as the tasks of the clients do.
-        tokio::spawn(serve(listener, latest));
-        let _ = stopped.await;
-    });
 }
 
 async fn serve(listener: Listener, latest: Latest) {

@@ -5,7 +5,7 @@ use crate::model::{
     AbsenceKind, MAX_INTRUDERS, ModeReason, NetworkRefusal, ProbeRefusal, SafetyMode, SubscriberState,
 };
 use crate::shm::ProcessRole;
-use crate::telemetry::report::SubscriberReport;
+use crate::telemetry::report::IntruderReport;
 use crate::telemetry::snapshot::Snapshot;
 use crate::telemetry::text::{counted, printable};
 
@@ -179,14 +179,13 @@ pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
         } else if report.warnings.is_empty() {
             return None;
         } else {
-            (
-                Level::Warn,
-                format!(
-                    "is above the warning threshold of {}: {}; check its link, or raise probes.*_threshold",
-                    report.warnings.join(", "),
-                    full_figures(&report)
-                ),
-            )
+            let jitter = report.jitter_ms.map_or(String::new(), |ms| format!(", jitter {ms:.1} ms"));
+            let text = format!(
+                "is above the warning threshold of {}: {}{jitter}; check its link, or raise probes.*_threshold",
+                report.warnings.join(", "),
+                report.figures()
+            );
+            (Level::Warn, text)
         };
         let on_lane = report.lane.as_ref().map_or(String::new(), |lane| format!(" on lane {lane}"));
         let text = format!("subscriber {}{on_lane} {trouble}", report.id);
@@ -194,28 +193,15 @@ pub(super) fn subscribers(now: &Snapshot) -> impl Iterator<Item = Problem> {
     })
 }
 
-fn full_figures(report: &SubscriberReport) -> String {
-    let jitter = report.jitter_ms.map_or(String::new(), |ms| format!(", jitter {ms:.1} ms"));
-    format!("{}{jitter}", report.figures())
-}
-
 /// Intruders, each with its remedy.
 pub(super) fn intruders(now: &Snapshot) -> Vec<Problem> {
     let warn = |text| Problem::new("intruders", Level::Warn, text);
-    let mut problems: Vec<Problem> = now
-        .intruders
-        .iter()
-        .map(|intruder| {
-            let text = |text: &str| printable(text);
-            let node = match intruder.node.as_str() {
-                "" => "a node of unknown name".to_owned(),
-                node => text(node),
-            };
-            let (topic, host) = (text(intruder.topic.as_str()), text(intruder.host.as_str()));
-            let remedy = text(intruder.remedy.as_str());
-            warn(format!("{node} on {host} bypasses the bridge, it subscribes to {topic}: {remedy}"))
-        })
-        .collect();
+    let intruders = now.intruders.iter().map(|intruder| {
+        let IntruderReport { topic, node, host, remedy, .. } = now.intruder_report(intruder);
+        let node = node.as_deref().unwrap_or("a node of unknown name");
+        warn(format!("{node} on {host} bypasses the bridge, it subscribes to {topic}: {remedy}"))
+    });
+    let mut problems: Vec<Problem> = intruders.collect();
     let seen = now.control.intruders_seen;
     if now.intruders.len() == MAX_INTRUDERS && seen > MAX_INTRUDERS as u64 {
         let text = format!(

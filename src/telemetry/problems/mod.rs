@@ -8,7 +8,7 @@ use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
 use super::snapshot::{LaneReading, OutputReading, RouteReading, Snapshot};
 use super::text::counted;
-use crate::model::{DropReason, LaneCounters, LaneMode, TrafficClass};
+use crate::model::{DropReason, IngressCounters, LaneCounters, LaneMode, TrafficClass};
 use crate::shm::ProcessRole;
 
 /// A lane's process writes the mode that it applies ten times a second. After this time without it, the
@@ -76,17 +76,15 @@ fn about_lane(lane: &LaneReading) -> String {
 fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading) -> Option<Problem> {
     let counters = &output.counters;
     (!counters.is_accounted_for()).then(|| {
+        let LaneCounters { forwarded, waiting, drops, .. } = counters;
         let text = format!(
-            "lane {}, route {}: the sample counts do not add up: {} received, but {} forwarded + {} waiting + {} \
-             dropped; unless egress-{} is stopped (SIGSTOP), this is a bug: report it with \
+            "lane {0}, route {1}: the sample counts do not add up: {2} received, but {forwarded} forwarded + \
+             {waiting} waiting + {3} dropped; unless egress-{0} is stopped (SIGSTOP), this is a bug: report it with \
              `adaptive-bridge status --json`",
             lane.name,
             route.id,
             counters.received(),
-            counters.forwarded,
-            counters.waiting,
-            counters.drops.total(),
-            lane.name
+            drops.total()
         );
         Problem::new(about_lane(lane), Level::Error, text)
     })
@@ -94,15 +92,13 @@ fn unaccounted(route: &RouteReading, output: &OutputReading, lane: &LaneReading)
 
 /// Ingress's counts of a route that do not add up.
 fn unaccounted_by_ingress(route: &RouteReading) -> Option<Problem> {
-    let counters = &route.counters;
     (!route.is_accounted_for()).then(|| {
+        let IngressCounters { received, published, drops, .. } = &route.counters;
         let text = format!(
-            "ingress, route {}: the sample counts do not add up: {} received, but {} published + {} dropped; this is \
-             a bug: report it with `adaptive-bridge status --json`",
+            "ingress, route {}: the sample counts do not add up: {received} received, but {published} published + {} \
+             dropped; this is a bug: report it with `adaptive-bridge status --json`",
             route.id,
-            counters.received,
-            counters.published,
-            counters.drops.total()
+            drops.total()
         );
         Problem::new(format!("route {}", route.id), Level::Error, text)
     })
@@ -214,10 +210,8 @@ fn slow_readers(
     let lane = &now.lanes[output.lane];
     let former = before.route(route).and_then(|former| former.output(output));
     for record in output.readers.iter() {
-        let earlier = former.and_then(|former| {
-            former.readers.iter().find(|earlier| earlier.reader == record.reader).copied()
-        });
-        let Some(earlier) = earlier else { continue };
+        let mut earlier = former.iter().flat_map(|former| former.readers.iter());
+        let Some(earlier) = earlier.find(|earlier| earlier.reader == record.reader) else { continue };
         let missed = record.overrun.saturating_sub(earlier.overrun);
         // The lane offered samples within the window and the reader acknowledged none of them, nor any of
         // the older unacknowledged ones.
@@ -225,7 +219,7 @@ fn slow_readers(
         let is_silent = offered >= SILENT_READER_SAMPLES
             && record.unacknowledged.saturating_sub(earlier.unacknowledged) == offered
             && earlier.unacknowledged > 0;
-        let reader = now.reader_name(record);
+        let reader = now.endpoint_name("reader", record.reader);
         let text = if missed > 0 {
             format!(
                 "lane {}, {}: {reader} missed {} in the last {}: it acknowledges too slowly \

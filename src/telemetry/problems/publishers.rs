@@ -25,7 +25,7 @@ pub(super) fn lost_by_publisher(now: &Snapshot, route: &RouteReading, former: &R
         return String::new();
     }
     let named = losses.iter().take(MAX_NAMED_PUBLISHERS);
-    let named = named.map(|(lost, writer)| format!("{lost} from {}", now.publisher_name(*writer)));
+    let named = named.map(|(lost, writer)| format!("{lost} from {}", now.endpoint_name("writer", *writer)));
     let and_others = if losses.len() > MAX_NAMED_PUBLISHERS { ", and others" } else { "" };
     format!(": {}{and_others}", named.collect::<Vec<_>>().join(", "))
 }
@@ -38,7 +38,7 @@ pub(super) fn clock_offset(now: &Snapshot, route: &RouteReading) -> Option<Probl
         "route {}: the clock of {} is {:.1} s {side} this computer's clock, so the bridge measures the age of its \
          samples from their arrival; synchronise the clocks (chrony, PTP)",
         route.id,
-        now.publisher_name(route.counters.clock_writer),
+        now.endpoint_name("writer", route.counters.clock_writer),
         offset_s.abs()
     );
     Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
@@ -56,7 +56,8 @@ pub(super) fn unrepaired(now: &Snapshot, route: &RouteReading) -> Option<Problem
     }
     let beyond = best_effort.len().saturating_sub(MAX_NAMED_PUBLISHERS);
     best_effort.truncate(MAX_NAMED_PUBLISHERS);
-    let names: Vec<_> = best_effort.into_iter().map(|account| now.publisher_name(account.writer)).collect();
+    let names: Vec<_> =
+        best_effort.into_iter().map(|account| now.endpoint_name("writer", account.writer)).collect();
     let and_others = if beyond > 0 { format!(" and {beyond} others") } else { String::new() };
     let text = format!(
         "route {}: BEST_EFFORT publishers beside RELIABLE ones of {}: {}{and_others}; samples of theirs that the \

@@ -1,6 +1,6 @@
 //! The parts of the report that come from control: safety, probes, subscribers, intruders, absences.
 
-use super::age_ms;
+use super::{age_ms, some_text};
 use crate::model::{
     AbsenceRecord, IntruderRecord, LaneMode, ModeReason, MonotonicNs, RefusalCounts, SubscriberState,
     SubscriberWarning, TrafficClass,
@@ -12,26 +12,21 @@ use crate::telemetry::text::printable;
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct SafetyReport {
     /// The safety mode: `normal`, `degraded` or `emergency`.
-    pub mode: &'static str,
+    pub(crate) mode: &'static str,
     /// The cause of the mode; null in normal mode.
-    pub reason: Option<String>,
+    pub(crate) reason: Option<String>,
     /// The time since the mode was entered; null when control never ran.
-    pub since_s: Option<f64>,
-    /// Changes of the mode since control started.
-    pub transitions: u64,
+    pub(crate) since_s: Option<f64>,
+    pub(crate) transitions: u64,
 }
 
 /// Probe counts, summed over all subscribers.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct ProbesReport {
-    /// Probe requests sent.
-    pub sent: u64,
-    /// Probe responses accepted.
-    pub accepted: u64,
-    /// Refused messages, by reason.
-    pub refused: RefusalCounts,
-    /// Refused messages within the window, by reason.
-    pub refused_in_window: RefusalCounts,
+    pub(crate) sent: u64,
+    pub(crate) accepted: u64,
+    pub(crate) refused: RefusalCounts,
+    pub(crate) refused_in_window: RefusalCounts,
 }
 
 /// The state and the link figures of one subscriber.
@@ -39,36 +34,24 @@ pub struct ProbesReport {
 pub struct SubscriberReport {
     /// The id of its responder.
     pub id: String,
-    /// Its lane; null when it has none.
-    pub lane: Option<String>,
-    /// Whether the configuration lists it.
-    pub listed: bool,
-    /// Its state: `UNKNOWN`, `CRITICAL` or `NONCRITICAL`.
-    pub state: &'static str,
-    /// Whether the configuration forces the state.
-    pub forced: bool,
-    /// The reason of its state.
-    pub reason: String,
-    /// The time since it entered its state.
-    pub state_since_s: Option<f64>,
-    /// Changes of its state since control started.
-    pub transitions: u64,
+    pub(crate) lane: Option<String>,
+    pub(crate) listed: bool,
+    pub(crate) state: &'static str,
+    pub(crate) forced: bool,
+    pub(crate) reason: String,
+    pub(crate) state_since_s: Option<f64>,
+    pub(crate) transitions: u64,
     /// Probes of the sliding window that were answered or timed out.
-    pub settled: u64,
+    pub(crate) settled: u64,
     /// Settled probes without a response in time.
-    pub lost: u64,
-    /// The share of lost probes, 0 to 1.
-    pub loss: Option<f64>,
-    /// Mean round trip within the sliding window.
-    pub rtt_mean_ms: Option<f64>,
-    /// 95th percentile of the round trips.
-    pub rtt_p95_ms: Option<f64>,
-    /// Jitter of the round trips.
-    pub jitter_ms: Option<f64>,
-    /// The time since its last response.
-    pub last_response_age_ms: Option<f64>,
+    pub(crate) lost: u64,
+    pub(crate) loss: Option<f64>,
+    pub(crate) rtt_mean_ms: Option<f64>,
+    pub(crate) rtt_p95_ms: Option<f64>,
+    pub(crate) jitter_ms: Option<f64>,
+    pub(crate) last_response_age_ms: Option<f64>,
     /// The figures above their warning threshold: `rtt`, `loss`, `jitter`.
-    pub warnings: Vec<&'static str>,
+    pub(crate) warnings: Vec<&'static str>,
 }
 
 impl SubscriberReport {
@@ -85,33 +68,27 @@ impl SubscriberReport {
 /// A remote subscriber that bypasses the bridge.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct IntruderReport {
-    /// The topic that it subscribes to.
-    pub topic: String,
+    pub(crate) topic: String,
     /// Its node; null when it is unknown.
-    pub node: Option<String>,
-    /// The addresses of its host.
-    pub host: String,
-    /// The remedy, as text for users.
-    pub remedy: String,
-    /// The time since it was first seen.
-    pub since_s: Option<f64>,
+    pub(crate) node: Option<String>,
+    pub(crate) host: String,
+    pub(crate) remedy: String,
+    pub(crate) since_s: Option<f64>,
 }
 
 /// A network interface or peer that is or was away.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct AbsenceReport {
-    /// `interface` or `peer`.
-    pub kind: &'static str,
+    pub(crate) kind: &'static str,
     /// The interface, or the peer's node; null when the node is unknown.
-    pub name: Option<String>,
+    pub(crate) name: Option<String>,
     /// The address of the interface, or of the peer's host; null when it is unknown.
-    pub host: Option<String>,
+    pub(crate) host: Option<String>,
     /// What the interface lacks, or the topics that the peer subscribes to and publishes.
-    pub detail: String,
+    pub(crate) detail: String,
     /// The time that it is or was away.
-    pub away_s: f64,
-    /// The time since it came back; null while it is away.
-    pub back_s: Option<f64>,
+    pub(crate) away_s: f64,
+    pub(crate) back_s: Option<f64>,
 }
 
 impl Snapshot {
@@ -135,10 +112,8 @@ impl Snapshot {
         }
     }
 
-    pub(in crate::telemetry) fn subscriber_report(
-        &self,
-        SubscriberReading { lane, record }: &SubscriberReading,
-    ) -> SubscriberReport {
+    pub(in crate::telemetry) fn subscriber_report(&self, reading: &SubscriberReading) -> SubscriberReport {
+        let SubscriberReading { lane, record } = reading;
         let answered = record.settled > record.lost;
         let ms = |us: u64| answered.then_some(us as f64 / 1e3);
         SubscriberReport {
@@ -161,7 +136,7 @@ impl Snapshot {
         }
     }
 
-    pub(super) fn intruder_report(&self, intruder: &IntruderRecord) -> IntruderReport {
+    pub(in crate::telemetry) fn intruder_report(&self, intruder: &IntruderRecord) -> IntruderReport {
         IntruderReport {
             topic: printable(intruder.topic.as_str()),
             node: some_text(intruder.node.as_str()),
@@ -242,10 +217,6 @@ impl Snapshot {
 
 fn age_s(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
     age_ms(at, now).map(|ms| ms / 1e3)
-}
-
-fn some_text(text: &str) -> Option<String> {
-    (!text.is_empty()).then(|| printable(text))
 }
 
 #[cfg(test)]

@@ -2,33 +2,27 @@
 
 use crate::model::LatencyHistogram;
 
-/// The latency of a stage within the window. Each value is the upper edge of a bucket: at most 6.3 % too
-/// large.
+/// The latency of a stage within the window. Values are upper edges of buckets: at most 6.3 % too large.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct Latency {
-    /// Samples measured.
-    pub count: u64,
-    /// Median.
-    pub p50_us: Option<f64>,
-    /// 99th percentile.
-    pub p99_us: Option<f64>,
-    /// Maximum.
-    pub max_us: Option<f64>,
+    pub(crate) count: u64,
+    pub(crate) p50_us: Option<f64>,
+    pub(crate) p99_us: Option<f64>,
+    pub(crate) max_us: Option<f64>,
     /// All latencies since the bridge started, for the metrics page; not part of the JSON.
     #[serde(skip)]
-    pub total: LatencyTotal,
+    pub(crate) total: LatencyTotal,
 }
 
 /// All latencies of a stage since the bridge started, in buckets that double in width.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LatencyTotal {
     /// For each of [`Self::EDGES_NS`], the number of latencies below it.
-    pub below: [u64; Self::EDGES_NS.len()],
+    pub(crate) below: [u64; Self::EDGES_NS.len()],
     /// The number of all latencies.
-    pub count: u64,
-    /// The sum, with each latency counted as the middle of its bucket: the error is at most 3.2 % from 1 µs
-    /// to 137 s.
-    pub sum_ns: u128,
+    pub(crate) count: u64,
+    /// The sum of the middles of the buckets: the error is at most 3.2 % from 1 µs to 137 s.
+    pub(crate) sum_ns: u128,
 }
 
 impl LatencyTotal {

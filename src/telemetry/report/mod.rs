@@ -8,235 +8,149 @@ mod latency;
 pub use control::{AbsenceReport, IntruderReport, ProbesReport, SafetyReport, SubscriberReport};
 pub use latency::{Latency, LatencyTotal};
 
-use super::liveness::ProcessState;
 use super::problem::Problem;
 use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
 use crate::model::{
-    DropCounts, FixedText, Guid, LaneMode, MonotonicNs, NetworkRefusals, PublisherAccount, ReaderRecord,
+    DropCounts, Guid, IngressCounters, LaneCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Report {
-    /// The name of the bridge's instance.
-    pub instance: String,
+    pub(crate) instance: String,
     /// The time of the later snapshot, in milliseconds since the Unix epoch.
-    pub time_unix_ms: u64,
+    pub(crate) time_unix_ms: u64,
     /// The time between the two snapshots, to which rates, latencies and `drops_in_window` refer.
-    pub window_ms: f64,
-    /// The problems, the most severe first.
-    pub problems: Vec<Problem>,
-    /// The safety supervisor.
-    pub safety: SafetyReport,
-    /// The processes.
-    pub processes: Vec<ProcessReport>,
-    /// The lanes.
-    pub lanes: Vec<LaneReport>,
-    /// The routes.
-    pub routes: Vec<RouteReport>,
-    /// The probes.
-    pub probes: ProbesReport,
+    pub(crate) window_ms: f64,
+    pub(crate) problems: Vec<Problem>,
+    pub(crate) safety: SafetyReport,
+    pub(crate) processes: Vec<ProcessReport>,
+    pub(crate) lanes: Vec<LaneReport>,
+    pub(crate) routes: Vec<RouteReport>,
+    pub(crate) probes: ProbesReport,
     /// The subscribers that control tracks.
     pub subscribers: Vec<SubscriberReport>,
-    /// The remote subscribers that bypass the bridge.
-    pub intruders: Vec<IntruderReport>,
+    pub(crate) intruders: Vec<IntruderReport>,
     /// Intruders seen since control started, including those not listed.
-    pub intruders_seen: u64,
+    pub(crate) intruders_seen: u64,
     /// The network interfaces and peers that are away, or came back within the last 15 minutes.
-    pub absences: Vec<AbsenceReport>,
+    pub(crate) absences: Vec<AbsenceReport>,
 }
 
 /// The state of one process.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct ProcessReport {
-    /// Its name: `ingress`, `control`, `egress-critical`, …
-    pub name: String,
-    /// Its process id; 0 when it never ran.
-    pub pid: u64,
-    /// Its state.
-    pub state: ProcessState,
-    /// The time since it started.
-    pub uptime_s: Option<f64>,
-    /// Starts of the process in this bridge, including the first one.
-    pub starts: u64,
-    /// Turns of its data path.
-    pub turns: u64,
-    /// The time since its last turn.
-    pub last_turn_age_ms: Option<f64>,
-    /// Errors of the process, except dropped samples.
-    pub errors: u64,
-    /// Reloads that it refused because of errors in the configuration file.
-    pub refused_reloads: u64,
-    /// What its participants refused of the network, by reason.
-    pub network_refusals: NetworkRefusals,
+    #[serde(flatten)]
+    pub(crate) reading: ProcessReading,
+    pub(crate) uptime_s: Option<f64>,
+    pub(crate) last_turn_age_ms: Option<f64>,
     /// A hash of the settings that it applies, in hexadecimal, to compare processes; null until it is known.
-    pub settings_fingerprint: Option<String>,
+    pub(crate) settings_fingerprint: Option<String>,
 }
 
 /// The mode of one lane.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct LaneReport {
-    /// Its name.
-    pub name: String,
-    /// Its class: `critical` or `noncritical`.
-    pub class: &'static str,
+    pub(crate) name: String,
+    pub(crate) class: &'static str,
     /// The mode that results from the policy board.
-    pub mode: &'static str,
-    /// The reason of the mode: `default`, `by_hand`, `control`, `safety`, `held` or `expired`.
-    pub mode_reason: &'static str,
+    pub(crate) mode: &'static str,
+    pub(crate) mode_reason: &'static str,
     /// The reason as text for users, with its cause. The wording may change.
-    pub mode_detail: String,
+    pub(crate) mode_detail: String,
     /// The time until the policy ends unless it is confirmed or set again.
-    pub mode_ends_in_s: Option<f64>,
+    pub(crate) mode_ends_in_s: Option<f64>,
     /// The epoch of the policy on the board; 0 when no policy was ever set.
-    pub policy_epoch: u64,
-    /// The mode that the lane's process applies.
-    pub applied_mode: Option<&'static str>,
-    /// The epoch of the policy that the lane's process applies.
-    pub applied_policy_epoch: u64,
+    pub(crate) policy_epoch: u64,
+    pub(crate) applied_mode: Option<&'static str>,
+    pub(crate) applied_policy_epoch: u64,
 }
 
 /// The counts, rates and latencies of one route.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct RouteReport {
-    /// Its id.
-    pub id: String,
-    /// The topic that ingress subscribes to.
-    pub input_topic: String,
+    pub(crate) id: String,
+    pub(crate) input_topic: String,
     /// The message type; null until it is known.
-    pub message_type: Option<String>,
-    /// Matched publishers.
-    pub writers: u64,
-    /// Samples that ingress received.
-    pub received: u64,
-    /// Payload bytes of the received samples.
-    pub received_bytes: u64,
-    /// Samples published to the lanes.
-    pub published: u64,
-    /// Published samples that the DDS library assembled in shared memory, so that they were not copied there.
-    pub in_place: u64,
-    /// Samples lost before ingress, by gaps in the publishers' sequence numbers.
-    pub lost_upstream: u64,
-    /// Discarded samples that arrived again or after newer ones of their publisher; not included in
-    /// `received`.
-    pub repeated: u64,
-    /// Received samples of publishers without an account, because there are more publishers than accounts.
-    pub unmarked: u64,
+    pub(crate) message_type: Option<String>,
+    #[serde(flatten)]
+    pub(crate) counters: IngressCounters,
     /// The publishers that have sent samples.
-    pub publishers: Vec<PublisherReport>,
-    /// Samples received but not published, by reason.
-    pub drops: DropCounts,
-    /// Drops within the window, by reason.
-    pub drops_in_window: DropCounts,
+    pub(crate) publishers: Vec<PublisherReport>,
+    pub(crate) drops_in_window: DropCounts,
     /// Whether `received = published + drops`.
-    pub whole: bool,
-    /// Samples received per second.
-    pub rate_hz: Option<f64>,
-    /// Payload bytes received per second.
-    pub bytes_per_s: Option<f64>,
-    /// The time since the last received sample.
-    pub last_received_age_ms: Option<f64>,
-    /// The offset of a publisher's clock to this computer's, positive when it is ahead; `null` while all
-    /// agree.
-    pub clock_offset_s: Option<f64>,
-    /// The GUID of the DDS writer with that clock offset.
-    pub clock_offset_writer: Option<String>,
+    pub(crate) whole: bool,
+    pub(crate) rate_hz: Option<f64>,
+    pub(crate) bytes_per_s: Option<f64>,
+    pub(crate) last_received_age_ms: Option<f64>,
+    /// How far a publisher's clock is ahead of this computer's; `null` while all agree.
+    pub(crate) clock_offset_s: Option<f64>,
+    pub(crate) clock_offset_writer: Option<String>,
     /// Latency from the publisher's source timestamp to ingress.
-    pub dds_in: Latency,
+    pub(crate) dds_in: Latency,
     /// The outputs of the route, one for each lane that serves it.
-    pub lanes: Vec<OutputReport>,
+    pub(crate) lanes: Vec<OutputReport>,
 }
 
 /// The account of one publisher of a route, from the sequence numbers of its DDS writer.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct PublisherReport {
-    /// The GUID of its DDS writer.
-    pub writer: String,
-    /// Its ROS 2 node; null while it is unknown.
-    pub node: Option<String>,
-    /// The address of its host; null while it is unknown.
-    pub host: Option<String>,
+    #[serde(flatten)]
+    pub(crate) account: PublisherAccount,
+    #[serde(flatten)]
+    pub(crate) origin: EndpointOrigin,
     /// `RELIABLE` or `BEST_EFFORT`; null when the publisher has left.
-    pub reliability: Option<&'static str>,
-    /// The sequence number of its first received sample.
-    pub first_sequence: i64,
-    /// The highest sequence number received.
-    pub last_sequence: i64,
-    /// Samples received.
-    pub received: u64,
-    /// Sequence numbers between the first and the last that did not reach the bridge.
-    pub lost_upstream: u64,
-    /// Discarded samples that arrived again or after newer ones.
-    pub repeated: u64,
-    /// The time since the last received sample.
-    pub last_received_age_ms: Option<f64>,
+    pub(crate) reliability: Option<&'static str>,
+    pub(crate) last_received_age_ms: Option<f64>,
 }
 
 /// The counts, rates and latencies of one output.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct OutputReport {
-    /// The lane.
-    pub lane: String,
-    /// The topic that the lane publishes to.
-    pub topic: String,
-    /// Matched readers.
-    pub readers: u64,
+    pub(crate) lane: String,
+    pub(crate) topic: String,
     /// The matched readers, 32 at most.
-    pub matched_readers: Vec<ReaderReport>,
-    /// Samples that left the history before single readers acknowledged them; the other readers have them.
-    pub reader_overrun: u64,
+    pub(crate) matched_readers: Vec<ReaderReport>,
     /// Samples offered to the lane since it first started.
-    pub received: u64,
-    /// Samples that the lane gave to its DDS writer.
-    pub forwarded: u64,
-    /// Payload bytes of the forwarded samples.
-    pub forwarded_bytes: u64,
-    /// Forwarded samples that were handed over by reference, not copied.
-    pub by_reference: u64,
-    /// Forwarded samples that were published while the lane was down.
-    pub caught_up: u64,
-    /// Samples waiting in the lane.
-    pub waiting: u64,
-    /// Samples not forwarded, by reason.
-    pub drops: DropCounts,
-    /// Drops within the window, by reason.
-    pub drops_in_window: DropCounts,
+    pub(crate) received: u64,
+    #[serde(flatten)]
+    pub(crate) counters: LaneCounters,
+    pub(crate) drops_in_window: DropCounts,
     /// Whether `received = forwarded + waiting + drops`.
-    pub whole: bool,
+    pub(crate) whole: bool,
     /// Samples offered per second.
-    pub received_hz: Option<f64>,
+    pub(crate) received_hz: Option<f64>,
     /// Samples forwarded per second.
-    pub rate_hz: Option<f64>,
-    /// Payload bytes forwarded per second.
-    pub bytes_per_s: Option<f64>,
-    /// The time since the last forwarded sample.
-    pub last_forwarded_age_ms: Option<f64>,
+    pub(crate) rate_hz: Option<f64>,
+    pub(crate) bytes_per_s: Option<f64>,
+    pub(crate) last_forwarded_age_ms: Option<f64>,
     /// Latency from ingress to the lane.
-    pub shm: Latency,
+    pub(crate) shm: Latency,
     /// Latency within the lane, up to its DDS writer.
-    pub dds_out: Latency,
+    pub(crate) dds_out: Latency,
     /// Age of the samples when the DDS writer gets them, by their source timestamp.
-    pub age: Latency,
+    pub(crate) age: Latency,
 }
 
 /// One reader of an output.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct ReaderReport {
-    /// Its GUID, in hexadecimal.
-    pub guid: String,
-    /// Its ROS 2 node; null while it is unknown.
-    pub node: Option<String>,
-    /// The address of its host; null while it is unknown.
-    pub host: Option<String>,
+    #[serde(flatten)]
+    pub(crate) record: ReaderRecord,
+    #[serde(flatten)]
+    pub(crate) origin: EndpointOrigin,
     /// `RELIABLE` or `BEST_EFFORT`.
-    pub reliability: &'static str,
-    /// Samples offered to it: the history when it was matched, and all samples written since.
-    pub offered: u64,
-    /// Offered samples that it has not acknowledged; 0 for a BEST_EFFORT reader.
-    pub unacknowledged: u64,
-    /// Offered samples that left the lane's history before the reader acknowledged them.
-    pub overrun: u64,
+    pub(crate) reliability: &'static str,
+}
+
+/// Where a publisher or a reader is.
+#[derive(Clone, Debug, Default, serde::Serialize)]
+pub struct EndpointOrigin {
+    /// Its ROS 2 node; null while it is unknown.
+    pub(crate) node: Option<String>,
+    /// The address of its host; null while it is unknown.
+    pub(crate) host: Option<String>,
 }
 
 impl Snapshot {
@@ -292,28 +206,17 @@ impl Snapshot {
 
     fn route_report(&self, now: &RouteReading, before: Option<&RouteReading>, window_ms: f64) -> RouteReport {
         let (counters, former) = (&now.counters, before.map(|before| before.counters));
+        let rate = |now, before: Option<u64>| per_s(now, before, window_ms);
         RouteReport {
             id: now.id.to_string(),
             input_topic: now.input_topic.to_string(),
             message_type: now.message_type.as_deref().map(printable),
-            writers: counters.writers,
-            received: counters.received,
-            received_bytes: counters.received_bytes,
-            published: counters.published,
-            in_place: counters.in_place,
-            lost_upstream: counters.lost_upstream,
-            repeated: counters.repeated,
-            unmarked: counters.unmarked,
+            counters: *counters,
             publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
-            drops: counters.drops,
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
             whole: now.is_accounted_for(),
-            rate_hz: per_s(counters.received, former.map(|former| former.received), window_ms),
-            bytes_per_s: per_s(
-                counters.received_bytes,
-                former.map(|former| former.received_bytes),
-                window_ms,
-            ),
+            rate_hz: rate(counters.received, former.map(|former| former.received)),
+            bytes_per_s: rate(counters.received_bytes, former.map(|former| former.received_bytes)),
             last_received_age_ms: age_ms(counters.last_received_at, self.at),
             clock_offset_s: counters.clock_offset_s(),
             clock_offset_writer: counters.clock_offset_s().map(|_| counters.clock_writer.to_string()),
@@ -330,21 +233,14 @@ impl Snapshot {
     }
 
     fn publisher_report(&self, account: &PublisherAccount) -> PublisherReport {
-        let (node, host) = self.node_and_host(account.writer);
         PublisherReport {
-            writer: account.writer.to_string(),
-            node,
-            host,
+            account: *account,
+            origin: self.origin(account.writer),
             reliability: match account.offered_reliability {
                 PublisherAccount::OFFERS_RELIABLE => Some("RELIABLE"),
                 PublisherAccount::OFFERS_BEST_EFFORT => Some("BEST_EFFORT"),
                 _ => None,
             },
-            first_sequence: account.first_sequence,
-            last_sequence: account.last_sequence,
-            received: account.received,
-            lost_upstream: account.lost_upstream,
-            repeated: account.repeated,
             last_received_age_ms: age_ms(account.last_at, self.at),
         }
     }
@@ -360,16 +256,9 @@ impl Snapshot {
         OutputReport {
             lane: self.lanes[now.lane].name.to_string(),
             topic: now.topic.to_string(),
-            readers: counters.readers,
             matched_readers: now.readers.iter().map(|record| self.reader_report(record)).collect(),
-            reader_overrun: counters.reader_overrun,
             received: counters.received(),
-            forwarded: counters.forwarded,
-            forwarded_bytes: counters.forwarded_bytes,
-            by_reference: counters.by_reference,
-            caught_up: counters.caught_up,
-            waiting: counters.waiting,
-            drops: counters.drops,
+            counters: *counters,
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
             whole: counters.is_accounted_for(),
             received_hz: rate(counters.received(), former.map(|former| former.received())),
@@ -381,46 +270,28 @@ impl Snapshot {
             age: Latency::of(&now.age, before.map(|before| &before.age)),
         }
     }
-}
 
-impl Snapshot {
     fn reader_report(&self, record: &ReaderRecord) -> ReaderReport {
-        let (node, host) = self.node_and_host(record.reader);
         ReaderReport {
-            guid: record.reader.to_string(),
-            node,
-            host,
+            record: *record,
+            origin: self.origin(record.reader),
             reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
-            offered: record.offered,
-            unacknowledged: record.unacknowledged,
-            overrun: record.overrun,
         }
     }
 
-    /// The ROS 2 node of an endpoint and the address of its host, if they are known.
-    fn node_and_host(&self, endpoint: Guid) -> (Option<String>, Option<String>) {
-        let Some(named) = self.named_endpoints.iter().find(|named| named.endpoint == endpoint) else {
-            return (None, None);
-        };
-        let text = |text: &FixedText| Some(printable(text.as_str())).filter(|text| !text.is_empty());
-        (text(&named.node), text(&named.host))
+    fn origin(&self, endpoint: Guid) -> EndpointOrigin {
+        let named = self.named_endpoints.iter().find(|named| named.endpoint == endpoint);
+        named.map_or_else(EndpointOrigin::default, |named| EndpointOrigin {
+            node: some_text(named.node.as_str()),
+            host: some_text(named.host.as_str()),
+        })
     }
 
-    /// A name for a publisher: its node, or its GUID if the node is unknown, and its host if it is known.
-    pub(super) fn publisher_name(&self, writer: Guid) -> String {
-        let (node, host) = self.node_and_host(writer);
-        let node = node.unwrap_or_else(|| format!("writer {writer}"));
+    /// A name for a writer or reader: its node, or else its GUID, and its host if it is known.
+    pub(super) fn endpoint_name(&self, kind: &str, endpoint: Guid) -> String {
+        let EndpointOrigin { node, host } = self.origin(endpoint);
+        let node = node.unwrap_or_else(|| format!("{kind} {endpoint}"));
         host.map_or_else(|| node.clone(), |host| format!("{node} on {host}"))
-    }
-
-    /// A name for a reader: its node, or its GUID if the node is unknown, and its host if it is known.
-    pub(super) fn reader_name(&self, record: &ReaderRecord) -> String {
-        let report = self.reader_report(record);
-        let node = report.node.unwrap_or_else(|| format!("reader {}", report.guid));
-        match report.host {
-            Some(host) => format!("{node} on {host}"),
-            None => node,
-        }
     }
 }
 
@@ -439,19 +310,16 @@ impl RouteReading {
 fn process_report(process: &ProcessReading, now: MonotonicNs) -> ProcessReport {
     let health = &process.health;
     ProcessReport {
-        name: process.name.clone(),
-        pid: health.pid,
-        state: process.state,
+        reading: process.clone(),
         uptime_s: age_ms(health.started_at, now).filter(|_| process.state.exists()).map(|ms| ms / 1e3),
-        starts: health.starts,
-        turns: health.turns,
         last_turn_age_ms: age_ms(health.alive_at, now),
-        errors: health.errors,
-        refused_reloads: health.refused_reloads,
-        network_refusals: health.network_refusals,
         settings_fingerprint: (health.settings_fingerprint != 0)
             .then(|| format!("{:016x}", health.settings_fingerprint)),
     }
+}
+
+fn some_text(text: &str) -> Option<String> {
+    (!text.is_empty()).then(|| printable(text))
 }
 
 /// The time since `at`; `None` for 0, which means that the event never happened.
@@ -459,8 +327,7 @@ fn age_ms(at: MonotonicNs, now: MonotonicNs) -> Option<f64> {
     (at.0 != 0).then(|| now.since(at) as f64 / 1e6)
 }
 
-/// The rate of a count; `None` without an earlier reading, and when the count decreased because the bridge
-/// was restarted.
+/// The rate of a count; `None` without an earlier reading, and when the bridge was restarted.
 fn per_s(now: u64, before: Option<u64>, window_ms: f64) -> Option<f64> {
     let grown = now.checked_sub(before?)?;
     (window_ms > 0.0).then(|| grown as f64 * 1e3 / window_ms)

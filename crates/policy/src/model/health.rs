@@ -1,5 +1,7 @@
 //! Records that the processes write to their boards: plain data of fixed size, which a reader can use even
-//! after the process that wrote them has died.
+//! after the process that wrote them has died. What `status --json` shows of them is serialized.
+
+use serde::Serialize;
 
 use super::drops::DropCounts;
 use super::network::NetworkRefusals;
@@ -12,7 +14,7 @@ pub const MAX_PUBLISHERS: usize = 64;
 /// The account of one publisher: which samples of its DDS writer ingress has taken, by sequence numbers.
 ///
 /// `last_sequence - first_sequence + 1 = received + lost_upstream`, always.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[repr(C)]
 pub struct PublisherAccount {
     /// The DDS writer; all zero for a free account.
@@ -29,8 +31,10 @@ pub struct PublisherAccount {
     /// Samples discarded because their sequence number was at or below the high-water mark.
     pub repeated: u64,
     /// When the last sample was taken.
+    #[serde(skip)]
     pub last_at: MonotonicNs,
     /// The reliability that discovery found: `OFFER_UNKNOWN`, `OFFERS_BEST_EFFORT` or `OFFERS_RELIABLE`.
+    #[serde(skip)]
     pub offered_reliability: u64,
 }
 
@@ -69,7 +73,7 @@ impl PublisherAccount {
 }
 
 /// The counters of ingress for one route. `received = published + drops`, always.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[repr(C)]
 pub struct IngressCounters {
     /// Samples taken from the DDS reader.
@@ -90,18 +94,23 @@ pub struct IngressCounters {
     /// Of the received, those of publishers beyond [`MAX_PUBLISHERS`], which have no high-water mark.
     pub unmarked: u64,
     /// The index of the account that changed last.
+    #[serde(skip)]
     pub changed_place: u64,
     /// That account after the change. Ingress writes it here in one step with the counters and then into the
     /// table: if ingress dies in between, its successor reads it here.
+    #[serde(skip)]
     pub changed_account: PublisherAccount,
     /// Writers matched at present.
     pub writers: u64,
     /// When the last sample was taken.
+    #[serde(skip)]
     pub last_received_at: MonotonicNs,
     /// How far the clock of `clock_writer` is behind this host's, in nanoseconds, negative when it is ahead;
     /// 0 while the clocks of all publishers agree with this host's.
+    #[serde(skip)]
     pub clock_offset_ns: i64,
     /// The writer whose clock differs most; all zero for none.
+    #[serde(skip)]
     pub clock_writer: Guid,
 }
 
@@ -115,12 +124,14 @@ impl IngressCounters {
 /// The counters of one lane for one route.
 ///
 /// `last_sequence - first_sequence = forwarded + drops + waiting`, always.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[repr(C)]
 pub struct LaneCounters {
     /// The last sequence number before the first one that the lane accounts for.
+    #[serde(skip)]
     pub first_sequence: u64,
     /// The highest sequence number that the lane has accounted for or holds.
+    #[serde(skip)]
     pub last_sequence: u64,
     /// Samples written to DDS.
     pub forwarded: u64,
@@ -135,12 +146,16 @@ pub struct LaneCounters {
     /// Samples waiting in the lane at present.
     pub waiting: u64,
     /// The sequence number of the last forwarded sample.
+    #[serde(skip)]
     pub last_forwarded_sequence: u64,
     /// When that sample was written to DDS.
+    #[serde(skip)]
     pub last_forwarded_at: MonotonicNs,
     /// The publisher's DDS writer of the last forwarded sample, from which a standby can resume.
+    #[serde(skip)]
     pub last_writer_guid: Guid,
     /// The sequence number that this writer gave the sample.
+    #[serde(skip)]
     pub last_writer_sequence: i64,
     /// Readers matched at present.
     pub readers: u64,
@@ -153,10 +168,11 @@ pub struct LaneCounters {
 pub const MAX_OUTPUT_READERS: usize = 32;
 
 /// The record of one reader that is matched with an output.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[repr(C)]
 pub struct ReaderRecord {
     /// The reader; all zero for none.
+    #[serde(rename = "guid")]
     pub reader: Guid,
     /// Samples written since it was matched, plus the history that it was offered then.
     pub offered: u64,
@@ -165,6 +181,7 @@ pub struct ReaderRecord {
     /// Of those, samples that left the writer's history before the reader received them.
     pub overrun: u64,
     /// 1 for a RELIABLE reader, 0 for a BEST_EFFORT one.
+    #[serde(skip)]
     pub reliable: u64,
 }
 
@@ -197,33 +214,41 @@ impl LaneCounters {
 }
 
 /// The health of a process: its id, its turns, its starts and the policy that it applies.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[repr(C)]
 pub struct ProcessHealth {
     /// Process id.
     pub pid: u64,
     /// When the process started.
+    #[serde(skip)]
     pub started_at: MonotonicNs,
     /// When its main loop last completed a turn: handled samples, or checked its wake-up source.
+    #[serde(skip)]
     pub alive_at: MonotonicNs,
     /// Turns of its main loop.
     pub turns: u64,
     /// Starts of processes with this role in this bridge, including this one.
     pub starts: u64,
     /// The mode that the process applies, as [`LaneMode`](super::modes::LaneMode)'s number.
+    #[serde(skip)]
     pub mode: u8,
     /// 1 when the process shut down in order; it stays 0 when the process dies.
+    #[serde(skip)]
     pub ended: u8,
     /// Always 0.
+    #[serde(skip)]
     pub reserved: [u8; 6],
     /// The epoch of the policy that the process applies.
+    #[serde(skip)]
     pub policy_epoch: u64,
     /// The process' DDS participant. If the process is killed, its successor announces to remote participants
     /// that this one has left.
+    #[serde(skip)]
     pub participant: Guid,
     /// Failures other than of samples: housekeeping, a board, a policy that it could not write.
     pub errors: u64,
     /// The fingerprint of the configuration that the process applies.
+    #[serde(skip)]
     pub settings_fingerprint: u64,
     /// Reloads that the process refused because the file was bad.
     pub refused_reloads: u64,

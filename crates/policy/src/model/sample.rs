@@ -2,6 +2,8 @@
 
 use core::fmt;
 
+use serde::{Serialize, Serializer};
+
 use super::time::{MonotonicNs, SourceTimestamp};
 
 /// The RTPS encapsulation header of a serialized payload (RTPS 2.5 clause 10.2): two bytes of representation
@@ -49,6 +51,12 @@ impl fmt::Display for Guid {
         prefix.iter().try_for_each(|byte| write!(f, "{byte:02x}"))?;
         f.write_str(":")?;
         entity.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl Serialize for Guid {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
     }
 }
 

@@ -1,10 +1,12 @@
 //! Instants, with one type for each of the three clocks, so that they cannot be confused.
 
+use serde::{Deserialize, Serialize};
+
 /// An instant of `CLOCK_MONOTONIC`, in nanoseconds.
 ///
 /// Unlike `std::time::Instant` it can be stored in shared memory and written as a literal in a test. It is
 /// comparable only between processes of one host since one boot.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[repr(transparent)]
 pub struct MonotonicNs(pub u64);
 
@@ -29,7 +31,7 @@ impl MonotonicNs {
 }
 
 /// An instant of `CLOCK_REALTIME`, in nanoseconds since the Unix epoch. It may step backwards.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[repr(transparent)]
 pub struct WallNs(pub u64);
 
