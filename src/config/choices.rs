@@ -3,12 +3,25 @@
 use super::settings::{DropPolicy, SchedulingPolicy, TrustMode, Verbosity};
 use crate::model::{Durability, Reliability, SubscriberState};
 
-pub(super) const RELIABILITIES: &[(&str, Reliability)] =
-    &[("RELIABLE", Reliability::Reliable), ("BEST_EFFORT", Reliability::BestEffort)];
-pub(super) const DURABILITIES: &[(&str, Durability)] =
-    &[("VOLATILE", Durability::Volatile), ("TRANSIENT_LOCAL", Durability::TransientLocal)];
-pub(super) const HISTORIES: &[(&str, HistoryKind)] =
-    &[("KEEP_LAST", HistoryKind::KeepLast), ("KEEP_ALL", HistoryKind::KeepAll)];
+type Words<T> = &'static [(&'static str, T)];
+
+/// A value that is one of a few words in the file.
+pub(super) trait Choice: Copy + PartialEq + 'static {
+    const WORDS: Words<Self>;
+}
+
+/// The words of a choice.
+pub(super) fn words<T: Choice>() -> Vec<&'static str> {
+    T::WORDS.iter().map(|(word, _)| *word).collect()
+}
+
+impl Choice for Reliability {
+    const WORDS: Words<Self> = &[("RELIABLE", Self::Reliable), ("BEST_EFFORT", Self::BestEffort)];
+}
+
+impl Choice for Durability {
+    const WORDS: Words<Self> = &[("VOLATILE", Self::Volatile), ("TRANSIENT_LOCAL", Self::TransientLocal)];
+}
 
 /// The kind of a history, without its depth.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,34 +30,38 @@ pub(super) enum HistoryKind {
     KeepAll,
 }
 
-pub(super) const DROP_POLICIES: &[(&str, DropPolicy)] = &[
-    ("drop_oldest", DropPolicy::DropOldest),
-    ("drop_latest", DropPolicy::DropLatest),
-    ("drop_stale", DropPolicy::DropStale),
-];
+impl Choice for HistoryKind {
+    const WORDS: Words<Self> = &[("KEEP_LAST", Self::KeepLast), ("KEEP_ALL", Self::KeepAll)];
+}
 
-pub(super) const SCHEDULING_POLICIES: &[(&str, SchedulingPolicy)] = &[
-    ("other", SchedulingPolicy::Other),
-    ("fifo", SchedulingPolicy::Fifo),
-    ("rr", SchedulingPolicy::RoundRobin),
-];
+impl Choice for DropPolicy {
+    const WORDS: Words<Self> = &[
+        ("drop_oldest", Self::DropOldest),
+        ("drop_latest", Self::DropLatest),
+        ("drop_stale", Self::DropStale),
+    ];
+}
 
-pub(super) const TRUST_MODES: &[(&str, TrustMode)] = &[
-    ("default_deny", TrustMode::DefaultDeny),
-    ("permissive", TrustMode::Permissive),
-    ("off", TrustMode::Off),
-];
+impl Choice for SchedulingPolicy {
+    const WORDS: Words<Self> = &[("other", Self::Other), ("fifo", Self::Fifo), ("rr", Self::RoundRobin)];
+}
 
-pub(super) const VERBOSITIES: &[(&str, Verbosity)] = &[
-    ("error", Verbosity::Error),
-    ("warn", Verbosity::Warn),
-    ("info", Verbosity::Info),
-    ("debug", Verbosity::Debug),
-    ("trace", Verbosity::Trace),
-];
+impl Choice for TrustMode {
+    const WORDS: Words<Self> =
+        &[("default_deny", Self::DefaultDeny), ("permissive", Self::Permissive), ("off", Self::Off)];
+}
 
-pub(super) const STATES: &[(&str, SubscriberState)] = &[
-    ("UNKNOWN", SubscriberState::Unknown),
-    ("CRITICAL", SubscriberState::Critical),
-    ("NONCRITICAL", SubscriberState::Noncritical),
-];
+impl Choice for Verbosity {
+    const WORDS: Words<Self> = &[
+        ("error", Self::Error),
+        ("warn", Self::Warn),
+        ("info", Self::Info),
+        ("debug", Self::Debug),
+        ("trace", Self::Trace),
+    ];
+}
+
+impl Choice for SubscriberState {
+    const WORDS: Words<Self> =
+        &[("UNKNOWN", Self::Unknown), ("CRITICAL", Self::Critical), ("NONCRITICAL", Self::Noncritical)];
+}

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use super::choices::{STATES, TRUST_MODES, VERBOSITIES};
 use super::field::Field;
 use super::settings::{
     Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
@@ -13,36 +12,33 @@ use super::settings::{
 };
 use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
 
-/// Reads `classifier`.
 pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     let section = root.section("classifier");
     let subscriber = section.get("subscriber_id").text().filter(|id| !id.is_empty());
-    let demote_loss = section.get("demote_loss_threshold");
-    let promote_loss = section.get("promote_loss_threshold");
-    let demote_rtt = section.get("demote_rtt_ms");
-    let promote_rtt = section.get("promote_rtt_ms");
     let classifier = Classifier {
         enabled: section.get("enabled").flag_or_default(),
         subscriber_id: subscriber.map(str::to_owned),
         evaluate_rate_hz: section.get("evaluate_rate_hz").decimal_or_default(),
         thresholds: ClassifierThresholds {
-            demote_loss: demote_loss.decimal_or_default(),
-            promote_loss: promote_loss.decimal_or_default(),
-            demote_rtt_ms: demote_rtt.decimal_or_default(),
-            promote_rtt_ms: promote_rtt.decimal_or_default(),
+            demote_loss: section.get("demote_loss_threshold").decimal_or_default(),
+            promote_loss: section.get("promote_loss_threshold").decimal_or_default(),
+            demote_rtt_ms: section.get("demote_rtt_ms").decimal_or_default(),
+            promote_rtt_ms: section.get("promote_rtt_ms").decimal_or_default(),
             hysteresis_count: section.get("hysteresis_count").count_or_default(),
             allow_unknown_state: section.get("allow_unknown_state").flag_or_default(),
         },
     };
-    let thresholds = &classifier.thresholds;
-    check_below((&promote_loss, thresholds.promote_loss), (&demote_loss, thresholds.demote_loss));
-    check_below((&promote_rtt, thresholds.promote_rtt_ms), (&demote_rtt, thresholds.demote_rtt_ms));
+    let ClassifierThresholds { demote_loss, promote_loss, demote_rtt_ms, promote_rtt_ms, .. } =
+        classifier.thresholds;
+    check_below(&section, ("promote_loss_threshold", promote_loss), ("demote_loss_threshold", demote_loss));
+    check_below(&section, ("promote_rtt_ms", promote_rtt_ms), ("demote_rtt_ms", demote_rtt_ms));
     classifier
 }
 
 /// Checks that one threshold is below the other. Without a gap between them a subscriber would be promoted
 /// and demoted alternately, and EMERGENCY would be called for at the same value as DEGRADED.
-fn check_below((lower, low): (&Field<'_>, f64), (upper, high): (&Field<'_>, f64)) {
+fn check_below(section: &Field<'_>, (lower, low): (&str, f64), (upper, high): (&str, f64)) {
+    let (lower, upper) = (section.get(lower), section.get(upper));
     if low < high || lower.was_reported() || upper.was_reported() {
         return;
     }
@@ -68,7 +64,7 @@ pub(super) fn probes(root: &Field<'_>, max_probe_rate_hz: u32) -> Probes {
         jitter_threshold_ms: section.get("jitter_threshold_ms").decimal_or_default(),
         window_size: section.get("window_size").count_or_default(),
         hysteresis_count: section.get("hysteresis_count").count_or_default(),
-        timeout_ms: section.get("timeout_ms").whole_or_default(),
+        timeout_ms: section.get("timeout_ms").count_or_default(),
         request_topic: topic(&request),
         response_topic: topic(&response),
     };
@@ -90,24 +86,21 @@ fn topic(field: &Field<'_>) -> TopicName {
     field.parsed_or_default(TopicName::ALLOWED, |text| TopicName::try_from(text).ok())
 }
 
-/// Reads `safety`.
 pub(super) fn safety(root: &Field<'_>) -> Safety {
     let section = root.section("safety");
     let flag = |name: &str| section.get(name).flag_or_default();
-    let silent = section.get("silent_ms");
-    let emergency_silent = section.get("emergency_silent_ms");
     let pair = |what: &str| {
-        let degraded = section.get(&format!("degraded_{what}"));
-        let emergency = section.get(&format!("emergency_{what}"));
-        let (low, high) = (degraded.decimal_or_default(), emergency.decimal_or_default());
-        check_below((&degraded, low), (&emergency, high));
+        let (degraded, emergency) = (format!("degraded_{what}"), format!("emergency_{what}"));
+        let [low, high] = [&degraded, &emergency].map(|name| section.get(name).decimal_or_default());
+        check_below(&section, (&degraded, low), (&emergency, high));
         (low, high)
     };
     let (lag_ms, occupancy, errors_per_s) = (pair("lag_ms"), pair("queue_occupancy"), pair("errors_per_s"));
-    let silent_ms = silent.whole_or_default();
-    let emergency_silent_ms = emergency_silent.whole_or_default();
+    let silent_ms = section.get("silent_ms").count_or_default();
+    let emergency_silent_ms = section.get("emergency_silent_ms").count_or_default();
     if emergency_silent_ms != 0 {
-        check_below((&silent, silent_ms as f64), (&emergency_silent, emergency_silent_ms as f64));
+        let emergency = ("emergency_silent_ms", emergency_silent_ms as f64);
+        check_below(&section, ("silent_ms", silent_ms as f64), emergency);
     }
     Safety {
         evaluate_rate_hz: section.get("evaluate_rate_hz").decimal_or_default(),
@@ -155,16 +148,15 @@ pub(super) fn security(root: &Field<'_>) -> Security {
         }
     }
     Security {
-        trust_mode: section.get("trust_mode").choice_or_default(TRUST_MODES),
+        trust_mode: section.get("trust_mode").choice_or_default(),
         enable_probe_hmac: section.get("enable_probe_hmac").flag_or_default(),
         secret: sources.into_iter().next().map(|(_, source)| source),
-        replay_window_ms: section.get("replay_window_ms").whole_or_default(),
+        replay_window_ms: section.get("replay_window_ms").count_or_default(),
         max_probe_rate_hz: section.get("max_probe_rate_hz").count_or_default(),
         allow_legacy_node_name_overrides: section.get("allow_legacy_node_name_overrides").flag_or_default(),
     }
 }
 
-/// Reads `diagnostics`.
 pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
     let section = root.section("diagnostics");
     let interval_s = section.get("publish_interval_s").decimal_or_default();
@@ -172,7 +164,7 @@ pub(super) fn diagnostics(root: &Field<'_>) -> Diagnostics {
         enabled: section.get("enabled").flag_or_default(),
         publish_interval_ms: (interval_s * 1_000.0).round() as u64,
         topic: topic(&section.get("topic")),
-        verbosity: section.get("verbosity").choice_or_default(VERBOSITIES),
+        verbosity: section.get("verbosity").choice_or_default(),
         metrics: section.get("metrics").parsed(
             "a loopback address and port such as 127.0.0.1:9464, or unix: and an absolute path",
             metrics_listener,
@@ -203,7 +195,7 @@ pub(super) fn overrides(root: &Field<'_>) -> BTreeMap<String, SubscriberState> {
     let entries = root.get("overrides").entries();
     let states = entries.into_iter().filter_map(|(id, field)| {
         check_id(id, &field);
-        field.choice(STATES).map(|state| (id.to_owned(), state))
+        field.choice().map(|state| (id.to_owned(), state))
     });
     states.collect()
 }

@@ -6,7 +6,6 @@ use std::net::Ipv4Addr;
 use super::problem::{Place, Problem, Problems, shown};
 use super::settings::NetworkSelector;
 
-/// The defaults from the environment.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Environment {
     /// `ROS_DOMAIN_ID`; 0 without it, as in ROS 2.
@@ -14,16 +13,6 @@ pub(super) struct Environment {
     /// The bytes of a graph identifier in the distribution that `ROS_DISTRO` names.
     pub graph_gid_bytes: usize,
     localhost_only: bool,
-}
-
-/// A variable that makes the nodes of the robot communicate in a way that the bridge does not. If it is set,
-/// the bridge would find no node, or receive nothing, without an error.
-struct NotSupported {
-    name: &'static str,
-    /// Whether nodes with this value and the bridge do not find each other.
-    hides: fn(&str) -> bool,
-    /// What is allowed, why, and what to do.
-    consequence: &'static str,
 }
 
 const DDS_IMPLEMENTATIONS: [&str; 5] = [
@@ -34,34 +23,38 @@ const DDS_IMPLEMENTATIONS: [&str; 5] = [
     "rmw_gurumdds_cpp",
 ];
 
+type NotSupported = (&'static str, fn(&str) -> bool, &'static str);
+
+/// Variables that make the nodes of the robot communicate in a way that the bridge does not: it would find no
+/// node, or receive nothing, without an error. Each with whether nodes with this value and the bridge do not
+/// find each other, and with what is allowed, why, and what to do.
 const NOT_SUPPORTED: [NotSupported; 4] = [
-    NotSupported {
-        name: "ROS_DISCOVERY_SERVER",
-        hides: |_| true,
-        consequence: "must not be set: nodes that use a discovery server and the bridge do not find each other; \
-                      start the nodes without it, and the bridge too",
-    },
-    NotSupported {
-        name: "ROS_SECURITY_ENABLE",
+    (
+        "ROS_DISCOVERY_SERVER",
+        |_| true,
+        "must not be set: nodes that use a discovery server and the bridge do not find each other; start the \
+         nodes without it, and the bridge too",
+    ),
+    (
+        "ROS_SECURITY_ENABLE",
         // rcl takes any other value for false.
-        hides: |value| value == "true",
-        consequence: "must not be true: the bridge has no DDS Security, and nodes that have it do not accept \
-                      the bridge; unset it for the bridge if the nodes that it serves run without",
-    },
-    NotSupported {
-        name: "RMW_IMPLEMENTATION",
-        hides: |value| !DDS_IMPLEMENTATIONS.contains(&value),
-        consequence: "must be a DDS implementation, rmw_fastrtps_cpp, rmw_fastrtps_dynamic_cpp, \
-                      rmw_cyclonedds_cpp, rmw_connextdds or rmw_gurumdds_cpp: nodes of others and the bridge do \
-                      not find each other; unset it for the bridge if the nodes that it serves use DDS",
-    },
-    NotSupported {
-        name: "FASTDDS_BUILTIN_TRANSPORTS",
-        hides: |value| !["DEFAULT", "UDPv4"].contains(&value),
-        consequence: "must be DEFAULT or UDPv4: the bridge receives and sends over UDP and IPv4 only, and with \
-                      other transports Fast DDS does not; unset it for the bridge if the nodes that it serves \
-                      run without",
-    },
+        |value| value == "true",
+        "must not be true: the bridge has no DDS Security, and nodes that have it do not accept the bridge; \
+         unset it for the bridge if the nodes that it serves run without",
+    ),
+    (
+        "RMW_IMPLEMENTATION",
+        |value| !DDS_IMPLEMENTATIONS.contains(&value),
+        "must be a DDS implementation, rmw_fastrtps_cpp, rmw_fastrtps_dynamic_cpp, rmw_cyclonedds_cpp, \
+         rmw_connextdds or rmw_gurumdds_cpp: nodes of others and the bridge do not find each other; unset it \
+         for the bridge if the nodes that it serves use DDS",
+    ),
+    (
+        "FASTDDS_BUILTIN_TRANSPORTS",
+        |value| !["DEFAULT", "UDPv4"].contains(&value),
+        "must be DEFAULT or UDPv4: the bridge receives and sends over UDP and IPv4 only, and with other \
+         transports Fast DDS does not; unset it for the bridge if the nodes that it serves run without",
+    ),
 ];
 
 impl Environment {
@@ -117,11 +110,9 @@ impl Environment {
                  with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
             );
         }
-        for not_supported in &NOT_SUPPORTED {
-            if let Some(value) = variable(not_supported.name)
-                && (not_supported.hides)(&value)
-            {
-                refuse(not_supported.name, &value, not_supported.consequence);
+        for (name, hides, consequence) in NOT_SUPPORTED {
+            if let Some(value) = variable(name).filter(|value| hides(value)) {
+                refuse(name, &value, consequence);
             }
         }
         // The identifier shrank from 24 to 16 bytes in Iron.
@@ -137,6 +128,33 @@ impl Environment {
         match self.localhost_only {
             true => vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)],
             false => Vec::new(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::config::parse;
+
+    const TOPIC: &str = "topics: [{id: scan, input_topic: /scan}]\n";
+
+    #[test]
+    fn a_variable_with_which_nodes_do_not_find_the_bridge_is_refused_with_what_to_do() {
+        let unset = "unset it for the bridge";
+        for (name, refused, accepted, remedy) in [
+            ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", "", "start the nodes without it"),
+            ("ROS_SECURITY_ENABLE", "true", "False", unset),
+            ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw_cyclonedds_cpp", unset),
+            ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA", "UDPv4", unset),
+            ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA?max_msg_size=1MB", "DEFAULT", unset),
+        ] {
+            let with = |value: &'static str| {
+                parse(TOPIC, "f.yaml", &|asked: &str| (asked == name).then(|| value.to_owned()))
+            };
+            let message = with(refused).unwrap_err().to_string();
+            assert!(message.starts_with(&format!("environment: {name} = {refused}: must ")), "{message}");
+            assert!(message.contains(remedy) && message.lines().count() == 1, "{message}");
+            assert!(with(accepted).is_ok());
         }
     }
 }

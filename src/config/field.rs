@@ -2,8 +2,10 @@
 //! missing: reading continues, so that one run finds every problem.
 
 use std::ops::RangeInclusive;
+use std::rc::Rc;
 
-use super::keys::{Key, Kind, joined};
+use super::choices::{Choice, words};
+use super::keys::{Key, Kind, Row, joined};
 use super::problem::{Place, Problem, Problems, did_you_mean, shown};
 use super::yaml::{Content, Node};
 
@@ -40,19 +42,19 @@ impl<'a> Field<'a> {
         self.node.filter(|node| !node.is_null())
     }
 
+    fn child(&self, path: String, line: usize, node: Option<&'a Node>, key: Option<&'static Key>) -> Self {
+        Self { path, line, node, key, problems: self.problems }
+    }
+
     /// The field with this name in a mapping; without a value if this is no mapping or has no such key.
     pub fn get(&self, name: &str) -> Self {
         let entry = match self.value().map(|node| &node.content) {
             Some(Content::Map(entries)) => entries.iter().find(|entry| entry.key == name),
             _ => None,
         };
-        Self {
-            path: joined(&self.path, name),
-            line: entry.map_or(self.line, |entry| entry.line),
-            node: entry.map(|entry| &*entry.value),
-            key: self.key.and_then(|key| key.get(name)),
-            problems: self.problems,
-        }
+        let line = entry.map_or(self.line, |entry| entry.line);
+        let key = self.key.and_then(|key| key.get(name));
+        self.child(joined(&self.path, name), line, entry.map(|entry| &*entry.value), key)
     }
 
     /// The field with this name; reports a value that is no mapping.
@@ -62,7 +64,6 @@ impl<'a> Field<'a> {
         section
     }
 
-    /// Whether this is a mapping.
     pub fn is_map(&self) -> bool {
         matches!(self.value().map(|node| &node.content), Some(Content::Map(_)))
     }
@@ -80,9 +81,7 @@ impl<'a> Field<'a> {
         once.map(|entry| {
             let path = joined(&self.path, &shown(&entry.key));
             let key = self.key.and_then(|key| key.get(&entry.key));
-            let field =
-                Self { path, line: entry.line, node: Some(&entry.value), key, problems: self.problems };
-            (entry.key.as_str(), field)
+            (entry.key.as_str(), self.child(path, entry.line, Some(&entry.value), key))
         })
         .collect()
     }
@@ -92,17 +91,13 @@ impl<'a> Field<'a> {
         let Content::List(items) = &self.value()?.content else {
             return self.report("must be a list");
         };
-        let items = items.iter().enumerate().map(|(index, item)| Self {
-            path: format!("{}[{index}]", self.path),
-            line: item.line,
-            node: Some(item),
-            key: self.key.and_then(Key::item),
-            problems: self.problems,
-        });
-        Some(items.collect())
+        let key = self.key.and_then(Key::item);
+        let item = |(index, item): (usize, &'a Rc<Node>)| {
+            self.child(format!("{}[{index}]", self.path), item.line, Some(item), key)
+        };
+        Some(items.iter().enumerate().map(item).collect())
     }
 
-    /// The text of a scalar and whether it is plain.
     fn scalar(&self) -> Option<(&'a str, bool)> {
         match &self.value()?.content {
             Content::Scalar { text, plain } => Some((text, *plain)),
@@ -110,66 +105,48 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// A boolean.
     pub fn flag(&self) -> Option<bool> {
-        const ALLOWED: &str = "must be true or false";
         self.value()?;
-        match self.scalar() {
-            Some(("true" | "True" | "TRUE", true)) => Some(true),
-            Some(("false" | "False" | "FALSE", true)) => Some(false),
-            Some(("yes" | "Yes" | "YES" | "on" | "On" | "ON", _) | ("true", false)) => {
-                self.report_with(ALLOWED, Some(did_you_mean("true")))
-            }
-            Some(("no" | "No" | "NO" | "off" | "Off" | "OFF", _) | ("false", false)) => {
-                self.report_with(ALLOWED, Some(did_you_mean("false")))
-            }
-            _ => self.report(ALLOWED),
-        }
+        let meant = match self.scalar() {
+            Some(("true" | "True" | "TRUE", true)) => return Some(true),
+            Some(("false" | "False" | "FALSE", true)) => return Some(false),
+            Some(("yes" | "Yes" | "YES" | "on" | "On" | "ON", _) | ("true", false)) => Some("true"),
+            Some(("no" | "No" | "NO" | "off" | "Off" | "OFF", _) | ("false", false)) => Some("false"),
+            _ => None,
+        };
+        self.report_with("must be true or false", meant.map(did_you_mean))
     }
 
-    /// The type and range that the row of the key declares; `None` for an unknown key, which is reported as
-    /// such.
-    fn kind(&self) -> Option<Kind> {
-        self.key.and_then(|key| key.row).map(|row| row.kind)
+    /// The row of the key; `None` for an unknown key, which is reported as such.
+    fn row(&self) -> Option<&'static Row> {
+        self.key?.row
     }
 
-    /// For a key that is read as another type than its row declares, or that has no row.
-    fn no_value<T>(&self, kind: Option<Kind>) -> Option<T> {
-        debug_assert!(kind.is_none(), "{} is declared as {kind:?}", self.path);
+    /// For a key that is read as another type than its row declares.
+    fn no_value<T>(&self, kind: Kind) -> Option<T> {
+        debug_assert!(false, "{} is declared as {kind:?}", self.path);
         None
     }
 
     /// The default that the row of the key declares.
     fn default<T>(&self, parse: impl Fn(&str) -> Option<T>) -> T {
-        let text = self.key.and_then(|key| key.row).map_or("", |row| row.default);
+        let text = self.row().map_or("", |row| row.default);
         #[allow(clippy::expect_used, reason = "the tests read a file without keys, so every default")]
         parse(text.trim_matches('`')).expect("the default of a key is one of its values")
     }
 
-    /// A boolean, or its default.
     pub fn flag_or_default(&self) -> bool {
         self.flag().unwrap_or_else(|| self.default(|text| text.parse().ok()))
     }
 
     /// A whole number in the key's range.
-    pub fn whole(&self) -> Option<u64> {
-        match self.kind() {
-            Some(Kind::Whole(least, most)) => self.whole_in(least..=most),
+    pub fn count<T: TryFrom<u64>>(&self) -> Option<T> {
+        match self.row()?.kind {
+            Kind::Whole(least, most, _) => T::try_from(self.whole_in(least..=most)?).ok(),
             other => self.no_value(other),
         }
     }
 
-    /// A whole number in the key's range, or its default.
-    pub fn whole_or_default(&self) -> u64 {
-        self.whole().unwrap_or_else(|| self.default(parse_whole))
-    }
-
-    /// A whole number in the key's range, as another type.
-    pub fn count<T: TryFrom<u64>>(&self) -> Option<T> {
-        self.whole().and_then(|number| T::try_from(number).ok())
-    }
-
-    /// A whole number in the key's range or its default, as another type.
     pub fn count_or_default<T: TryFrom<u64>>(&self) -> T {
         let default = || self.default(|text| T::try_from(parse_whole(text)?).ok());
         self.count().unwrap_or_else(default)
@@ -177,16 +154,14 @@ impl<'a> Field<'a> {
 
     /// A finite number in the key's range.
     pub fn decimal(&self) -> Option<f64> {
-        let (least, most) = match self.kind() {
-            Some(Kind::Decimal(least, most)) => (least, most),
+        let (least, most) = match self.row()?.kind {
+            Kind::Decimal(least, most, _) => (least, most),
             other => return self.no_value(other),
         };
-        self.value()?;
         let allowed = format!("must be a number from {least} to {most}");
         self.number(&allowed, |text| parse_decimal(text).filter(|number| (least..=most).contains(number)))
     }
 
-    /// A finite number in the key's range, or its default.
     pub fn decimal_or_default(&self) -> f64 {
         self.decimal().unwrap_or_else(|| self.default(parse_decimal))
     }
@@ -199,11 +174,11 @@ impl<'a> Field<'a> {
 
     /// A whole number that satisfies a condition.
     pub fn whole_where(&self, allowed: &str, accept: impl Fn(u64) -> bool) -> Option<u64> {
-        self.value()?;
         self.number(allowed, |text| parse_whole(text).filter(|&number| accept(number)))
     }
 
     fn number<T>(&self, allowed: &str, parse: impl Fn(&str) -> Option<T>) -> Option<T> {
+        self.value()?;
         match self.scalar() {
             Some((text, true)) => parse(text).or_else(|| self.report(allowed)),
             Some((text, false)) if parse(text).is_some() => {
@@ -232,24 +207,22 @@ impl<'a> Field<'a> {
     }
 
     /// One of a few words, in any case.
-    pub fn choice<T: Copy>(&self, choices: &[(&str, T)]) -> Option<T> {
+    pub fn choice<T: Choice>(&self) -> Option<T> {
         self.value()?;
         let word = self.scalar().map_or("", |(text, _)| text);
-        let found = choices.iter().find(|(name, _)| name.eq_ignore_ascii_case(word));
+        let found = T::WORDS.iter().find(|(name, _)| name.eq_ignore_ascii_case(word));
         found.map(|&(_, choice)| choice).or_else(|| {
-            let names: Vec<&str> = choices.iter().map(|&(name, _)| name).collect();
+            let names = words::<T>();
             let hint = self.problems.hint(word, &names);
             self.report_with(&format!("must be one of {}", names.join(", ")), hint)
         })
     }
 
-    /// One of a few words in any case, or the default.
-    pub fn choice_or_default<T: Copy>(&self, choices: &[(&str, T)]) -> T {
-        let find = |text: &str| choices.iter().find(|(name, _)| *name == text).map(|&(_, choice)| choice);
-        self.choice(choices).unwrap_or_else(|| self.default(find))
+    pub fn choice_or_default<T: Choice>(&self) -> T {
+        let find = |text: &str| T::WORDS.iter().find(|(name, _)| *name == text).map(|&(_, choice)| choice);
+        self.choice().unwrap_or_else(|| self.default(find))
     }
 
-    /// A text that `parse` accepts, or the default.
     pub fn parsed_or_default<T>(&self, allowed: &str, parse: impl Fn(&str) -> Option<T>) -> T {
         self.parsed(allowed, &parse).unwrap_or_else(|| self.default(parse))
     }

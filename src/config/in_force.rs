@@ -19,13 +19,9 @@ pub struct Configuration {
 /// A secret from a configuration file. `Debug` does not show it.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct InlineSecret(String);
+pub struct InlineSecret(pub(super) String);
 
 impl InlineSecret {
-    pub(super) fn new(secret: &str) -> Self {
-        Self(secret.to_owned())
-    }
-
     /// The secret itself.
     pub fn reveal(&self) -> &str {
         &self.0

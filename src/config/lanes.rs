@@ -1,6 +1,5 @@
 //! Reads the lanes: their networks, queues, rates and scheduling.
 
-use super::choices::SCHEDULING_POLICIES;
 use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
@@ -27,17 +26,12 @@ const NONCRITICAL_SLICE_US: u32 = 10_000;
 
 /// The default scheduling of a process: of a lane by its class, of others with `None`.
 pub(super) fn default_scheduling(class: Option<TrafficClass>) -> Scheduling {
-    match class {
-        Some(TrafficClass::Critical) => {
-            Scheduling { slice_us: Some(CRITICAL_SLICE_US), ..Scheduling::default() }
-        }
-        Some(TrafficClass::Noncritical) => Scheduling {
-            nice: NONCRITICAL_NICE,
-            slice_us: Some(NONCRITICAL_SLICE_US),
-            ..Scheduling::default()
-        },
-        None => Scheduling::default(),
-    }
+    let (nice, slice_us) = match class {
+        Some(TrafficClass::Critical) => (0, Some(CRITICAL_SLICE_US)),
+        Some(TrafficClass::Noncritical) => (NONCRITICAL_NICE, Some(NONCRITICAL_SLICE_US)),
+        None => (0, None),
+    };
+    Scheduling { nice, slice_us, ..Scheduling::default() }
 }
 
 /// A lane without its outputs, and the default QoS of its outputs.
@@ -95,24 +89,16 @@ struct LaneReader<'a> {
 impl LaneReader<'_> {
     fn read(&self, name: LaneName, field: &Field<'_>) -> LaneDraft {
         field.entries();
-        let class = match name == LaneName::critical() {
-            true => TrafficClass::Critical,
-            false => TrafficClass::Noncritical,
-        };
-        let queue_depth = match class {
-            TrafficClass::Critical => 64,
-            TrafficClass::Noncritical => 4,
+        let (class, queue_depth, forwarding) = if name == LaneName::critical() {
+            rates::refuse_rates(field);
+            (TrafficClass::Critical, 64, Forwarding::Everything)
+        } else {
+            (TrafficClass::Noncritical, 4, Forwarding::Limited(self.policy.lane_rates(field)))
         };
         let qos = field.get("qos");
         let lane = Lane {
             name,
-            forwarding: match class {
-                TrafficClass::Critical => {
-                    rates::refuse_rates(field);
-                    Forwarding::Everything
-                }
-                TrafficClass::Noncritical => Forwarding::Limited(self.policy.lane_rates(field)),
-            },
+            forwarding,
             network: network(field, self.input, self.environment),
             outputs: Vec::new(),
             queue_depth: field.get("queue_depth").count().unwrap_or(queue_depth),
@@ -121,12 +107,9 @@ impl LaneReader<'_> {
             window_samples: field.get("window_samples").count_or_default(),
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
         };
-        let qos = if qos.is_map() { PartialQos::read(&qos) } else { self.named_qos(&qos) };
+        let qos =
+            if qos.is_map() { PartialQos::read(&qos) } else { self.profiles.named(&qos).unwrap_or_default() };
         LaneDraft { lane, qos }
-    }
-
-    fn named_qos(&self, field: &Field<'_>) -> PartialQos {
-        self.profiles.named(field).unwrap_or_default()
     }
 }
 
@@ -149,7 +132,7 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
 pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling {
     let policy = section.get("policy");
     let priority = section.get("priority");
-    let kind = policy.choice_or_default(SCHEDULING_POLICIES);
+    let kind = policy.choice_or_default();
     let priority = match kind {
         // If the policy itself is wrong, the allowed priority is unknown.
         SchedulingPolicy::Other if policy.was_reported() => 0,
@@ -160,7 +143,7 @@ pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling
             if !priority.is_given() {
                 priority.report::<()>("must be a whole number from 1 to 99, because policy is fifo or rr");
             }
-            priority.whole().unwrap_or(1)
+            priority.count().unwrap_or(1)
         }
     };
     let given_nice = section.get("nice").count();

@@ -135,21 +135,15 @@ fn parse_configuration(
         keys::check(node, &problems);
     }
     let settings = settings(&root, &Environment::read(env, &problems));
-    let problems = problems.into_inner();
     if !problems.is_empty() {
-        return Err(ConfigError::new(file_name, problems));
+        return Err(ConfigError::new(file_name, problems.into_inner()));
     }
     let inline_secret = match settings.security.secret {
-        Some(SecretSource::ConfigFile) => inline_secret(document),
+        Some(SecretSource::ConfigFile) => root.get("security").get("hmac_secret").text(),
         _ => None,
     };
+    let inline_secret = inline_secret.map(|secret| InlineSecret(secret.to_owned()));
     Ok(Configuration { settings, inline_secret })
-}
-
-/// The secret in the file.
-fn inline_secret(document: Option<&yaml::Node>) -> Option<InlineSecret> {
-    let problems = Problems::default();
-    Field::root(document, &problems).section("security").get("hmac_secret").text().map(InlineSecret::new)
 }
 
 /// Builds the settings, which are valid only if no problems are reported.
@@ -178,10 +172,13 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     };
     let security = control::security(root);
     let policy_hold_s = root.get("policy_hold_s").decimal_or_default();
+    let ros = root.get("ros");
+    let gid_bytes = ros.get("graph_gid_bytes");
+    let gid_bytes = gid_bytes.whole_where("must be 16 or 24", |bytes| matches!(bytes, 16 | 24));
     Settings {
         instance,
         input,
-        graph_gid_bytes: gid_bytes(root, environment),
+        graph_gid_bytes: gid_bytes.map_or(environment.graph_gid_bytes, |bytes| bytes as usize),
         routes,
         shared_memory,
         policy_hold_ms: (policy_hold_s * 1_000.0).round() as u64,
@@ -195,15 +192,5 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         overrides: control::overrides(root),
         subscribers: control::subscribers(root, &lanes),
         lanes,
-    }
-}
-
-fn gid_bytes(root: &Field<'_>, environment: &Environment) -> usize {
-    let bytes =
-        root.get("ros").get("graph_gid_bytes").whole_where("must be 16 or 24", |n| matches!(n, 16 | 24));
-    match bytes {
-        Some(24) => 24,
-        Some(_) => 16,
-        None => environment.graph_gid_bytes,
     }
 }

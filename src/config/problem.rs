@@ -101,7 +101,6 @@ impl fmt::Display for Problem {
 pub(super) struct Problems(RefCell<Vec<Problem>>);
 
 impl Problems {
-    /// Adds a problem.
     pub fn report(&self, problem: Problem) {
         self.0.borrow_mut().push(problem);
     }
@@ -120,7 +119,10 @@ impl Problems {
         nearest(word, names).map(did_you_mean)
     }
 
-    /// All problems.
+    pub fn is_empty(&self) -> bool {
+        self.0.borrow().is_empty()
+    }
+
     pub fn into_inner(self) -> Vec<Problem> {
         self.0.into_inner()
     }
@@ -161,7 +163,6 @@ pub(super) fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
         .map(|(_, name)| name)
 }
 
-/// The text of a hint.
 pub(super) fn did_you_mean(name: &str) -> String {
     format!("did you mean `{name}`?")
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::choices::{DURABILITIES, HISTORIES, HistoryKind, RELIABILITIES};
+use super::choices::HistoryKind;
 use super::field::Field;
 use super::settings::InputQos;
 use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
@@ -10,7 +10,6 @@ use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 /// The depth of KEEP_LAST without a depth in the file: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
 
-/// QoS policies, each of which may be missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct PartialQos {
     reliability: Option<Reliability>,
@@ -26,12 +25,12 @@ impl PartialQos {
     pub fn read(field: &Field<'_>) -> Self {
         field.entries();
         Self {
-            reliability: field.get("reliability").choice(RELIABILITIES),
-            history: field.get("history").choice(HISTORIES),
+            reliability: field.get("reliability").choice(),
+            history: field.get("history").choice(),
             depth: field.get("depth").count(),
-            durability: field.get("durability").choice(DURABILITIES),
-            lifespan_ms: field.get("lifespan_ms").whole(),
-            deadline_ms: field.get("deadline_ms").whole(),
+            durability: field.get("durability").choice(),
+            lifespan_ms: field.get("lifespan_ms").count(),
+            deadline_ms: field.get("deadline_ms").count(),
         }
     }
 
@@ -55,12 +54,10 @@ impl PartialQos {
         };
         QosProfile {
             reliability: self.reliability.unwrap_or(default.reliability),
-            history: match self.history {
-                Some(HistoryKind::KeepAll) => History::KeepAll,
-                _ => match self.depth {
-                    Some(depth) => History::KeepLast { depth },
-                    None => default.history,
-                },
+            history: match (self.history, self.depth) {
+                (Some(HistoryKind::KeepAll), _) => History::KeepAll,
+                (_, Some(depth)) => History::KeepLast { depth },
+                (_, None) => default.history,
             },
             durability: self.durability.unwrap_or(default.durability),
             lifespan_ms: self.lifespan_ms,
@@ -72,17 +69,11 @@ impl PartialQos {
     pub fn input(self) -> InputQos {
         let history = match (self.history, self.depth) {
             (Some(HistoryKind::KeepAll), _) => Some(History::KeepAll),
-            (Some(HistoryKind::KeepLast), depth) => {
-                Some(History::KeepLast { depth: depth.unwrap_or(DEFAULT_DEPTH) })
-            }
-            (None, depth) => depth.map(|depth| History::KeepLast { depth }),
+            (Some(HistoryKind::KeepLast), None) => Some(History::KeepLast { depth: DEFAULT_DEPTH }),
+            (_, depth) => depth.map(|depth| History::KeepLast { depth }),
         };
-        InputQos {
-            reliability: self.reliability,
-            durability: self.durability,
-            history,
-            deadline_ms: self.deadline_ms,
-        }
+        let Self { reliability, durability, deadline_ms, .. } = self;
+        InputQos { reliability, durability, history, deadline_ms }
     }
 }
 

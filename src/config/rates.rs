@@ -1,7 +1,6 @@
 //! Reads the rates, stale thresholds and queues of noncritical lanes, from `routing_policy` and from each
 //! lane.
 
-use super::choices::DROP_POLICIES;
 use super::field::Field;
 use super::settings::{DropPolicy, LaneRates, RatePolicy};
 
@@ -48,7 +47,6 @@ pub(super) struct RoutingPolicy {
     degraded_queue: Queue,
 }
 
-/// The queue of a mode.
 struct Queue {
     drop_policy: DropPolicy,
     samples: usize,
@@ -63,8 +61,8 @@ impl RoutingPolicy {
             forward.report::<()>("must be true: a critical lane forwards in every mode but emergency");
         }
         let rate_hz = section.get("noncritical_max_rate_hz").decimal_or_default();
-        let stale_ms = section.get("stale_threshold_ms").whole_or_default();
-        let drop_policy = section.get("noncritical_drop_policy").choice_or_default(DROP_POLICIES);
+        let stale_ms = section.get("stale_threshold_ms").count_or_default();
+        let drop_policy = section.get("noncritical_drop_policy").choice_or_default();
 
         let modes = section.section("modes");
         for (name, mode) in modes.entries() {
@@ -75,17 +73,17 @@ impl RoutingPolicy {
             }
         }
         let queue = |mode: &Field<'_>, default: u64| {
-            let cap = mode.get("max_noncritical_queue").whole().unwrap_or(max_noncritical_queue);
-            let depth = mode.get("noncritical_depth").whole().unwrap_or(default);
+            let cap = mode.get("max_noncritical_queue").count().unwrap_or(max_noncritical_queue);
+            let depth = mode.get("noncritical_depth").count().unwrap_or(default);
             Queue {
-                drop_policy: mode.get("noncritical_drop_policy").choice(DROP_POLICIES).unwrap_or(drop_policy),
+                drop_policy: mode.get("noncritical_drop_policy").choice().unwrap_or(drop_policy),
                 // At least one sample waits: the one that the next token sends.
                 samples: usize::try_from(depth.min(cap).max(1)).unwrap_or(1),
             }
         };
         let (normal, degraded) = (modes.section("normal"), modes.section("degraded"));
         let mode_rate_hz = |mode: &Field<'_>| mode.get("noncritical_max_rate_hz").decimal();
-        let mode_stale_ms = |mode: &Field<'_>| mode.get("stale_threshold_ms").whole();
+        let mode_stale_ms = |mode: &Field<'_>| mode.get("stale_threshold_ms").count();
         Self {
             enabled: section.get("noncritical_enabled").flag_or_default(),
             normal_rate_hz: mode_rate_hz(&normal).unwrap_or(rate_hz),
@@ -100,8 +98,8 @@ impl RoutingPolicy {
     /// The rates of one noncritical lane: its own, else the defaults of the mode.
     pub fn lane_rates(&self, lane: &Field<'_>) -> LaneRates {
         let rate_hz = |key: &str| lane.get(key).decimal();
-        let bytes_per_s = |key: &str| lane.get(key).whole();
-        let stale_ms = |key: &str| lane.get(key).whole();
+        let bytes_per_s = |key: &str| lane.get(key).count();
+        let stale_ms = |key: &str| lane.get(key).count();
 
         let normal_rate_hz = rate_hz("max_rate_hz").unwrap_or(self.normal_rate_hz);
         // A lane with a normal rate below 3 Hz does not become faster in DEGRADED.
@@ -114,7 +112,7 @@ impl RoutingPolicy {
         let normal_bytes_per_s = bytes_per_s("max_bytes_per_s");
         let degraded_bytes_per_s = bytes_per_s("degraded_max_bytes_per_s").or(normal_bytes_per_s);
 
-        let drop_policy = lane.get("drop_policy").choice(DROP_POLICIES);
+        let drop_policy = lane.get("drop_policy").choice();
         let queue_samples = lane.get("queue_samples").count::<usize>();
         let policy = |queue: &Queue, max_rate_hz, max_bytes_per_s, stale_threshold_ms| RatePolicy {
             max_rate_hz: if self.enabled { max_rate_hz } else { 0.0 },
@@ -135,8 +133,8 @@ fn check_closed_mode(mode: &Field<'_>) {
     mode.entries();
     let rate = mode.get("noncritical_max_rate_hz");
     rate.whole_where("must be 0: noncritical lanes forward nothing in this mode", |rate| rate == 0);
-    mode.get("noncritical_depth").whole();
-    mode.get("noncritical_drop_policy").choice(DROP_POLICIES);
-    mode.get("stale_threshold_ms").whole();
-    mode.get("max_noncritical_queue").whole();
+    mode.get("noncritical_depth").count::<u64>();
+    mode.get("noncritical_drop_policy").choice::<DropPolicy>();
+    mode.get("stale_threshold_ms").count::<u64>();
+    mode.get("max_noncritical_queue").count::<u64>();
 }

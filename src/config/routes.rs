@@ -1,6 +1,7 @@
 //! Reads the routes and their outputs, and checks them against each other.
 
 use std::collections::{HashMap, HashSet};
+use std::hash::Hash;
 
 use super::environment::Environment;
 use super::field::Field;
@@ -15,7 +16,6 @@ const MAX_ROUTES: usize = 1_024;
 /// Samples retained for a restarted lane when no output is TRANSIENT_LOCAL.
 const RETAINED_SAMPLES: usize = 8;
 
-/// Reads the network of the publishers.
 pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
     let base = DdsNetwork { domain_id: environment.domain_id, interfaces: Vec::new() };
     lanes::network(&root.section("ros"), &base, environment)
@@ -69,7 +69,6 @@ struct RouteDraft<'a> {
 }
 
 struct OutputDraft<'a> {
-    /// Index of the lane.
     lane: usize,
     topic: TopicName,
     /// The field of the topic, given or not.
@@ -89,13 +88,8 @@ impl<'f> RouteReader<'_, 'f> {
         field.entries();
         if field.was_reported() {
             // It is no mapping, so its missing keys are not reported.
-            return RouteDraft {
-                field: field.clone(),
-                id: None,
-                input: None,
-                route: None,
-                outputs: Vec::new(),
-            };
+            let outputs = Vec::new();
+            return RouteDraft { field: field.clone(), id: None, input: None, route: None, outputs };
         }
         let id = required(&field.get("id"), RouteId::ALLOWED, |text| RouteId::try_from(text).ok());
         let input = field.get("input_topic");
@@ -156,18 +150,15 @@ impl<'f> RouteReader<'_, 'f> {
             if !serving[index] {
                 continue;
             }
-            let topic = match (topic, input) {
-                (Some(topic), _) => topic,
-                (None, Some(input)) if !given.is_given() => {
-                    let default = format!("/adaptive_bridge/{name}{input}");
-                    let Ok(topic) = TopicName::try_from(default.as_str()) else {
-                        given.report_value(&default, format!("must be {}", TopicName::ALLOWED));
-                        continue;
-                    };
-                    topic
+            let default = || {
+                let default = format!("/adaptive_bridge/{name}{}", input.filter(|_| !given.is_given())?);
+                let topic = TopicName::try_from(default.as_str()).ok();
+                if topic.is_none() {
+                    given.report_value(&default, format!("must be {}", TopicName::ALLOWED));
                 }
-                _ => continue,
+                topic
             };
+            let Some(topic) = topic.or_else(default) else { continue };
             let qos = override_qos.over(profile.unwrap_or(*lane_qos)).complete(lane.class());
             outputs.push(OutputDraft { lane: index, topic, field: given, qos });
         }
@@ -234,7 +225,6 @@ impl<'f> RouteReader<'_, 'f> {
     }
 }
 
-/// Reads a required text.
 fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Option<T>) -> Option<T> {
     if !field.is_given() {
         return field.report(&format!("must be {allowed}"));
@@ -245,35 +235,22 @@ fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Opt
 /// Checks that ids are unique, and that each topic of a domain is only one input or one output. A topic that
 /// is both would be a loop.
 fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraft]) {
-    let mut ids: HashMap<&str, &Field<'_>> = HashMap::new();
-    let mut inputs: HashMap<&str, &Field<'_>> = HashMap::new();
+    let mut ids = HashMap::new();
+    let mut inputs = HashMap::new();
     for route in routes {
-        if let Some(id) = &route.id {
-            match ids.get(id.as_str()) {
-                Some(first) => {
-                    let first = first.get("id");
-                    route
-                        .field
-                        .get("id")
-                        .report::<()>(&format!("must be unique; it is the same as {}", at(&first)));
-                }
-                None => {
-                    ids.insert(id.as_str(), &route.field);
-                }
-            }
+        if let Some(id) = &route.id
+            && let Some(first) = first_of(&mut ids, id.as_str(), &route.field)
+        {
+            let allowed = format!("must be unique; it is the same as {}", at(&first.get("id")));
+            route.field.get("id").report::<()>(&allowed);
         }
-        if let Some((topic, field)) = &route.input {
-            match inputs.get(topic.as_str()) {
-                Some(first) => {
-                    field.report::<()>(&format!("must be listed once; {} is the same topic", at(first)));
-                }
-                None => {
-                    inputs.insert(topic.as_str(), field);
-                }
-            }
+        if let Some((topic, field)) = &route.input
+            && let Some(first) = first_of(&mut inputs, topic.as_str(), field)
+        {
+            field.report::<()>(&format!("must be listed once; {} is the same topic", at(first)));
         }
     }
-    let mut outputs: HashMap<(u16, &str), &Field<'_>> = HashMap::new();
+    let mut outputs = HashMap::new();
     for output in routes.iter().flat_map(|route| &route.outputs) {
         let domain_id = lanes[output.lane].lane.network.domain_id;
         let topic = output.topic.as_str();
@@ -282,16 +259,21 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
             let allowed = format!("must not be an input topic in the same domain ({}): a loop", at(field));
             output.field.report_value(topic, allowed);
         }
-        match outputs.get(&(domain_id, topic)) {
-            Some(first) => {
-                let allowed = format!("must not be another output in the same domain ({})", at(first));
-                output.field.report_value(topic, allowed);
-            }
-            None => {
-                outputs.insert((domain_id, topic), &output.field);
-            }
+        if let Some(first) = first_of(&mut outputs, (domain_id, topic), &output.field) {
+            let allowed = format!("must not be another output in the same domain ({})", at(first));
+            output.field.report_value(topic, allowed);
         }
     }
+}
+
+/// The first field with this key; `None` if that is this one.
+fn first_of<'m, K: Eq + Hash>(
+    seen: &mut HashMap<K, &'m Field<'m>>,
+    key: K,
+    field: &'m Field<'m>,
+) -> Option<&'m Field<'m>> {
+    let first = *seen.entry(key).or_insert(field);
+    (!std::ptr::eq(first, field)).then_some(first)
 }
 
 /// The key path and line of a field, for a message.

@@ -4,6 +4,7 @@
 //! Code that uses these types does not check values again and does not depend on YAML.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
@@ -75,6 +76,15 @@ pub enum NetworkSelector {
     Name(String),
     /// An address, such as `192.168.0.7`.
     Address(Ipv4Addr),
+}
+
+impl fmt::Display for NetworkSelector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Name(name) => f.write_str(name),
+            Self::Address(address) => address.fmt(f),
+        }
+    }
 }
 
 impl NetworkSelector {

@@ -2,16 +2,9 @@
 
 use std::path::PathBuf;
 
-use super::choices::{
-    DROP_POLICIES, DURABILITIES, RELIABILITIES, SCHEDULING_POLICIES, TRUST_MODES, VERBOSITIES,
-};
-use super::settings::{
-    MetricsListener, NetworkSelector, SchedulingPolicy, SecretSource, TrustMode, Verbosity,
-};
-use crate::model::{
-    DropPolicy, Durability, History, InstanceName, LaneName, Reliability, SubscriberState, TopicName,
-    TypeName,
-};
+use super::choices::Choice;
+use super::settings::{MetricsListener, NetworkSelector, SecretSource};
+use crate::model::{History, InstanceName, LaneName, TopicName, TypeName};
 
 /// A value that can be shown as in the file. Secrets do not implement it.
 pub(super) trait Shown {
@@ -30,42 +23,20 @@ macro_rules! shown_as_displayed {
 }
 
 shown_as_displayed!(bool, u8, u16, u32, u64, usize, f64, String);
-shown_as_displayed!(InstanceName, LaneName, SubscriberState, TopicName, TypeName);
+shown_as_displayed!(InstanceName, LaneName, TopicName, TypeName, NetworkSelector);
 
-macro_rules! shown_as_a_choice {
-    ($($type:ty: $choices:ident),+) => {
-        $(impl Shown for $type {
-            fn shown(&self) -> String {
-                let found = $choices.iter().find(|(_, value)| value == self);
-                found.map_or_else(|| format!("{self:?}"), |(word, _)| (*word).to_owned())
-            }
-        })+
-    };
+impl<T: Choice> Shown for T {
+    fn shown(&self) -> String {
+        let word = T::WORDS.iter().find(|(_, value)| value == self);
+        word.map_or_else(String::new, |(word, _)| (*word).to_owned())
+    }
 }
-
-shown_as_a_choice!(
-    DropPolicy: DROP_POLICIES,
-    Durability: DURABILITIES,
-    Reliability: RELIABILITIES,
-    SchedulingPolicy: SCHEDULING_POLICIES,
-    TrustMode: TRUST_MODES,
-    Verbosity: VERBOSITIES
-);
 
 impl Shown for History {
     fn shown(&self) -> String {
         match self {
             Self::KeepLast { depth } => format!("KEEP_LAST {depth}"),
             Self::KeepAll => "KEEP_ALL".to_owned(),
-        }
-    }
-}
-
-impl Shown for NetworkSelector {
-    fn shown(&self) -> String {
-        match self {
-            Self::Name(name) => name.clone(),
-            Self::Address(address) => address.to_string(),
         }
     }
 }

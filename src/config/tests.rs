@@ -514,25 +514,6 @@ fn a_wrong_environment_variable_is_reported() {
 }
 
 #[test]
-fn a_variable_with_which_nodes_do_not_find_the_bridge_is_refused_with_what_to_do() {
-    let unset = "unset it for the bridge";
-    for (name, refused, accepted, remedy) in [
-        ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", "", "start the nodes without it"),
-        ("ROS_SECURITY_ENABLE", "true", "False", unset),
-        ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw_cyclonedds_cpp", unset),
-        ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA", "UDPv4", unset),
-        ("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA?max_msg_size=1MB", "DEFAULT", unset),
-    ] {
-        let found = messages_in(TOPIC, &|asked: &str| (asked == name).then(|| refused.to_owned()));
-        assert_eq!(found.len(), 1, "{found:?}");
-        assert!(found[0].starts_with(&format!("environment: {name} = {refused}: must ")), "{found:?}");
-        assert!(found[0].contains(remedy), "{found:?}");
-        let accepted = |asked: &str| (asked == name).then(|| accepted.to_owned());
-        assert!(parse(TOPIC, "f.yaml", &accepted).is_ok());
-    }
-}
-
-#[test]
 fn each_degraded_threshold_of_safety_is_below_its_emergency_threshold() {
     let rules =
         with("safety: {emergency_lag_ms: 900, silent_ms: 600, emergency_silent_ms: 0}\n").safety.rules;

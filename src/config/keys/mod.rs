@@ -75,7 +75,6 @@ pub(super) struct Key {
 }
 
 impl Key {
-    /// The file as a whole.
     pub fn root() -> &'static Self {
         &TREE
     }
@@ -102,14 +101,8 @@ impl Key {
         found.extend(self.row.map(|row| (path, row)));
     }
 
-    /// The items of a list.
     pub fn item(&self) -> Option<&Self> {
         self.below.iter().find(|(name, _)| *name == "[]").map(|(_, key)| key)
-    }
-
-    /// The row of a key path without lists, such as `lanes.rviz.queue_depth`.
-    pub fn row_of(path: &str) -> Option<&'static Row> {
-        path.split('.').try_fold(Self::root(), |key, name| key.get(name))?.row
     }
 
     fn names(&self) -> Vec<&'static str> {
@@ -187,7 +180,6 @@ fn shown_key(path: &str, key: &str) -> String {
     shown(&key[..end.unwrap_or(key.len())])
 }
 
-/// The path of `name` below `path`.
 pub(super) fn joined(path: &str, name: &str) -> String {
     if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
 }

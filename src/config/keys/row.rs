@@ -1,7 +1,5 @@
 //! What is declared of a configuration key.
 
-use std::fmt::Write as _;
-
 /// The declaration of a key, or of several that differ in their place only. The list of known keys, the
 /// reading and checking of the value, its default, the messages, what a reload applies and the tables of
 /// `config/README.md` come from it.
@@ -11,10 +9,6 @@ pub struct Row {
     pub paths: &'static [&'static str],
     /// Type and range.
     pub kind: Kind,
-    /// The unit; empty for none.
-    unit: &'static str,
-    /// What the documentation adds to the range.
-    note: &'static str,
     /// The default as in the documentation: a value, or where it is taken from.
     pub default: &'static str,
     /// Whether a reload applies a change; if not, it waits for a restart.
@@ -28,56 +22,43 @@ pub struct Row {
 pub enum Kind {
     /// A boolean.
     Flag,
-    /// A whole number, with the least and the greatest.
-    Whole(u64, u64),
-    /// A number, with the least and the greatest.
-    Decimal(f64, f64),
+    /// A whole number, with the least, the greatest, and what the documentation adds, such as the unit.
+    Whole(u64, u64, &'static str),
+    /// A number, likewise.
+    Decimal(f64, f64, &'static str),
     /// One of these words.
     Choice(fn() -> Vec<&'static str>),
     /// Another type, which its reader checks; the allowed values as in the documentation.
     Other(&'static str),
 }
 
-/// The words of a choice.
-pub(super) fn names<T>(choices: &[(&'static str, T)]) -> Vec<&'static str> {
-    choices.iter().map(|(name, _)| *name).collect()
+pub(super) const TOPIC: Kind = Kind::Other("absolute topic name");
+pub(super) const AGE: Kind = Kind::Whole(0, 86_400_000, " ms");
+
+/// A key that a reload applies.
+pub(super) const fn reloads(paths: &'static [&'static str], kind: Kind, default: &'static str) -> Row {
+    Row { paths, kind, default, reloads: true, documentation: "" }
+}
+
+/// A key whose change waits for a restart of the whole bridge.
+pub(super) const fn restarts(paths: &'static [&'static str], kind: Kind, default: &'static str) -> Row {
+    Row { paths, kind, default, reloads: false, documentation: "" }
 }
 
 impl Row {
-    pub(super) const fn new(
-        paths: &'static [&'static str],
-        kind: Kind,
-        default: &'static str,
-        documentation: &'static str,
-    ) -> Self {
-        Self { paths, kind, unit: "", note: "", default, reloads: false, documentation }
-    }
-
-    pub(super) const fn unit(self, unit: &'static str) -> Self {
-        Self { unit, ..self }
-    }
-
-    pub(super) const fn note(self, note: &'static str) -> Self {
-        Self { note, ..self }
-    }
-
-    pub(super) const fn reloads(self) -> Self {
-        Self { reloads: true, ..self }
+    pub(super) const fn doc(self, documentation: &'static str) -> Self {
+        Self { documentation, ..self }
     }
 
     /// The range and the unit, for the documentation.
     pub fn range(&self) -> String {
-        let mut range = match self.kind {
+        match self.kind {
             Kind::Flag => "`true`, `false`".to_owned(),
-            Kind::Whole(least, most) => format!("{least} to {most}"),
-            Kind::Decimal(least, most) => format!("{least} to {most}"),
+            Kind::Whole(least, most, unit) => format!("{least} to {most}{unit}"),
+            Kind::Decimal(least, most, unit) => format!("{least} to {most}{unit}"),
             Kind::Choice(names) => format!("`{}`", names().join("`, `")),
             Kind::Other(allowed) => allowed.to_owned(),
-        };
-        if !self.unit.is_empty() {
-            let _ = write!(range, " {}", self.unit);
         }
-        range + self.note
     }
 
     /// The row of this key in the tables of `config/README.md`.

@@ -16,8 +16,8 @@ use std::collections::HashSet;
 use std::fmt;
 use std::rc::Rc;
 
-use serde::Deserializer;
 use serde::de::{DeserializeSeed, Error as _, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 use serde_yaml::DeserializerOptions;
 
 use outline::{Kind, Shape, line_after, not_yaml, outline};
@@ -45,7 +45,6 @@ const MAX_ALIASED_BYTES: usize = 1 << 29;
 pub(super) struct Node {
     /// The line, counted from 1, of the key of this value, or of this item of a list.
     pub line: usize,
-    /// The value.
     pub content: Content,
 }
 
@@ -59,20 +58,15 @@ pub(super) enum Content {
         /// Whether it may be a number, boolean or null: `10` may, `"10"` may not.
         plain: bool,
     },
-    /// A sequence.
     List(Vec<Rc<Node>>),
     /// A mapping, in the order of the file, with duplicates.
     Map(Vec<Entry>),
 }
 
-/// One key of a mapping.
 #[derive(Clone, Debug)]
 pub(super) struct Entry {
-    /// The key.
     pub key: String,
-    /// The line of the key.
     pub line: usize,
-    /// Its value.
     pub value: Rc<Node>,
 }
 
@@ -146,20 +140,17 @@ fn max_aliases(text: &str) -> usize {
 /// the first parser YAML 1.2.
 fn explain(error: &serde_yaml::Error, text: &str) -> SyntaxError {
     let line = error.location().map(|location| line_after(text, location.index()));
-    let message = match error.is_message() {
-        true => {
-            not_yaml("YAML 1.1 and YAML 1.2 read this differently; put text in quotes, and indent by spaces")
-        }
-        false => {
-            let error = error.to_string();
-            if error.contains("more than one document") {
-                return SyntaxError::of_file("must be one YAML document");
-            }
-            let end = [" at line ", " at position "].iter().filter_map(|at| error.find(at)).min();
-            not_yaml(&error[..end.unwrap_or(error.len())])
-        }
-    };
-    SyntaxError { line, message }
+    if error.is_message() {
+        let differently =
+            "YAML 1.1 and YAML 1.2 read this differently; put text in quotes, and indent by spaces";
+        return SyntaxError { line, message: not_yaml(differently) };
+    }
+    let error = error.to_string();
+    if error.contains("more than one document") {
+        return SyntaxError::of_file("must be one YAML document");
+    }
+    let end = [" at line ", " at position "].iter().filter_map(|at| error.find(at)).min();
+    SyntaxError { line, message: not_yaml(&error[..end.unwrap_or(error.len())]) }
 }
 
 /// The second pass: reads one value, whose kind is known, into a [`Node`].
@@ -179,9 +170,7 @@ impl<'de> DeserializeSeed<'de> for NodeSeed<'_> {
         };
         self.next.set(self.next.get() + 1);
         let content = match kind {
-            Kind::Scalar { plain } => {
-                Content::Scalar { text: deserializer.deserialize_str(TextVisitor)?, plain }
-            }
+            Kind::Scalar { plain } => Content::Scalar { text: String::deserialize(deserializer)?, plain },
             Kind::List => deserializer.deserialize_seq(self)?,
             Kind::Map => deserializer.deserialize_map(self)?,
         };
@@ -230,45 +219,24 @@ impl<'de> DeserializeSeed<'de> for Unread {
     }
 }
 
-/// Reads a scalar as text.
-struct TextVisitor;
-
-impl Visitor<'_> for TextVisitor {
-    type Value = String;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("text")
-    }
-
-    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<String, E> {
-        Ok(text.to_owned())
-    }
-}
-
 /// Replaces each merge key (`<<: *alias`) by the entries of the mapping that it names, except keys that the
 /// mapping itself has. A `<<` with a value other than mappings stays, and is reported as an unknown key.
 fn merged(entries: Vec<Entry>) -> Vec<Entry> {
-    if !entries.iter().any(|entry| entry.key == "<<") {
-        return entries;
-    }
     let (merges, mut entries): (Vec<Entry>, Vec<Entry>) =
         entries.into_iter().partition(|entry| entry.key == "<<");
     for merge in merges {
-        let sources: Vec<&Node> = match &merge.value.content {
-            Content::List(items) => items.iter().map(Rc::as_ref).collect(),
-            _ => vec![&*merge.value],
+        let sources = match &merge.value.content {
+            Content::List(items) => items.as_slice(),
+            _ => std::slice::from_ref(&merge.value),
         };
-        let maps: Vec<&[Entry]> = sources
-            .iter()
-            .filter_map(|source| match &source.content {
-                Content::Map(entries) => Some(entries.as_slice()),
-                _ => None,
-            })
-            .collect();
-        if maps.len() < sources.len() {
+        let maps = sources.iter().map(|source| match &source.content {
+            Content::Map(entries) => Some(entries),
+            _ => None,
+        });
+        let Some(maps) = maps.collect::<Option<Vec<_>>>() else {
             entries.push(merge);
             continue;
-        }
+        };
         let mut known: HashSet<String> = entries.iter().map(|entry| entry.key.clone()).collect();
         for inherited in maps.into_iter().flatten() {
             if known.insert(inherited.key.clone()) {

@@ -171,19 +171,21 @@ impl Outline<'_> {
 
     fn check_counts(&mut self, line: usize) -> Result<(), SyntaxError> {
         let most = max_aliases(self.source);
-        let message = if self.shapes.len() > MAX_NODES {
-            format!("must have at most {MAX_NODES} keys and values, including those of aliases")
-        } else if self.aliases > most {
-            format!("must use at most {most} aliases in a file of this size")
-        } else {
-            if self.text_bytes > MAX_TEXT_BYTES {
-                let most = MAX_TEXT_BYTES;
-                let message = format!("must have at most {most} bytes of text, including that of aliases");
-                self.later.get_or_insert(SyntaxError::at(line, message));
-            }
-            return Ok(());
-        };
-        Err(SyntaxError::at(line, message))
+        if self.shapes.len() > MAX_NODES {
+            let message =
+                format!("must have at most {MAX_NODES} keys and values, including those of aliases");
+            return Err(SyntaxError::at(line, message));
+        }
+        if self.aliases > most {
+            let message = format!("must use at most {most} aliases in a file of this size");
+            return Err(SyntaxError::at(line, message));
+        }
+        if self.text_bytes > MAX_TEXT_BYTES {
+            let message =
+                format!("must have at most {MAX_TEXT_BYTES} bytes of text, including that of aliases");
+            self.later.get_or_insert(SyntaxError::at(line, message));
+        }
+        Ok(())
     }
 
     fn check_depth(&self, height: usize, line: usize) -> Result<(), SyntaxError> {
@@ -231,7 +233,6 @@ impl Outline<'_> {
         self.end(open.anchor, anchor);
     }
 
-    /// Ends a value.
     fn end(&mut self, anchor: usize, value: Anchor) {
         if let Some(around) = self.open.last_mut() {
             around.height = around.height.max(value.height);
