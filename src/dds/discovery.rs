@@ -75,17 +75,9 @@ pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery
             };
             Some(Discovery::ParticipantGone { prefix: id.as_ref().try_into().ok()?, silent_ms })
         }
-        Event::RemoteReaderQosIncompatible { local_writer, remote_reader, .. } => {
-            Some(Discovery::Incompatible {
-                local: Guid(local_writer.to_bytes()),
-                remote: Guid(remote_reader.to_bytes()),
-            })
-        }
-        Event::RemoteWriterQosIncompatible { local_reader, remote_writer, .. } => {
-            Some(Discovery::Incompatible {
-                local: Guid(local_reader.to_bytes()),
-                remote: Guid(remote_writer.to_bytes()),
-            })
+        Event::RemoteReaderQosIncompatible { local_writer: local, remote_reader: remote, .. }
+        | Event::RemoteWriterQosIncompatible { local_reader: local, remote_writer: remote, .. } => {
+            Some(Discovery::Incompatible { local: Guid(local.to_bytes()), remote: Guid(remote.to_bytes()) })
         }
         _ => None,
     }

@@ -4,11 +4,13 @@ use std::fmt;
 use std::io;
 
 /// Why a participant, reader or writer could not be created.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum DdsError {
     /// The host's interfaces could not be listed.
+    #[error("cannot list the network interfaces: {0}")]
     Interfaces(io::Error),
     /// The DDS library returned an error.
+    #[error("cannot create {what}: {reason}")]
     Library {
         /// The entity that was to be created.
         what: String,
@@ -16,17 +18,6 @@ pub enum DdsError {
         reason: String,
     },
 }
-
-impl fmt::Display for DdsError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Interfaces(error) => write!(f, "cannot list the network interfaces: {error}"),
-            Self::Library { what, reason } => write!(f, "cannot create {what}: {reason}"),
-        }
-    }
-}
-
-impl std::error::Error for DdsError {}
 
 impl DdsError {
     pub(super) fn library(what: impl Into<String>, reason: impl fmt::Debug) -> Self {

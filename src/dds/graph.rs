@@ -14,7 +14,6 @@ const MAX_ENDPOINTS: usize = 8_192;
 /// The longest namespace or node name, as in ROS 2 (`rmw_validate_node_name`).
 const MAX_NAME_BYTES: usize = 255;
 
-/// The DDS topic of the graph entries.
 pub(super) const TOPIC: &str = "ros_discovery_info";
 /// The DDS type of the graph entries.
 pub(super) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
@@ -45,9 +44,6 @@ pub fn encode_graph(
     }
     cdr
 }
-
-/// The encapsulation of [`encode_graph`]'s result.
-pub(super) const ENCAPSULATION: Encapsulation = Encapsulation::CDR_LE;
 
 /// A decoded graph entry: the nodes of one participant.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -85,7 +81,6 @@ pub fn decode_graph(cdr: &[u8], encapsulation: Encapsulation) -> Option<GraphEnt
     [16, 24].into_iter().find_map(|gid_bytes| CdrReader { cdr, at: 0, big_endian, gid_bytes }.entry())
 }
 
-/// Reads values from plain CDR.
 struct CdrReader<'a> {
     cdr: &'a [u8],
     at: usize,

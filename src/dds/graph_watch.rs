@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use super::graph::{GraphNode, decode_graph};
-use super::reader::{RawReader, Take};
+use super::reader::{RawReader, TakePayload};
 use crate::model::Guid;
 
 /// The most participants whose entries are kept.
@@ -39,20 +39,18 @@ impl GraphWatch {
     /// Reads the entries that have arrived since the last call.
     pub fn poll(&mut self) {
         loop {
-            let mut decoded = None;
-            let taken =
-                self.reader.take(&mut |cdr, encapsulation| decoded = decode_graph(cdr, encapsulation));
-            match taken {
-                Take::Sample(origin) => {
-                    let own_entry =
-                        decoded.filter(|entry| entry.participant.prefix() == origin.writer.prefix());
+            match self.reader.take_payload() {
+                TakePayload::Sample(origin, mut payload, encapsulation) => {
+                    let prefix = origin.writer.prefix();
+                    let own_entry = decode_graph(payload.bytes(), encapsulation)
+                        .filter(|entry| entry.participant.prefix() == prefix);
                     match own_entry {
-                        Some(entry) => self.entries.insert(origin.writer.prefix(), entry.nodes),
+                        Some(entry) => self.entries.insert(prefix, entry.nodes),
                         None => self.entries.refusals.malformed += 1,
                     }
                 }
-                Take::Malformed => self.entries.refusals.malformed += 1,
-                Take::Empty => return,
+                TakePayload::Malformed => self.entries.refusals.malformed += 1,
+                TakePayload::Empty => return,
             }
         }
     }
@@ -66,11 +64,6 @@ impl GraphWatch {
     /// Removes the entry of a participant that has left or whose lease has expired.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
         self.entries.remove(prefix);
-    }
-
-    /// The number of participants whose entries are kept.
-    pub fn participants(&self) -> usize {
-        self.entries.nodes_by_participant.len()
     }
 
     /// The samples from which no entry was stored, since this was created.

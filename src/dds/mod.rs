@@ -21,14 +21,14 @@ pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
-pub use network::{AbsentInterface, absent_interfaces, host_addresses, interfaces};
+pub use network::{host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{
     ArrivalFlag, AssemblyLimits, Inbox, LentMemory, Payload, RawReader, ReaderEvent, SampleMemory,
     SampleOrigin, Take, TakePayload,
 };
-pub use writer::{MatchedReader, RawWriter, WriteError, WriterEvent, Written};
+pub use writer::{RawWriter, WriteError, WriterEvent, Written};
 
 /// RustDDS in the version that ros2-client uses, so that the program contains one version of it.
 use ros2_client::dds::rustdds;

@@ -1,6 +1,5 @@
 //! Network interfaces: the configured ones, as the DDS library takes them, and those that the host has.
 
-use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
@@ -20,45 +19,19 @@ pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustd
     })
 }
 
-/// A configured interface that has no IPv4 address on this host at present.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct AbsentInterface {
-    /// Its name or address, as configured.
-    pub asked: String,
-    /// The interfaces that the host has, as `name address`.
-    pub present: Vec<String>,
-}
-
-impl fmt::Display for AbsentInterface {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "network interface {} is not on this host or has no IPv4 address; it is used as soon as it has \
-             one; the host has: {}",
-            self.asked,
-            self.present.join(", ")
-        )
-    }
-}
-
-/// The configured interfaces that have no IPv4 address at present.
+/// A message for each configured interface that has no IPv4 address at present.
 ///
 /// # Errors
 /// The kernel cannot list the interfaces.
-pub fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<AbsentInterface>, DdsError> {
+pub(super) fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<String>, DdsError> {
     if asked.is_empty() {
         return Ok(Vec::new());
     }
-    Ok(absent(asked, &host_interfaces()?))
-}
-
-fn host_interfaces() -> Result<Vec<(String, Ipv4Addr)>, DdsError> {
-    Ok(interface_addresses()?
-        .filter_map(|interface| {
-            let address = interface.address?.as_sockaddr_in()?.ip();
-            Some((interface.interface_name, address))
-        })
-        .collect())
+    let present = interface_addresses()?.filter_map(|interface| {
+        let address = interface.address?.as_sockaddr_in()?.ip();
+        Some((interface.interface_name, address))
+    });
+    Ok(absent(asked, &present.collect::<Vec<_>>()))
 }
 
 /// The IPv4 and IPv6 addresses of this host at present, with which
@@ -107,21 +80,22 @@ fn interface_addresses() -> Result<impl Iterator<Item = InterfaceAddress>, DdsEr
     getifaddrs().map_err(|errno| DdsError::Interfaces(errno.into()))
 }
 
-fn absent(asked: &[NetworkSelector], present: &[(String, Ipv4Addr)]) -> Vec<AbsentInterface> {
+fn absent(asked: &[NetworkSelector], present: &[(String, Ipv4Addr)]) -> Vec<String> {
     let is_absent = |selector: &&NetworkSelector| {
         !present.iter().any(|(name, address)| match selector {
             NetworkSelector::Name(wanted) => wanted == name,
             NetworkSelector::Address(wanted) => wanted == address,
         })
     };
-    let absent = asked.iter().filter(is_absent).map(|selector| AbsentInterface {
-        asked: match selector {
-            NetworkSelector::Name(name) => name.clone(),
-            NetworkSelector::Address(address) => address.to_string(),
-        },
-        present: present.iter().map(|(name, address)| format!("{name} {address}")).collect(),
-    });
-    absent.collect()
+    let has: Vec<String> = present.iter().map(|(name, address)| format!("{name} {address}")).collect();
+    let message = |selector: &NetworkSelector| {
+        format!(
+            "network interface {selector} is not on this host or has no IPv4 address; it is used as soon as \
+             it has one; the host has: {}",
+            has.join(", ")
+        )
+    };
+    asked.iter().filter(is_absent).map(message).collect()
 }
 
 #[cfg(test)]
@@ -136,14 +110,14 @@ mod tests {
     fn an_interface_that_the_host_has_by_name_or_address_is_not_absent() {
         let asked =
             [NetworkSelector::Name("wlan0".into()), NetworkSelector::Address(Ipv4Addr::new(192, 168, 0, 7))];
-        assert_eq!(absent(&asked, &host()), []);
+        assert_eq!(absent(&asked, &host()), Vec::<String>::new());
     }
 
     #[test]
     fn the_message_names_the_absent_interface_and_those_of_the_host() {
         let absent = absent(&[NetworkSelector::Name("eth9".into())], &host());
         assert_eq!(absent.len(), 1);
-        let text = absent[0].to_string();
+        let text = &absent[0];
         assert!(text.contains("eth9") && text.contains("wlan0 192.168.0.7"), "{text}");
     }
 }

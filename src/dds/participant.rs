@@ -17,11 +17,13 @@ use super::rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, NetworkCounters,
     Publisher, QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic,
     TopicKind,
+    dds::result::{CreateError, CreateResult},
 };
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
 use crate::model::{
-    Durability, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile, Reliability, SourceTimestamp,
+    Durability, Encapsulation, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile, Reliability,
+    SourceTimestamp,
 };
 
 /// The settings of a participant.
@@ -112,7 +114,6 @@ impl Participant {
         options: &ParticipantOptions,
         extend: impl FnOnce(DomainParticipantBuilder) -> DomainParticipantBuilder,
     ) -> Result<Self, DdsError> {
-        let what = || format!("a participant in DDS domain {}", options.network.domain_id);
         let mut builder = DomainParticipantBuilder::new(options.network.domain_id);
         let interfaces = &options.network.interfaces;
         if !interfaces.is_empty() {
@@ -121,19 +122,20 @@ impl Participant {
         for absent in network::absent_interfaces(interfaces)? {
             tracing::warn!(node = options.node_name, domain_id = options.network.domain_id, "{absent}");
         }
-        let participant = extend(builder).build().map_err(|error| DdsError::library(what(), error))?;
+        let failed = |error: CreateError| {
+            DdsError::library(format!("a participant in DDS domain {}", options.network.domain_id), error)
+        };
+        let participant = extend(builder).build().map_err(failed)?;
         let none = QosPolicies::qos_none();
-        let publisher =
-            participant.create_publisher(&none).map_err(|error| DdsError::library(what(), error))?;
-        let subscriber =
-            participant.create_subscriber(&none).map_err(|error| DdsError::library(what(), error))?;
+        let publisher = participant.create_publisher(&none).map_err(failed)?;
+        let subscriber = participant.create_subscriber(&none).map_err(failed)?;
         let listener = participant.status_listener();
         let graph = make_writer(
             &participant,
             &publisher,
             graph::TOPIC,
             graph::TYPE,
-            &qos::of_writer(&GRAPH_QOS, GRAPH_WINDOW_SAMPLES),
+            qos::of_writer(&GRAPH_QOS, GRAPH_WINDOW_SAMPLES),
         )?;
         let network_counters = participant.network_counters();
         let opened = Self {
@@ -226,10 +228,8 @@ impl Participant {
         dds_type: &str,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
-        self.begin_now(topic, dds_type, reader_qos)?;
-        let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.add_to_graph(&reader);
-        Ok(reader)
+        let reader = self.make_reader(topic, dds_type, reader_qos, DomainParticipant::begin_now)?;
+        Ok(self.add_to_graph(reader))
     }
 
     /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that continues after an earlier
@@ -245,17 +245,14 @@ impl Participant {
         reader_qos: &ReaderQos,
         taken: impl IntoIterator<Item = (Guid, i64)>,
     ) -> Result<RawReader, DdsError> {
-        let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
         // The library adds 1 to the number.
         let last_taken = |number: i64| SequenceNumber::from(number.min(i64::MAX - 1));
         let taken =
             taken.into_iter().map(|(writer, number)| (GUID::from_bytes(writer.0), last_taken(number)));
-        self.participant
-            .begin_after(&made_topic, taken)
-            .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
-        let reader = self.make_reader(topic, dds_type, reader_qos)?;
-        self.add_to_graph(&reader);
-        Ok(reader)
+        let reader = self.make_reader(topic, dds_type, reader_qos, |participant, topic| {
+            participant.begin_after(topic, taken)
+        })?;
+        Ok(self.add_to_graph(reader))
     }
 
     /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the
@@ -269,27 +266,15 @@ impl Participant {
         dds_type: &str,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
-        self.begin_now(topic, dds_type, reader_qos)?;
-        let reader = self.make_reader(topic, dds_type, reader_qos)?;
+        let reader = self.make_reader(topic, dds_type, reader_qos, DomainParticipant::begin_now)?;
         reader.ignore_reliable_writers();
-        self.add_to_graph(&reader);
-        Ok(reader)
+        Ok(self.add_to_graph(reader))
     }
 
-    /// Makes the next reader of the topic begin with samples that arrive after its creation. The library
-    /// keeps samples by topic, beyond the life of a reader, so the new reader would take samples again that
-    /// an earlier one has taken.
-    fn begin_now(&self, topic: &str, dds_type: &str, reader_qos: &ReaderQos) -> Result<(), DdsError> {
-        let made_topic = make_topic(&self.participant, topic, dds_type, &qos::of_reader(reader_qos))?;
-        self.participant
-            .begin_now(&made_topic)
-            .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))
-    }
-
-    /// Adds the reader to the node's graph entry.
-    fn add_to_graph(&mut self, reader: &RawReader) {
+    fn add_to_graph(&mut self, reader: RawReader) -> RawReader {
         self.readers.push(reader.guid);
         self.publish_graph_entry();
+        reader
     }
 
     /// Creates a [`GraphWatch`], which reads the graph entries of the other participants. As in ROS 2 itself,
@@ -298,24 +283,25 @@ impl Participant {
     /// # Errors
     /// The DDS library cannot create the reader.
     pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
-        let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS)?;
+        let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS, |_, _| Ok(()))?;
         reader.expect_small_samples();
         Ok(GraphWatch::new(reader))
     }
 
+    /// Creates a reader. `begin` determines with which sample it begins: the library keeps samples by topic,
+    /// beyond the life of a reader, so a new reader would take samples again that an earlier one has taken.
     fn make_reader(
         &self,
         topic: &str,
         dds_type: &str,
         reader_qos: &ReaderQos,
+        begin: impl FnOnce(&DomainParticipant, &Topic) -> CreateResult<()>,
     ) -> Result<RawReader, DdsError> {
         let policies = qos::of_reader(reader_qos);
-        let what = || format!("a reader of {topic}");
         let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
-        let inner = self
-            .subscriber
-            .create_simple_datareader_no_key(&made_topic, Some(policies))
-            .map_err(|error| DdsError::library(what(), error))?;
+        let inner = begin(&self.participant, &made_topic)
+            .and_then(|()| self.subscriber.create_simple_datareader_no_key(&made_topic, Some(policies)))
+            .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
         let guid = Guid(inner.guid().to_bytes());
         Ok(RawReader { inner, guid })
     }
@@ -333,7 +319,7 @@ impl Participant {
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        self.add_writer(topic, dds_type, &qos::of_writer(writer_qos, window_samples))
+        self.add_writer(topic, dds_type, qos::of_writer(writer_qos, window_samples))
     }
 
     /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
@@ -351,14 +337,14 @@ impl Participant {
         max_blocking: Duration,
     ) -> Result<RawWriter, DdsError> {
         let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
-        self.add_writer(topic, dds_type, &policies)
+        self.add_writer(topic, dds_type, policies)
     }
 
     fn add_writer(
         &mut self,
         topic: &str,
         dds_type: &str,
-        policies: &QosPolicies,
+        policies: QosPolicies,
     ) -> Result<RawWriter, DdsError> {
         let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, policies)?;
         self.writers.push(writer.guid());
@@ -382,7 +368,6 @@ impl Participant {
         }
     }
 
-    /// Publishes the node's graph entry.
     fn publish_graph_entry(&self) {
         let entry = graph::encode_graph(
             self.guid(),
@@ -393,7 +378,7 @@ impl Participant {
             self.graph_gid_bytes,
         );
         // A full window means that 1024 entries are unacknowledged; the next entry lists all endpoints again.
-        if let Err(error) = self.graph.write(Bytes::from(entry), graph::ENCAPSULATION, SourceTimestamp::NONE)
+        if let Err(error) = self.graph.write(Bytes::from(entry), Encapsulation::CDR_LE, SourceTimestamp::NONE)
         {
             tracing::warn!(node = self.node_name, %error, "cannot publish the node's ROS 2 graph entry");
         }
@@ -416,11 +401,11 @@ fn make_writer(
     publisher: &Publisher,
     topic: &str,
     dds_type: &str,
-    policies: &QosPolicies,
+    policies: QosPolicies,
 ) -> Result<RawWriter, DdsError> {
-    let made_topic = make_topic(participant, topic, dds_type, policies)?;
+    let made_topic = make_topic(participant, topic, dds_type, &policies)?;
     let inner = publisher
-        .create_datawriter_no_key(&made_topic, Some(policies.clone()))
+        .create_datawriter_no_key(&made_topic, Some(policies))
         .map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
     let guid = Guid(inner.guid().to_bytes());
     Ok(RawWriter { inner, guid })

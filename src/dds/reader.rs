@@ -28,6 +28,16 @@ pub enum Payload {
     Lent(Box<dyn LentMemory>),
 }
 
+impl Payload {
+    /// The bytes of the payload.
+    pub fn bytes(&mut self) -> &[u8] {
+        match self {
+            Self::Bytes(bytes) => bytes,
+            Self::Lent(memory) => memory.bytes(),
+        }
+    }
+}
+
 /// Of topics with samples of at most some KiB: graph entries, probes and their responses. Anyone on the
 /// network can send fragments that claim more.
 struct SmallSamples;
@@ -78,11 +88,8 @@ impl TakePayload {
     /// Calls `read` with the payload, if there is one.
     pub fn read(self, read: &mut dyn FnMut(&[u8], Encapsulation)) -> Take {
         match self {
-            Self::Sample(origin, payload, encapsulation) => {
-                match payload {
-                    Payload::Bytes(bytes) => read(&bytes, encapsulation),
-                    Payload::Lent(mut memory) => read(memory.bytes(), encapsulation),
-                }
+            Self::Sample(origin, mut payload, encapsulation) => {
+                read(payload.bytes(), encapsulation);
                 Take::Sample(origin)
             }
             Self::Malformed => Take::Malformed,
@@ -337,7 +344,6 @@ static ENCAPSULATIONS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::XML,
 ];
 
-/// A received payload, with its encapsulation.
 type Received = (Payload, Encapsulation);
 
 /// Passes payloads through RustDDS' deserialization traits: returns the payload, either in the receive buffer

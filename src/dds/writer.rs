@@ -1,7 +1,6 @@
 //! A DDS writer of raw payloads. A write does not wait for readers unless the writer was created as blocking.
 
 use std::convert::Infallible;
-use std::fmt;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -11,27 +10,18 @@ use super::rustdds::{
     DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp};
 
 /// Why a sample was not written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WriteError {
     /// A blocking writer has waited for acknowledgements for its whole blocking time.
+    #[error("the window of unacknowledged samples is full")]
     WindowFull,
     /// The DDS library refused the sample for another reason.
+    #[error("the DDS library refused the sample")]
     Refused,
 }
-
-impl fmt::Display for WriteError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::WindowFull => "the window of unacknowledged samples is full",
-            Self::Refused => "the DDS library refused the sample",
-        })
-    }
-}
-
-impl std::error::Error for WriteError {}
 
 impl<T> From<DdsWriteError<T>> for WriteError {
     fn from(error: DdsWriteError<T>) -> Self {
@@ -68,21 +58,6 @@ pub struct Written {
     pub readers: usize,
     /// The sample's RTPS sequence number, from 1 on.
     pub sequence: i64,
-}
-
-/// A matched reader, with the samples that it was offered, has acknowledged and has missed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct MatchedReader {
-    /// The reader.
-    pub guid: Guid,
-    /// Whether it requested RELIABLE.
-    pub reliable: bool,
-    /// Samples written since it was matched, plus the history that it was offered then.
-    pub offered: u64,
-    /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
-    pub unacknowledged: u64,
-    /// Of those, samples evicted from the writer's history before the reader acknowledged them.
-    pub overrun: u64,
 }
 
 /// A DDS writer of raw payloads.
@@ -138,11 +113,11 @@ impl RawWriter {
         self.inner.sent_through().into()
     }
 
-    /// Lists the matched readers.
-    pub fn matched_readers(&self) -> impl Iterator<Item = MatchedReader> {
-        self.inner.matched_readers().into_iter().map(|reader| MatchedReader {
-            guid: Guid(reader.guid.to_bytes()),
-            reliable: reader.reliable,
+    /// Lists the matched readers, with the samples that each was offered, has acknowledged and has missed.
+    pub fn matched_readers(&self) -> impl Iterator<Item = ReaderRecord> {
+        self.inner.matched_readers().into_iter().map(|reader| ReaderRecord {
+            reader: Guid(reader.guid.to_bytes()),
+            reliable: u64::from(reader.reliable),
             offered: reader.offered,
             unacknowledged: reader.unacknowledged,
             overrun: reader.overrun,
@@ -175,7 +150,6 @@ impl RawWriter {
     }
 }
 
-/// A payload to be written, with its encapsulation.
 pub(super) struct RawPayload {
     bytes: Bytes,
     encapsulation: Encapsulation,

@@ -8,7 +8,6 @@ use crate::model::{Counts, DropCounts, DropReason, MonotonicNs, ProbeRefusal, Re
 /// Shortest interval between two log lines of the same reason. The first increase is logged at once.
 const REPEAT_MS: u64 = 10_000;
 
-/// Logs the increases of counts by reason.
 #[derive(Debug)]
 pub(super) struct CountLog<R, const N: usize> {
     logged: Counts<R, N>,

@@ -16,8 +16,8 @@ pub(super) const FOLDER_VARIABLE: &str = "ADAPTIVE_BRIDGE_FOLDER";
 /// The configuration that this process uses, and its share in the file that keeps it in force.
 #[derive(Debug)]
 pub struct InForce {
-    configuration: Configuration,
-    share: InForceShare,
+    pub(super) configuration: Configuration,
+    pub(super) share: InForceShare,
 }
 
 /// Why a process cannot get a configuration.
@@ -38,10 +38,8 @@ impl InForce {
     /// # Errors
     /// The bridge does not run and the file is bad, or the folder of the instance cannot be used.
     pub fn join(file: &Path, loaded: Result<Configuration, ConfigError>) -> Result<Self, InForceError> {
-        let address = supervised_folder().or_else(|| {
-            let address = BridgeAddress::find(&own_root(), file)?;
-            Some((address.root().to_owned(), address.instance().clone()))
-        });
+        let by_file = || BridgeAddress::find(&own_root(), file).map(|found| (found.root, found.instance));
+        let address = supervised_folder().or_else(by_file);
         if let Some((root, instance)) = address
             && let Some((share, bytes)) = InForceShare::join_running(&root, &instance)?
         {
@@ -106,15 +104,11 @@ impl InForce {
         &self.configuration
     }
 
-    pub(super) fn into_parts(self) -> (Configuration, InForceShare) {
-        (self.configuration, self.share)
-    }
-
     /// Finds the settings in force of a running bridge: the one that was started with `file`, or else the one
     /// of the instance that the file names now; `None` when neither runs. Takes no lock and writes nothing.
     pub fn find(file: &Path, loaded: Option<&Settings>) -> Option<Settings> {
         let by_file = BridgeAddress::find(&own_root(), file)
-            .and_then(|address| settings_of_running(address.root(), address.instance()));
+            .and_then(|address| settings_of_running(&address.root, &address.instance));
         by_file.or_else(|| {
             let named = loaded?;
             settings_of_running(&root_of(named), &named.instance)
@@ -130,10 +124,8 @@ fn settings_of_running(root: &Path, instance: &InstanceName) -> Option<Settings>
 }
 
 fn encode(configuration: &Configuration) -> Result<Vec<u8>, ShmError> {
-    configuration.encode().map_err(|error| ShmError::Failed {
-        what: "to encode the configuration".to_owned(),
-        path: root_of(&configuration.settings),
-        reason: error.to_string(),
+    configuration.encode().map_err(|error| {
+        ShmError::failed("to encode the configuration", &root_of(&configuration.settings), error)
     })
 }
 

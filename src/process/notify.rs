@@ -18,7 +18,8 @@ const FEEDS_PER_TIMEOUT: u32 = 4;
 /// Sends the state of this process to its service manager.
 #[derive(Debug)]
 pub(super) struct Notifier {
-    is_enabled: bool,
+    /// Whether a service manager receives the notifications.
+    pub is_enabled: bool,
     /// Shortest interval between two watchdog messages; `None` without a watchdog.
     feed_every: Option<Duration>,
     feed_at: MonotonicNs,
@@ -43,15 +44,9 @@ impl Notifier {
         }
     }
 
-    /// Whether a service manager receives the notifications.
-    pub fn is_enabled(&self) -> bool {
-        self.is_enabled
-    }
-
-    /// Reports, once, that the process is up: shared memory is attached, and the DDS endpoints whose types
-    /// are known are created.
+    /// Reports, once, that the process has shared memory and the DDS endpoints whose types are known.
     pub fn ready(&mut self) {
-        if self.is_enabled && !std::mem::replace(&mut self.ready, true) {
+        if !std::mem::replace(&mut self.ready, true) {
             send(&[NotifyState::Ready]);
         }
     }
@@ -73,8 +68,7 @@ impl Notifier {
             return;
         }
         self.status_at = now.plus_ms(STATUS_MS);
-        let mut status = String::with_capacity(self.status.len());
-        status.push_str(self.prefix);
+        let mut status = self.prefix.to_owned();
         describe(&mut status);
         if status != self.status {
             send(&[NotifyState::Status(&status)]);
@@ -82,24 +76,17 @@ impl Notifier {
         }
     }
 
-    /// Reports that a reload is complete.
     pub fn reloaded(&mut self, refused: bool) {
         self.prefix = if refused { "the changed configuration file is bad and not in force; " } else { "" };
         self.status_at = MonotonicNs(0);
-        if self.is_enabled {
-            send(&[NotifyState::Ready]);
-        }
+        send(&[NotifyState::Ready]);
     }
 
-    /// Reports that the process has begun to shut down.
     pub fn stopping(&self) {
-        if self.is_enabled {
-            send(&[NotifyState::Stopping]);
-        }
+        send(&[NotifyState::Stopping]);
     }
 }
 
-/// Reports that a reload begins.
 pub(super) fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => send(&[NotifyState::Reloading, now]),
@@ -107,6 +94,7 @@ pub(super) fn reloading() {
     }
 }
 
+/// Does nothing without a service manager.
 fn send(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(state) {
         warn!(%error, "cannot notify the service manager");

@@ -6,7 +6,6 @@
 //! outcome is in the log, on the health board, and in a note beside the role's lock file, which
 //! `adaptive-bridge reload` reads.
 
-use std::fmt;
 use std::fs;
 use std::io::{self, ErrorKind, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -72,12 +71,6 @@ impl ReloadRequests {
     }
 }
 
-impl fmt::Debug for ReloadRequests {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("ReloadRequests").field(&self.request.is_some()).finish()
-    }
-}
-
 /// Records SIGHUP for a supervisor, which forwards it to its children. To be created before anything else, as
 /// [`ReloadRequests`].
 #[derive(Debug)]
@@ -86,10 +79,8 @@ pub struct HangUp {
     terminal: Terminal,
 }
 
-/// What a SIGHUP requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum HangUpMeaning {
-    /// To read the configuration file again.
     Reload,
     /// To stop: the terminal was closed, so that Ctrl-C can no longer stop the bridge.
     Stop,
@@ -148,38 +139,22 @@ impl Terminal {
 
 /// The configuration in force of this process, updated by reloads.
 pub(super) struct Reloads {
-    in_force: Configuration,
-    fingerprint: u64,
-    refused: u64,
+    pub in_force: Configuration,
+    /// The number of requests that were refused because the file was invalid.
+    pub refused: u64,
     outcomes: Option<Receiver<Outcome>>,
     /// Keeps the configuration in force for processes that start while this one runs.
     _share: Option<InForceShare>,
 }
 
-/// The outcome of one request.
-enum Outcome {
-    Accepted(Box<Configuration>),
-    Refused,
-}
-
-/// What [`Reloads::poll`] found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum ReloadEvent {
-    /// No reload has completed since the last call.
-    Nothing,
-    /// The file is valid, and its configuration in force, even if it equals the former one. The files that it
-    /// refers to, such as that of a secret, are to be read again.
-    Reloaded,
-    /// The file is invalid, and nothing has changed.
-    Refused,
-}
+/// The configuration in force after a request; `None` if the file was invalid, and nothing has changed.
+type Outcome = Option<Box<Configuration>>;
 
 impl Reloads {
-    /// Starts the reload thread, which inherits the scheduling of the calling thread. It writes each outcome
-    /// to the file `note`.
-    pub fn start(requests: ReloadRequests, settings: &Settings, note: Option<PathBuf>) -> io::Result<Self> {
-        let (in_force, share) = match requests.in_force.map(InForce::into_parts) {
-            Some((configuration, share)) => (configuration, Some(share)),
+    /// Starts the reload thread, with the scheduling of the calling one. Outcomes go to the file `note`.
+    pub fn start(requests: ReloadRequests, settings: &Settings, note: PathBuf) -> io::Result<Self> {
+        let (in_force, share) = match requests.in_force {
+            Some(InForce { configuration, share }) => (configuration, Some(share)),
             None => (settings.clone().into(), None),
         };
         let file = share.as_ref().map(InForceShare::file);
@@ -189,46 +164,31 @@ impl Reloads {
             let reloader = Reloader { current: in_force.clone(), file };
             std::thread::Builder::new()
                 .name("reload".to_owned())
-                .spawn(move || serve(request, reloader, &sender, note.as_deref()))
+                .spawn(move || serve(request, reloader, &sender, &note))
                 .map(|_| outcomes)
         });
-        let fingerprint = in_force.settings.fingerprint();
-        Ok(Self { in_force, fingerprint, refused: 0, outcomes: outcomes.transpose()?, _share: share })
+        Ok(Self { in_force, refused: 0, outcomes: outcomes.transpose()?, _share: share })
     }
 
-    /// The configuration in force.
-    pub fn configuration(&self) -> &Configuration {
-        &self.in_force
-    }
-
-    /// The fingerprint of the settings in force.
-    pub fn fingerprint(&self) -> u64 {
-        self.fingerprint
-    }
-
-    /// The number of requests that were refused because the file was invalid.
-    pub fn refused(&self) -> u64 {
-        self.refused
-    }
-
-    /// Takes the outcome of a request and puts its configuration in force. Never waits, and allocates nothing
-    /// while there is no outcome.
-    pub fn poll(&mut self) -> ReloadEvent {
-        match self.outcomes.as_ref().map(Receiver::try_recv) {
-            None | Some(Err(TryRecvError::Empty)) => ReloadEvent::Nothing,
-            Some(Err(TryRecvError::Disconnected)) => {
+    /// Takes the outcome of a request, puts its configuration in force, and returns whether the file was
+    /// valid; `None` if no reload has completed since the last call. Even if a valid file has not changed,
+    /// the files that it refers to, such as that of a secret, are to be read again. Never waits, and
+    /// allocates nothing while there is no outcome.
+    pub fn poll(&mut self) -> Option<bool> {
+        match self.outcomes.as_ref()?.try_recv() {
+            Err(TryRecvError::Empty) => None,
+            Err(TryRecvError::Disconnected) => {
                 error!("the reload thread has ended; SIGHUP does nothing until this process is restarted");
                 self.outcomes = None;
-                ReloadEvent::Nothing
+                None
             }
-            Some(Ok(Outcome::Refused)) => {
+            Ok(None) => {
                 self.refused += 1;
-                ReloadEvent::Refused
+                Some(false)
             }
-            Some(Ok(Outcome::Accepted(configuration))) => {
-                self.fingerprint = configuration.settings.fingerprint();
+            Ok(Some(configuration)) => {
                 self.in_force = *configuration;
-                ReloadEvent::Reloaded
+                Some(true)
             }
         }
     }
@@ -236,7 +196,6 @@ impl Reloads {
 
 /// Applies reloads to the configuration in force, on the reload thread.
 struct Reloader {
-    /// The configuration in force of this process.
     current: Configuration,
     /// The file with the configuration in force of the bridge.
     file: Option<InForceFile>,
@@ -277,7 +236,7 @@ fn serve(
     Request { mut signals, mut load, terminal }: Request,
     mut reloader: Reloader,
     outcomes: &SyncSender<Outcome>,
-    note: Option<&Path>,
+    note: &Path,
 ) {
     for _ in signals.forever() {
         if terminal.is_closed() {
@@ -294,26 +253,24 @@ fn serve(
                 let reload = reloader.reload(new);
                 telemetry::set_verbosity(reloader.current.settings.diagnostics.verbosity);
                 log(&reload);
-                let outcome = Outcome::Accepted(Box::new(reloader.current.clone()));
+                let outcome = Some(Box::new(reloader.current.clone()));
                 (outcome, ReloadResult::Accepted { file_fingerprint, reload })
             }
             Err(error) => {
                 error!("the configuration file is bad, and nothing is changed:\n{error}");
-                (Outcome::Refused, ReloadResult::Refused { problems: error.to_string() })
+                (None, ReloadResult::Refused { problems: error.to_string() })
             }
         };
         if outcomes.send(outcome).is_err() {
             return;
         }
-        if let Some(path) = note {
-            let note = ReloadNote { pid: std::process::id(), began_at_ns: began_at.0, result };
-            if let Err(error) = note.write(path) {
-                warn!(
-                    path = %path.display(),
-                    %error,
-                    "cannot write the outcome of the reload for `adaptive-bridge reload`"
-                );
-            }
+        let written = ReloadNote { pid: std::process::id(), began_at_ns: began_at.0, result }.write(note);
+        if let Err(error) = written {
+            warn!(
+                path = %note.display(),
+                %error,
+                "cannot write the outcome of the reload for `adaptive-bridge reload`"
+            );
         }
     }
 }

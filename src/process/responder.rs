@@ -11,15 +11,13 @@ use tracing::{debug, info, warn};
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
 use super::notify::{Meter, Notifier};
-use super::probes::{
-    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RequestHandler, Trust,
-};
+use super::probes::{PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RequestHandler, Trust};
 use super::role::RoleError;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::DdsNetwork;
-use crate::dds::{Inbox, Participant, ParticipantOptions, RawWriter, Take};
-use crate::model::{Encapsulation, MonotonicNs, RefusalCounts, SourceTimestamp, TopicName};
+use crate::dds::{Inbox, Participant, ParticipantOptions, RawWriter, TakePayload};
+use crate::model::{Encapsulation, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp, TopicName};
 use crate::telemetry;
 
 /// How long the responder waits for a probe request before it logs a warning.
@@ -85,8 +83,6 @@ struct Responder {
     responses: RawWriter,
     participant: Participant,
     handler: RequestHandler,
-    /// The current request, cut at one byte more than the longest valid request.
-    request: Vec<u8>,
     refused: RefusalLog,
     accepted: RefusalLog,
     housekeeping_at: MonotonicNs,
@@ -99,7 +95,6 @@ struct Responder {
     answered: Meter,
 }
 
-/// The state of the requests that was logged last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LoggedState {
     Nothing,
@@ -131,7 +126,6 @@ impl Responder {
             responses,
             participant,
             handler: RequestHandler::new(options.id, options.trust, options.max_probe_rate_hz, now),
-            request: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
             refused: RefusalLog::new(RefusalCounts::default()),
             accepted: RefusalLog::new(RefusalCounts::default()),
             housekeeping_at: MonotonicNs(0),
@@ -143,8 +137,7 @@ impl Responder {
         })
     }
 
-    /// Does housekeeping if it is due, and answers the requests that have arrived. Returns whether more may
-    /// be waiting.
+    /// Does housekeeping if it is due, and answers requests. Returns whether more may be waiting.
     fn turn(&mut self) -> bool {
         let now = clock::monotonic();
         if now >= self.housekeeping_at {
@@ -155,27 +148,21 @@ impl Responder {
 
     /// Takes one request and answers it. Returns whether there was one.
     fn step(&mut self) -> bool {
-        let request = &mut self.request;
-        let mut lent = None;
-        let take = self.requests.take(&mut |payload: &[u8], encapsulation: Encapsulation| {
-            request.clear();
-            request.extend_from_slice(&payload[..payload.len().min(MAX_MESSAGE_BYTES + 1)]);
-            lent = Some(encapsulation);
-        });
+        let taken = self.requests.take_from_any();
         let received = clock::wall();
-        let (origin, encapsulation) = match (take, lent) {
-            (Take::Empty, _) => return false,
-            (Take::Sample(origin), Some(encapsulation)) => (origin, encapsulation),
-            (Take::Sample(_) | Take::Malformed, _) => {
-                self.handler.count_malformed();
+        let (origin, mut payload, encapsulation) = match taken {
+            TakePayload::Empty => return false,
+            TakePayload::Malformed => {
+                self.handler.refused.add(ProbeRefusal::Malformed, 1);
                 return true;
             }
+            TakePayload::Sample(origin, payload, encapsulation) => (origin, payload, encapsulation),
         };
         let now = clock::monotonic();
         if !self.handler.is_within_rate(origin.writer, now) {
             return true;
         }
-        let Some(request) = self.handler.check(&self.request, encapsulation, received) else {
+        let Some(request) = self.handler.check(payload.bytes(), encapsulation, received) else {
             return true;
         };
         let begun = clock::wall();

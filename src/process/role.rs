@@ -4,7 +4,7 @@
 use tracing::info;
 
 use super::notify::Notifier;
-use super::reload::{ReloadEvent, ReloadRequests, Reloads};
+use super::reload::{ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
 use crate::config::{Configuration, Scheduling, Settings};
@@ -60,7 +60,7 @@ pub(super) struct Role {
     pub boards: Boards,
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
-    notifier: Notifier,
+    pub notifier: Notifier,
     /// The participant of the predecessor of this process; all zero for none, and once it is disposed of.
     former_participant: Guid,
     /// The last field, so that the lock is released only after everything else is dropped.
@@ -101,7 +101,7 @@ impl Role {
                 started_at: now,
                 alive_at: now,
                 starts,
-                settings_fingerprint: reloads.fingerprint(),
+                settings_fingerprint: reloads.in_force.settings.fingerprint(),
                 ..ProcessHealth::default()
             };
         });
@@ -137,11 +137,6 @@ impl Role {
         participant.dispose_participant(std::mem::take(&mut self.former_participant));
     }
 
-    /// Whether the participant of a killed predecessor is not disposed of yet.
-    pub fn has_former(&self) -> bool {
-        self.former_participant != Guid::default()
-    }
-
     /// Writes the participant to the health board, for a successor that has to dispose of it.
     fn record_participant(&mut self, participant: &Participant) {
         let guid = participant.guid();
@@ -151,35 +146,19 @@ impl Role {
     /// Returns the new configuration in force if a reload has completed since the last call, for the caller
     /// to apply. Writes the outcome to the health board and to the service manager.
     pub fn reload(&mut self) -> Option<&Configuration> {
-        let event = self.reloads.poll();
-        if event == ReloadEvent::Nothing {
-            return None;
-        }
-        let (fingerprint, refused) = (self.reloads.fingerprint(), self.reloads.refused());
+        let is_valid = self.reloads.poll()?;
         self.health.update(|health| {
-            health.settings_fingerprint = fingerprint;
-            health.refused_reloads = refused;
+            health.settings_fingerprint = self.reloads.in_force.settings.fingerprint();
+            health.refused_reloads = self.reloads.refused;
         });
-        self.notifier.reloaded(event == ReloadEvent::Refused);
-        (event == ReloadEvent::Reloaded).then(|| self.reloads.configuration())
+        self.notifier.reloaded(!is_valid);
+        is_valid.then_some(&self.reloads.in_force)
     }
 
-    /// Reports, once, that the process is up: its DDS endpoints exist, except those of a type not yet
-    /// discovered.
-    pub fn ready(&mut self) {
-        self.notifier.ready();
-    }
-
-    /// Sends the status line that `describe` writes to the service manager, and logs how many log lines were
-    /// left out, both at most once a second.
+    /// Sends the status line of `describe`, and logs how many log lines were left out, once a second.
     pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
         self.notifier.status(now, describe);
         telemetry::log_left_out(now);
-    }
-
-    /// Reports that the process has begun to shut down.
-    pub fn stopping(&self) {
-        self.notifier.stopping();
     }
 
     /// Counts an error that dropped no sample.

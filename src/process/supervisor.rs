@@ -31,8 +31,7 @@ use crate::telemetry::{Snapshot, Threads};
 /// Interval at which the supervisor checks its children.
 const POLL_MS: u64 = 20;
 
-/// Interval at which the supervisor reads the boards, for the progress of its children and its report to the
-/// service manager.
+/// Interval of reading the boards, for the progress of the children and the service manager.
 const READ_BOARDS_MS: u64 = 250;
 
 /// How long ingress or a critical lane, and how long another child, may make no progress before it is killed
@@ -136,7 +135,7 @@ pub fn up(
         match hang_up.take() {
             Some(HangUpMeaning::Reload) => {
                 info!("reload: SIGHUP sent to every child");
-                children.iter().for_each(Supervised::reload);
+                children.iter().for_each(|child| child.signal(&[Signal::SIGHUP]));
             }
             Some(HangUpMeaning::Stop) => {
                 info!("the terminal was closed; stopping");
@@ -212,7 +211,7 @@ impl<'a> ManagerReport<'a> {
                 None => child.check_start(now),
             }
         }
-        if !self.notifier.is_enabled() {
+        if !self.notifier.is_enabled {
             return;
         }
         if turned == children.len() {
@@ -238,12 +237,12 @@ impl<'a> ManagerReport<'a> {
     }
 }
 
-/// Stops all children: sends SIGTERM, waits for `GRACE_MS`, and kills the ones that still run, whose names it
-/// returns.
+/// Sends SIGTERM, waits for `GRACE_MS`, kills the children that still run, and returns their names.
 fn stop_all(children: &mut [Supervised]) -> Vec<String> {
     let mut killed = Vec::new();
     for child in children.iter() {
-        child.signal(Signal::SIGTERM);
+        // Continues a child in SIGSTOP, so that it handles the SIGTERM.
+        child.signal(&[Signal::SIGTERM, Signal::SIGCONT]);
     }
     let deadline = clock::monotonic().plus_ms(GRACE_MS);
     while children.iter_mut().any(|child| !child.has_ended()) {
@@ -251,7 +250,7 @@ fn stop_all(children: &mut [Supervised]) -> Vec<String> {
             for child in children.iter_mut().filter(|child| child.process.is_some()) {
                 warn!(child = child.name, "did not end in time after SIGTERM; killed");
                 killed.push(child.name.clone());
-                child.signal(Signal::SIGKILL);
+                child.signal(&[Signal::SIGKILL]);
                 // A process cannot block SIGKILL, not even in SIGSTOP, so this wait is short.
                 if let Some(mut process) = child.process.take() {
                     let _ = process.wait();
@@ -276,7 +275,6 @@ enum State {
 struct Supervised {
     name: String,
     arguments: Vec<OsString>,
-    /// The folder of the instance.
     folder: PathBuf,
     process: Option<Child>,
     backoff: RestartBackoff,
@@ -340,32 +338,27 @@ impl Supervised {
     /// Notices the end of the child, and restarts it when its backoff is over.
     fn poll(&mut self, now: MonotonicNs) {
         match self.state {
-            State::GaveUp => {}
-            State::RestartAt(at) => {
-                if now >= at {
-                    self.backoff.started(now);
-                    if let Err(error) = self.start() {
-                        error!(child = self.name, %error, "restart failed");
-                        // Counts as a child that fails at once.
-                        self.ended(ChildExit::Code(1), now);
-                    }
+            State::RestartAt(at) if now >= at => {
+                self.backoff.started(now);
+                if let Err(error) = self.start() {
+                    error!(child = self.name, %error, "restart failed");
+                    // Counts as a child that fails at once.
+                    self.ended(ChildExit::Code(1), now);
                 }
             }
-            State::Running => {
-                let ended = self.process.as_mut().map(Child::try_wait);
-                match ended {
-                    Some(Ok(Some(status))) => {
-                        self.process = None;
-                        let exit = exit_of(status);
-                        warn!(child = self.name, ?exit, "ended unexpectedly");
-                        self.ended(exit, now);
-                    }
-                    Some(Err(error)) => {
-                        error!(child = self.name, %error, "cannot read the state of the child process")
-                    }
-                    Some(Ok(None)) | None => {}
+            State::GaveUp | State::RestartAt(_) => {}
+            State::Running => match self.process.as_mut().map(Child::try_wait) {
+                Some(Ok(Some(status))) => {
+                    self.process = None;
+                    let exit = exit_of(status);
+                    warn!(child = self.name, ?exit, "ended unexpectedly");
+                    self.ended(exit, now);
                 }
-            }
+                Some(Err(error)) => {
+                    error!(child = self.name, %error, "cannot read the state of the child process");
+                }
+                Some(Ok(None)) | None => {}
+            },
         }
     }
 
@@ -374,7 +367,7 @@ impl Supervised {
         let starved = self.hang_watch.is_stalled(alive_at) && self.is_starved(now);
         if self.hang_watch.has_hung(alive_at, starved, now) {
             error!(child = self.name, "no progress for {} ms; killed, to be restarted", self.hang_ms);
-            self.signal(Signal::SIGKILL);
+            self.signal(&[Signal::SIGKILL]);
         }
     }
 
@@ -397,7 +390,7 @@ impl Supervised {
         // It has made no progress at all.
         if self.state == State::Running && self.start_watch.has_hung(MonotonicNs(0), starved, now) {
             error!(child = self.name, "no first turn within {START_MS} ms; killed, to be restarted");
-            self.signal(Signal::SIGKILL);
+            self.signal(&[Signal::SIGKILL]);
         }
     }
 
@@ -415,60 +408,34 @@ impl Supervised {
         };
     }
 
-    /// Sends SIGHUP. A child in SIGSTOP reloads when it is continued.
-    fn reload(&self) {
+    /// Sends the signals. A child in SIGSTOP handles them when it is continued; SIGKILL ends it at once.
+    fn signal(&self, signals: &[Signal]) {
         if let Some(process) = &self.process
             && let Ok(pid) = i32::try_from(process.id())
         {
-            let _ = kill(Pid::from_raw(pid), Signal::SIGHUP);
-        }
-    }
-
-    /// Sends the signal, and continues a child in SIGSTOP so that it handles the signal.
-    fn signal(&self, signal: Signal) {
-        if let Some(process) = &self.process
-            && let Ok(pid) = i32::try_from(process.id())
-        {
-            let _ = kill(Pid::from_raw(pid), signal);
-            let _ = kill(Pid::from_raw(pid), Signal::SIGCONT);
+            for &signal in signals {
+                let _ = kill(Pid::from_raw(pid), signal);
+            }
         }
     }
 
     fn has_ended(&mut self) -> bool {
-        if let Some(process) = &mut self.process
-            && !matches!(process.try_wait(), Ok(None))
-        {
-            self.process = None;
-        }
+        self.process.take_if(|process| !matches!(process.try_wait(), Ok(None)));
         self.process.is_none()
     }
 }
 
 fn exit_of(status: ExitStatus) -> ChildExit {
-    match (status.code(), status.signal()) {
-        (Some(code), _) => ChildExit::Code(code),
-        (None, Some(signal)) => ChildExit::Signal(signal),
-        (None, None) => ChildExit::Code(1),
-    }
+    let by_signal = || status.signal().map(ChildExit::Signal);
+    status.code().map(ChildExit::Code).or_else(by_signal).unwrap_or(ChildExit::Code(1))
 }
 
 /// Copies each line of a child's log to this process's log, with the child's name before it. Each line is one
 /// write, so that lines of several children do not mix.
 fn forward_log(name: &str, log: impl io::Read) {
-    let mut lines = BufReader::new(log);
-    let mut line = Vec::with_capacity(256);
-    loop {
-        line.clear();
-        line.extend_from_slice(format!("[{name}] ").as_bytes());
-        match lines.read_until(b'\n', &mut line) {
-            Ok(0) | Err(_) => return,
-            Ok(_) => {
-                if line.last() != Some(&b'\n') {
-                    line.push(b'\n');
-                }
-                // A closed stderr leaves no place to report the failure.
-                let _ = io::stderr().lock().write_all(&line);
-            }
-        }
+    for line in BufReader::new(log).split(b'\n').map_while(Result::ok) {
+        let line = [format!("[{name}] ").as_bytes(), &line, b"\n"].concat();
+        // A closed stderr leaves no place to report the failure.
+        let _ = io::stderr().lock().write_all(&line);
     }
 }

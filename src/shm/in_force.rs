@@ -234,8 +234,10 @@ fn write_privately(path: &Path, bytes: &[u8]) -> io::Result<()> {
 pub struct BridgeAddress {
     /// The configuration file, as an absolute path.
     file: PathBuf,
-    root: PathBuf,
-    instance: InstanceName,
+    /// The folder that contains the folder of the instance.
+    pub root: PathBuf,
+    /// The instance.
+    pub instance: InstanceName,
 }
 
 /// The folder of the addresses in the default root. Names of instances cannot begin with a dot.
@@ -245,16 +247,6 @@ impl BridgeAddress {
     /// Creates the address of the instance in `root` that was started with `file`.
     pub fn new(file: &Path, root: &Path, instance: &InstanceName) -> Self {
         Self { file: file.to_owned(), root: root.to_owned(), instance: instance.clone() }
-    }
-
-    /// The root, the folder that contains the folder of the instance.
-    pub fn root(&self) -> &Path {
-        &self.root
-    }
-
-    /// The instance.
-    pub fn instance(&self) -> &InstanceName {
-        &self.instance
     }
 
     /// Writes the address below `default_root`, and removes addresses of bridges whose folders are gone.

@@ -41,8 +41,8 @@ impl RoleLock {
 
     /// The path of a file beside the lock, in which the holder reports the result of its last reload
     /// ([`RoleHolder`]). The file is removed with the instance.
-    pub fn note_path(&self) -> Option<PathBuf> {
-        Some(note_path(&self.lock.path))
+    pub fn note_path(&self) -> PathBuf {
+        note_path(&self.lock.path)
     }
 
     /// The id of the process that holds the role; `None` when no process does. Takes no lock.

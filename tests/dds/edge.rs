@@ -380,7 +380,7 @@ fn a_writer_takes_every_sample_and_the_reader_that_lags_misses_the_oldest() {
         std::thread::sleep(Duration::from_millis(10));
     }
     let progress = writer.matched_readers().next().unwrap();
-    assert_eq!((progress.guid, progress.offered), (reader.guid(), 200));
+    assert_eq!((progress.reader, progress.offered), (reader.guid(), 200));
     assert!(progress.overrun > 0, "{progress:?}");
 }
 

@@ -6,16 +6,14 @@ use std::net::IpAddr;
 use tracing::{info, warn};
 
 use super::networks;
-use crate::config::{NetworkSelector, Settings};
+use crate::config::Settings;
 use crate::dds::{self, Discovery, GraphWatch, Participant};
 use crate::model::{AbsenceKind, AbsenceRecord, FixedText, MAX_ABSENCES, MonotonicNs};
 use crate::policy::{Absence, AbsenceEvent, AbsenceWatch, Locality};
-use crate::shm::{BoardWriter, Boards};
+use crate::shm::{BoardWriter, Boards, write_rows};
 
-/// Detects absences and writes their table to the boards.
 pub(super) struct Absences {
     watch: AbsenceWatch,
-    /// One for each row of the table.
     writers: Vec<BoardWriter<AbsenceRecord>>,
 }
 
@@ -23,12 +21,8 @@ impl Absences {
     pub fn new(boards: &Boards, settings: &Settings) -> Self {
         let (networks, _) = networks(settings);
         let configured = networks.iter().flat_map(|network| &network.interfaces);
-        let configured = configured.map(|selector| match selector {
-            NetworkSelector::Name(name) => name.clone(),
-            NetworkSelector::Address(address) => address.to_string(),
-        });
         let mut absences = Self {
-            watch: AbsenceWatch::new(configured),
+            watch: AbsenceWatch::new(configured.map(ToString::to_string)),
             writers: (0..MAX_ABSENCES).map(|index| boards.absence_writer(index)).collect(),
         };
         absences.write_table();
@@ -68,7 +62,6 @@ impl Absences {
         }
     }
 
-    /// Looks up the node names of a network's peers.
     pub fn name_nodes(&mut self, network: usize, graph: &GraphWatch) {
         self.watch.name_nodes(network, |endpoint| graph.node_of(endpoint));
     }
@@ -80,54 +73,38 @@ impl Absences {
             Err(error) => warn!(%error, "cannot read the network interfaces"),
         }
         while let Some(event) = self.watch.poll() {
-            match event {
-                AbsenceEvent::Away(absence) => {
-                    let Absence { name, detail, .. } = &absence;
-                    let host = host_text(&absence);
-                    match absence.kind {
-                        AbsenceKind::Interface => {
-                            warn!(
-                                interface = name,
-                                address = host,
-                                "a network interface is away: it {detail}"
-                            )
-                        }
-                        AbsenceKind::Peer => {
-                            warn!(node = name, host, "a peer is silent: it {detail}");
-                        }
-                    }
-                }
+            let (absence, away_s) = match event {
+                AbsenceEvent::Away(absence) => (absence, None),
                 AbsenceEvent::Back(absence) => {
-                    let back_at = absence.back_at.unwrap_or(now);
-                    let away_s = back_at.since(absence.since) as f64 / 1e9;
-                    let (name, host) = (&absence.name, host_text(&absence));
-                    match absence.kind {
-                        AbsenceKind::Interface => {
-                            info!(interface = name, address = host, away_s, "a network interface is back")
-                        }
-                        AbsenceKind::Peer => info!(node = name, host, away_s, "a peer is back"),
-                    }
+                    let away_s = absence.back_at.unwrap_or(now).since(absence.since) as f64 / 1e9;
+                    (absence, Some(away_s))
                 }
+            };
+            let (name, detail, host) = (&absence.name, &absence.detail, host_text(&absence));
+            match (absence.kind, away_s) {
+                (AbsenceKind::Interface, None) => {
+                    warn!(interface = name, address = host, "a network interface is away: it {detail}");
+                }
+                (AbsenceKind::Interface, Some(away_s)) => {
+                    info!(interface = name, address = host, away_s, "a network interface is back");
+                }
+                (AbsenceKind::Peer, None) => warn!(node = name, host, "a peer is silent: it {detail}"),
+                (AbsenceKind::Peer, Some(away_s)) => info!(node = name, host, away_s, "a peer is back"),
             }
         }
         self.write_table();
     }
 
     fn write_table(&mut self) {
-        let absences = self.watch.absences();
-        for (number, writer) in self.writers.iter_mut().enumerate() {
-            let record = absences.get(number).map_or_else(AbsenceRecord::default, |absence| AbsenceRecord {
-                since: absence.since,
-                back_at: absence.back_at.unwrap_or_default(),
-                kind: absence.kind as u64,
-                name: FixedText::new(&absence.name),
-                host: FixedText::new(&host_text(absence)),
-                detail: FixedText::new(&absence.detail),
-            });
-            if *writer.get() != record {
-                writer.update(|written| *written = record);
-            }
-        }
+        let rows = self.watch.absences().into_iter().map(|absence| AbsenceRecord {
+            since: absence.since,
+            back_at: absence.back_at.unwrap_or_default(),
+            kind: absence.kind as u64,
+            name: FixedText::new(&absence.name),
+            host: FixedText::new(&host_text(&absence)),
+            detail: FixedText::new(&absence.detail),
+        });
+        write_rows(&mut self.writers, rows);
     }
 }
 

@@ -3,8 +3,8 @@
 //! Decisions are published as they are made. A separate thread makes the reports, so that reading and
 //! encoding all boards delays neither a probe nor a policy.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -12,14 +12,12 @@ use bytes::Bytes;
 use tracing::{debug, error, warn};
 
 use super::super::role::RoleError;
-use super::subscribers::{Change, Subscribers};
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter};
 use crate::model::{
     Durability, Encapsulation, History, MonotonicNs, QosProfile, Reliability, SourceTimestamp,
 };
-use crate::policy::LinkReading;
 use crate::shm::Boards;
 use crate::telemetry::{self, Decision, MetricsServer, Report, Snapshot};
 
@@ -43,31 +41,16 @@ pub(super) struct Diagnostics {
     enabled: bool,
     decisions: RawWriter,
     next_states_at: MonotonicNs,
-    shared: Arc<Shared>,
-    reporter: Option<JoinHandle<()>>,
+    /// The reporting thread, which ends when the sender of reloaded settings is dropped.
+    reporter: Option<(Sender<Settings>, JoinHandle<()>)>,
 }
 
-/// State that control shares with the reporting thread.
-struct Shared {
-    /// Set when the thread has to end.
-    end: AtomicBool,
-    settings: Mutex<Settings>,
-}
-
-impl Shared {
-    #[allow(clippy::disallowed_methods, reason = "held for a copy of the settings, by control only")]
-    fn settings(&self) -> Settings {
-        self.settings.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
-
-/// State of the reporting thread.
 struct Reporter {
     boards: Boards,
     array: RawWriter,
     json: RawWriter,
     metrics: Option<MetricsServer>,
-    shared: Arc<Shared>,
+    settings: Settings,
 }
 
 impl Diagnostics {
@@ -76,7 +59,6 @@ impl Diagnostics {
         settings: &Settings,
         participant: &mut Participant,
     ) -> Result<Self, RoleError> {
-        let shared = Arc::new(Shared { end: AtomicBool::new(false), settings: Mutex::new(settings.clone()) });
         // Creates all writers even while diagnostics are off: a reload may switch them on.
         let mut writer =
             |topic: &str, dds_type| participant.create_writer(topic, dds_type, &QOS, WINDOW_SAMPLES);
@@ -87,56 +69,31 @@ impl Diagnostics {
         let metrics = settings.diagnostics.metrics.as_ref().and_then(|listener| {
             MetricsServer::start(listener).inspect_err(|error| error!(%error, "metrics are not served")).ok()
         });
-        let reporting_thread =
-            Reporter { boards: boards.clone(), array, json, metrics, shared: Arc::clone(&shared) };
+        let reporter = Reporter { boards: boards.clone(), array, json, metrics, settings: settings.clone() };
+        let (sender, reloaded) = channel();
         let thread = std::thread::Builder::new().name("report".to_owned());
-        let reporter = Some(thread.spawn(move || reporting_thread.run())?);
+        let thread = thread.spawn(move || reporter.run(&reloaded))?;
         let enabled = settings.diagnostics.enabled;
-        Ok(Self { enabled, decisions, next_states_at: MonotonicNs(0), shared, reporter })
+        Ok(Self { enabled, decisions, next_states_at: MonotonicNs(0), reporter: Some((sender, thread)) })
     }
 
-    /// Applies a reloaded configuration.
-    #[allow(clippy::disallowed_methods, reason = "held for a copy of the settings, by control only")]
     pub fn apply(&mut self, settings: &Settings) {
         self.enabled = settings.diagnostics.enabled;
-        *self.shared.settings.lock().unwrap_or_else(PoisonError::into_inner) = settings.clone();
-    }
-
-    /// Publishes the change of a subscriber's state.
-    pub fn publish_change(&self, change: &Change, settings: &Settings) {
-        self.publish_decision(&Decision {
-            subscriber_id: &change.subscriber,
-            lane: settings.lanes[change.lane].name.as_str(),
-            state: change.transition.to,
-            previous_state: change.transition.from,
-            reason: &change.reason,
-            rtt_ms: change.reading.rtt_mean_ms,
-            loss: loss(&change.reading),
-            time: clock::wall(),
-        });
+        if let Some((reloaded, _)) = &self.reporter {
+            // Fails only if the thread has panicked, which ends the process.
+            let _ = reloaded.send(settings.clone());
+        }
     }
 
     /// Publishes the states of all subscribers, once a second.
-    pub fn publish_states(&mut self, subscribers: &Subscribers, settings: &Settings, now: MonotonicNs) {
-        if now < self.next_states_at {
-            return;
-        }
-        self.next_states_at = now.plus_ms(STATES_MS);
-        for subscriber in subscribers.iter(settings) {
-            self.publish_decision(&Decision {
-                subscriber_id: subscriber.id,
-                lane: subscriber.lane,
-                state: subscriber.state,
-                previous_state: subscriber.previous_state,
-                reason: subscriber.reason,
-                rtt_ms: subscriber.reading.rtt_mean_ms,
-                loss: loss(subscriber.reading),
-                time: clock::wall(),
-            });
+    pub fn publish_states<'a>(&mut self, states: impl Iterator<Item = Decision<'a>>, now: MonotonicNs) {
+        if now >= self.next_states_at {
+            self.next_states_at = now.plus_ms(STATES_MS);
+            states.for_each(|state| self.publish(&state));
         }
     }
 
-    fn publish_decision(&self, decision: &Decision<'_>) {
+    pub fn publish(&self, decision: &Decision<'_>) {
         if self.enabled {
             write(&self.decisions, decision.payload());
         }
@@ -145,9 +102,8 @@ impl Diagnostics {
 
 impl Drop for Diagnostics {
     fn drop(&mut self) {
-        self.shared.end.store(true, Ordering::Relaxed);
-        if let Some(reporter) = self.reporter.take() {
-            reporter.thread().unpark();
+        if let Some((reloaded, reporter)) = self.reporter.take() {
+            drop(reloaded);
             if reporter.join().is_err() {
                 warn!("the reporting thread panicked");
             }
@@ -156,27 +112,32 @@ impl Drop for Diagnostics {
 }
 
 impl Reporter {
-    fn run(self) {
+    fn run(mut self, reloaded: &Receiver<Settings>) {
         let mut previous: Option<Snapshot> = None;
         let mut next_report_at = clock::monotonic();
-        while !self.shared.end.load(Ordering::Relaxed) {
+        loop {
             let now = clock::monotonic();
-            if now < next_report_at {
-                // Until the next report, or until `drop` wakes the thread.
-                std::thread::park_timeout(Duration::from_nanos(next_report_at.since(now)));
-                continue;
-            }
-            let settings = self.shared.settings();
-            next_report_at = now.plus_ms(settings.diagnostics.publish_interval_ms);
-            match Snapshot::read(&self.boards, &settings) {
-                Ok(snapshot) => {
-                    if let Some(previous) = &previous {
-                        self.publish(snapshot.report_since(previous), settings.diagnostics.enabled);
-                    }
-                    previous = Some(snapshot);
+            match reloaded.recv_timeout(Duration::from_nanos(next_report_at.since(now))) {
+                Ok(settings) => self.settings = settings,
+                Err(RecvTimeoutError::Disconnected) => return,
+                Err(RecvTimeoutError::Timeout) => {
+                    next_report_at =
+                        clock::monotonic().plus_ms(self.settings.diagnostics.publish_interval_ms);
+                    self.report(&mut previous);
                 }
-                Err(error) => warn!(%error, "cannot read the boards; this report is skipped"),
             }
+        }
+    }
+
+    fn report(&self, previous: &mut Option<Snapshot>) {
+        match Snapshot::read(&self.boards, &self.settings) {
+            Ok(snapshot) => {
+                if let Some(previous) = previous {
+                    self.publish(snapshot.report_since(previous), self.settings.diagnostics.enabled);
+                }
+                *previous = Some(snapshot);
+            }
+            Err(error) => warn!(%error, "cannot read the boards; this report is skipped"),
         }
     }
 
@@ -200,10 +161,6 @@ fn write(writer: &RawWriter, payload: Bytes) {
     {
         debug!(%error, "cannot publish a diagnostics message");
     }
-}
-
-fn loss(reading: &LinkReading) -> Option<f64> {
-    (reading.settled > 0).then_some(reading.loss)
 }
 
 fn dds_topic(topic: &str) -> String {

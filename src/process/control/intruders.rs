@@ -1,7 +1,7 @@
 //! Monitoring of remote endpoints: intruders (remote readers that bypass the bridge), the node names of input
 //! publishers and output readers, and the output readers that miss samples.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeSet, HashMap};
 use std::net::IpAddr;
 
 use tracing::{info, warn};
@@ -16,7 +16,7 @@ use crate::model::{
     TrafficClass,
 };
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
-use crate::shm::{BoardWriter, Boards};
+use crate::shm::{BoardWriter, Boards, write_rows};
 
 /// Interval of updating node names, absences and the losses of the outputs' readers.
 const ENDPOINTS_MS: u64 = 1_000;
@@ -24,21 +24,19 @@ const ENDPOINTS_MS: u64 = 1_000;
 /// Minimum time between two log messages about the same reader that misses samples.
 const OVERRUN_REPEAT_MS: u64 = 10_000;
 
-/// The endpoints of one network.
 struct WatchedNetwork {
     watch: IntruderWatch,
     graph: GraphWatch,
-    /// The outputs on this network, by DDS name: lane and route.
-    outputs: BTreeMap<String, (usize, usize)>,
-    /// The input topics on this network, by DDS name.
+    /// The DDS names of the outputs and of the inputs on this network.
+    outputs: BTreeSet<String>,
     inputs: BTreeSet<String>,
     /// The readers of the outputs and the writers of the inputs, with their locations.
     endpoints: Vec<(Guid, Location)>,
 }
 
 /// Overrun samples of one reader that were already logged.
+#[derive(Default)]
 struct LoggedOverrun {
-    reader: Guid,
     samples: u64,
     next_warning_at: MonotonicNs,
 }
@@ -48,13 +46,12 @@ pub(super) struct EndpointMonitor {
     /// One for each network, in the order of the participants.
     networks: Vec<WatchedNetwork>,
     absences: Absences,
-    overruns: Vec<LoggedOverrun>,
+    overruns: HashMap<Guid, LoggedOverrun>,
     endpoint_writers: Vec<BoardWriter<NamedEndpoint>>,
     next_update_at: MonotonicNs,
     own_addresses: Vec<IpAddr>,
     intruder_writers: Vec<BoardWriter<IntruderRecord>>,
-    /// Intruders in the table on the boards.
-    intruder_count: usize,
+    pub intruder_count: usize,
     boards: Boards,
 }
 
@@ -68,7 +65,7 @@ impl EndpointMonitor {
         let mut watched = Vec::with_capacity(participants.len());
         for (network, participant) in participants.iter().enumerate() {
             let mut guarded = Vec::new();
-            let mut outputs = BTreeMap::new();
+            let mut outputs = BTreeSet::new();
             let mut inputs = BTreeSet::new();
             if network == 0 {
                 inputs.extend(settings.routes.iter().map(|route| route.input_topic.to_dds()));
@@ -80,20 +77,16 @@ impl EndpointMonitor {
                     }
                 }));
             }
-            for (lane, configured) in settings.lanes.iter().enumerate() {
-                if network_of_lane[lane] != network {
-                    continue;
-                }
-                for output in &configured.outputs {
-                    outputs.insert(output.topic.to_dds(), (lane, output.route));
-                    if configured.class() != TrafficClass::Critical {
-                        continue;
-                    }
-                    guarded.push(GuardedTopic {
+            let lanes =
+                settings.lanes.iter().zip(&network_of_lane).filter(|(_, of_lane)| **of_lane == network);
+            for (lane, _) in lanes {
+                outputs.extend(lane.outputs.iter().map(|output| output.topic.to_dds()));
+                if lane.class() == TrafficClass::Critical {
+                    guarded.extend(lane.outputs.iter().map(|output| GuardedTopic {
                         topic: output.topic.clone(),
                         guarded: Guarded::CriticalOutput,
                         alternative: noncritical_output(settings, output.route),
-                    });
+                    }));
                 }
             }
             watched.push(WatchedNetwork {
@@ -104,32 +97,23 @@ impl EndpointMonitor {
                 endpoints: Vec::new(),
             });
         }
-        let mut endpoint_writers: Vec<_> =
-            (0..MAX_NAMED_ENDPOINTS).map(|index| boards.named_endpoint_writer(index)).collect();
-        for writer in &mut endpoint_writers {
-            writer.update(|record| *record = NamedEndpoint::default());
-        }
-        let mut intruder_writers: Vec<_> =
-            (0..MAX_INTRUDERS).map(|index| boards.intruder_writer(index)).collect();
-        for writer in &mut intruder_writers {
-            writer.update(|record| *record = IntruderRecord::default());
-        }
-        Ok(Self {
+        let endpoint_writers = (0..MAX_NAMED_ENDPOINTS).map(|index| boards.named_endpoint_writer(index));
+        let intruder_writers = (0..MAX_INTRUDERS).map(|index| boards.intruder_writer(index));
+        let mut monitor = Self {
             networks: watched,
             absences: Absences::new(boards, settings),
-            overruns: Vec::new(),
-            endpoint_writers,
+            overruns: HashMap::new(),
+            endpoint_writers: endpoint_writers.collect(),
             next_update_at: MonotonicNs(0),
             own_addresses: Vec::new(),
-            intruder_writers,
+            intruder_writers: intruder_writers.collect(),
             intruder_count: 0,
             boards: boards.clone(),
-        })
-    }
-
-    /// The number of intruders in the table on the boards.
-    pub fn intruder_count(&self) -> usize {
-        self.intruder_count
+        };
+        // Clears the tables of a previous control process.
+        monitor.write_endpoints();
+        monitor.write_intruders();
+        Ok(monitor)
     }
 
     /// The number of intruders seen since control started.
@@ -138,8 +122,7 @@ impl EndpointMonitor {
         counts.map(|counts| counts.reported + counts.unreported).sum()
     }
 
-    /// Handles discovery events and logs new intruders; once a second also updates node names, absences and
-    /// overruns.
+    /// Handles discovery and logs new intruders; each second updates node names, absences and overruns.
     pub fn housekeeping(&mut self, participants: &mut [Participant], settings: &Settings, now: MonotonicNs) {
         let mut changed = false;
         for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
@@ -160,11 +143,8 @@ impl EndpointMonitor {
                     }
                 }
                 let is_bridge_topic = |topic: &str, publishes: bool| {
-                    if publishes {
-                        network.inputs.iter().any(|input| input == topic)
-                    } else {
-                        network.outputs.contains_key(topic)
-                    }
+                    let topics = if publishes { &network.inputs } else { &network.outputs };
+                    topics.contains(topic)
                 };
                 if let Discovery::ParticipantGone { .. } = change {
                     // Before `network.handle` removes the participant's nodes from the graph.
@@ -195,34 +175,26 @@ impl EndpointMonitor {
         }
     }
 
-    /// Writes the table of intruders to the boards.
     fn write_intruders(&mut self) {
         let present: Vec<_> = self.networks.iter().flat_map(|network| network.watch.present()).collect();
-        self.intruder_count = present.len().min(self.intruder_writers.len());
-        for (number, writer) in self.intruder_writers.iter_mut().enumerate() {
-            let record = present.get(number).map_or_else(IntruderRecord::default, |intruder| {
-                let host = intruder.host.map_or_else(|| "another host".to_owned(), |host| host.to_string());
-                IntruderRecord {
-                    topic: FixedText::new(intruder.topic.topic.as_str()),
-                    node: FixedText::new(intruder.node.as_deref().unwrap_or("")),
-                    host: FixedText::new(&host),
-                    remedy: FixedText::new(&intruder.remedy()),
-                    since: intruder.since,
-                }
-            });
-            writer.update(|written| *written = record);
-        }
+        self.intruder_count = present.len().min(MAX_INTRUDERS);
+        let rows = present.into_iter().map(|intruder| {
+            let host = intruder.host.map_or_else(|| "another host".to_owned(), |host| host.to_string());
+            IntruderRecord {
+                topic: FixedText::new(intruder.topic.topic.as_str()),
+                node: FixedText::new(intruder.node.as_deref().unwrap_or("")),
+                host: FixedText::new(&host),
+                remedy: FixedText::new(&intruder.remedy()),
+                since: intruder.since,
+            }
+        });
+        write_rows(&mut self.intruder_writers, rows);
     }
 
     /// Writes the nodes of the inputs' publishers and of the outputs' readers to the boards.
     fn write_endpoints(&mut self) {
-        let endpoints = self.networks.iter().flat_map(WatchedNetwork::named_endpoints);
-        let mut endpoints = endpoints.chain(std::iter::repeat(NamedEndpoint::default()));
-        for (writer, endpoint) in self.endpoint_writers.iter_mut().zip(&mut endpoints) {
-            if *writer.get() != endpoint {
-                writer.update(|written| *written = endpoint);
-            }
-        }
+        let rows = self.networks.iter().flat_map(WatchedNetwork::named_endpoints);
+        write_rows(&mut self.endpoint_writers, rows);
     }
 
     /// Logs each reader that has missed samples since its last log message.
@@ -233,20 +205,7 @@ impl EndpointMonitor {
                 let readers = self.boards.output_readers(lane, output.route).unwrap_or_default();
                 for record in readers.iter() {
                     matched.push(record.reader);
-                    let logged = match self.overruns.iter().position(|logged| logged.reader == record.reader)
-                    {
-                        Some(index) => &mut self.overruns[index],
-                        None if record.overrun == 0 => continue,
-                        None => {
-                            self.overruns.push(LoggedOverrun {
-                                reader: record.reader,
-                                samples: 0,
-                                next_warning_at: now,
-                            });
-                            let last = self.overruns.len() - 1;
-                            &mut self.overruns[last]
-                        }
-                    };
+                    let logged = self.overruns.entry(record.reader).or_default();
                     let missed = record.overrun.saturating_sub(logged.samples);
                     if missed == 0 || now < logged.next_warning_at {
                         continue;
@@ -267,12 +226,11 @@ impl EndpointMonitor {
                 }
             }
         }
-        self.overruns.retain(|logged| matched.contains(&logged.reader));
+        self.overruns.retain(|reader, _| matched.contains(reader));
     }
 }
 
 impl WatchedNetwork {
-    /// Handles a discovery event of this network.
     fn handle(
         &mut self,
         change: Discovery,
@@ -282,7 +240,7 @@ impl WatchedNetwork {
     ) {
         match change {
             Discovery::Reader(reader) if !participant.owns(reader.guid) => {
-                if self.outputs.contains_key(&reader.topic) {
+                if self.outputs.contains(&reader.topic) {
                     self.remember(&reader);
                 }
                 self.watch.endpoint_discovered(
@@ -340,7 +298,6 @@ impl WatchedNetwork {
     }
 }
 
-/// The output topic of a route on a noncritical lane.
 fn noncritical_output(settings: &Settings, route: usize) -> Option<crate::model::TopicName> {
     let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);

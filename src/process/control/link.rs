@@ -3,13 +3,12 @@
 use std::collections::VecDeque;
 
 use super::super::probes::{
-    MAX_MESSAGE_BYTES, PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse,
-    Trust,
+    PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse, Trust,
 };
 use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
-use crate::dds::{Inbox, Participant, RawWriter, ReaderQos, Take};
+use crate::dds::{Inbox, Participant, RawWriter, ReaderQos, TakePayload};
 use crate::model::{
     Encapsulation, FixedText, Guid, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, RefusalCounts,
     SourceTimestamp,
@@ -29,19 +28,12 @@ const MAX_RESPONDERS: usize = 2 * MAX_SUBSCRIBERS;
 /// The time whose responses may arrive at once, after an outage of a responder's link.
 const BURST_S: f64 = 10.0;
 
-/// A probe request that was sent.
 #[derive(Clone, Debug)]
 pub(super) struct Probe {
     pub seq: u64,
     pub sent_at: MonotonicNs,
-    id: u64,
-}
-
-impl Probe {
-    /// The probe's id; random, so that only a responder that received the request can answer it.
-    fn id(&self) -> ProbeId {
-        ProbeId::Text(format!("{:016x}", self.id))
-    }
+    /// Random, so that only a responder that received the request can answer it.
+    id: ProbeId,
 }
 
 /// An accepted response to a probe that was sent.
@@ -51,7 +43,6 @@ pub(super) struct Response {
     pub arrived_at: MonotonicNs,
 }
 
-/// The numbers of invalid responses, by reason.
 #[derive(Debug, Default)]
 pub(super) struct InvalidResponses {
     pub refused: RefusalCounts,
@@ -59,15 +50,13 @@ pub(super) struct InvalidResponses {
     pub accepted: RefusalCounts,
 }
 
-/// Sends the probes of one network and receives the responses.
 pub(super) struct Link {
     writer: RawWriter,
     inbox: Inbox,
     sender_id: String,
-    /// Oldest first.
-    probes: VecDeque<Probe>,
+    /// The remembered probes, oldest first.
+    pub probes: VecDeque<Probe>,
     next_seq: u64,
-    scratch: Vec<u8>,
     limits: SenderLimits<Guid>,
 }
 
@@ -85,7 +74,6 @@ impl Link {
             sender_id: sender_id(settings),
             probes: VecDeque::with_capacity(REMEMBERED_PROBES),
             next_seq: 1,
-            scratch: Vec::with_capacity(MAX_MESSAGE_BYTES + 1),
             limits: SenderLimits::with_burst(
                 max_rate_hz(settings),
                 BURST_S,
@@ -95,7 +83,6 @@ impl Link {
         })
     }
 
-    /// Applies a new configuration.
     pub fn apply(&mut self, settings: &Settings, now: MonotonicNs) {
         self.limits.set_rate(max_rate_hz(settings), now);
     }
@@ -104,13 +91,13 @@ impl Link {
     pub fn send(&mut self, trust: &mut Trust) -> Option<&Probe> {
         // A predictable id could be forged, so that no probe is sent without random numbers. In practice the
         // kernel always has them.
-        let id = getrandom::u64().ok()?;
+        let id = ProbeId::Text(format!("{:016x}", getrandom::u64().ok()?));
         let probe = Probe { seq: self.next_seq, sent_at: clock::monotonic(), id };
         let mut request = ProbeRequest {
             seq: probe.seq,
             send_time: clock::wall(),
             sender_id: self.sender_id.clone(),
-            probe_id: probe.id(),
+            probe_id: probe.id.clone(),
             signature: None,
         };
         trust.sign(&mut request);
@@ -123,11 +110,6 @@ impl Link {
         self.probes.back()
     }
 
-    /// Iterates over the remembered probes from number `seq` on.
-    pub fn probes_since(&self, seq: u64) -> impl Iterator<Item = &Probe> {
-        self.probes.iter().filter(move |probe| probe.seq >= seq)
-    }
-
     /// Returns the next accepted response, and counts invalid ones. Each message reduces `budget` by one and
     /// the function returns at zero, so that a flood of messages does not delay the rest of control's turn.
     pub fn receive(
@@ -137,55 +119,45 @@ impl Link {
         budget: &mut usize,
     ) -> Option<Response> {
         while *budget > 0 {
-            let scratch = &mut self.scratch;
-            let mut encapsulation = Encapsulation::CDR_LE;
-            let take = self.inbox.take(&mut |payload, sample_encapsulation| {
-                scratch.clear();
-                // One byte beyond the limit lets `decode` detect an oversized message.
-                scratch.extend_from_slice(&payload[..payload.len().min(MAX_MESSAGE_BYTES + 1)]);
-                encapsulation = sample_encapsulation;
-            });
-            match take {
-                Take::Empty => return None,
-                Take::Malformed => invalid.refused.add(ProbeRefusal::Malformed, 1),
-                Take::Sample(origin) => {
-                    let arrived_at = clock::monotonic();
-                    match self.check(encapsulation, trust, origin.writer, arrived_at) {
-                        Ok((response, tolerated)) => {
-                            if let Some(reason) = tolerated {
-                                invalid.accepted.add(reason, 1);
-                            }
-                            *budget -= 1;
-                            return Some(Response {
-                                responder_id: response.responder_id,
-                                seq: response.seq,
-                                arrived_at,
-                            });
-                        }
-                        Err(reason) => invalid.refused.add(reason, 1),
-                    }
+            let taken = self.inbox.take_from_any();
+            let arrived_at = clock::monotonic();
+            let checked = match taken {
+                TakePayload::Empty => return None,
+                TakePayload::Malformed => Err(ProbeRefusal::Malformed),
+                TakePayload::Sample(origin, mut payload, encapsulation) => {
+                    self.check(payload.bytes(), encapsulation, trust, origin.writer, arrived_at)
                 }
-            }
+            };
             *budget -= 1;
+            match checked {
+                Ok((ProbeResponse { responder_id, seq, .. }, tolerated)) => {
+                    if let Some(reason) = tolerated {
+                        invalid.accepted.add(reason, 1);
+                    }
+                    return Some(Response { responder_id, seq, arrived_at });
+                }
+                Err(reason) => invalid.refused.add(reason, 1),
+            }
         }
         None
     }
 
-    /// Checks the message in the scratch buffer. The second value is the reason for which trust mode
-    /// `default_deny` would have refused the response; `None` for an authentic one.
+    /// Checks a message. The second value is the reason for which trust mode `default_deny` would have
+    /// refused the response; `None` for an authentic one.
     fn check(
         &mut self,
+        payload: &[u8],
         encapsulation: Encapsulation,
         trust: &mut Trust,
         writer: Guid,
         now: MonotonicNs,
     ) -> Result<(ProbeResponse, Option<ProbeRefusal>), ProbeRefusal> {
-        let response = ProbeResponse::decode(&self.scratch, encapsulation)?;
+        let response = ProbeResponse::decode(payload, encapsulation)?;
         // Checked before the signature: it is cheaper, and a response to another bridge's probe on a shared
         // topic must not be reported as badly signed.
         let known = self.probes.binary_search_by_key(&response.seq, |probe| probe.seq);
         let probe = known.ok().and_then(|index| self.probes.get(index));
-        if probe.is_none_or(|probe| probe.id() != response.probe_id) {
+        if probe.is_none_or(|probe| probe.id != response.probe_id) {
             return Err(ProbeRefusal::Unsolicited);
         }
         // After that, because a responder also answers other bridges on this topic, at their rates.

@@ -65,7 +65,7 @@ pub fn control(
         let until = control.turn();
         control.sleep(until);
     }
-    control.role.stopping();
+    control.role.notifier.stopping();
     info!("control is done");
     Ok(())
 }
@@ -190,10 +190,9 @@ impl Control {
         if wait_ns > 0 {
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
-        self.subscribers.note_asleep(until);
+        self.subscribers.expected_awake_at = until;
     }
 
-    /// Handles the responses that have arrived.
     fn receive(&mut self) {
         let Some(trust) = &mut self.trust else { return };
         let mut budget = RESPONSES_PER_TURN;
@@ -220,7 +219,6 @@ impl Control {
         }
     }
 
-    /// Sends one probe on each network.
     fn probe(&mut self) {
         let Some(trust) = self.trust.as_mut().filter(|_| self.settings.probes.enabled) else { return };
         let mut sent = 0;
@@ -235,13 +233,10 @@ impl Control {
         }
     }
 
-    /// Evaluates all subscribers and publishes the results.
     fn evaluate(&mut self, now: MonotonicNs) {
-        for change in self.subscribers.evaluate(&self.settings, now) {
-            self.diagnostics.publish_change(&change, &self.settings);
-        }
+        self.subscribers.evaluate(&self.settings, now, |changed| self.diagnostics.publish(changed));
         self.subscribers.write_table(&self.settings);
-        self.diagnostics.publish_states(&self.subscribers, &self.settings, now);
+        self.diagnostics.publish_states(self.subscribers.decisions(&self.settings), now);
     }
 
     /// Writes or confirms the policy of each lane.
@@ -266,18 +261,17 @@ impl Control {
         }
     }
 
-    /// Decides the mode of a lane and the safety floor (the mildest mode that the safety supervisor allows).
-    /// Logs changes.
+    /// Decides a lane's mode and its safety floor, the mildest mode that the supervisor allows.
     fn decide_lane(&mut self, lane: usize) -> (LaneMode, LaneMode) {
         let class = self.settings.lanes[lane].class();
         let decision = self.subscribers.lane_mode(&self.settings, lane);
         let safety_floor = safety_floor(
             class,
-            self.supervision.mode(),
-            self.supervision.critical_trouble(),
+            self.supervision.supervisor.mode(),
+            self.supervision.critical_trouble,
             &self.settings.safety.rules,
         );
-        let text = decision_text(&decision, safety_floor, self.supervision.mode());
+        let text = decision_text(&decision, safety_floor, self.supervision.supervisor.mode());
         if self.decisions[lane] != text {
             info!(lane = self.settings.lanes[lane].name.as_str(), "control decided: {text}");
             self.decisions[lane] = text;
@@ -288,12 +282,12 @@ impl Control {
     /// Writes the state of the whole bridge to control's record on the boards.
     fn write_record(&mut self) {
         let record = ControlRecord {
-            safety: self.supervision.mode() as u8,
-            safety_since: self.supervision.since(),
-            safety_transitions: self.supervision.transitions(),
-            safety_reason: FixedText::new(self.supervision.reason()),
+            safety: self.supervision.supervisor.mode() as u8,
+            safety_since: self.supervision.since,
+            safety_transitions: self.supervision.supervisor.transitions(),
+            safety_reason: FixedText::new(&self.supervision.reason),
             subscribers: self.subscribers.count() as u64,
-            intruders: self.endpoints.intruder_count() as u64,
+            intruders: self.endpoints.intruder_count as u64,
             intruders_seen: self.endpoints.intruders_seen(),
             classifies: u8::from(
                 self.settings.classifier.enabled && self.settings.probes.enabled && self.trust.is_some(),
@@ -301,12 +295,9 @@ impl Control {
             without_secret: u8::from(self.trust.is_none()),
             ..*self.record.get()
         };
-        if record != *self.record.get() {
-            self.record.update(|written| *written = record);
-        }
+        self.record.set(record);
     }
 
-    /// Applies a reload, handles discovery, and updates logs, health and status.
     fn housekeeping(&mut self, now: MonotonicNs) {
         if let Some(Configuration { settings, inline_secret }) = self.role.reload() {
             self.settings = settings.clone();
@@ -329,31 +320,24 @@ impl Control {
             for participant in &self.participants {
                 refusals.merge(&participant.network_refusals());
             }
-            self.role.report_turn(self.supervision.mode() as u8, 0, refusals);
+            self.role.report_turn(self.supervision.supervisor.mode() as u8, 0, refusals);
         }
         // Only the first call has an effect: control has completed its first turn.
-        self.role.ready();
-        self.role.status(now, |line| describe(self.record.get(), &self.settings, &self.decisions, line));
+        self.role.notifier.ready();
+        self.role.status(now, |line| {
+            let record = self.record.get();
+            // Writing to a String cannot fail.
+            let _ = write!(line, "safety mode {}; {} subscribers", record.safety(), record.subscribers);
+            let lanes = self.settings.lanes.iter().zip(&self.decisions);
+            write_list(line, "; lanes:", lanes.map(|(lane, decision)| format!("{} {decision}", lane.name)));
+        });
     }
-}
-
-/// Writes the status line for the service manager: safety mode, subscribers, decisions for the lanes.
-fn describe(record: &ControlRecord, settings: &Settings, decisions: &[String], line: &mut String) {
-    // Writing to a String cannot fail.
-    let _ = write!(line, "safety mode {}; {} subscribers", record.safety(), record.subscribers);
-    let lanes = settings.lanes.iter().zip(decisions);
-    write_list(line, "; lanes:", lanes.map(|(lane, decision)| format!("{} {decision}", lane.name)));
 }
 
 /// Loads the secret. Without it control runs on, but sends no probes.
 fn load_trust(settings: &Settings, secret: Option<&InlineSecret>) -> Option<Trust> {
-    match Trust::load(&settings.security, secret) {
-        Ok(trust) => Some(trust),
-        Err(error) => {
-            error!("no subscriber is probed, so that every subscriber keeps its state: {error}");
-            None
-        }
-    }
+    let failed = "no subscriber is probed, so that every subscriber keeps its state";
+    Trust::load(&settings.security, secret).inspect_err(|error| error!("{failed}: {error}")).ok()
 }
 
 /// The next instant of periodic work that was due at `due`. Missed periods are skipped.

@@ -3,14 +3,13 @@
 use tracing::{info, warn};
 
 use crate::config::{Lane, Settings};
-use crate::model::{DropReason, LaneCounters, LatencyHistogram, MonotonicNs, SafetyMode, TrafficClass};
+use crate::model::{DropReason, LatencyHistogram, MonotonicNs, SafetyMode, TrafficClass};
 use crate::policy::{ErrorCounts, ProcessLoad, SafetyCause, SafetySupervisor, SafetyTrouble, SourceLag};
 use crate::shm::{Boards, ProcessRole, Stage};
 
 /// The counters of one process at the previous evaluation.
 #[derive(Default)]
 struct PreviousCounters {
-    /// Whether the process was running.
     was_running: bool,
     starts: u64,
     errors: ErrorCounts,
@@ -19,10 +18,13 @@ struct PreviousCounters {
 
 /// The safety supervisor and the counters with which it compares the next reading.
 pub(super) struct Supervision {
-    supervisor: SafetySupervisor,
-    since: MonotonicNs,
-    reason: String,
-    critical_trouble: bool,
+    pub supervisor: SafetySupervisor,
+    /// When the safety mode was entered.
+    pub since: MonotonicNs,
+    /// The cause of the safety mode; empty in normal mode.
+    pub reason: String,
+    /// Whether a process of the critical path is in trouble.
+    pub critical_trouble: bool,
     ingress: PreviousCounters,
     lanes: Vec<PreviousCounters>,
     source_lags: Vec<SourceLag>,
@@ -48,31 +50,6 @@ impl Supervision {
         };
         supervision.read_loads(boards, settings, now);
         supervision
-    }
-
-    /// The safety mode.
-    pub fn mode(&self) -> SafetyMode {
-        self.supervisor.mode()
-    }
-
-    /// When the safety mode was entered.
-    pub fn since(&self) -> MonotonicNs {
-        self.since
-    }
-
-    /// The number of changes of the safety mode.
-    pub fn transitions(&self) -> u64 {
-        self.supervisor.transitions()
-    }
-
-    /// The cause of the safety mode; empty in normal mode.
-    pub fn reason(&self) -> &str {
-        &self.reason
-    }
-
-    /// Whether a process of the critical path is in trouble.
-    pub fn critical_trouble(&self) -> bool {
-        self.critical_trouble
     }
 
     /// Reads the boards, evaluates the safety mode and logs a change.
@@ -128,15 +105,11 @@ impl Supervision {
             if let Some(p99_ns) = window.quantile_ns(0.99)
                 && let Some(excess_ms) = self.source_lags[route].excess_ms(p99_ns as f64 / 1e6, now)
             {
-                source_lag_ms = Some(source_lag_ms.map_or(excess_ms, |lag_ms| lag_ms.max(excess_ms)));
+                source_lag_ms = larger(source_lag_ms, Some(excess_ms));
             }
         }
-        let mut pool_exhausted = 0;
-        for route in 0..settings.routes.len() {
-            if let Some(counters) = boards.ingress(route) {
-                pool_exhausted += counters.drops.get(DropReason::PoolExhausted);
-            }
-        }
+        let counters = (0..settings.routes.len()).filter_map(|route| boards.ingress(route));
+        let pool_exhausted = counters.map(|counters| counters.drops.get(DropReason::PoolExhausted)).sum();
         let total = ErrorCounts { pool_exhausted, ..ErrorCounts::default() };
         let (silent_ms, errors) = self.ingress.advance(boards, ProcessRole::Ingress, total, now)?;
         let load = ProcessLoad::idle("ingress", TrafficClass::Critical);
@@ -159,14 +132,14 @@ impl Supervision {
             let drops = |reason| counters.drops.get(reason);
             total.write_failed += drops(DropReason::WriteFailed);
             total.queue_overflow += drops(DropReason::QueueOverflow);
-            queued = queued.max(queued_samples(&counters, published[output.route]));
+            if counters.last_sequence > 0 {
+                // Samples that ingress has published and the lane has not taken.
+                queued = queued.max(published[output.route].saturating_sub(counters.last_sequence));
+            }
             waiting = waiting.max(counters.waiting);
             caught_up += counters.caught_up;
             let lag_ms = self.read_writer_lag_ms(boards, lane, output.route, configured.class());
-            writer_lag_ms = match (writer_lag_ms, lag_ms) {
-                (Some(one), Some(other)) => Some(one.max(other)),
-                (one, other) => one.or(other),
-            };
+            writer_lag_ms = larger(writer_lag_ms, lag_ms);
         }
         let previous = &mut self.lanes[lane];
         // Samples with which the lane catches up waited while it was down; their latency is not its present
@@ -220,7 +193,6 @@ impl PreviousCounters {
     ) -> Option<(u64, ErrorCounts)> {
         let health = boards.health(role)?;
         let is_running = health.pid != 0 && health.ended == 0;
-        let increase = |now: u64, before: u64| now.saturating_sub(before);
         let before = std::mem::replace(&mut self.errors, total);
         let starts = std::mem::replace(&mut self.starts, health.starts);
         if !is_running || !std::mem::replace(&mut self.was_running, is_running) {
@@ -229,18 +201,17 @@ impl PreviousCounters {
             return is_running.then(|| (now.since(health.alive_at) / 1_000_000, ErrorCounts::default()));
         }
         let errors = ErrorCounts {
-            write_failed: increase(total.write_failed, before.write_failed),
-            pool_exhausted: increase(total.pool_exhausted, before.pool_exhausted),
-            queue_overflow: increase(total.queue_overflow, before.queue_overflow),
-            restarts: increase(health.starts, starts),
+            write_failed: total.write_failed.saturating_sub(before.write_failed),
+            pool_exhausted: total.pool_exhausted.saturating_sub(before.pool_exhausted),
+            queue_overflow: total.queue_overflow.saturating_sub(before.queue_overflow),
+            restarts: health.starts.saturating_sub(starts),
         };
         Some((now.since(health.alive_at) / 1_000_000, errors))
     }
 }
 
-/// The number of samples that ingress has published and the lane has not taken.
-fn queued_samples(counters: &LaneCounters, published: u64) -> u64 {
-    if counters.last_sequence == 0 { 0 } else { published.saturating_sub(counters.last_sequence) }
+fn larger(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    one.into_iter().chain(other).reduce(f64::max)
 }
 
 /// The cause of a safety mode, as a sentence that fits into [`FixedText`](crate::model::FixedText).

@@ -4,6 +4,7 @@
 use tracing::{info, trace, warn};
 
 use super::link::{Link, Response};
+use crate::clock;
 use crate::config::Settings;
 use crate::model::{
     FixedText, MAX_SUBSCRIBERS, MonotonicNs, ProbeRefusal, SubscriberRecord, SubscriberState,
@@ -13,13 +14,13 @@ use crate::policy::{
     SubscriberWarnings, Transition, TransitionReason, WarningThresholds, is_forgotten, lane_mode,
 };
 use crate::shm::{BoardWriter, Boards};
+use crate::telemetry::Decision;
 
 /// What determines a subscriber's state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum StateSource {
     Classifier,
     Override,
-    /// The classifier is switched off.
     Unclassified,
 }
 
@@ -35,7 +36,6 @@ impl StateSource {
     }
 }
 
-/// A subscriber and what control knows about it.
 struct Subscriber {
     id: String,
     lane: usize,
@@ -46,7 +46,6 @@ struct Subscriber {
     window: ProbeWindow,
     classifier: SubscriberClassifier,
     reading: LinkReading,
-    /// The state before the last change.
     previous: Option<SubscriberState>,
     since: MonotonicNs,
     source: StateSource,
@@ -56,31 +55,10 @@ struct Subscriber {
     warning_bits: u8,
 }
 
-/// A change of a subscriber's state, to be published.
-#[derive(Clone, Debug)]
-pub(super) struct Change {
-    pub subscriber: String,
-    pub lane: usize,
-    pub transition: Transition,
-    pub reading: LinkReading,
-    pub reason: String,
-}
-
-/// The published properties of a subscriber.
-pub(super) struct SubscriberView<'a> {
-    pub id: &'a str,
-    pub lane: &'a str,
-    pub state: SubscriberState,
-    pub previous_state: SubscriberState,
-    pub reading: &'a LinkReading,
-    pub reason: &'a str,
-}
-
-/// All subscribers that control probes.
 pub(super) struct Subscribers {
     list: Vec<Subscriber>,
     /// When control last ran, or the end of its present sleep.
-    expected_awake_at: MonotonicNs,
+    pub expected_awake_at: MonotonicNs,
     /// One for each row of the table on the boards, in the order of `list`.
     writers: Vec<BoardWriter<SubscriberRecord>>,
 }
@@ -102,8 +80,7 @@ impl Subscribers {
         subscribers
     }
 
-    /// Applies a configuration: lanes, windows, listed subscribers. Known subscribers keep their windows and
-    /// states.
+    /// Applies lanes, windows and listed subscribers. Known subscribers keep their windows and states.
     pub fn apply(&mut self, settings: &Settings, link_of_lane: &[usize], now: MonotonicNs) {
         let probes = &settings.probes;
         for subscriber in &mut self.list {
@@ -136,7 +113,6 @@ impl Subscribers {
         }
     }
 
-    /// Records a probe that was sent on a link.
     pub fn on_probe_sent(&mut self, link: usize, seq: u64, at: MonotonicNs) {
         self.note_awake(at);
         // Together with the responses a recording of the link:
@@ -157,11 +133,6 @@ impl Subscribers {
             }
         }
         self.expected_awake_at = now;
-    }
-
-    /// Records that control sleeps until `until`.
-    pub fn note_asleep(&mut self, until: MonotonicNs) {
-        self.expected_awake_at = until;
     }
 
     /// Handles an accepted response that arrived on link `link_index`.
@@ -222,17 +193,15 @@ impl Subscribers {
             "added a responder that is not listed under `subscribers`"
         );
         let mut subscriber = Subscriber::new(id, lane, link_index, false, settings, response.arrived_at);
-        for probe in link.probes_since(response.seq) {
+        for probe in link.probes.iter().filter(|probe| probe.seq >= response.seq) {
             subscriber.window.sent(probe.seq, probe.sent_at);
         }
         self.list.push(subscriber);
         Ok(self.list.len() - 1)
     }
 
-    /// Evaluates every subscriber and returns the changes of state. Removes silent subscribers that are not
-    /// listed.
-    pub fn evaluate(&mut self, settings: &Settings, now: MonotonicNs) -> Vec<Change> {
-        let mut changes = Vec::new();
+    /// Evaluates every subscriber, publishes changes of state, and removes silent ones that are not listed.
+    pub fn evaluate(&mut self, settings: &Settings, now: MonotonicNs, publish: impl Fn(&Decision<'_>)) {
         let warning_thresholds = WarningThresholds {
             rtt_ms: settings.probes.rtt_threshold_ms,
             loss: settings.probes.loss_threshold,
@@ -263,13 +232,7 @@ impl Subscribers {
             subscriber.since = now;
             subscriber.reason = reason_text(&transition.reason);
             log(subscriber, &transition, settings);
-            changes.push(Change {
-                subscriber: subscriber.id.clone(),
-                lane: subscriber.lane,
-                transition,
-                reading: subscriber.reading,
-                reason: subscriber.reason.clone(),
-            });
+            publish(&subscriber.decision(settings));
         }
         self.list.retain(|subscriber| {
             // An unlisted subscriber without any response was listed until the last reload.
@@ -280,7 +243,6 @@ impl Subscribers {
             }
             !is_removed
         });
-        changes
     }
 
     /// The mode of a lane that follows from the states of its subscribers, and the reason.
@@ -295,36 +257,19 @@ impl Subscribers {
         lane_mode(settings.lanes[lane].class(), enabled, states, &settings.safety.rules)
     }
 
-    /// The number of subscribers.
     pub fn count(&self) -> usize {
         self.list.len()
     }
 
-    /// Writes the table of subscribers to the boards.
     pub fn write_table(&mut self, settings: &Settings) {
         let thresholds = &settings.classifier.thresholds;
         for (writer, subscriber) in self.writers.iter_mut().zip(&self.list) {
-            let record = subscriber.record(subscriber.classifier.state(thresholds));
-            if record != *writer.get() {
-                writer.update(|written| *written = record);
-            }
+            writer.set(subscriber.record(subscriber.classifier.state(thresholds)));
         }
     }
 
-    /// Iterates over the published properties of all subscribers.
-    pub fn iter<'a>(&'a self, settings: &'a Settings) -> impl Iterator<Item = SubscriberView<'a>> {
-        let thresholds = &settings.classifier.thresholds;
-        self.list.iter().map(|subscriber| {
-            let state = subscriber.classifier.state(thresholds);
-            SubscriberView {
-                id: &subscriber.id,
-                lane: settings.lanes[subscriber.lane].name.as_str(),
-                state,
-                previous_state: subscriber.previous.unwrap_or(state),
-                reading: &subscriber.reading,
-                reason: &subscriber.reason,
-            }
-        })
+    pub fn decisions<'a>(&'a self, settings: &'a Settings) -> impl Iterator<Item = Decision<'a>> {
+        self.list.iter().map(|subscriber| subscriber.decision(settings))
     }
 }
 
@@ -344,6 +289,20 @@ impl Subscriber {
             reason: StateSource::Classifier.initial_reason(StateSource::Unclassified).to_owned(),
             warnings: SubscriberWarnings::default(),
             warning_bits: 0,
+        }
+    }
+
+    fn decision<'a>(&'a self, settings: &'a Settings) -> Decision<'a> {
+        let state = self.classifier.state(&settings.classifier.thresholds);
+        Decision {
+            subscriber_id: &self.id,
+            lane: settings.lanes[self.lane].name.as_str(),
+            state,
+            previous_state: self.previous.unwrap_or(state),
+            reason: &self.reason,
+            rtt_ms: self.reading.rtt_mean_ms,
+            loss: (self.reading.settled > 0).then_some(self.reading.loss),
+            time: clock::wall(),
         }
     }
 
@@ -408,16 +367,10 @@ fn reason_text(reason: &TransitionReason) -> String {
 fn log(subscriber: &Subscriber, transition: &Transition, settings: &Settings) {
     let lane = settings.lanes[subscriber.lane].name.as_str();
     let (from, to) = (transition.from.label(), transition.to.label());
+    let (id, reason) = (&subscriber.id, &subscriber.reason);
     if transition.to == SubscriberState::Noncritical {
-        warn!(subscriber = subscriber.id, lane, from, to, reason = subscriber.reason, "subscriber demoted");
+        warn!(subscriber = id, lane, from, to, reason, "subscriber demoted");
     } else {
-        info!(
-            subscriber = subscriber.id,
-            lane,
-            from,
-            to,
-            reason = subscriber.reason,
-            "subscriber state changed"
-        );
+        info!(subscriber = id, lane, from, to, reason, "subscriber state changed");
     }
 }

@@ -33,20 +33,11 @@ impl CopyArena {
         self.current.split().freeze()
     }
 
-    /// Continues with the oldest full chunk if the writer has dropped all payloads in it, else with a new
-    /// one.
+    /// Continues with the oldest full chunk if no payload in it is held, else with a new one.
     fn next_chunk(&mut self) {
-        let next = match self.filled.pop_front() {
-            Some(mut oldest) => {
-                if oldest.try_reclaim(CHUNK_BYTES) {
-                    oldest
-                } else {
-                    self.filled.push_front(oldest);
-                    BytesMut::with_capacity(CHUNK_BYTES)
-                }
-            }
-            None => BytesMut::with_capacity(CHUNK_BYTES),
-        };
+        let is_free = self.filled.front_mut().is_some_and(|oldest| oldest.try_reclaim(CHUNK_BYTES));
+        let reused = if is_free { self.filled.pop_front() } else { None };
+        let next = reused.unwrap_or_else(|| BytesMut::with_capacity(CHUNK_BYTES));
         let full = std::mem::replace(&mut self.current, next);
         self.filled.push_back(full);
     }

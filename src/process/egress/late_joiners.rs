@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 
 use bytes::Bytes;
 
-use crate::model::{Encapsulation, Guid, MonotonicNs, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
 
 /// How long the lane waits after a match before it sends the history. The writer matches a reader before the
 /// reader matches the writer, and samples sent in between are lost. Discovery of both directions takes some
@@ -26,6 +26,16 @@ pub(super) struct KeptSample {
     pub timestamp: SourceTimestamp,
 }
 
+impl KeptSample {
+    pub fn copy(payload: &[u8], header: &SampleHeader) -> Self {
+        Self {
+            payload: Bytes::copy_from_slice(payload),
+            encapsulation: header.encapsulation,
+            timestamp: header.source_timestamp,
+        }
+    }
+}
+
 /// The history of one output, and the readers that have not received it yet.
 #[derive(Debug)]
 pub(super) struct LateJoiners {
@@ -35,7 +45,6 @@ pub(super) struct LateJoiners {
 }
 
 impl LateJoiners {
-    /// Creates an empty history of `depth` samples.
     pub fn new(depth: usize) -> Self {
         Self { depth: depth.max(1), history: VecDeque::with_capacity(depth.max(1)), waiting: VecDeque::new() }
     }
@@ -60,7 +69,6 @@ impl LateJoiners {
         has_room
     }
 
-    /// Removes a reader that is no longer matched.
     pub fn left(&mut self, reader: Guid) {
         self.waiting.retain(|(waiting, _)| *waiting != reader);
     }

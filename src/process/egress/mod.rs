@@ -22,7 +22,7 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{Configuration, Forwarding, Lane, Settings};
+use crate::config::{Configuration, Forwarding, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::{critical_drop, mode_and_source};
@@ -79,7 +79,7 @@ pub fn egress(
         let turn = egress.turn();
         egress.sleep(&turn);
     }
-    egress.role.stopping();
+    egress.role.notifier.stopping();
     egress.shut_down();
     info!(lane = name, "egress is done");
     Ok(())
@@ -93,32 +93,20 @@ pub fn end_unused(name: &str) {
 }
 
 struct Egress {
-    /// The index of the lane.
     index: usize,
     /// Before the participant: the DDS library wants its readers and writers gone first.
     outputs: Vec<Output>,
     participant: Participant,
     role: Role,
-    forwarder: Forwarder,
+    /// Chooses which samples to send, and when; `None` in a critical lane.
+    noncritical: Option<Noncritical>,
     arena: CopyArena,
     sleeper: LaneSleeper,
     policy: PolicyWatch,
     housekeeping_at: MonotonicNs,
     applied_mode: LaneMode,
-    meters: Meters,
-}
-
-/// Rates of the lane, for its status line.
-#[derive(Default)]
-struct Meters {
     offered: Meter,
     forwarded: Meter,
-}
-
-/// Chooses which samples to send, and when.
-enum Forwarder {
-    Critical,
-    Noncritical(Noncritical),
 }
 
 impl Egress {
@@ -138,26 +126,34 @@ impl Egress {
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
         }
         let now = clock::monotonic();
-        let forwarder = match &lane.forwarding {
-            Forwarding::Everything => Forwarder::Critical,
-            Forwarding::Limited(rates) => Forwarder::Noncritical(Noncritical::new(lane, *rates, now)),
+        let noncritical = match &lane.forwarding {
+            Forwarding::Everything => None,
+            Forwarding::Limited(rates) => Some(Noncritical::new(lane, *rates, now)),
         };
         let sleeper = role.boards.sleeper(index);
         let mut egress = Self {
             index,
-            policy: PolicyWatch::new(settings, lane, index),
+            policy: PolicyWatch {
+                lane: index,
+                name: lane.name.clone(),
+                class: lane.class(),
+                policy_hold_ms: settings.policy_hold_ms,
+                policy: LanePolicy::default(),
+                mode: LaneMode::Normal,
+            },
             role,
             participant,
             outputs,
-            forwarder,
+            noncritical,
             arena: CopyArena::new(),
             sleeper,
             housekeeping_at: now,
             applied_mode: LaneMode::Normal,
-            meters: Meters::default(),
+            offered: Meter::default(),
+            forwarded: Meter::default(),
         };
         egress.housekeeping(now);
-        egress.role.ready();
+        egress.role.notifier.ready();
         Ok(egress)
     }
 
@@ -173,7 +169,7 @@ impl Egress {
             }
             self.applied_mode = mode;
         }
-        if let Forwarder::Noncritical(lane) = &mut self.forwarder {
+        if let Some(lane) = &mut self.noncritical {
             return lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode);
         }
         let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
@@ -226,27 +222,36 @@ impl Egress {
         // The lane uses no discovery events, but the list of them grows unless it is emptied.
         while self.participant.poll_discovery().is_some() {}
         for output in &mut self.outputs {
-            output.housekeeping(&mut self.participant, &self.role.boards, now);
+            output.housekeeping(&mut self.participant, now);
         }
         self.reload(now);
         // A turn of this thread forwards nothing if a thread of the DDS library hangs.
         if self.participant.have_threads_turned() {
             let refusals = self.participant.network_refusals();
-            self.role.report_turn(self.policy.mode as u8, self.policy.epoch, refusals);
+            self.role.report_turn(self.policy.mode as u8, self.policy.policy.epoch, refusals);
         }
-        self.role.status(now, |line| describe(&self.outputs, self.policy.mode, &mut self.meters, line, now));
+        self.role.status(now, |line| {
+            let counters = || self.outputs.iter().map(|output| output.counters.get());
+            let offered_per_s = self.offered.per_s(counters().map(LaneCounters::received).sum(), now);
+            let forwarded_per_s = self.forwarded.per_s(counters().map(|one| one.forwarded).sum(), now);
+            let mode = self.policy.mode;
+            // Writing to a String cannot fail.
+            let _ =
+                write!(line, "mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
+            write_drops(line, counters().map(|one| &one.drops));
+            let without = self.outputs.iter().filter(|output| output.writer.is_none());
+            write_list(line, "; type not known yet for route", without.map(|output| &output.id));
+        });
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }
 
-    /// Applies the settings of a reload.
     fn reload(&mut self, now: MonotonicNs) {
         let Some(Configuration { settings, .. }) = self.role.reload() else {
             return;
         };
         self.policy.policy_hold_ms = settings.policy_hold_ms;
         let forwarding = &settings.lanes[self.index].forwarding;
-        if let (Forwarder::Noncritical(lane), Forwarding::Limited(rates)) = (&mut self.forwarder, forwarding)
-        {
+        if let (Some(lane), Forwarding::Limited(rates)) = (&mut self.noncritical, forwarding) {
             lane.set_rates(*rates, &mut self.outputs, now);
         }
         for output in &mut self.outputs {
@@ -257,22 +262,19 @@ impl Egress {
     /// Forwards the samples that still wait, as far as the lane's mode allows, and accounts for the rest.
     fn shut_down(&mut self) {
         let began_at = clock::monotonic();
-        match &mut self.forwarder {
-            Forwarder::Critical => {
-                while clock::monotonic() < began_at.plus_ms(LAST_SAMPLES_MS) {
-                    if !matches!(self.turn(), Turn::Busy) {
-                        break;
-                    }
-                }
-            }
-            Forwarder::Noncritical(lane) => lane.shut_down(&mut self.outputs),
+        if let Some(lane) = &mut self.noncritical {
+            lane.shut_down(&mut self.outputs);
+        } else {
+            let last_at = began_at.plus_ms(LAST_SAMPLES_MS);
+            while clock::monotonic() < last_at && matches!(self.turn(), Turn::Busy) {}
         }
         let give_up_at = began_at.plus_ms(LAST_SAMPLES_MS + LAST_ACKNOWLEDGEMENTS_MS);
         for output in &mut self.outputs {
-            let timeout_ns = give_up_at.since(clock::monotonic());
-            if !output.wait_acknowledged(Duration::from_nanos(timeout_ns)) {
+            let timeout = Duration::from_nanos(give_up_at.since(clock::monotonic()));
+            let writer = output.writer.as_ref();
+            if !writer.is_none_or(|writer| writer.wait_acknowledged(timeout)) {
                 warn!(
-                    route = output.id(),
+                    route = output.id,
                     "a reader had not acknowledged the last samples when the lane shut down"
                 );
             }
@@ -287,18 +289,6 @@ impl Egress {
     }
 }
 
-/// Writes the status line of the lane for the service manager.
-fn describe(outputs: &[Output], mode: LaneMode, meters: &mut Meters, line: &mut String, now: MonotonicNs) {
-    let sum = |count: fn(&LaneCounters) -> u64| outputs.iter().map(|output| count(output.counters())).sum();
-    let offered_per_s = meters.offered.per_s(sum(LaneCounters::received), now);
-    let forwarded_per_s = meters.forwarded.per_s(sum(|counters| counters.forwarded), now);
-    // Writing to a String cannot fail.
-    let _ = write!(line, "mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
-    write_drops(line, outputs.iter().map(|output| &output.counters().drops));
-    let without = outputs.iter().filter(|output| !output.has_writer());
-    write_list(line, "; type not known yet for route", without.map(Output::id));
-}
-
 /// Follows this lane's policy on the policy board.
 struct PolicyWatch {
     lane: usize,
@@ -307,28 +297,14 @@ struct PolicyWatch {
     policy_hold_ms: u64,
     policy: LanePolicy,
     mode: LaneMode,
-    epoch: u64,
 }
 
 impl PolicyWatch {
-    fn new(settings: &Settings, lane: &Lane, index: usize) -> Self {
-        Self {
-            lane: index,
-            name: lane.name.clone(),
-            class: lane.class(),
-            policy_hold_ms: settings.policy_hold_ms,
-            policy: LanePolicy::default(),
-            mode: LaneMode::Normal,
-            epoch: 0,
-        }
-    }
-
     /// Reads the policy board and returns the mode in force now. While the board cannot be read, the policy
     /// of the last call applies.
     fn update(&mut self, boards: &Boards, now: MonotonicNs) -> LaneMode {
         if let Some(policy) = boards.policy(self.lane) {
             self.policy = policy;
-            self.epoch = policy.epoch;
         }
         let (mode, _) = mode_and_source(&self.policy, self.class, now, self.policy_hold_ms);
         if mode != self.mode {

@@ -10,7 +10,6 @@ use crate::model::{DropReason, Durability, LaneMode, MonotonicNs};
 use crate::policy::{ByteBudget, Decision, PollOrder, RouteShaper, SampleStamps};
 use crate::shm::ShmSample;
 
-/// Rate limits and queues of a noncritical lane.
 pub(super) struct Noncritical {
     rates: LaneRates,
     mode: LaneMode,
@@ -106,7 +105,6 @@ impl Noncritical {
         }
     }
 
-    /// Drops and counts the samples that still wait.
     pub fn shut_down(&mut self, outputs: &mut [Output]) {
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
             fill_queue(shaper, output);

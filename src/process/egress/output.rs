@@ -1,7 +1,5 @@
 //! One output: takes the samples of a route from shared memory, writes them to DDS, and accounts for them.
 
-use std::time::Duration;
-
 use bytes::Bytes;
 use tracing::{error, info, warn};
 
@@ -9,13 +7,13 @@ use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::late_joiners::{KeptSample, LateJoiners};
-use super::unsent::{Unsent, UnsentSamples};
+use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
 use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
-    ReaderRecord, Reliability, SampleHeader, TrafficClass,
+    Reliability, SampleHeader, TrafficClass,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -28,20 +26,9 @@ use crate::shm::{
 /// matched by then counts as gone.
 const FORMER_READERS_MS: u64 = 5_000;
 
-/// What the account of a forwarded sample needs.
-struct Forwarded {
-    bytes: u64,
-    by_reference: bool,
-    caught_up: bool,
-    sequence: u64,
-    written_at: MonotonicNs,
-    writer: Guid,
-    writer_sequence: i64,
-}
-
 /// One output of a lane: the DDS writer of one route, and its account.
 pub(super) struct Output {
-    id: String,
+    pub id: String,
     lane: String,
     class: TrafficClass,
     route: usize,
@@ -55,13 +42,14 @@ pub(super) struct Output {
     gap_reason: DropReason,
     mode: LaneMode,
     subscriber: SampleSubscriber,
-    writer: Option<RawWriter>,
+    /// Created once the message type is known.
+    pub writer: Option<RawWriter>,
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
     late_joiners: Option<LateJoiners>,
     tracker: SequenceTracker,
-    counters: BoardWriter<LaneCounters>,
+    pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
     /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
     /// receive the samples written until they match.
@@ -102,15 +90,15 @@ impl Output {
         let mut readers = boards.output_readers_writer(lane_index, output.route);
         let former_readers = readers.get().iter().map(|record| record.reader).collect();
         readers.update(|readers| *readers = OutputReaders::default());
-        let late_joiners = (output.qos.durability == Durability::TransientLocal
-            && output.qos.reliability == Reliability::BestEffort)
-            .then(|| LateJoiners::new(output.qos.depth().unwrap_or(1) as usize));
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
             SubscriberRole::Lane(QueueLimits::of(lane)),
             true,
         )?;
+        let late_joiners = (output.qos.durability == Durability::TransientLocal
+            && output.qos.reliability == Reliability::BestEffort)
+            .then(|| LateJoiners::new(output.qos.depth().unwrap_or(1) as usize));
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
@@ -146,20 +134,6 @@ impl Output {
             None => opened.try_make_writer(participant),
         }
         Ok(opened)
-    }
-
-    pub fn id(&self) -> &str {
-        &self.id
-    }
-
-    /// The counters so far.
-    pub fn counters(&self) -> &LaneCounters {
-        self.counters.get()
-    }
-
-    /// Whether the DDS writer exists. It is created once the message type is known.
-    pub fn has_writer(&self) -> bool {
-        self.writer.is_some()
     }
 
     pub fn durability(&self) -> Durability {
@@ -223,11 +197,7 @@ impl Output {
         let by_reference = bytes >= self.by_reference_min_bytes
             && self.subscriber.borrowed() < self.subscriber.max_borrowed();
         let payload = if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) };
-        let kept = self.late_joiners.as_ref().map(|_| KeptSample {
-            payload: Bytes::copy_from_slice(&payload),
-            encapsulation: header.encapsulation,
-            timestamp: header.source_timestamp,
-        });
+        let kept = self.late_joiners.as_ref().map(|_| KeptSample::copy(&payload, &header));
         let outcome = writer.write(payload, header.encapsulation, header.source_timestamp);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
@@ -344,11 +314,11 @@ impl Output {
     }
 
     /// Creates the writer if its type is known by now, follows matching, serves late joiners, logs drops.
-    pub fn housekeeping(&mut self, participant: &mut Participant, boards: &Boards, now: MonotonicNs) {
+    pub fn housekeeping(&mut self, participant: &mut Participant, now: MonotonicNs) {
         if self.writer.is_none() {
             self.try_make_writer(participant);
         }
-        if let Some(health) = boards.health(ProcessRole::Ingress) {
+        if let Some(health) = self.boards.health(ProcessRole::Ingress) {
             self.ingress_starts = health.starts;
         }
         self.follow_matching(now);
@@ -357,12 +327,6 @@ impl Output {
         let class = self.class;
         let is_expected = |reason: DropReason| reason.is_expected(class);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
-    }
-
-    /// Waits until all RELIABLE readers have acknowledged all samples, at most for `timeout`. Returns whether
-    /// they have.
-    pub fn wait_acknowledged(&mut self, timeout: Duration) -> bool {
-        self.writer.as_ref().is_none_or(|writer| writer.wait_acknowledged(timeout))
     }
 
     fn follow_matching(&mut self, now: MonotonicNs) {
@@ -378,18 +342,15 @@ impl Output {
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
                     if let Some(late_joiners) = &mut self.late_joiners {
-                        if joined {
-                            if !late_joiners.joined(reader, now) {
-                                warn!(
-                                    route = self.id,
-                                    lane = self.lane,
-                                    ?reader,
-                                    "too many late joiners wait \
-                                      for the history; this one gets only new samples"
-                                );
-                            }
-                        } else {
+                        if !joined {
                             late_joiners.left(reader);
+                        } else if !late_joiners.joined(reader, now) {
+                            warn!(
+                                route = self.id,
+                                lane = self.lane,
+                                ?reader,
+                                "too many late joiners wait for the history; this one gets only new samples"
+                            );
                         }
                     }
                 }
@@ -418,19 +379,11 @@ impl Output {
         let mut current = OutputReaders::default();
         let mut overrun = 0;
         for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
-            let former = self.readers.get().iter().find(|record| record.reader == reader.guid);
+            let former = self.readers.get().iter().find(|record| record.reader == reader.reader);
             overrun += reader.overrun.saturating_sub(former.map_or(0, |record| record.overrun));
-            *place = ReaderRecord {
-                reader: reader.guid,
-                offered: reader.offered,
-                unacknowledged: reader.unacknowledged,
-                overrun: reader.overrun,
-                reliable: u64::from(reader.reliable),
-            };
+            *place = reader;
         }
-        if current != *self.readers.get() {
-            self.readers.update(|readers| *readers = current);
-        }
+        self.readers.set(current);
         if overrun > 0 {
             self.counters.update(|counters| counters.reader_overrun += overrun);
         }
@@ -510,31 +463,15 @@ impl Output {
 
     /// Writes a sample that was forwarded before a restart again, for late joiners.
     fn restore(&mut self, sample: &ShmSample) {
-        let header = sample.header();
-        let payload = Bytes::copy_from_slice(sample.payload());
+        let kept = KeptSample::copy(sample.payload(), sample.header());
         if let Some(late_joiners) = &mut self.late_joiners {
-            late_joiners.keep(KeptSample {
-                payload,
-                encapsulation: header.encapsulation,
-                timestamp: header.source_timestamp,
-            });
+            late_joiners.keep(kept);
         } else if let Some(writer) = &self.writer
-            && let Err(failure) = writer.write(payload, header.encapsulation, header.source_timestamp)
+            && let Err(failure) = writer.write(kept.payload, kept.encapsulation, kept.timestamp)
         {
             warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
         }
     }
-}
-
-fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
-    counters.forwarded += 1;
-    counters.forwarded_bytes += sample.bytes;
-    counters.by_reference += u64::from(sample.by_reference);
-    counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_sequence = sample.sequence;
-    counters.last_forwarded_at = sample.written_at;
-    counters.last_writer_guid = sample.writer;
-    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 /// Records the sequence numbers that are accounted for, up to the last sample taken.

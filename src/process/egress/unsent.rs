@@ -6,6 +6,8 @@
 
 use std::collections::VecDeque;
 
+use crate::model::{Guid, LaneCounters, MonotonicNs};
+
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Unsent<T> {
@@ -27,20 +29,15 @@ impl<T> UnsentSamples<T> {
         Self { samples: VecDeque::with_capacity(capacity), capacity }
     }
 
-    /// Unsent samples.
     pub fn len(&self) -> usize {
         self.samples.len()
     }
 
     /// Adds a sample, and returns the oldest one if the history has no room for both: it was evicted unsent.
     pub fn push(&mut self, sample: Unsent<T>) -> Option<T> {
-        let evicted = if self.samples.len() == self.capacity {
-            self.samples.pop_front().map(|old| old.account)
-        } else {
-            None
-        };
+        let evicted = if self.samples.len() == self.capacity { self.samples.pop_front() } else { None };
         self.samples.push_back(sample);
-        evicted
+        evicted.map(|old| old.account)
     }
 
     /// Removes the oldest sample if it was sent.
@@ -57,6 +54,28 @@ impl<T> UnsentSamples<T> {
         self.samples.clear();
         unsent
     }
+}
+
+/// What the account records of a sample when it is sent.
+pub(super) struct Forwarded {
+    pub bytes: u64,
+    pub by_reference: bool,
+    pub caught_up: bool,
+    pub sequence: u64,
+    pub written_at: MonotonicNs,
+    pub writer: Guid,
+    pub writer_sequence: i64,
+}
+
+pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
+    counters.forwarded += 1;
+    counters.forwarded_bytes += sample.bytes;
+    counters.by_reference += u64::from(sample.by_reference);
+    counters.caught_up += u64::from(sample.caught_up);
+    counters.last_forwarded_sequence = sample.sequence;
+    counters.last_forwarded_at = sample.written_at;
+    counters.last_writer_guid = sample.writer;
+    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@
 //! `docs/decisions/0013-early-waker.md` has the measurements.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -85,7 +86,7 @@ fn run(arrivals: &Arrivals, receiving: &Receiving) {
             // Only for the last fragment: until then the publisher still sends, perhaps on this CPU, and must
             // not be preempted.
             Arrival::Sample { writer, sequence, left_bytes: 0 } => {
-                receiving.wake_early(writer, sequence, 0, receiving.cpu())
+                receiving.wake_early(writer, sequence, 0, receiving.cpu.load(Ordering::Relaxed))
             }
             Arrival::Sample { .. } | Arrival::Other => false,
             Arrival::Closed => return,

@@ -1,5 +1,6 @@
 //! The input of one route in ingress: its DDS readers, its pool, its counters.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use tracing::{error, info, warn};
@@ -7,7 +8,7 @@ use tracing::{error, info, warn};
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::pool::{Filled, PoolOwner};
-use super::publishers::{HighWaterMarks, Publishers, SequenceCheck};
+use super::publishers::{Publishers, SequenceCheck};
 use super::source::{ReaderPlan, Source, label};
 use crate::clock;
 use crate::config::{Route, Settings};
@@ -16,7 +17,7 @@ use crate::dds::{
 };
 use crate::model::{
     AgeBasis, DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability,
-    RouteInfo, SampleHeader, TopicName,
+    RouteInfo, SampleHeader,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
@@ -28,31 +29,27 @@ pub(super) struct Input {
     id: String,
     dds_topic: String,
     configured_type: Option<String>,
-    route: Route,
+    pub route: Route,
     source: Source,
     inbox: Inbox,
-    /// The reader of the RELIABLE publishers, or of all where the configuration says RELIABLE.
-    reliable: Option<ActiveReader>,
-    /// The reader of the BEST_EFFORT publishers, or of all where the configuration says BEST_EFFORT.
-    best_effort: Option<ActiveReader>,
+    /// The reader of the publishers of each reliability, or of all where the configuration sets one.
+    readers: BTreeMap<Reliability, ActiveReader>,
     /// The type of the first reader. It never changes, because the lanes have writers of it.
     settled_type: Option<String>,
     /// Whether the publishers have changed since `connect` last chose the readers.
     source_changed: bool,
     pool: PoolOwner,
-    counters: BoardWriter<IngressCounters>,
+    pub counters: BoardWriter<IngressCounters>,
     info: BoardWriter<RouteInfo>,
     dds_in: HistogramWriter,
-    publishers: Publishers,
+    pub publishers: Publishers,
     drop_log: DropLog,
-    remind_at: MonotonicNs,
     /// The type conflict that was logged last.
     conflict: Option<(String, String)>,
+    remind_at: MonotonicNs,
 }
 
-/// The result of [`Input::step`].
 pub(super) enum Step {
-    /// A sample was published.
     Published,
     /// A sample was taken and not published: repeated, malformed or dropped.
     Discarded,
@@ -60,13 +57,10 @@ pub(super) enum Step {
     Empty,
 }
 
-/// A DDS reader in the inbox.
 struct ActiveReader {
     guid: Guid,
     qos: ReaderQos,
-    /// The number of matched publishers.
     writers: u64,
-    /// Whether all its publishers are gone.
     idle: bool,
 }
 
@@ -87,8 +81,7 @@ impl Input {
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
             inbox: Inbox::with_flag(Arc::clone(flag)),
-            reliable: None,
-            best_effort: None,
+            readers: BTreeMap::new(),
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
@@ -97,36 +90,15 @@ impl Input {
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             publishers,
-            remind_at: MonotonicNs(0),
             conflict: None,
+            remind_at: MonotonicNs(0),
             route,
         })
     }
 
     /// Whether there is a reader for at least one publisher.
     pub fn is_connected(&self) -> bool {
-        self.readers().any(|reader| !reader.idle)
-    }
-
-    /// Whether each publisher that wrote until the predecessor of this process died has sent a sample to this
-    /// process, or is gone.
-    pub fn has_resumed(&self) -> bool {
-        self.publishers.have_resumed()
-    }
-
-    /// The counters so far.
-    pub fn counters(&self) -> &IngressCounters {
-        self.counters.get()
-    }
-
-    /// The input topic.
-    pub fn topic(&self) -> &TopicName {
-        &self.route.input_topic
-    }
-
-    /// The high-water marks of the publishers.
-    pub fn marks(&self) -> Arc<HighWaterMarks> {
-        self.publishers.marks()
+        self.readers.values().any(|reader| !reader.idle)
     }
 
     /// Takes one sample and publishes it to the lanes, which the caller has to wake then.
@@ -219,7 +191,7 @@ impl Input {
             return;
         }
         self.source_changed = true;
-        self.publishers.writer_found(writer.guid);
+        self.publishers.mark_gone(|known| known == writer.guid, false);
         if self.source.insert(writer) {
             info!(
                 route = self.id,
@@ -234,7 +206,7 @@ impl Input {
     /// Handles the loss of a participant, and with it of its writers.
     pub fn participant_gone(&mut self, prefix: [u8; 12]) {
         self.source_changed |= self.source.remove_participant(prefix);
-        self.publishers.participant_gone(prefix);
+        self.publishers.mark_gone(|known| known.prefix() == prefix, true);
     }
 
     /// Handles the loss of a writer. The writer may be of any topic.
@@ -253,9 +225,7 @@ impl Input {
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();
         self.publishers.report_clocks(&self.id, &mut counters, now);
-        if counters != *self.counters.get() {
-            self.counters.update(|current| *current = counters);
-        }
+        self.counters.set(counters);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, "ingress", |_| false, now);
         Ok(())
     }
@@ -314,7 +284,7 @@ impl Input {
             self.retire(participant, reliability);
             return Ok(());
         };
-        if let Some(current) = self.reader_mut(reliability) {
+        if let Some(current) = self.readers.get_mut(&reliability) {
             // A reader that requests less than all publishers offer matches each of them, and to replace it
             // would lose samples. But a TRANSIENT_LOCAL publisher sends its history only to a reader that is
             // TRANSIENT_LOCAL itself, so an idle VOLATILE reader is replaced.
@@ -332,7 +302,7 @@ impl Input {
     /// recover lost first samples of a RELIABLE publisher; beside a RELIABLE reader, it would make that
     /// publisher send each sample twice.
     fn retire(&mut self, participant: &mut Participant, reliability: Reliability) {
-        if let Some(reader) = self.reader_mut(reliability) {
+        if let Some(reader) = self.readers.get_mut(&reliability) {
             reader.idle = true;
             if reliability == Reliability::BestEffort {
                 self.remove_reader(participant, reliability);
@@ -356,7 +326,7 @@ impl Input {
                 participant.create_reader_after(topic, dds_type, &qos, self.publishers.last_sequences())?
             }
             // A BEST_EFFORT reader takes what arrives from now on; it cannot request earlier samples.
-            Reliability::BestEffort if self.reliable.is_none() => {
+            Reliability::BestEffort if !self.readers.contains_key(&Reliability::Reliable) => {
                 participant.create_reader(topic, dds_type, &qos)?
             }
             Reliability::BestEffort => participant.create_reader_beside_reliable(topic, dds_type, &qos)?,
@@ -375,8 +345,8 @@ impl Input {
             }
         }
         self.settled_type = Some(dds_type.to_owned());
-        *self.reader_of(qos.reliability) =
-            Some(ActiveReader { guid: reader.guid(), qos, writers: 0, idle: false });
+        let active = ActiveReader { guid: reader.guid(), qos, writers: 0, idle: false };
+        self.readers.insert(qos.reliability, active);
         self.inbox.add(reader);
         self.lend_memory();
         Ok(())
@@ -384,13 +354,13 @@ impl Input {
 
     /// Drops the readers, which the DDS library requires before the participant is dropped.
     pub fn close(&mut self) {
-        for reader in [self.reliable.take(), self.best_effort.take()].into_iter().flatten() {
+        for reader in std::mem::take(&mut self.readers).into_values() {
             drop(self.inbox.remove(reader.guid));
         }
     }
 
     fn remove_reader(&mut self, participant: &mut Participant, reliability: Reliability) {
-        if let Some(former) = self.reader_of(reliability).take() {
+        if let Some(former) = self.readers.remove(&reliability) {
             drop(self.inbox.remove(former.guid));
             participant.remove_endpoint(former.guid);
             self.lend_memory();
@@ -405,35 +375,21 @@ impl Input {
         }
     }
 
-    fn reader_of(&mut self, reliability: Reliability) -> &mut Option<ActiveReader> {
-        match reliability {
-            Reliability::Reliable => &mut self.reliable,
-            Reliability::BestEffort => &mut self.best_effort,
-        }
-    }
-
-    fn reader_mut(&mut self, reliability: Reliability) -> Option<&mut ActiveReader> {
-        self.reader_of(reliability).as_mut()
-    }
-
-    fn readers(&self) -> impl Iterator<Item = &ActiveReader> {
-        [&self.reliable, &self.best_effort].into_iter().flatten()
-    }
-
     /// The number of matched publishers. A RELIABLE one that the BEST_EFFORT reader matched before there was
     /// a RELIABLE reader counts once.
     fn matched_writers(&self) -> u64 {
-        match (&self.reliable, &self.best_effort) {
-            (Some(reliable), Some(best_effort)) => {
-                reliable.writers + best_effort.writers.min(self.source.best_effort_writers())
+        let writers = self.readers.iter().map(|(reliability, reader)| match reliability {
+            Reliability::BestEffort if self.readers.len() > 1 => {
+                reader.writers.min(self.source.best_effort_writers())
             }
-            _ => self.readers().map(|reader| reader.writers).sum(),
-        }
+            _ => reader.writers,
+        });
+        writers.sum()
     }
 
     fn follow_matching(&mut self) {
         for reader in self.inbox.readers() {
-            let mut active = [&mut self.reliable, &mut self.best_effort].into_iter().flatten();
+            let mut active = self.readers.values_mut();
             let Some(active) = active.find(|active| active.guid == reader.guid()) else { continue };
             while let Some(event) = reader.poll_event() {
                 match event {

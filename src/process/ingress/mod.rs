@@ -60,7 +60,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
             tracing::error!(%error, "housekeeping failed");
         }
     }
-    ingress.role.stopping();
+    ingress.role.notifier.stopping();
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
     while ingress.receiving.turn(false) && clock::monotonic() < give_up_at {}
@@ -86,10 +86,7 @@ impl Drop for Ingress {
     fn drop(&mut self) {
         // The participant's thread shares the inputs, and the library requires that readers are dropped
         // before their participant.
-        let Ok(_) = self.receiving.for_each_input::<std::convert::Infallible>(|input| {
-            input.close();
-            Ok(())
-        });
+        self.receiving.for_each_input(Input::close);
     }
 }
 
@@ -134,11 +131,10 @@ impl Ingress {
             received: Meter::default(),
         };
         ingress.housekeeping(housekeeping_at)?;
-        ingress.role.ready();
+        ingress.role.notifier.ready();
         Ok(ingress)
     }
 
-    /// Sleeps until housekeeping is due.
     fn sleep(&self) {
         let wait_ns = self.housekeeping_at.since(clock::monotonic());
         #[allow(clippy::disallowed_methods, reason = "other threads receive the samples")]
@@ -149,22 +145,11 @@ impl Ingress {
         while let Some(change) = self.participant.poll_discovery() {
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
-                    self.for_each_input(|input, _| {
-                        input.writer_found(&writer);
-                        Ok(())
-                    })?;
+                    self.for_each_input(|input, _| input.writer_found(&writer));
                 }
-                Discovery::WriterGone(guid) => {
-                    self.for_each_input(|input, _| {
-                        input.writer_gone(guid);
-                        Ok(())
-                    })?;
-                }
+                Discovery::WriterGone(guid) => self.for_each_input(|input, _| input.writer_gone(guid)),
                 Discovery::ParticipantGone { prefix, .. } => {
-                    self.for_each_input(|input, _| {
-                        input.participant_gone(prefix);
-                        Ok(())
-                    })?;
+                    self.for_each_input(|input, _| input.participant_gone(prefix));
                 }
                 Discovery::Incompatible { local, remote } => {
                     debug!(?local, ?remote, "endpoints are not compatible");
@@ -174,18 +159,19 @@ impl Ingress {
         }
         let mut searching = false;
         let mut resumed = true;
-        let outcome = self.for_each_input(|input, participant| {
-            let outcome = input.housekeeping(participant, now);
+        let mut outcome = Ok(());
+        self.for_each_input(|input, participant| {
+            let done = input.housekeeping(participant, now);
+            outcome = std::mem::replace(&mut outcome, Ok(())).and(done);
             searching |= !input.is_connected();
-            resumed &= input.has_resumed();
-            outcome
+            resumed &= input.publishers.have_resumed();
         });
         // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
         // readers of this process have not requested them yet.
         if resumed && !std::mem::replace(&mut self.has_resumed, true) {
             self.resume_until = self.resume_until.min(now.plus_ms(RESUMED_MS));
         }
-        if self.role.has_former() && now >= self.resume_until {
+        if now >= self.resume_until {
             self.role.dispose_former(&self.participant);
         }
         self.role.reload();
@@ -200,15 +186,10 @@ impl Ingress {
     }
 
     /// Calls `work` with each input, which the receiving thread cannot use meanwhile.
-    fn for_each_input(
-        &mut self,
-        mut work: impl FnMut(&mut Input, &mut Participant) -> Result<(), RoleError>,
-    ) -> Result<(), RoleError> {
-        let participant = &mut self.participant;
-        if self.receiving.for_each_input(|input| work(input, participant))? {
+    fn for_each_input(&mut self, mut work: impl FnMut(&mut Input, &mut Participant)) {
+        if self.receiving.for_each_input(|input| work(input, &mut self.participant)) {
             self.participant.ring();
         }
-        Ok(())
     }
 }
 
@@ -216,22 +197,20 @@ impl Ingress {
 /// afterwards, because this locks the inputs.
 fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) {
     let (mut routes, mut connected, mut total) = (0, 0, 0);
-    let mut drops = Vec::new();
-    let mut without = Vec::new();
-    let Ok(_) = receiving.for_each_input::<std::convert::Infallible>(|input| {
+    let (mut drops, mut without) = (Vec::new(), Vec::new());
+    receiving.for_each_input(|input| {
         routes += 1;
-        total += input.counters().received;
-        drops.push(input.counters().drops);
+        total += input.counters.get().received;
+        drops.push(input.counters.get().drops);
         if input.is_connected() {
             connected += 1;
         } else {
-            without.push(input.topic().to_string());
+            without.push(input.route.input_topic.to_string());
         }
-        Ok(())
     });
+    let per_s = received.per_s(total, now);
     // Writing to a String cannot fail.
-    let _ =
-        write!(line, "reading {connected} of {routes} routes, {:.1} samples/s", received.per_s(total, now));
+    let _ = write!(line, "reading {connected} of {routes} routes, {per_s:.1} samples/s");
     write_drops(line, drops.iter());
     write_list(line, "; no publisher found yet for", without.iter());
 }

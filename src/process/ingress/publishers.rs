@@ -22,14 +22,12 @@ const CLOCK_LOG_MS: u64 = 30_000;
 /// A publisher whose last sample is at most this old at a restart is expected to send more.
 const EXPECTED_MS: u64 = 5_000;
 
-/// The accounts of a route's publishers. They outlive the process, so that a successor publishes no sample
-/// twice.
+/// The accounts of a route's publishers, which a successor continues: it publishes no sample twice.
 pub(super) struct Publishers {
     accounts: Vec<BoardWriter<PublisherAccount>>,
     /// For each account, whether discovery has removed its writer.
     gone: [bool; MAX_PUBLISHERS],
-    /// For each account, whether its publisher is expected to send more and has not since this process
-    /// started.
+    /// For each account, whether its publisher wrote until the restart and has not written since.
     expected: [bool; MAX_PUBLISHERS],
     marks: Arc<HighWaterMarks>,
     /// For each account, the offset of its publisher's clock; not kept over a restart.
@@ -85,7 +83,6 @@ impl Publishers {
         }
     }
 
-    /// The high-water marks, for other threads.
     pub fn marks(&self) -> Arc<HighWaterMarks> {
         Arc::clone(&self.marks)
     }
@@ -153,8 +150,7 @@ impl Publishers {
         }
     }
 
-    /// Records the reliability that each publisher offers; `reliability_of` returns `None` for one that
-    /// discovery does not know.
+    /// Records the reliability that each publisher offers; `None` for one that discovery does not know.
     pub fn set_reliabilities(&mut self, reliability_of: impl Fn(Guid) -> Option<Reliability>) {
         for account in &mut self.accounts {
             let present = *account.get();
@@ -198,22 +194,13 @@ impl Publishers {
         result
     }
 
-    /// Notes that discovery has found the writer.
-    pub fn writer_found(&mut self, writer: Guid) {
-        self.mark_gone(|known| known == writer, false);
-    }
-
     /// Notes that the writer is gone. Its account stays, because the writer may return.
     pub fn writer_gone(&mut self, writer: Guid) {
         self.mark_gone(|known| known == writer, true);
     }
 
-    /// Notes that a participant and its writers are gone.
-    pub fn participant_gone(&mut self, prefix: [u8; 12]) {
-        self.mark_gone(|known| known.prefix() == prefix, true);
-    }
-
-    fn mark_gone(&mut self, matches: impl Fn(Guid) -> bool, is_gone: bool) {
+    /// Notes whether the writers that `matches` chooses are gone.
+    pub fn mark_gone(&mut self, matches: impl Fn(Guid) -> bool, is_gone: bool) {
         for (account, gone) in self.accounts.iter().zip(&mut self.gone) {
             if matches(account.get().writer) {
                 *gone = is_gone;
@@ -342,7 +329,7 @@ mod tests {
         assert_eq!(take(&mut successor, ONE, 14, at(101)), None);
         assert_eq!(take(&mut successor, ONE, 20, at(101)), Some(5));
         assert!(!successor.1.have_resumed());
-        successor.1.participant_gone(TWO.prefix());
+        successor.1.mark_gone(|known| known.prefix() == TWO.prefix(), true);
         assert!(successor.1.have_resumed());
         let account = fixture.boards.publisher(0, 0).unwrap();
         assert_eq!((account.first_sequence, account.last_sequence), (10, 20));

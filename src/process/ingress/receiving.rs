@@ -38,11 +38,9 @@ struct SharedRoute {
     /// Whether the receiving thread has skipped the route because the main thread had locked it.
     skipped: AtomicBool,
     marks: Arc<HighWaterMarks>,
-    /// Whether a critical lane serves the route.
     is_critical: bool,
 }
 
-/// A lane that samples are published to.
 pub(super) struct ServedLane {
     pub waker: LaneWaker,
     pub class: TrafficClass,
@@ -57,7 +55,7 @@ pub(super) struct Receiving {
     lanes: Vec<ServedLane>,
     pending_wake: PendingWake,
     /// The CPU on which the receiving thread ran last.
-    cpu: AtomicU32,
+    pub cpu: AtomicU32,
 }
 
 impl Receiving {
@@ -66,7 +64,7 @@ impl Receiving {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
         };
         let shared = |(route, (input, flag)): (usize, (Input, _))| SharedRoute {
-            marks: input.marks(),
+            marks: input.publishers.marks(),
             input: Mutex::new(input),
             flag,
             skipped: AtomicBool::new(false),
@@ -115,11 +113,6 @@ impl Receiving {
         claimed
     }
 
-    /// The CPU on which the receiving thread ran last.
-    pub fn cpu(&self) -> u32 {
-        self.cpu.load(Ordering::Relaxed)
-    }
-
     /// Takes and publishes the samples that have arrived, up to `SAMPLES_PER_TURN` of each route. On the
     /// receiving thread (`is_receiving`) it skips a locked route and wakes critical lanes early; on any other
     /// thread it waits for the locks. Returns whether more may wait.
@@ -157,17 +150,13 @@ impl Receiving {
 
     /// Locks each input in turn and calls `work` with it. Returns whether the caller has to ring the
     /// receiving thread, because that has skipped a locked route, or because a route has a new reader.
-    ///
-    /// # Errors
-    /// The first error of `work`, after `work` was called with all inputs.
-    pub fn for_each_input<E>(&self, mut work: impl FnMut(&mut Input) -> Result<(), E>) -> Result<bool, E> {
+    pub fn for_each_input(&self, mut work: impl FnMut(&mut Input)) -> bool {
         let mut ring = false;
-        let mut outcome = Ok(());
         for shared in &self.routes {
-            outcome = outcome.and(work(&mut shared.lock()));
+            work(&mut shared.lock());
             ring |= shared.take_skipped() || shared.flag.is_raised();
         }
-        outcome.map(|()| ring)
+        ring
     }
 
     /// Wakes the critical lanes that serve the route while its sample is being taken on `cpu`. A noncritical
@@ -180,7 +169,6 @@ impl Receiving {
         }
     }
 
-    /// Wakes the lanes that serve the route.
     fn wake(&self, route: usize) {
         for lane in &self.lanes {
             if lane.serves[route] {

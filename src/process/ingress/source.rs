@@ -17,21 +17,13 @@ pub(super) struct Source {
 /// The readers that a route needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum ReaderPlan {
-    /// Not decidable yet: no publisher is known, and the configuration does not set type, reliability and
-    /// durability.
+    /// No publisher is known, and the configuration does not set type, reliability and durability.
     Unknown,
     /// Two publishers use the topic with different types, and the configuration sets none.
     TypeConflict(String, String),
     /// At least one of these readers. A RELIABLE reader does not match BEST_EFFORT publishers, and a
     /// BEST_EFFORT one does not recover lost samples, so publishers of both kinds need both readers.
-    Readers {
-        /// DDS type.
-        dds_type: String,
-        /// A RELIABLE reader.
-        reliable: Option<ReaderQos>,
-        /// A BEST_EFFORT reader.
-        best_effort: Option<ReaderQos>,
-    },
+    Readers { dds_type: String, reliable: Option<ReaderQos>, best_effort: Option<ReaderQos> },
 }
 
 impl Source {
@@ -49,7 +41,6 @@ impl Source {
         }
     }
 
-    /// Removes a publisher.
     pub fn remove(&mut self, guid: Guid) {
         self.writers.retain(|writer| writer.guid != guid);
     }
@@ -66,12 +57,10 @@ impl Source {
         self.writers.iter().find(|writer| writer.dds_type != dds_type)
     }
 
-    /// The reliability that the publisher offers, if it is known.
     pub fn reliability_of(&self, writer: Guid) -> Option<Reliability> {
         self.writers.iter().find(|known| known.guid == writer).map(|known| known.reliability)
     }
 
-    /// The number of publishers that offer BEST_EFFORT.
     pub fn best_effort_writers(&self) -> u64 {
         let offers = |writer: &&Endpoint| writer.reliability == Reliability::BestEffort;
         self.writers.iter().filter(offers).count() as u64

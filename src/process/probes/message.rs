@@ -3,8 +3,7 @@
 //! versions work together.
 
 use bytes::Bytes;
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::model::{Encapsulation, ProbeRefusal, WallNs, is_probe_id};
 use crate::telemetry::{STRING_TYPE, string_message};
@@ -51,45 +50,53 @@ impl std::fmt::Display for ProbeId {
 }
 
 /// Proves that the sender of a message has the secret and that the message is no replay.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Signature {
     /// Differs in every message.
+    #[serde(serialize_with = "as_hex", deserialize_with = "from_hex_text")]
     pub nonce: [u8; 16],
     /// HMAC-SHA-256 of the message.
+    #[serde(serialize_with = "as_hex", deserialize_with = "from_hex_text")]
     pub hmac: [u8; 32],
 }
 
 /// A probe request.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ProbeRequest {
     /// The sequence number of the probe, counted by its sender.
     pub seq: u64,
     /// When it was sent, in the sender's wall-clock time.
+    #[serde(rename = "send_time_ns")]
     pub send_time: WallNs,
     /// The id of the bridge that sends it.
     pub sender_id: String,
     /// The id of the probe, which the response repeats.
     pub probe_id: ProbeId,
     /// `None` if it is unsigned or its signature is malformed.
+    #[serde(flatten, skip_deserializing)]
     pub signature: Option<Signature>,
 }
 
 /// The response to a probe. Its times are the responder's wall-clock times.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ProbeResponse {
     /// The sequence number in the request.
     pub seq: u64,
     /// The probe id in the request.
     pub probe_id: ProbeId,
     /// When the request was received.
+    #[serde(rename = "recv_time_ns")]
     pub recv_time: WallNs,
     /// When the responder started the response.
+    #[serde(rename = "reply_time_ns")]
     pub reply_time: WallNs,
     /// When the response was sent.
+    #[serde(rename = "response_send_time_ns")]
     pub response_send_time: WallNs,
     /// The id of the responder.
     pub responder_id: String,
     /// `None` if it is unsigned or its signature is malformed.
+    #[serde(flatten, skip_deserializing)]
     pub signature: Option<Signature>,
 }
 
@@ -99,68 +106,21 @@ struct Version {
     v: u64,
 }
 
-#[derive(Serialize, Deserialize)]
-struct RequestFields<'a> {
-    v: u64,
-    seq: u64,
-    send_time_ns: u64,
-    sender_id: std::borrow::Cow<'a, str>,
-    probe_id: ProbeId,
-    #[serde(default, skip_serializing_if = "Value::is_null")]
-    nonce: Value,
-    #[serde(default, skip_serializing_if = "Value::is_null")]
-    hmac: Value,
-}
-
-#[derive(Serialize, Deserialize)]
-struct ResponseFields<'a> {
-    v: u64,
-    seq: u64,
-    probe_id: ProbeId,
-    recv_time_ns: u64,
-    reply_time_ns: u64,
-    response_send_time_ns: u64,
-    responder_id: std::borrow::Cow<'a, str>,
-    #[serde(default, skip_serializing_if = "Value::is_null")]
-    nonce: Value,
-    #[serde(default, skip_serializing_if = "Value::is_null")]
-    hmac: Value,
-}
-
 impl ProbeRequest {
     /// Decodes a request from a sample's payload and encapsulation, without checking its signature.
     ///
     /// # Errors
     /// The message is oversized, malformed or of another version.
     pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
-        let fields: RequestFields<'_> = parse(payload, encapsulation)?;
-        let is_valid = [fields.seq, fields.send_time_ns].iter().all(|number| *number <= MAX_NUMBER)
-            && is_probe_id(&fields.sender_id)
-            && fields.probe_id.is_valid();
-        if !is_valid {
-            return Err(ProbeRefusal::Malformed);
-        }
-        Ok(Self {
-            seq: fields.seq,
-            send_time: WallNs(fields.send_time_ns),
-            sender_id: fields.sender_id.into_owned(),
-            probe_id: fields.probe_id,
-            signature: signature(&fields.nonce, &fields.hmac),
-        })
+        let (request, signature): (Self, _) = parse(payload, encapsulation)?;
+        let numbers = [request.seq, request.send_time.0];
+        check(&numbers, &request.sender_id, &request.probe_id)?;
+        Ok(Self { signature, ..request })
     }
 
     /// Encodes the message as the payload of a sample with encapsulation [`Encapsulation::CDR_LE`].
     pub fn encode(&self) -> Bytes {
-        let (nonce, hmac) = signature_fields(self.signature);
-        serialize(&RequestFields {
-            v: VERSION,
-            seq: self.seq,
-            send_time_ns: self.send_time.0,
-            sender_id: self.sender_id.as_str().into(),
-            probe_id: self.probe_id.clone(),
-            nonce,
-            hmac,
-        })
+        serialize(self)
     }
 }
 
@@ -170,43 +130,32 @@ impl ProbeResponse {
     /// # Errors
     /// The message is oversized, malformed or of another version.
     pub fn decode(payload: &[u8], encapsulation: Encapsulation) -> Result<Self, ProbeRefusal> {
-        let fields: ResponseFields<'_> = parse(payload, encapsulation)?;
-        let numbers = [fields.seq, fields.recv_time_ns, fields.reply_time_ns, fields.response_send_time_ns];
-        let is_valid = numbers.iter().all(|number| *number <= MAX_NUMBER)
-            && is_probe_id(&fields.responder_id)
-            && fields.probe_id.is_valid();
-        if !is_valid {
-            return Err(ProbeRefusal::Malformed);
-        }
-        Ok(Self {
-            seq: fields.seq,
-            probe_id: fields.probe_id,
-            recv_time: WallNs(fields.recv_time_ns),
-            reply_time: WallNs(fields.reply_time_ns),
-            response_send_time: WallNs(fields.response_send_time_ns),
-            responder_id: fields.responder_id.into_owned(),
-            signature: signature(&fields.nonce, &fields.hmac),
-        })
+        let (response, signature): (Self, _) = parse(payload, encapsulation)?;
+        let [received, begun, sent] =
+            [response.recv_time, response.reply_time, response.response_send_time].map(|time| time.0);
+        check(&[response.seq, received, begun, sent], &response.responder_id, &response.probe_id)?;
+        Ok(Self { signature, ..response })
     }
 
     /// Encodes the message as the payload of a sample with encapsulation [`Encapsulation::CDR_LE`].
     pub fn encode(&self) -> Bytes {
-        let (nonce, hmac) = signature_fields(self.signature);
-        serialize(&ResponseFields {
-            v: VERSION,
-            seq: self.seq,
-            probe_id: self.probe_id.clone(),
-            recv_time_ns: self.recv_time.0,
-            reply_time_ns: self.reply_time.0,
-            response_send_time_ns: self.response_send_time.0,
-            responder_id: self.responder_id.as_str().into(),
-            nonce,
-            hmac,
-        })
+        serialize(self)
     }
 }
 
-fn parse<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation) -> Result<T, ProbeRefusal> {
+/// Checks that no number of a message is too large, and that the ids of its sender and probe are valid.
+fn check(numbers: &[u64], sender: &str, probe: &ProbeId) -> Result<(), ProbeRefusal> {
+    let is_valid =
+        numbers.iter().all(|number| *number <= MAX_NUMBER) && is_probe_id(sender) && probe.is_valid();
+    if is_valid { Ok(()) } else { Err(ProbeRefusal::Malformed) }
+}
+
+/// Decodes a message and its signature. A malformed signature is treated as absent, so that a receiver that
+/// checks no signatures accepts the message.
+fn parse<'a, T: Deserialize<'a>>(
+    payload: &'a [u8],
+    encapsulation: Encapsulation,
+) -> Result<(T, Option<Signature>), ProbeRefusal> {
     if payload.len() > MAX_MESSAGE_BYTES {
         return Err(ProbeRefusal::Oversized);
     }
@@ -215,12 +164,20 @@ fn parse<'a, T: Deserialize<'a>>(payload: &'a [u8], encapsulation: Encapsulation
     if version.v != VERSION {
         return Err(ProbeRefusal::UnsupportedVersion);
     }
-    serde_json::from_str(json).map_err(|_| ProbeRefusal::Malformed)
+    let message = serde_json::from_str(json).map_err(|_| ProbeRefusal::Malformed)?;
+    Ok((message, serde_json::from_str(json).ok()))
 }
 
-fn serialize(fields: &impl Serialize) -> Bytes {
+fn serialize(message: &impl Serialize) -> Bytes {
+    #[derive(Serialize)]
+    struct Versioned<'a, T> {
+        v: u64,
+        #[serde(flatten)]
+        message: &'a T,
+    }
     // Cannot fail: the fields are numbers and strings, and all keys are strings.
-    string_message(&serde_json::to_string(fields).unwrap_or_default())
+    let json = serde_json::to_string(&Versioned { v: VERSION, message });
+    string_message(&json.unwrap_or_default())
 }
 
 /// Decodes the text of a `std_msgs/String`, in any encapsulation that uses plain CDR for a final type (RTPS
@@ -238,16 +195,13 @@ fn decode_string(payload: &[u8], encapsulation: Encapsulation) -> Option<&str> {
     if padding.len() > 3 { None } else { std::str::from_utf8(text).ok() }
 }
 
-/// Parses a signature. A malformed one is treated as absent, so that a receiver that checks no signatures
-/// accepts the message.
-fn signature(nonce: &Value, hmac: &Value) -> Option<Signature> {
-    Some(Signature { nonce: from_hex(nonce.as_str()?)?, hmac: from_hex(hmac.as_str()?)? })
+fn as_hex<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&to_hex(bytes))
 }
 
-fn signature_fields(signature: Option<Signature>) -> (Value, Value) {
-    signature.map_or((Value::Null, Value::Null), |signature| {
-        (to_hex(&signature.nonce).into(), to_hex(&signature.hmac).into())
-    })
+fn from_hex_text<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<[u8; N], D::Error> {
+    let text = String::deserialize(deserializer)?;
+    from_hex(&text).ok_or_else(|| serde::de::Error::custom("not lowercase hexadecimal digits"))
 }
 
 /// Formats bytes as lowercase hexadecimal digits.
@@ -278,6 +232,7 @@ fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use serde_json::Value;
 
     use super::*;
 

@@ -59,23 +59,11 @@ impl RequestHandler {
     ) -> Option<ProbeRequest> {
         let checked = ProbeRequest::decode(payload, encapsulation)
             .and_then(|request| self.trust.check(&request, received).map(|tolerated| (request, tolerated)));
-        match checked {
-            Ok((request, tolerated)) => {
-                if let Some(reason) = tolerated {
-                    self.accepted_anyway.add(reason, 1);
-                }
-                Some(request)
-            }
-            Err(reason) => {
-                self.refused.add(reason, 1);
-                None
-            }
+        let (request, tolerated) = checked.inspect_err(|reason| self.refused.add(*reason, 1)).ok()?;
+        if let Some(reason) = tolerated {
+            self.accepted_anyway.add(reason, 1);
         }
-    }
-
-    /// Counts a sample that the DDS library could not read.
-    pub fn count_malformed(&mut self) {
-        self.refused.add(ProbeRefusal::Malformed, 1);
+        Some(request)
     }
 
     /// Makes the response to a request that was received at `received`. `begun` and `sent` are the times at

@@ -1,7 +1,5 @@
 //! Authentication of probe messages: signs sent messages and checks received ones (docs/probe-protocol.md).
 
-use std::fmt::Write as _;
-
 use super::message::{ProbeRequest, ProbeResponse, Signature, to_hex};
 use super::secret::{Secret, SecretError};
 use crate::config::{InlineSecret, Security, TrustMode};
@@ -82,15 +80,8 @@ impl Signed for ProbeResponse {
     }
 }
 
-/// Joins fields with line breaks.
 fn lines(fields: &[&dyn std::fmt::Display]) -> String {
-    let mut text = String::with_capacity(512);
-    for (number, field) in fields.iter().enumerate() {
-        let separator = if number == 0 { "" } else { "\n" };
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{separator}{field}");
-    }
-    text
+    fields.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
 }
 
 /// Signs and checks the probe messages of one process.
