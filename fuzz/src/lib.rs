@@ -61,10 +61,10 @@ pub fn config(bytes: &[u8]) {
         }
         Err(error) => {
             let printed = error.to_string();
-            assert!(!error.problems().is_empty());
-            assert_eq!(printed.lines().count(), error.problems().len(), "{printed}");
+            assert!(!error.problems.is_empty());
+            assert_eq!(printed.lines().count(), error.problems.len(), "{printed}");
             let last = file.iter().filter(|&&byte| matches!(byte, b'\n' | b'\r')).count() + 1;
-            for problem in error.problems() {
+            for problem in &error.problems {
                 if let Place::Line(line) = problem.place {
                     assert!((1..=last).contains(&line), "line {line} of {last}: {printed}");
                 }

@@ -11,12 +11,12 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, print};
-use crate::config::{self, ConfigError, Place, Row, Settings};
+use crate::config::{self, ConfigError, Place, Problem, Route, Row, Settings};
+use crate::model::{InstanceName, LaneName, RouteId, TopicName, TypeName};
 use crate::process::InForce;
 use crate::shm::RouteChannel;
 use crate::telemetry::bytes_text;
 
-/// The arguments of `check`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Print JSON, for the problems of a bad file too
@@ -36,22 +36,25 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     if let Some(path) = &arguments.explain {
         return explain(path);
     }
-    let (text, code) = if arguments.json {
-        match arguments.config.try_load() {
-            Ok(settings) => (json!(Summary::of(&settings)).to_string() + "\n", ExitCode::SUCCESS),
-            Err(error) => (problems(&error).to_string() + "\n", ExitCode::from(EXIT_CONFIG)),
+    if arguments.json {
+        let (json, code) = match arguments.config.try_load() {
+            Ok(settings) => (json!(Summary::of(&settings)), ExitCode::SUCCESS),
+            Err(error) => (problems(&error), ExitCode::from(EXIT_CONFIG)),
+        };
+        print(format!("{json}\n"))?;
+        return Ok(code);
+    }
+    let settings = arguments.config.load()?;
+    let running = InForce::find(&arguments.config.file(), Some(&settings));
+    let summary = Summary::of(&settings).to_string();
+    let differences = match running {
+        Some(running) => {
+            differences(&running, settings)
         }
-    } else {
-        let settings = arguments.config.load()?;
-        let running = InForce::find(&arguments.config.file(), Some(&settings));
-        let text = Summary::of(&settings).to_string();
-        (
-            text + &running.map_or_else(String::new, |running| differences(&running, settings)),
-            ExitCode::SUCCESS,
-        )
+        None => String::new(),
     };
-    print(&text)?;
-    Ok(code)
+    print(summary + &differences)?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Reads the path of a key, and offers all paths to the completions of a shell.
@@ -96,7 +99,7 @@ fn explain(path: &str) -> Result<ExitCode, ExitCode> {
         return Err(ExitCode::from(EXIT_USAGE));
     }
     let explained: Vec<String> = keys.iter().map(|(path, row)| explained(path, row)).collect();
-    print(&explained.join("\n"))?;
+    print(explained.join("\n"))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -111,71 +114,65 @@ fn explained(path: &str, row: &Row) -> String {
     )
 }
 
-/// The lanes, routes and shared memory of a good configuration.
 #[derive(Serialize)]
-struct Summary {
-    instance: String,
-    lanes: Vec<String>,
-    routes: Vec<RouteSummary>,
+struct Summary<'a> {
+    instance: &'a InstanceName,
+    lanes: Vec<&'a LaneName>,
+    routes: Vec<RouteSummary<'a>>,
     shared_memory_bytes: u64,
 }
 
 #[derive(Serialize)]
-struct RouteSummary {
-    id: String,
-    input_topic: String,
-    message_type: Option<String>,
-    outputs: Vec<OutputSummary>,
-    max_sample_bytes: u64,
+struct RouteSummary<'a> {
+    id: &'a RouteId,
+    input_topic: &'a TopicName,
+    message_type: Option<&'a TypeName>,
+    outputs: Vec<OutputSummary<'a>>,
+    max_sample_bytes: usize,
     slots: usize,
     shared_memory_bytes: u64,
 }
 
 #[derive(Serialize)]
-struct OutputSummary {
-    lane: String,
-    topic: String,
+struct OutputSummary<'a> {
+    lane: &'a LaneName,
+    topic: &'a TopicName,
 }
 
-impl Summary {
-    fn of(settings: &Settings) -> Self {
-        let routes: Vec<RouteSummary> = settings
-            .routes
-            .iter()
-            .enumerate()
-            .map(|(index, route)| {
-                let pool = RouteChannel::of(settings, index).pool_size();
-                let outputs = settings.lanes.iter().flat_map(|lane| {
-                    lane.outputs.iter().filter(|output| output.route == index).map(|output| OutputSummary {
-                        lane: lane.name.to_string(),
-                        topic: output.topic.to_string(),
-                    })
-                });
-                RouteSummary {
-                    id: route.id.to_string(),
-                    input_topic: route.input_topic.to_string(),
-                    message_type: route.message_type.as_ref().map(ToString::to_string),
-                    outputs: outputs.collect(),
-                    max_sample_bytes: route.max_sample_bytes as u64,
-                    slots: pool.slots,
-                    shared_memory_bytes: pool.bytes,
-                }
-            })
-            .collect();
+impl<'a> Summary<'a> {
+    fn of(settings: &'a Settings) -> Self {
+        let summary = |(index, route): (usize, &'a Route)| {
+            let pool = RouteChannel::of(settings, index).pool_size();
+            let outputs = settings.lanes.iter().filter_map(|lane| {
+                let output = lane.outputs.iter().find(|output| output.route == index)?;
+                Some(OutputSummary { lane: &lane.name, topic: &output.topic })
+            });
+            RouteSummary {
+                id: &route.id,
+                input_topic: &route.input_topic,
+                message_type: route.message_type.as_ref(),
+                outputs: outputs.collect(),
+                max_sample_bytes: route.max_sample_bytes,
+                slots: pool.slots,
+                shared_memory_bytes: pool.bytes,
+            }
+        };
+        let routes: Vec<_> = settings.routes.iter().enumerate().map(summary).collect();
         Self {
-            instance: settings.instance.to_string(),
-            lanes: settings.lanes.iter().map(|lane| lane.name.to_string()).collect(),
+            instance: &settings.instance,
+            lanes: settings.lanes.iter().map(|lane| &lane.name).collect(),
             shared_memory_bytes: routes.iter().map(|route| route.shared_memory_bytes).sum(),
             routes,
         }
     }
 }
 
-impl fmt::Display for Summary {
+impl fmt::Display for Summary<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "instance {}: {} routes, {} lanes", self.instance, self.routes.len(), self.lanes.len())?;
         for route in &self.routes {
-            let message_type = route.message_type.as_deref().unwrap_or("type from DDS discovery");
+            let from_dds = || "type from DDS discovery".to_owned();
+            let message_type = route.message_type.map_or_else(from_dds, ToString::to_string);
             writeln!(f, "\nroute {}: {} ({message_type})", route.id, route.input_topic)?;
             for output in &route.outputs {
                 writeln!(f, "  {} -> {}", output.lane, output.topic)?;
@@ -203,33 +200,24 @@ fn differences(running: &Settings, file: Settings) -> String {
     for change in &reload.waits {
         let _ = writeln!(text, "waits for a restart of the whole bridge: {change}");
     }
-    if text.is_empty() {
-        text
-    } else {
-        format!("\nthe configuration in force in the running bridge differs from this file:\n{text}")
+    if !text.is_empty() {
+        text.insert_str(0, "\nthe configuration in force in the running bridge differs from this file:\n");
     }
+    text
 }
 
-/// The problems of a bad file as JSON.
 fn problems(error: &ConfigError) -> serde_json::Value {
-    let problems: Vec<_> = error
-        .problems()
-        .iter()
-        .map(|problem| {
-            let (place, line) = match problem.place {
-                Place::Environment => ("environment", None),
-                Place::File => ("file", None),
-                Place::Line(line) => ("file", Some(line)),
-            };
-            json!({
-                "place": place,
-                "line": line,
-                "key": problem.key,
-                "value": problem.value,
-                "allowed": problem.allowed,
-                "hint": problem.hint,
-            })
+    let problem = |problem: &Problem| {
+        let (place, line) = match problem.place {
+            Place::Environment => ("environment", None),
+            Place::File => ("file", None),
+            Place::Line(line) => ("file", Some(line)),
+        };
+        let Problem { key, value, allowed, hint, .. } = problem;
+        json!({
+            "place": place, "line": line, "key": key, "value": value, "allowed": allowed, "hint": hint
         })
-        .collect();
-    json!({ "file": error.file(), "problems": problems })
+    };
+    let problems: Vec<_> = error.problems.iter().map(problem).collect();
+    json!({ "file": error.file, "problems": problems })
 }

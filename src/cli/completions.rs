@@ -5,9 +5,8 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory};
 use clap_complete::Shell;
 
-use super::{Cli, print_bytes};
+use super::{Cli, print};
 
-/// The arguments of `completions`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The shell
@@ -20,6 +19,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     // Generated in memory first, because the generator panics when a write fails.
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut command, name, &mut script);
-    print_bytes(&script)?;
+    print(script)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -17,22 +17,21 @@ mod scan;
 mod screen;
 mod tally;
 
-use std::io;
+use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::{ExitCode, ExitStatus};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::model::MonotonicNs;
+use crate::process::Stop;
 use crate::shm::ShmError;
 use outcome::{Outcome, wrapped};
 use sandbox::Sandbox;
 use screen::Screen;
 
-pub(super) use peers::{PublisherArguments, SubscriberArguments, publisher, subscriber};
+pub(super) use peers::{PeerArguments, SubscriberArguments, publisher, subscriber};
 
 /// Scans that the laser publishes per second.
 const RATE_HZ: u64 = 30;
@@ -46,7 +45,6 @@ const MAX_BLOCKING_MS: u64 = 100;
 const STALL_EVERY_MS: u64 = 6_000;
 /// The time from the start of a period to its stall.
 const STALL_AFTER_MS: u64 = 2_000;
-/// The duration of a stall.
 const STALL_MS: u64 = 3_000;
 /// The laser's topic, in the demo's own DDS domain.
 const INPUT_TOPIC: &str = "/scan";
@@ -60,7 +58,6 @@ enum Setup {
     Bridge,
 }
 
-/// The arguments of `demo`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Duration of each of the two phases, in seconds
@@ -75,7 +72,6 @@ pub(super) struct Arguments {
     svg: Option<PathBuf>,
 }
 
-/// The instant at which a scan is due.
 const fn due_at(began_at: MonotonicNs, number: u64) -> MonotonicNs {
     began_at.plus_ns(number * 1_000_000_000 / RATE_HZ)
 }
@@ -89,7 +85,6 @@ fn first_due_after(began_at: MonotonicNs, instant: MonotonicNs) -> u64 {
     number
 }
 
-/// Why a demo ended early.
 #[derive(Debug, thiserror::Error)]
 enum DemoError {
     /// The user stopped it.
@@ -116,30 +111,6 @@ enum DemoError {
     Os { action: &'static str, error: io::Error },
 }
 
-impl DemoError {
-    fn os(action: &'static str, error: io::Error) -> Self {
-        Self::Os { action, error }
-    }
-}
-
-/// Set when the user stops the demo: by Ctrl-C, SIGTERM, or closing the terminal.
-struct Interrupt(Arc<AtomicBool>);
-
-impl Interrupt {
-    fn on_signals() -> Result<Self, DemoError> {
-        let flag = Arc::new(AtomicBool::new(false));
-        for signal in [SIGINT, SIGTERM, SIGHUP] {
-            signal_hook::flag::register(signal, Arc::clone(&flag))
-                .map_err(|error| DemoError::os("cannot handle signals", error))?;
-        }
-        Ok(Self(flag))
-    }
-
-    fn is_requested(&self) -> bool {
-        self.0.load(Ordering::Acquire)
-    }
-}
-
 pub(super) fn run(arguments: &Arguments) -> ExitCode {
     let mut screen = Screen::new(arguments.json);
     match show(arguments, &mut screen) {
@@ -156,12 +127,14 @@ pub(super) fn run(arguments: &Arguments) -> ExitCode {
 }
 
 fn show(arguments: &Arguments, screen: &mut Screen) -> Result<Outcome, DemoError> {
-    let interrupt = Interrupt::on_signals()?;
+    // Ctrl-C, a request, or a closed terminal.
+    let stop = Stop::on(&[SIGINT, SIGTERM, SIGHUP])
+        .map_err(|error| DemoError::Os { action: "cannot handle signals", error })?;
     let sandbox = Sandbox::create()?;
-    screen.print(&introduction(arguments.seconds, sandbox.domain()));
+    screen.print(&introduction(arguments.seconds, sandbox.settings.input.domain_id));
     let mut phase = |setup, title: &str| {
         screen.print(title);
-        let figures = phase::run(&sandbox, setup, arguments.seconds, &interrupt, screen);
+        let figures = phase::run(&sandbox, setup, arguments.seconds, &stop, screen);
         if let Err(error) = &figures
             && !matches!(error, DemoError::Interrupted)
         {
@@ -200,21 +173,13 @@ fn introduction(seconds: u64, domain: u16) -> String {
 /// Prints the result, and writes its picture if there is a file for it.
 fn print(outcome: &Outcome, arguments: &Arguments, screen: &mut Screen) -> Result<(), String> {
     if arguments.json {
-        print_json(outcome).map_err(|error| error.to_string())?;
+        let json = serde_json::to_string_pretty(outcome).map_err(|error| error.to_string())?;
+        writeln!(io::stdout(), "{json}").map_err(|error| error.to_string())?;
     } else {
         screen.print(&outcome.text());
     }
-    match &arguments.svg {
-        None => Ok(()),
-        Some(path) => std::fs::write(path, picture::picture(outcome))
-            .map_err(|error| format!("{}: {error}", path.display())),
-    }
-}
-
-fn print_json(outcome: &Outcome) -> io::Result<()> {
-    use io::Write;
-    let json = serde_json::to_string_pretty(outcome)?;
-    writeln!(io::stdout().lock(), "{json}")
+    let Some(path) = &arguments.svg else { return Ok(()) };
+    std::fs::write(path, picture::picture(outcome)).map_err(|error| format!("{}: {error}", path.display()))
 }
 
 #[cfg(test)]

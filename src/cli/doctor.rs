@@ -5,7 +5,7 @@ mod memory;
 mod network;
 mod services;
 
-use std::fmt::{self, Write};
+use std::fmt;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, ExitCode};
@@ -28,7 +28,6 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-/// The severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Severity {
@@ -61,7 +60,6 @@ impl Severity {
     }
 }
 
-/// The result of one check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct Finding {
     /// The stable name of the check.
@@ -76,24 +74,28 @@ struct Finding {
 }
 
 impl Finding {
+    fn new(check: &'static str, severity: Severity, found: impl Into<String>) -> Self {
+        Self { check, severity, found: found.into(), meaning: "", command: None }
+    }
+
     fn ok(check: &'static str, found: impl Into<String>) -> Self {
-        Self { check, severity: Severity::Ok, found: found.into(), meaning: "", command: None }
+        Self::new(check, Severity::Ok, found)
     }
 
-    fn new(check: &'static str, severity: Severity, found: impl Into<String>, meaning: &'static str) -> Self {
-        Self { check, severity, found: found.into(), meaning, command: None }
+    fn note(check: &'static str, found: impl Into<String>) -> Self {
+        Self::new(check, Severity::Note, found)
     }
 
-    fn note(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
-        Self::new(check, Severity::Note, found, meaning)
+    fn warning(check: &'static str, found: impl Into<String>) -> Self {
+        Self::new(check, Severity::Warning, found)
     }
 
-    fn warning(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
-        Self::new(check, Severity::Warning, found, meaning)
+    fn error(check: &'static str, found: impl Into<String>) -> Self {
+        Self::new(check, Severity::Error, found)
     }
 
-    fn error(check: &'static str, found: impl Into<String>, meaning: &'static str) -> Self {
-        Self::new(check, Severity::Error, found, meaning)
+    fn means(self, meaning: &'static str) -> Self {
+        Self { meaning, ..self }
     }
 
     fn with_command(mut self, command: impl Into<String>) -> Self {
@@ -102,7 +104,6 @@ impl Finding {
     }
 }
 
-/// All findings, with the worst severity.
 #[derive(Debug, Serialize)]
 struct Diagnosis {
     /// The worst severity of the findings.
@@ -141,14 +142,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
             settings
         }
         Err(error) => {
-            let problems = error.problems().len();
+            let problems = error.problems.len();
             findings.push(
-                Finding::error(
-                    "configuration",
-                    format!("{}: {problems} problems", file.display()),
-                    "No process of the bridge starts. The following checks use the default settings.",
-                )
-                .with_command(format!("adaptive-bridge check --config {}", file.display())),
+                Finding::error("configuration", format!("{}: {problems} problems", file.display()))
+                    .means("No process of the bridge starts. The following checks use the default settings.")
+                    .with_command(format!("adaptive-bridge check --config {}", file.display())),
             );
             config::parse("topics: [{id: none, input_topic: /none}]", "the defaults", &|_| None)
                 .map_err(|error| failed(&error))?
@@ -161,7 +159,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     } else {
         diagnosis.to_string()
     };
-    print(&text)?;
+    print(text)?;
     Ok(ExitCode::from(diagnosis.severity.exit_code()))
 }
 
@@ -185,15 +183,8 @@ fn output(program: &str, arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-/// The items separated by commas.
 fn list<T: fmt::Display>(items: impl IntoIterator<Item = T>) -> String {
-    let mut text = String::new();
-    for item in items {
-        let comma = if text.is_empty() { "" } else { ", " };
-        // Writing to a String cannot fail.
-        let _ = write!(text, "{comma}{item}");
-    }
-    text
+    items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]
@@ -202,7 +193,7 @@ mod tests {
 
     #[test]
     fn the_exit_code_is_that_of_the_worst_finding() {
-        let found = |severity| Finding::new("x", severity, "y", "z");
+        let found = |severity| Finding::new("x", severity, "y").means("z");
         let code = |findings: &[Severity]| {
             Diagnosis::of(findings.iter().copied().map(found).collect()).severity.exit_code()
         };
@@ -214,7 +205,7 @@ mod tests {
 
     #[test]
     fn a_finding_is_shown_with_its_meaning_and_its_command() {
-        let finding = Finding::new("clock", Severity::Warning, "hpet", "Slow.").with_command("fix it");
+        let finding = Finding::new("clock", Severity::Warning, "hpet").means("Slow.").with_command("fix it");
         let shown = Diagnosis::of(vec![finding]).to_string();
         assert_eq!(
             shown,

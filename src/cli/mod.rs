@@ -26,6 +26,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::clock;
 use crate::config::{self, ConfigError, Configuration, Settings};
+use crate::model::TopicName;
 use crate::process::{InForce, Stop};
 use crate::shm::ShmError;
 use crate::telemetry::{self, Snapshot};
@@ -88,7 +89,7 @@ enum Command {
     /// Demonstrate the bridge with a publisher and two subscribers on this machine, without ROS 2
     Demo(demo::Arguments),
     #[command(hide = true)]
-    DemoPublisher(demo::PublisherArguments),
+    DemoPublisher(demo::PeerArguments),
     #[command(hide = true)]
     DemoSubscriber(demo::SubscriberArguments),
 }
@@ -143,7 +144,6 @@ impl ConfigArguments {
     }
 }
 
-/// Prints every problem of a configuration file and returns the exit code.
 fn bad_configuration(error: &ConfigError) -> ExitCode {
     eprintln!("{error}");
     ExitCode::from(EXIT_CONFIG)
@@ -168,7 +168,7 @@ pub fn main() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Units(arguments) => units::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
-        Command::Man(arguments) => Ok(man::run(&arguments)),
+        Command::Man(arguments) => man::run(&arguments),
         Command::Demo(arguments) => Ok(demo::run(&arguments)),
         Command::DemoPublisher(arguments) => Ok(demo::publisher(&arguments)),
         Command::DemoSubscriber(arguments) => Ok(demo::subscriber(&arguments)),
@@ -176,10 +176,13 @@ pub fn main() -> ExitCode {
     ended.unwrap_or_else(|code| code)
 }
 
-/// Prints why a command failed and returns its exit code.
 fn failed(error: &dyn std::fmt::Display) -> ExitCode {
     eprintln!("adaptive-bridge: {error}");
     ExitCode::FAILURE
+}
+
+fn topic(text: &str) -> Result<TopicName, String> {
+    TopicName::try_from(text).map_err(|error| error.to_string())
 }
 
 /// Takes a snapshot of the bridge that runs with these settings; `None` when no bridge runs.
@@ -200,7 +203,6 @@ fn running_bridge(root: &Path, settings: &Settings) -> Result<Snapshot, ExitCode
     snapshot.ok_or_else(|| no_bridge(settings, root))
 }
 
-/// Prints that no bridge runs with these settings and returns the exit code.
 fn no_bridge(settings: &Settings, root: &Path) -> ExitCode {
     let services = Path::new("/run/adaptive-bridge");
     let hint = match std::fs::metadata(services) {
@@ -225,13 +227,8 @@ fn output_ended(error: &io::Error) -> ExitCode {
     }
 }
 
-/// Writes the result of a subcommand to stdout.
-fn print(text: &str) -> Result<(), ExitCode> {
-    print_bytes(text.as_bytes())
-}
-
-fn print_bytes(bytes: &[u8]) -> Result<(), ExitCode> {
-    io::stdout().write_all(bytes).map_err(|error| output_ended(&error))
+fn print(text: impl AsRef<[u8]>) -> Result<(), ExitCode> {
+    io::stdout().write_all(text.as_ref()).map_err(|error| output_ended(&error))
 }
 
 /// Sleeps for `ms` and returns `true`; returns `false` as soon as a stop is requested.

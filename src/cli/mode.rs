@@ -9,7 +9,6 @@ use super::{ConfigArguments, failed};
 use crate::model::LaneMode;
 use crate::process;
 
-/// The arguments of `mode`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The lane
@@ -24,7 +23,6 @@ pub(super) struct Arguments {
     config: ConfigArguments,
 }
 
-/// The modes that can be set by hand.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Mode {
     /// Forward at the configured rate

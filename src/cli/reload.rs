@@ -48,13 +48,11 @@ fn summary(answers: &[ReloadAnswer], fingerprint: u64) -> String {
         Some(ReloadResult::Accepted { reload, .. }) => Some(reload),
         _ => None,
     });
-    for reload in accepted.clone() {
-        reload.changed.iter().for_each(|change| add(format!("changed: {change}")));
+    for change in accepted.clone().flat_map(|reload| &reload.changed) {
+        add(format!("changed: {change}"));
     }
-    for reload in accepted {
-        for change in &reload.waits {
-            add(format!("waits for a restart of the whole bridge: {change}"));
-        }
+    for change in accepted.flat_map(|reload| &reload.waits) {
+        add(format!("waits for a restart of the whole bridge: {change}"));
     }
     for ReloadAnswer { role, pid, result } in answers {
         add(format!("{role} (pid {pid}): {}", outcome(result.as_ref(), fingerprint)));

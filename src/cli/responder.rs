@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, EXIT_CONFIG, bad_configuration, failed, roles};
+use super::{ConfigArguments, EXIT_CONFIG, bad_configuration, failed, roles, topic};
 use crate::config::{self, Configuration, DdsNetwork, NetworkSelector, SecretSource, Settings};
 use crate::model::{LaneName, TopicName, is_probe_id};
 use crate::process::probes::Trust;
@@ -98,8 +98,4 @@ fn id(text: &str) -> Result<String, String> {
 
 fn network(text: &str) -> Result<NetworkSelector, String> {
     NetworkSelector::parse(text).ok_or_else(|| format!("must be {}", NetworkSelector::ALLOWED))
-}
-
-fn topic(text: &str) -> Result<TopicName, String> {
-    TopicName::try_from(text).map_err(|error| error.to_string())
 }

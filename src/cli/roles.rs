@@ -14,7 +14,6 @@ use crate::telemetry;
 /// after 100 ms; a process that lacks, say, a network interface gains nothing from being started that often.
 const FAILED_START_MS: u64 = 2_000;
 
-/// The arguments of `egress`.
 #[derive(Args, Debug)]
 pub(super) struct EgressArguments {
     /// The lane to serve
@@ -24,7 +23,6 @@ pub(super) struct EgressArguments {
     config: ConfigArguments,
 }
 
-/// The arguments of `up`.
 #[derive(Args, Debug)]
 pub(super) struct UpArguments {
     /// Leave processes alone that make no progress, for example because a debugger has stopped them;

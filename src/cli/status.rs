@@ -16,7 +16,6 @@ use crate::telemetry::{ProcessState, Report, Snapshot};
 /// Allowed values of `--interval-ms`: from 10 ms, one period of 100 Hz, to an hour.
 const INTERVALS_MS: RangeInclusive<u64> = 10..=3_600_000;
 
-/// The arguments of `status`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Print JSON (docs/status-json.md): one object; with --watch one object per line
@@ -108,10 +107,10 @@ fn watch(
 }
 
 fn show(report: &Report, json: bool) -> io::Result<()> {
-    let mut text = if json { serde_json::to_string(report)? } else { report.to_string() };
-    if json {
-        text.push('\n');
-    }
+    write(&if json { serde_json::to_string(report)? + "\n" } else { report.to_string() })
+}
+
+fn write(text: &str) -> io::Result<()> {
     let mut stdout = io::stdout().lock();
     stdout.write_all(text.as_bytes())?;
     stdout.flush()
@@ -122,9 +121,7 @@ fn redraw(text: &str) -> io::Result<()> {
         Some((terminal_size::Width(columns), terminal_size::Height(lines))) => (columns, lines),
         None => (80, 24),
     };
-    let mut stdout = io::stdout().lock();
-    stdout.write_all(frame(text, usize::from(columns), usize::from(lines)).as_bytes())?;
-    stdout.flush()
+    write(&frame(text, usize::from(columns), usize::from(lines)))
 }
 
 /// The escape sequences and text that overwrite the previous report: from the upper left corner, each line is

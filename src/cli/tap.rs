@@ -4,7 +4,6 @@
 //! nor waits for it, and a sample that it does not take in time is overwritten. Ingress and the lanes are
 //! unaffected.
 
-use std::fmt::Write as _;
 use std::io::{self, BufWriter, StdoutLock, Write};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -26,7 +25,6 @@ const REPORT_MS: u64 = 1_000;
 /// bridge that has ended, and a bridge with other routes could not start.
 const BRIDGE_CHECK_MS: u64 = 200;
 
-/// The arguments of `tap`.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// The input topic, such as /scan, or the id of the route
@@ -64,8 +62,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let subscriber = opened.map_err(|error| failed(&error))?;
     let bridge_runs = || matches!(read_bridge(&root, &settings), Ok(Some(_)));
     match Tap::new(arguments).follow(&subscriber, &stop, bridge_runs) {
-        Ok(End::Done) => Ok(ExitCode::SUCCESS),
-        Ok(End::BridgeGone) => Err(failed(&"the bridge has ended")),
+        Ok(true) => Ok(ExitCode::SUCCESS),
+        Ok(false) => Err(failed(&"the bridge has ended")),
         Err(error) => Err(output_ended(&error)),
     }
 }
@@ -82,20 +80,12 @@ fn unknown_topic(settings: &Settings, topic: &str) -> String {
     format!("no route has the input topic or id {topic}; the routes are: {}", known.join(", "))
 }
 
-/// Why a tap ended.
-enum End {
-    Done,
-    BridgeGone,
-}
-
-/// The output format of a tap.
 enum Format {
     Lines,
     Raw,
     Hz { intervals: Intervals, lost: u64, new: u64, report_at: MonotonicNs },
 }
 
-/// Shows the samples of one route on stdout.
 struct Tap {
     format: Format,
     /// Samples to show until the end; `None` without a limit.
@@ -122,13 +112,14 @@ impl Tap {
         }
     }
 
-    /// Shows samples until a stop is requested, the last wanted sample is shown, or the bridge ends.
+    /// Shows samples until a stop is requested, the last wanted sample is shown, or the bridge ends: then
+    /// returns `false`.
     fn follow(
         &mut self,
         subscriber: &SampleSubscriber,
         stop: &Stop,
         bridge_runs: impl Fn() -> bool,
-    ) -> io::Result<End> {
+    ) -> io::Result<bool> {
         let mut interval = PollInterval::default();
         let mut check_at = clock::monotonic().plus_ms(BRIDGE_CHECK_MS);
         while !stop.is_requested() {
@@ -139,8 +130,7 @@ impl Tap {
                         taken += 1;
                         self.show(&sample)?;
                         if self.left == Some(0) {
-                            self.finish()?;
-                            return Ok(End::Done);
+                            return self.finish();
                         }
                     }
                     Ok(None) | Err(TakeError::BorrowLimit) => break,
@@ -158,22 +148,19 @@ impl Tap {
             self.output.flush()?;
             if now >= check_at {
                 if !bridge_runs() {
-                    return Ok(End::BridgeGone);
+                    return Ok(false);
                 }
                 check_at = now.plus_ms(BRIDGE_CHECK_MS);
             }
             #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
             std::thread::sleep(interval.after(taken));
         }
-        self.finish()?;
-        Ok(End::Done)
+        self.finish()
     }
 
     fn show(&mut self, sample: &ShmSample) -> io::Result<()> {
         let header = sample.header();
-        if let Some(left) = &mut self.left {
-            *left = left.saturating_sub(1);
-        }
+        self.left = self.left.map(|left| left.saturating_sub(1));
         let missed = match self.tracker.record(header.sequence) {
             SequenceOutcome::AfterGap(missed) => missed,
             SequenceOutcome::InOrder | SequenceOutcome::Duplicate => 0,
@@ -197,19 +184,11 @@ impl Tap {
 
     /// Prints the line of `--hz` when it is due.
     fn report(&mut self, now: MonotonicNs) -> io::Result<()> {
-        match &mut self.format {
-            Format::Hz { report_at, .. } if now >= *report_at => {
-                *report_at = now.plus_ms(REPORT_MS);
-                self.report_now()
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn report_now(&mut self) -> io::Result<()> {
-        let Format::Hz { intervals, lost, new, .. } = &mut self.format else {
+        let Format::Hz { intervals, lost, new, report_at } = &mut self.format else { return Ok(()) };
+        if now < *report_at {
             return Ok(());
-        };
+        }
+        *report_at = now.plus_ms(REPORT_MS);
         let text = match intervals.statistics() {
             _ if *new == 0 => "no new samples".to_owned(),
             None => "one sample".to_owned(),
@@ -222,11 +201,12 @@ impl Tap {
         writeln!(self.output, "{text}")
     }
 
-    fn finish(&mut self) -> io::Result<()> {
+    fn finish(&mut self) -> io::Result<bool> {
         if matches!(self.format, Format::Hz { new: 1.., .. }) {
-            self.report_now()?;
+            self.report(MonotonicNs(u64::MAX))?;
         }
-        self.output.flush()
+        self.output.flush()?;
+        Ok(true)
     }
 }
 
@@ -237,42 +217,39 @@ fn line(sample: &ShmSample) -> String {
         Some(written) => format!("{:.1}", clock::wall().since(written) as f64 / 1e3),
         None => "none".to_owned(),
     };
-    let mut text = format!(
-        "sequence={} age_us={age} bytes={} encapsulation={} options={} writer=",
+    format!(
+        "sequence={} age_us={age} bytes={} encapsulation={} options={} writer={}",
         header.sequence,
         sample.payload().len(),
         representation(header.encapsulation),
         hex(&header.encapsulation.options()),
-    );
-    text.push_str(&hex(&header.writer_guid.0));
-    text
+        hex(&header.writer_guid.0),
+    )
 }
 
 fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// The name of the data representation (RTPS 2.5 clause 10.2, XTypes 1.3 clause 7.6.3.1.2), or its number.
 fn representation(encapsulation: Encapsulation) -> String {
-    let name = match encapsulation.representation() {
-        [0, 0] => "CDR_BE",
-        [0, 1] => "CDR_LE",
-        [0, 2] => "PL_CDR_BE",
-        [0, 3] => "PL_CDR_LE",
-        [0, 4] => "XML",
-        [0, 6] => "CDR2_BE",
-        [0, 7] => "CDR2_LE",
-        [0, 8] => "D_CDR2_BE",
-        [0, 9] => "D_CDR2_LE",
-        [0, 0x0a] => "PL_CDR2_BE",
-        [0, 0x0b] => "PL_CDR2_LE",
-        other => return format!("0x{}", hex(&other)),
-    };
-    name.to_owned()
+    const NAMES: [&str; 12] = [
+        "CDR_BE",
+        "CDR_LE",
+        "PL_CDR_BE",
+        "PL_CDR_LE",
+        "XML",
+        "",
+        "CDR2_BE",
+        "CDR2_LE",
+        "D_CDR2_BE",
+        "D_CDR2_LE",
+        "PL_CDR2_BE",
+        "PL_CDR2_LE",
+    ];
+    let number = encapsulation.representation();
+    let name = NAMES.get(usize::from(u16::from_be_bytes(number))).filter(|name| !name.is_empty());
+    name.map_or_else(|| format!("0x{}", hex(&number)), |name| (*name).to_owned())
 }
 
 /// Writes one sample in the format of `--raw`.

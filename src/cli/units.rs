@@ -51,7 +51,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     } else {
         wanted.print(&arguments.folder)
     };
-    print(&text)?;
+    print(text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -74,29 +74,27 @@ impl DropIns {
         add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
 
         let common = common(settings, config);
-        let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Vec<String>| {
+        let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Option<String>| {
+            let own = Vec::from_iter(own);
             add(unit, "Service", [common.clone(), scheduling(configured, critical), own].concat());
         };
-        service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, Vec::new());
+        service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, None);
         for lane in &settings.lanes {
             let critical = lane.class() == TrafficClass::Critical;
-            service(egress(lane.name.as_str()), &lane.scheduling, critical, Vec::new());
+            service(egress(lane.name.as_str()), &lane.scheduling, critical, None);
         }
-        let mut own = Vec::new();
-        if let Some(MetricsListener::Unix(socket)) = &settings.diagnostics.metrics {
-            own.extend(socket.parent().map(|folder| format!("ReadWritePaths={}", quoted(folder))));
-        }
+        let own = match &settings.diagnostics.metrics {
+            Some(MetricsListener::Unix(socket)) => socket.parent().map(read_write),
+            _ => None,
+        };
         service("adaptive-bridge-control.service".to_owned(), &settings.control_scheduling, false, own);
         Self(drop_ins)
     }
 
     /// Whether `folder` has exactly these drop-ins.
     pub fn match_folder(&self, folder: &Path) -> bool {
-        let written = self
-            .0
-            .iter()
-            .all(|(unit, text)| fs::read_to_string(path(folder, unit)).is_ok_and(|present| present == *text));
-        written && self.obsolete(folder).is_ok_and(|obsolete| obsolete.is_empty())
+        self.0.iter().all(|(unit, text)| is_written(&path(folder, unit), text))
+            && self.obsolete(folder).is_ok_and(|obsolete| obsolete.is_empty())
     }
 
     fn print(&self, folder: &Path) -> String {
@@ -126,7 +124,7 @@ impl DropIns {
         }
         for (unit, drop_in) in &self.0 {
             let path = path(folder, unit);
-            if fs::read_to_string(&path).is_ok_and(|present| present == *drop_in) {
+            if is_written(&path, drop_in) {
                 continue;
             }
             path.parent().map_or(Ok(()), fs::create_dir_all).map_err(|error| at(&path, error))?;
@@ -167,6 +165,10 @@ fn path(folder: &Path, unit: &str) -> PathBuf {
     folder.join(format!("{unit}.d")).join(FILE)
 }
 
+fn is_written(path: &Path, text: &str) -> bool {
+    fs::read_to_string(path).is_ok_and(|present| present == text)
+}
+
 fn egress(lane: &str) -> String {
     format!("adaptive-bridge-egress@{lane}.service")
 }
@@ -186,10 +188,12 @@ fn common(settings: &Settings, config: &Path) -> Vec<String> {
     if read.iter().any(is_home) {
         lines.push("ProtectHome=read-only".to_owned());
     }
-    if let Some(root) = &settings.shared_memory.root_path {
-        lines.push(format!("ReadWritePaths={}", quoted(root)));
-    }
+    lines.extend(settings.shared_memory.root_path.as_deref().map(read_write));
     lines
+}
+
+fn read_write(folder: &Path) -> String {
+    format!("ReadWritePaths={}", quoted(folder))
 }
 
 /// A quoted word of a unit file, with special characters escaped (systemd.syntax(7)).

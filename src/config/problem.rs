@@ -34,8 +34,10 @@ pub struct Problem {
 /// Every problem of a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigError {
-    file: String,
-    problems: Vec<Problem>,
+    /// The name of the file as given to the loader.
+    pub file: String,
+    /// The problems, in the order of the file; those of the environment come first.
+    pub problems: Vec<Problem>,
 }
 
 impl ConfigError {
@@ -45,16 +47,6 @@ impl ConfigError {
         problems.retain(|problem| seen.insert((problem.place, problem.key.clone(), problem.allowed.clone())));
         problems.sort_by_key(|problem| problem.place);
         Self { file: file.to_owned(), problems }
-    }
-
-    /// The name of the file as given to the loader.
-    pub fn file(&self) -> &str {
-        &self.file
-    }
-
-    /// The problems, in the order of the file; those of the environment come first.
-    pub fn problems(&self) -> &[Problem] {
-        &self.problems
     }
 }
 

@@ -16,8 +16,16 @@ impl Stop {
     /// # Errors
     /// The operating system refused the signal handlers.
     pub fn on_signals() -> io::Result<Self> {
+        Self::on(&[SIGINT, SIGTERM])
+    }
+
+    /// As [`Stop::on_signals`], for other signals.
+    ///
+    /// # Errors
+    /// The operating system refused the signal handlers.
+    pub fn on(signals: &[i32]) -> io::Result<Self> {
         let stop = Self::default();
-        for signal in [SIGINT, SIGTERM] {
+        for &signal in signals {
             signal_hook::flag::register(signal, Arc::clone(&stop.0))?;
         }
         Ok(stop)

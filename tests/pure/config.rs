@@ -210,7 +210,7 @@ fn the_originals_stress_file_keeps_its_meaning() {
 fn twelve_mistakes_in_one_file_are_twelve_problems_with_their_lines() {
     let error = parse(include_str!("../fixtures/config/twelve_mistakes.yaml")).unwrap_err();
     let found: Vec<(Place, &str)> =
-        error.problems().iter().map(|problem| (problem.place, problem.key.as_str())).collect();
+        error.problems.iter().map(|problem| (problem.place, problem.key.as_str())).collect();
     let expected = [
         (3, "instance"),
         (5, "ros.domain_id"),
@@ -387,7 +387,7 @@ fn every_key_is_read() {
         let below = lines[key.line + 1..].iter();
         changed.extend(below.skip_while(|line| indent(line) > own_indent).map(|line| (*line).to_owned()));
         let error = parse(&changed.join("\n")).expect_err(&key.path);
-        let found = error.problems().iter().find(|problem| problem.key.starts_with(&key.path));
+        let found = error.problems.iter().find(|problem| problem.key.starts_with(&key.path));
         let found = found.unwrap_or_else(|| panic!("{}: {error}", key.path));
         assert_eq!(found.place, Place::Line(key.line + 1), "{}", key.path);
         checked += 1;
@@ -408,7 +408,7 @@ fn a_file_is_found_by_its_path_or_by_the_environment() {
     // The command line has priority over the environment.
     let missing = folder.path().join("b.yaml");
     let error = config::load(Some(&missing), &env).unwrap_err();
-    assert_eq!(error.file(), missing.display().to_string());
+    assert_eq!(error.file, missing.display().to_string());
     assert!(error.to_string().contains("b.yaml: cannot be read: No such file"), "{error}");
 }
 
@@ -703,11 +703,11 @@ fn check_any(text: &[u8]) -> Result<(), TestCaseError> {
     let outcome = config::parse(text, "f.yaml", &no_env);
     prop_assert_eq!(&outcome, &config::parse(text, "f.yaml", &no_env));
     if let Err(error) = outcome {
-        prop_assert!(!error.problems().is_empty());
+        prop_assert!(!error.problems.is_empty());
         let printed = error.to_string();
-        prop_assert_eq!(printed.lines().count(), error.problems().len(), "{}", &printed);
+        prop_assert_eq!(printed.lines().count(), error.problems.len(), "{}", &printed);
         let last = text.iter().filter(|&&byte| matches!(byte, b'\n' | b'\r')).count() + 1;
-        for problem in error.problems() {
+        for problem in &error.problems {
             if let Place::Line(line) = problem.place {
                 prop_assert!((1..=last).contains(&line), "line {} of {}: {}", line, last, &printed);
             }

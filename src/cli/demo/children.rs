@@ -1,6 +1,6 @@
 //! The processes of a demo: all are its children, and none outlives it, however it ends.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::{self, BufRead, BufReader};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
@@ -35,7 +35,6 @@ const REMOVED_VARIABLES: [&str; 10] = [
     "ADAPTIVE_BRIDGE_CONFIG",
 ];
 
-/// The role of a process of the demo.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Role {
     Publisher,
@@ -168,9 +167,8 @@ fn pid_of(child: &Child) -> Pid {
 
 /// Sends each report that a process prints on its stdout to the channel.
 fn forward_reports(role: Role, stdout: ChildStdout, sender: &Sender<(Role, Report)>) {
-    for line in BufReader::new(stdout).lines() {
-        let Ok(line) = line else { return };
-        if let Some(report) = Report::parse(&line)
+    for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+        if let Ok(report) = serde_json::from_str(&line)
             && sender.send((role, report)).is_err()
         {
             return;
@@ -183,14 +181,12 @@ pub(super) fn last_log_lines(sandbox: &Sandbox) -> String {
     const LINES: usize = 12;
     let mut text = String::new();
     for role in Role::ALL {
-        let Ok(log) = File::open(sandbox.log(role.name())) else { continue };
-        let lines: Vec<String> = BufReader::new(log).lines().map_while(Result::ok).collect();
+        let log = fs::read(sandbox.log(role.name())).unwrap_or_default();
+        let log = String::from_utf8_lossy(&log);
+        let lines: Vec<&str> = log.lines().collect();
         if !lines.is_empty() {
-            text.push_str(&format!("--- the last lines of the {}'s log\n", role.name()));
-        }
-        for line in &lines[lines.len().saturating_sub(LINES)..] {
-            text.push_str(line);
-            text.push('\n');
+            let last = lines[lines.len().saturating_sub(LINES)..].join("\n");
+            text.push_str(&format!("--- the last lines of the {}'s log\n{last}\n", role.name()));
         }
     }
     text

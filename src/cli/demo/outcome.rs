@@ -13,7 +13,9 @@ use crate::model::DropReason;
 const SUPERSEDED: &str = "Superseded: the remote lane forwards 10 scans a second, each time the latest one, \
                           and drops the older ones.";
 
-/// The result of a demo.
+/// The label of a row, and its figure of one phase.
+type Row = (&'static str, fn(&Figures) -> String);
+
 #[derive(Debug, Serialize)]
 pub(super) struct Outcome {
     pub seconds_per_phase: u64,
@@ -27,7 +29,6 @@ pub(super) struct Outcome {
     pub with_bridge: Figures,
     /// Whether the stalls impaired the critical subscriber without the bridge and not with it.
     pub shown: bool,
-    /// The result in a sentence.
     pub summary: String,
 }
 
@@ -57,24 +58,20 @@ impl Outcome {
             let _ = writeln!(text, "  {label:<37}{without:>18}{with:>18}");
         };
         row("", "without bridge", "with bridge");
-        let both = |figure: &dyn Fn(&Figures) -> String| [figure(without), figure(with)];
-        let rows: [(&str, [String; 2]); 10] = [
-            ("publisher: scans written", both(&|one| format!("{:.1} Hz", one.publisher.rate_hz))),
-            ("publisher: longest publish call", both(&|one| latency(one.publisher.call_max_ms))),
-            (
-                "critical: scans received",
-                both(&|one| format!("{} of {}", one.critical.received, one.publisher.due)),
-            ),
-            ("critical: scans lost", both(&|one| one.critical.lost.to_string())),
-            ("critical: longest silence", both(&|one| format!("{:.2} s", one.critical.silence_max_ms / 1e3))),
-            ("critical: latency p50", both(&|one| quantile(one, |all| all.p50))),
-            ("                  p95", both(&|one| quantile(one, |all| all.p95))),
-            ("                  p99", both(&|one| quantile(one, |all| all.p99))),
-            ("                  max", both(&|one| quantile(one, |all| all.max))),
-            ("remote: scans received", both(&|one| one.remote.received.to_string())),
+        let rows: [Row; 10] = [
+            ("publisher: scans written", |one| format!("{:.1} Hz", one.publisher.rate_hz)),
+            ("publisher: longest publish call", |one| latency(one.publisher.call_max_ms)),
+            ("critical: scans received", |one| format!("{} of {}", one.critical.received, one.publisher.due)),
+            ("critical: scans lost", |one| one.critical.lost.to_string()),
+            ("critical: longest silence", |one| format!("{:.2} s", one.critical.silence_max_ms / 1e3)),
+            ("critical: latency p50", |one| quantile(one, |all| all.p50)),
+            ("                  p95", |one| quantile(one, |all| all.p95)),
+            ("                  p99", |one| quantile(one, |all| all.p99)),
+            ("                  max", |one| quantile(one, |all| all.max)),
+            ("remote: scans received", |one| one.remote.received.to_string()),
         ];
-        for (label, [without, with]) in &rows {
-            row(label, without, with);
+        for (label, figure) in rows {
+            row(label, &figure(without), &figure(with));
         }
         if let Some(drops) = &with.drops {
             let processes = [

@@ -1,6 +1,8 @@
 //! The demo's publisher and subscribers: ordinary DDS programs, each a process of its own and independent of
 //! the bridge.
 
+use std::convert::Infallible;
+use std::error::Error;
 use std::io::{self, Write};
 use std::net::Ipv4Addr;
 use std::process::ExitCode;
@@ -10,12 +12,12 @@ use std::thread;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clap::{Args, ValueEnum};
+use clap::Args;
 
 use super::report::Report;
 use super::scan::{DDS_TYPE, Scan};
 use super::{HISTORY_SCANS, MAX_BLOCKING_MS, due_at, first_due_after};
-use crate::cli::failed;
+use crate::cli::{failed, topic};
 use crate::clock;
 use crate::config::{DdsNetwork, NetworkSelector};
 use crate::dds::{ArrivalFlag, DdsError, Participant, ParticipantOptions, ReaderQos, Take};
@@ -25,17 +27,11 @@ use crate::model::{Durability, Encapsulation, History, QosProfile, Reliability, 
 const READER_DEPTH: u32 = 64;
 
 /// QoS of the publisher: it keeps unacknowledged scans, up to [`HISTORY_SCANS`].
-const PUBLISHER_QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
-    history: History::KeepAll,
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+const PUBLISHER_QOS: QosProfile = QosProfile { history: History::KeepAll, ..QosProfile::CRITICAL };
 
 /// The arguments of the demo's publisher.
 #[derive(Args, Debug)]
-pub(in crate::cli) struct PublisherArguments {
+pub(in crate::cli) struct PeerArguments {
     /// DDS domain
     #[arg(long)]
     domain: u16,
@@ -47,54 +43,28 @@ pub(in crate::cli) struct PublisherArguments {
 /// The arguments of a subscriber of the demo.
 #[derive(Args, Debug)]
 pub(in crate::cli) struct SubscriberArguments {
-    /// DDS domain
-    #[arg(long)]
-    domain: u16,
-    /// ROS 2 topic
-    #[arg(long, value_parser = topic)]
-    topic: TopicName,
+    #[command(flatten)]
+    peer: PeerArguments,
     /// Name of the node
     #[arg(long)]
     name: String,
-    /// Requested reliability
+    /// Request BEST_EFFORT
     #[arg(long)]
-    reliability: ReliabilityArgument,
+    best_effort: bool,
 }
 
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum ReliabilityArgument {
-    Reliable,
-    BestEffort,
-}
-
-fn topic(text: &str) -> Result<TopicName, String> {
-    TopicName::try_from(text).map_err(|error| error.to_string())
-}
-
-/// Why a publisher or subscriber ended.
-#[derive(Debug, thiserror::Error)]
-enum PeerError {
-    #[error(transparent)]
-    Dds(#[from] DdsError),
-    /// The demo no longer reads the reports on stdout.
-    #[error(transparent)]
-    PipeClosed(#[from] io::Error),
-}
-
-/// Publishes until it is killed.
-pub(in crate::cli) fn publisher(arguments: &PublisherArguments) -> ExitCode {
+pub(in crate::cli) fn publisher(arguments: &PeerArguments) -> ExitCode {
     let Err(error) = publish(arguments);
     failed(&error)
 }
 
-/// Subscribes until it is killed.
 pub(in crate::cli) fn subscriber(arguments: &SubscriberArguments) -> ExitCode {
     let Err(error) = subscribe(arguments);
     failed(&error)
 }
 
 /// Publishes scans like a timer of rclcpp: scans that become due during a publish call are skipped.
-fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, PeerError> {
+fn publish(arguments: &PeerArguments) -> Result<Infallible, Box<dyn Error>> {
     let mut participant = join(arguments.domain, "publisher")?;
     let writer = participant.create_blocking_writer(
         &arguments.topic.to_dds(),
@@ -124,18 +94,18 @@ fn publish(arguments: &PublisherArguments) -> Result<std::convert::Infallible, P
     }
 }
 
-fn subscribe(arguments: &SubscriberArguments) -> Result<std::convert::Infallible, PeerError> {
-    let mut participant = join(arguments.domain, &arguments.name)?;
+fn subscribe(arguments: &SubscriberArguments) -> Result<Infallible, Box<dyn Error>> {
+    let mut participant = join(arguments.peer.domain, &arguments.name)?;
     let qos = ReaderQos {
-        reliability: match arguments.reliability {
-            ReliabilityArgument::Reliable => Reliability::Reliable,
-            ReliabilityArgument::BestEffort => Reliability::BestEffort,
+        reliability: match arguments.best_effort {
+            true => Reliability::BestEffort,
+            false => Reliability::Reliable,
         },
         durability: Durability::Volatile,
         depth: READER_DEPTH,
         deadline_ms: None,
     };
-    let reader = participant.create_reader(&arguments.topic.to_dds(), DDS_TYPE, &qos)?;
+    let reader = participant.create_reader(&arguments.peer.topic.to_dds(), DDS_TYPE, &qos)?;
     let flag = ArrivalFlag::of_this_thread();
     let waker = Waker::from(Arc::clone(&flag));
     loop {
@@ -168,5 +138,5 @@ fn join(domain_id: u16, name: &str) -> Result<Participant, DdsError> {
 
 /// Prints a report on stdout, where the demo reads it.
 fn report(report: Report) -> io::Result<()> {
-    writeln!(io::stdout().lock(), "{report}")
+    writeln!(io::stdout(), "{}", serde_json::to_string(&report)?)
 }

@@ -14,12 +14,10 @@ const HEIGHT: f64 = 484.0;
 /// The left and right ends of both plots.
 const LEFT: f64 = 62.0;
 const RIGHT: f64 = 776.0;
-/// The upper ends of the two plots.
 const TOPS: [f64; 2] = [118.0, 288.0];
 const PLOT_HEIGHT: f64 = 110.0;
 /// The upper end of the rate axis: the rate, and room above its line.
 const MOST_HZ: f64 = RATE_HZ as f64 * 1.2;
-/// The most marks on the time axis.
 const MARKS: u64 = 12;
 
 const STYLE: &str = "
@@ -36,7 +34,6 @@ const STYLE: &str = "
   }
 ";
 
-/// The picture of a demo, an SVG document.
 pub(super) fn picture(outcome: &Outcome) -> String {
     let phases = [
         ("Without the bridge: one writer for both", &outcome.without_bridge),
@@ -74,7 +71,6 @@ pub(super) fn picture(outcome: &Outcome) -> String {
     svg + "</svg>\n"
 }
 
-/// Draws the plot of one phase.
 fn plot(svg: &mut String, name: &str, figures: &Figures, seconds: u64, top: f64) {
     let bottom = top + PLOT_HEIGHT;
     let x = |at_s: f64| LEFT + at_s / seconds as f64 * (RIGHT - LEFT);

@@ -1,11 +1,11 @@
-//! The reports of the demo's publisher and subscribers to the demo: a line on their stdout for each scan.
+//! The reports of the demo's publisher and subscribers to the demo: a line of JSON on stdout for each scan.
 
-use std::fmt;
+use serde::{Deserialize, Serialize};
 
 use crate::model::MonotonicNs;
 
 /// One line on the stdout of a publisher or subscriber.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Report {
     /// The publisher has started its timer; scan `n` is due `n` periods later.
     Began {
@@ -14,57 +14,19 @@ pub(super) enum Report {
     },
     /// The publish call for a scan has returned.
     Published {
-        /// The number of the scan.
         number: u64,
-        /// The duration of the call.
         call_ns: u64,
         /// Whether the writer accepted the scan.
         written: bool,
     },
     /// A subscriber has received a scan.
     Arrived {
-        /// The number of the scan.
         number: u64,
         /// The instant before the publish call.
         taken_at: MonotonicNs,
         /// The instant at which the subscriber took the scan from its reader.
         arrived_at: MonotonicNs,
     },
-}
-
-impl fmt::Display for Report {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Began { at } => write!(f, "began {}", at.0),
-            Self::Published { number, call_ns, written } => {
-                write!(f, "published {number} {call_ns} {}", u8::from(*written))
-            }
-            Self::Arrived { number, taken_at, arrived_at } => {
-                write!(f, "arrived {number} {} {}", taken_at.0, arrived_at.0)
-            }
-        }
-    }
-}
-
-impl Report {
-    /// Parses a line; `None` when it is not a report.
-    pub fn parse(line: &str) -> Option<Self> {
-        let mut words = line.split_ascii_whitespace();
-        let kind = words.next()?;
-        let numbers: Vec<u64> = words.map(str::parse).collect::<Result<_, _>>().ok()?;
-        match (kind, numbers.as_slice()) {
-            ("began", &[at]) => Some(Self::Began { at: MonotonicNs(at) }),
-            ("published", &[number, call_ns, written]) => {
-                Some(Self::Published { number, call_ns, written: written == 1 })
-            }
-            ("arrived", &[number, taken_at, arrived_at]) => Some(Self::Arrived {
-                number,
-                taken_at: MonotonicNs(taken_at),
-                arrived_at: MonotonicNs(arrived_at),
-            }),
-            _ => None,
-        }
-    }
 }
 
 #[cfg(test)]
@@ -80,10 +42,23 @@ mod tests {
             Report::Arrived { number: 9, taken_at: MonotonicNs(1), arrived_at: MonotonicNs(2) },
         ];
         for report in reports {
-            assert_eq!(Report::parse(&report.to_string()), Some(report));
+            let line = serde_json::to_string(&report).unwrap();
+            assert!(!line.contains('\n'));
+            assert_eq!(serde_json::from_str::<Report>(&line).unwrap(), report);
         }
-        for line in ["", "arrived", "arrived 1 2", "arrived 1 2 3 4", "published x 1 1", "began -1"] {
-            assert_eq!(Report::parse(line), None, "{line}");
+        let arrived = |fields: &str| format!("{{\"Arrived\":{{{fields}}}}}");
+        assert!(
+            serde_json::from_str::<Report>(&arrived(r#""number":1,"taken_at":2,"arrived_at":3"#)).is_ok()
+        );
+        for line in [
+            String::new(),
+            "arrived 1 2 3".to_owned(),
+            "\"Arrived\"".to_owned(),
+            arrived(r#""number":1,"taken_at":2"#),
+            arrived(r#""number":"x","taken_at":2,"arrived_at":3"#),
+            arrived(r#""number":-1,"taken_at":2,"arrived_at":3"#),
+        ] {
+            assert!(serde_json::from_str::<Report>(&line).is_err(), "{line}");
         }
     }
 }

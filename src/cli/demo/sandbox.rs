@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use super::scan::{SCAN_BYTES, TYPE};
 use super::{DemoError, INPUT_TOPIC};
 use crate::config::{self, Settings};
-use crate::shm::ShmNode;
+use crate::shm::{ShmNode, root_of};
 
 /// DDS domains of demos. Robots use low ones, and from 101 on the ports of a domain are in Linux's ephemeral
 /// range.
@@ -27,6 +27,8 @@ const fn claim_port(domain: u16) -> u16 {
     discovery_port(domain) + 5
 }
 
+const CONFIG_FILE: &str = "config.yaml";
+
 /// The size of a slot in shared memory, which holds one scan.
 const MAX_SAMPLE_BYTES: usize = 4096;
 const _: () = assert!(SCAN_BYTES <= MAX_SAMPLE_BYTES);
@@ -35,8 +37,7 @@ const _: () = assert!(SCAN_BYTES <= MAX_SAMPLE_BYTES);
 #[derive(Debug)]
 pub(super) struct Sandbox {
     folder: PathBuf,
-    domain: u16,
-    settings: Settings,
+    pub settings: Settings,
     /// Bound to the claim port as long as the demo uses the domain.
     _claim: UdpSocket,
 }
@@ -44,9 +45,10 @@ pub(super) struct Sandbox {
 impl Sandbox {
     pub fn create() -> Result<Self, DemoError> {
         let (domain, claim) = claim_domain()?;
-        let folder = make_folder().map_err(|error| DemoError::os("cannot make a temporary folder", error))?;
+        let folder = make_folder()
+            .map_err(|error| DemoError::Os { action: "cannot make a temporary folder", error })?;
         match write_config(&folder, domain) {
-            Ok(settings) => Ok(Self { folder, domain, settings, _claim: claim }),
+            Ok(settings) => Ok(Self { folder, settings, _claim: claim }),
             Err(error) => {
                 let _ = fs::remove_dir_all(&folder);
                 Err(error)
@@ -54,23 +56,10 @@ impl Sandbox {
         }
     }
 
-    pub fn domain(&self) -> u16 {
-        self.domain
-    }
-
-    pub fn settings(&self) -> &Settings {
-        &self.settings
-    }
-
     pub fn config_file(&self) -> PathBuf {
-        config_file(&self.folder)
+        self.folder.join(CONFIG_FILE)
     }
 
-    pub fn shm_root(&self) -> PathBuf {
-        shm_root(&self.folder)
-    }
-
-    /// The path of the log of the process called `name`.
     pub fn log(&self, name: &str) -> PathBuf {
         self.folder.join(format!("{name}.log"))
     }
@@ -80,8 +69,9 @@ impl Drop for Sandbox {
     fn drop(&mut self) {
         // The last process of a bridge removes its shared memory. If it was killed, the memory remains until
         // another process opens and closes the instance, as this does.
-        if self.shm_root().join(self.settings.instance.as_str()).exists() {
-            drop(ShmNode::open(&self.shm_root(), &self.settings.instance, "demo"));
+        let root = root_of(&self.settings);
+        if root.join(self.settings.instance.as_str()).exists() {
+            drop(ShmNode::open(&root, &self.settings.instance, "demo"));
         }
         if let Err(error) = fs::remove_dir_all(&self.folder) {
             eprintln!("adaptive-bridge: cannot remove {}: {error}", self.folder.display());
@@ -89,7 +79,6 @@ impl Drop for Sandbox {
     }
 }
 
-/// Finds an unused domain and claims it.
 fn claim_domain() -> Result<(u16, UdpSocket), DemoError> {
     for domain in DOMAINS {
         let Ok(claim) = UdpSocket::bind((Ipv4Addr::LOCALHOST, claim_port(domain))) else { continue };
@@ -117,20 +106,12 @@ fn make_folder() -> io::Result<PathBuf> {
     }
 }
 
-fn config_file(folder: &Path) -> PathBuf {
-    folder.join("config.yaml")
-}
-
-fn shm_root(folder: &Path) -> PathBuf {
-    folder.join("shm")
-}
-
-/// Writes the configuration file of the bridge and returns its settings.
 fn write_config(folder: &Path, domain: u16) -> Result<Settings, DemoError> {
-    let file = config_file(folder);
-    let text = config_text(domain, &shm_root(folder));
-    fs::write(&file, &text).map_err(|error| DemoError::os("cannot write the configuration", error))?;
-    config::parse(text.into_bytes(), &file.display().to_string(), &|_| None)
+    let file = folder.join(CONFIG_FILE);
+    let text = config_text(domain, &folder.join("shm"));
+    fs::write(&file, &text)
+        .map_err(|error| DemoError::Os { action: "cannot write the configuration", error })?;
+    config::parse(text, &file.display().to_string(), &|_| None)
         .map_err(|error| DemoError::Config(error.to_string()))
 }
 

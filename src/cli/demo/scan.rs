@@ -3,10 +3,8 @@
 
 use crate::model::MonotonicNs;
 
-/// The ROS 2 message type.
 pub(super) const TYPE: &str = "sensor_msgs/msg/LaserScan";
 
-/// The DDS type name of the message.
 pub(super) const DDS_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
 
 /// The size of one serialized scan, without the 4-byte encapsulation header.
@@ -33,26 +31,24 @@ pub(super) struct Scan {
 }
 
 impl Scan {
-    /// Serializes the scan, without the encapsulation header.
     pub fn encode(self) -> Vec<u8> {
         let mut cdr = Vec::with_capacity(SCAN_BYTES);
         // The uptime in seconds exceeds 31 bits after 68 years.
         let seconds = (self.taken_at.0 / 1_000_000_000) as u32;
         let nanos = (self.taken_at.0 % 1_000_000_000) as u32;
-        cdr.extend_from_slice(&seconds.to_le_bytes());
-        cdr.extend_from_slice(&nanos.to_le_bytes());
-        cdr.extend_from_slice(&(FRAME_ID.len() as u32).to_le_bytes());
+        cdr.extend([seconds, nanos, FRAME_ID.len() as u32].into_iter().flat_map(u32::to_le_bytes));
         cdr.extend_from_slice(FRAME_ID);
         let step = std::f32::consts::TAU / BEAMS as f32;
         // angle_min, angle_max, angle_increment, time_increment, scan_time, range_min, range_max
         let parameters = [0.0, std::f32::consts::TAU - step, step, 0.0, 1.0 / 30.0, 0.12, 12.0];
         let room = |beam: u32| 2.0 + (beam as f32 * step * 2.0).cos();
-        put_floats(&mut cdr, parameters.into_iter());
+        cdr.extend(parameters.into_iter().flat_map(f32::to_le_bytes));
         cdr.extend_from_slice(&BEAMS.to_le_bytes());
-        put_floats(&mut cdr, (0..BEAMS).map(room));
+        cdr.extend((0..BEAMS).map(room).flat_map(f32::to_le_bytes));
         cdr.extend_from_slice(&BEAMS.to_le_bytes());
         let number = (self.number % NUMBERS) as f32;
-        put_floats(&mut cdr, std::iter::once(number).chain((1..BEAMS).map(|_| 47.0)));
+        let intensities = std::iter::once(number).chain((1..BEAMS).map(|_| 47.0));
+        cdr.extend(intensities.flat_map(f32::to_le_bytes));
         cdr
     }
 
@@ -65,12 +61,6 @@ impl Scan {
         let taken_at = MonotonicNs(u64::from(word(0)?) * 1_000_000_000 + u64::from(word(4)?));
         let number = f32::from_bits(word(NUMBER_AT)?);
         (number >= 0.0 && number < NUMBERS as f32).then_some(Self { number: number as u64, taken_at })
-    }
-}
-
-fn put_floats(cdr: &mut Vec<u8>, floats: impl Iterator<Item = f32>) {
-    for float in floats {
-        cdr.extend_from_slice(&float.to_le_bytes());
     }
 }
 

@@ -4,7 +4,7 @@
 use std::io::{self, IsTerminal, Write};
 
 use super::children::Role;
-use super::tally::{Stalls, Tally, Window};
+use super::tally::{Figures, Tally, Window};
 use super::{RATE_HZ, Setup};
 use crate::model::MonotonicNs;
 
@@ -26,14 +26,14 @@ enum Style {
     Quiet,
 }
 
-/// The display on stdout.
 #[derive(Debug)]
 pub(super) struct Screen {
     style: Style,
     /// The number of lines of the table on the terminal.
     table_lines: usize,
     next_line_at: MonotonicNs,
-    closed: bool,
+    /// Whether a write to stdout has failed.
+    pub closed: bool,
 }
 
 impl Screen {
@@ -47,11 +47,6 @@ impl Screen {
         Self { style, table_lines: 0, next_line_at: MonotonicNs(0), closed: false }
     }
 
-    /// Whether a write to stdout has failed.
-    pub fn is_closed(&self) -> bool {
-        self.closed
-    }
-
     /// Prints text that later updates do not overwrite.
     pub fn print(&mut self, text: &str) {
         self.table_lines = 0;
@@ -61,22 +56,19 @@ impl Screen {
         }
     }
 
-    /// Shows the progress of a phase.
     pub fn draw(
         &mut self,
         setup: Setup,
         tally: &Tally,
         window: &Window,
-        stalls: Stalls,
         stalled_since: Option<MonotonicNs>,
         now: MonotonicNs,
     ) {
-        let over = now >= window.end();
+        let first = window.start().plus_ms(LINE_EVERY_MS);
+        let view = || View::of(tally, window, stalled_since, now);
         match self.style {
-            Style::Quiet => {}
             Style::InPlace => {
-                let view = View::of(tally, window, stalls, stalled_since, now);
-                let lines = view.table(setup, tally, window, now);
+                let lines = view().table(setup, tally, window, now);
                 // Moves the cursor up to the start of the table. Wrapping is off, so that a line of the table
                 // stays one line on a narrow terminal.
                 let mut text = String::from("\x1b[?7l");
@@ -90,14 +82,11 @@ impl Screen {
                 self.table_lines = lines.len();
                 self.write(&text);
             }
-            Style::Lines => {
-                let first = window.start().plus_ms(LINE_EVERY_MS);
-                if over || now >= self.next_line_at.max(first) {
-                    self.next_line_at = now.plus_ms(LINE_EVERY_MS);
-                    let view = View::of(tally, window, stalls, stalled_since, now);
-                    self.write(&format!("{}\n", view.line(window, now)));
-                }
+            Style::Lines if now >= window.end() || now >= self.next_line_at.max(first) => {
+                self.next_line_at = now.plus_ms(LINE_EVERY_MS);
+                self.write(&format!("{}\n", view().line()));
             }
+            Style::Lines | Style::Quiet => {}
         }
     }
 
@@ -109,111 +98,72 @@ impl Screen {
 
 /// The state of a phase at an instant.
 struct View {
+    figures: Figures,
+    /// The scans of the last second that the publisher wrote, and that each subscriber received.
     publisher_hz: usize,
     critical_hz: usize,
     remote_hz: usize,
-    due: u64,
-    written: u64,
-    call_max_ms: f64,
-    critical_received: u64,
     silent_s: f64,
-    silence_max_s: f64,
-    remote_received: u64,
     stalled_s: Option<f64>,
+    elapsed_s: u64,
 }
 
 impl View {
-    fn of(
-        tally: &Tally,
-        window: &Window,
-        stalls: Stalls,
-        stalled_since: Option<MonotonicNs>,
-        now: MonotonicNs,
-    ) -> Self {
+    fn of(tally: &Tally, window: &Window, stalled_since: Option<MonotonicNs>, now: MonotonicNs) -> Self {
         // At the end of a phase every scan counts, because the last ones had time to arrive.
-        let settled = if now >= window.end() {
-            now
-        } else {
-            MonotonicNs(now.0.saturating_sub(ARRIVAL_GRACE_MS * 1_000_000))
-        };
+        let grace_ms = if now >= window.end() { 0 } else { ARRIVAL_GRACE_MS };
+        let settled = MonotonicNs(now.0.saturating_sub(grace_ms * 1_000_000));
         let second = MonotonicNs(settled.0.saturating_sub(RATE_OVER_MS * 1_000_000))..settled;
-        let figures = tally.figures(window, stalls, settled);
         Self {
+            figures: tally.figures(window, &[], settled),
             publisher_hz: tally.written_in(window, second.clone()),
             critical_hz: tally.arrived_in(Role::Critical, window, second.clone()),
             remote_hz: tally.arrived_in(Role::Remote, window, second),
-            due: figures.publisher.due,
-            written: figures.publisher.written,
-            call_max_ms: figures.publisher.call_max_ms,
-            critical_received: figures.critical.received,
             silent_s: tally.silent_ns(window, now) as f64 / 1e9,
-            silence_max_s: figures.critical.silence_max_ms / 1e3,
-            remote_received: figures.remote.received,
             stalled_s: stalled_since.map(|since| now.since(since) as f64 / 1e9),
+            elapsed_s: now.min(window.end()).since(window.start()) / 1_000_000_000,
         }
     }
 
     fn table(&self, setup: Setup, tally: &Tally, window: &Window, now: MonotonicNs) -> Vec<String> {
-        let seconds = window.end().since(window.start()) / 1_000_000_000;
-        let elapsed = (now.since(window.start()) / 1_000_000_000).min(seconds);
-        let missed = |received: u64| self.due.saturating_sub(received);
+        let Figures { publisher, critical, remote, .. } = &self.figures;
         let silence = if self.silent_s > 0.3 {
             format!("silent for {:.1} s!", self.silent_s)
         } else {
-            format!("longest silence {:.2} s", self.silence_max_s)
+            format!("longest silence {:.2} s", critical.silence_max_ms / 1e3)
         };
         let link = match self.stalled_s {
             Some(stalled_s) => format!("link down for {stalled_s:.1} s"),
             None => "link up".to_owned(),
         };
+        let missed = |scans: u64| publisher.due.saturating_sub(scans).to_string();
         let remote_missed = match setup {
-            Setup::Direct => missed(self.remote_received).to_string(),
+            Setup::Direct => missed(remote.received),
             // The remote lane is rate-limited, so the remote subscriber does not receive every scan.
             Setup::Bridge => "-".to_owned(),
         };
-        let row = |name: &str, hz: usize, scans: u64, missed: String, note: String| {
+        let row = |name: &str, hz: usize, scans: u64, missed: &str, note: &str| {
             format!("  {name:<12}{hz:>6} Hz {scans:>8} {missed:>9}   {note}")
         };
+        let seconds = window.end().since(window.start()) / 1_000_000_000;
+        let progress = format!("{} of {seconds} s", self.elapsed_s);
+        let call = format!("longest publish call {:.1} ms", publisher.call_max_ms);
         let mut lines = vec![
-            format!(
-                "  {:<12}{:>9} {:>8} {:>9}{:>36}",
-                "",
-                "now",
-                "scans",
-                "missed",
-                format!("{elapsed} of {seconds} s")
-            ),
-            row(
-                "publisher",
-                self.publisher_hz,
-                self.written,
-                missed(self.written).to_string(),
-                format!("longest publish call {:.1} ms", self.call_max_ms),
-            ),
-            row(
-                "critical",
-                self.critical_hz,
-                self.critical_received,
-                missed(self.critical_received).to_string(),
-                silence,
-            ),
-            row("remote", self.remote_hz, self.remote_received, remote_missed, link),
+            format!("  {:<12}{:>9} {:>8} {:>9}{progress:>36}", "", "now", "scans", "missed"),
+            row("publisher", self.publisher_hz, publisher.written, &missed(publisher.written), &call),
+            row("critical", self.critical_hz, critical.received, &missed(critical.received), &silence),
+            row("remote", self.remote_hz, remote.received, &remote_missed, &link),
+            String::new(),
         ];
-        lines.push(String::new());
         lines.extend(timelines(tally, window, now));
         lines
     }
 
-    fn line(&self, window: &Window, now: MonotonicNs) -> String {
+    fn line(&self) -> String {
         let link = if self.stalled_s.is_some() { "down" } else { "up" };
         format!(
             "  {:>3} s  publisher {:>2} Hz   critical {:>2} Hz, missed {:>3}   remote {:>2} Hz, link {link}",
-            (now.since(window.start()) / 1_000_000_000)
-                .min(window.end().since(window.start()) / 1_000_000_000),
-            self.publisher_hz,
-            self.critical_hz,
-            self.due.saturating_sub(self.critical_received),
-            self.remote_hz,
+            self.elapsed_s, self.publisher_hz, self.critical_hz, self.figures.critical.lost, self.remote_hz,
         )
     }
 }
@@ -272,9 +222,9 @@ mod tests {
                 }
             }
             for stalled_since in [None, Some(window.start())] {
-                let view = View::of(&tally, &window, Stalls::default(), stalled_since, window.end());
+                let view = View::of(&tally, &window, stalled_since, window.end());
                 let mut lines = view.table(Setup::Direct, &tally, &window, window.end());
-                lines.push(view.line(&window, window.end()));
+                lines.push(view.line());
                 for line in lines {
                     assert!(line.chars().count() < 80, "{} columns: {line}", line.chars().count());
                 }

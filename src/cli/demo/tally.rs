@@ -28,17 +28,16 @@ struct Arrival {
     arrived_at: MonotonicNs,
 }
 
-/// The publish call of a scan.
 #[derive(Clone, Copy, Debug)]
 struct Published {
     call_ns: u64,
     written: bool,
 }
 
-/// All reports of one phase.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
-    began_at: Option<MonotonicNs>,
+    /// The instant at which scan 0 was due; `None` until the publisher has started its timer.
+    pub began_at: Option<MonotonicNs>,
     published: BTreeMap<u64, Published>,
     critical: BTreeMap<u64, Arrival>,
     remote: BTreeMap<u64, Arrival>,
@@ -52,28 +51,21 @@ impl Tally {
             (Role::Publisher, Report::Published { number, call_ns, written }) => {
                 self.published.insert(number, Published { call_ns, written });
             }
-            (Role::Critical, Report::Arrived { number, taken_at, arrived_at }) => {
-                self.critical.entry(number).or_insert(Arrival { taken_at, arrived_at });
-            }
-            (Role::Remote, Report::Arrived { number, taken_at, arrived_at }) => {
-                self.remote.entry(number).or_insert(Arrival { taken_at, arrived_at });
+            (Role::Critical | Role::Remote, Report::Arrived { number, taken_at, arrived_at }) => {
+                let arrivals = if role == Role::Remote { &mut self.remote } else { &mut self.critical };
+                arrivals.entry(number).or_insert(Arrival { taken_at, arrived_at });
             }
             _ => {}
         }
     }
 
-    /// The instant at which scan 0 was due; `None` until the publisher has started its timer.
-    pub fn began_at(&self) -> Option<MonotonicNs> {
-        self.began_at
+    fn arrivals(&self, role: Role) -> &BTreeMap<u64, Arrival> {
+        if role == Role::Remote { &self.remote } else { &self.critical }
     }
 
     /// The number of scans that have arrived at a subscriber.
     pub fn arrived(&self, role: Role) -> usize {
-        match role {
-            Role::Critical => self.critical.len(),
-            Role::Remote => self.remote.len(),
-            Role::Publisher | Role::Bridge => 0,
-        }
+        self.arrivals(role).len()
     }
 
     /// The number of written scans that were due in an interval.
@@ -84,8 +76,8 @@ impl Tally {
 
     /// The number of scans of the window that arrived in an interval.
     pub fn arrived_in(&self, role: Role, window: &Window, interval: Range<MonotonicNs>) -> usize {
-        let arrivals = if role == Role::Remote { &self.remote } else { &self.critical };
-        arrivals.range(window.numbers.clone()).filter(|(_, one)| interval.contains(&one.arrived_at)).count()
+        let arrivals = self.arrivals(role).range(window.numbers.clone());
+        arrivals.filter(|(_, one)| interval.contains(&one.arrived_at)).count()
     }
 
     /// What the picture shows of a window in which the remote subscriber was stalled at these times.
@@ -102,14 +94,13 @@ impl Tally {
         }
     }
 
-    /// The time since the last arrival at the critical subscriber.
     pub fn silent_ns(&self, window: &Window, now: MonotonicNs) -> u64 {
         let last = self.critical.range(window.numbers.clone()).next_back();
         now.since(last.map_or(window.start(), |(_, one)| one.arrived_at))
     }
 
     /// The figures of a window up to `until`.
-    pub fn figures(&self, window: &Window, stalls: Stalls, until: MonotonicNs) -> Figures {
+    pub fn figures(&self, window: &Window, stalls: &[Range<MonotonicNs>], until: MonotonicNs) -> Figures {
         let until = until.min(window.end());
         let numbers = window.numbers.start..window.numbers_before(until);
         let due = numbers.end - numbers.start;
@@ -150,8 +141,8 @@ impl Tally {
             },
             remote: RemoteFigures {
                 received: self.remote.range(numbers).count() as u64,
-                stalls: stalls.count,
-                stalled_s: stalls.ns as f64 / 1e9,
+                stalls: stalls.len(),
+                stalled_s: stalls.iter().map(|one| one.end.since(one.start)).sum::<u64>() as f64 / 1e9,
             },
             drops: None,
             timeline: Timeline::default(),
@@ -164,7 +155,6 @@ impl Tally {
 pub(super) struct Window {
     /// The instant at which scan 0 was due.
     pub began_at: MonotonicNs,
-    /// The numbers of the measured scans.
     pub numbers: Range<u64>,
 }
 
@@ -185,22 +175,11 @@ impl Window {
 
     /// The end of the range of scans of the window that are due before an instant.
     fn numbers_before(&self, instant: MonotonicNs) -> u64 {
-        if instant >= self.end() {
-            return self.numbers.end;
-        }
         let number = super::first_due_after(self.began_at, instant);
         number.clamp(self.numbers.start, self.numbers.end)
     }
 }
 
-/// The number and the total duration of the stalls of the remote subscriber.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Stalls {
-    pub count: u64,
-    pub ns: u64,
-}
-
-/// The figures of one phase.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Figures {
     pub publisher: PublisherFigures,
@@ -241,15 +220,13 @@ pub(super) struct CriticalFigures {
     pub latency_ms: Option<Quantiles>,
 }
 
-/// The figures of the remote subscriber.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct RemoteFigures {
     pub received: u64,
-    pub stalls: u64,
+    pub stalls: usize,
     pub stalled_s: f64,
 }
 
-/// Quantiles of a latency in milliseconds.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Quantiles {
     pub p50: f64,
@@ -278,16 +255,21 @@ pub(super) struct BridgeDrops {
     pub noncritical: BTreeMap<&'static str, u64>,
 }
 
-/// The samples dropped between two readings of a board, by drop reason.
-pub(super) fn drops_between(before: &DropCounts, after: &DropCounts) -> BTreeMap<&'static str, u64> {
-    after.since(before).iter().map(|(reason, count)| (reason.label(), count)).collect()
+impl BridgeDrops {
+    /// The samples dropped between two readings of the boards of ingress and the two lanes.
+    pub fn between(before: &[DropCounts; 3], after: &[DropCounts; 3]) -> Self {
+        let [ingress, critical, noncritical] = std::array::from_fn(|index| {
+            let dropped = after[index].since(&before[index]);
+            dropped.iter().map(|(reason, count)| (reason.label(), count)).collect()
+        });
+        Self { ingress, critical, noncritical }
+    }
 }
 
 fn ms(ns: u64) -> f64 {
     ns as f64 / 1e6
 }
 
-/// The number of scans that are due in `seconds`.
 pub(super) const fn scans_in_s(seconds: u64) -> u64 {
     seconds * RATE_HZ
 }
@@ -325,8 +307,7 @@ mod tests {
         published.retain(|(number, _)| !(41..44).contains(number));
         published[40].1 = false;
         let arrived: Vec<_> = (0..90).filter(|n| !(40..44).contains(n) && *n != 50).collect();
-        let figures =
-            tally(&published, &arrived, 250_000).figures(&window(), Stalls::default(), MonotonicNs(u64::MAX));
+        let figures = tally(&published, &arrived, 250_000).figures(&window(), &[], MonotonicNs(u64::MAX));
         let publisher = &figures.publisher;
         assert_eq!((publisher.due, publisher.written), (30, 26));
         assert_eq!((publisher.timed_out, publisher.skipped), (1, 3));
@@ -346,10 +327,10 @@ mod tests {
         let published: Vec<_> = (0..90).map(|number| (number, true)).collect();
         let arrived: Vec<_> = (0..50).collect();
         let tally = tally(&published, &arrived, 0);
-        let figures = tally.figures(&window(), Stalls::default(), MonotonicNs(u64::MAX));
+        let figures = tally.figures(&window(), &[], MonotonicNs(u64::MAX));
         assert!((figures.critical.silence_max_ms - 11.0 * 100.0 / 3.0).abs() < 0.01);
         assert_eq!(figures.critical.lost_on_the_way, 10);
-        let nothing = Tally::default().figures(&window(), Stalls::default(), window().end());
+        let nothing = Tally::default().figures(&window(), &[], window().end());
         assert!((nothing.critical.silence_max_ms - 1000.0).abs() < 0.01);
         assert!(nothing.critical.latency_ms.is_none());
         assert_eq!((nothing.publisher.skipped, nothing.critical.never_written), (30, 30));

@@ -18,7 +18,6 @@ const NEGLIGIBLE_EXIT_US: i64 = 10;
 
 /// Bit of CAP_IPC_LOCK in `CapEff` (capabilities(7)).
 const CAP_IPC_LOCK: u32 = 14;
-/// Bit of CAP_SYS_NICE in `CapEff`.
 const CAP_SYS_NICE: u32 = 23;
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
@@ -56,15 +55,12 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
 
 /// The rights of this process to real-time scheduling and locked memory. The systemd services have their own.
 struct Rights {
-    /// CAP_SYS_NICE.
     nice: bool,
-    /// CAP_IPC_LOCK.
     lock: bool,
     rtprio: u64,
     memlock: u64,
 }
 
-/// The effective capabilities of this process.
 fn capabilities() -> u64 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -76,7 +72,8 @@ fn open_files(limit: u64) -> Finding {
     if limit >= OPEN_FILES {
         return Finding::ok("open files", found);
     }
-    Finding::warning("open files", found, "Too few for many routes.")
+    Finding::warning("open files", found)
+        .means("Too few for many routes.")
         .with_command(format!("ulimit -n {OPEN_FILES}"))
 }
 
@@ -100,12 +97,15 @@ fn real_time(configured: &[&Scheduling], rights: &Rights) -> Finding {
         Some(priority) if rights.nice || rights.rtprio >= priority => {
             Finding::ok(check, format!("priority {priority} is allowed"))
         }
-        Some(priority) => Finding::warning(
-            check,
-            format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio),
-            "Processes that this user starts run without a real-time policy. The installed services are allowed 50.",
-        )
-        .with_command(limits_line("rtprio", &priority.to_string())),
+        Some(priority) => {
+            let found =
+                format!("priority {priority} is configured, and this user is allowed {}", rights.rtprio);
+            Finding::warning(check, found).means(
+                "Processes that this user starts run without a real-time policy. The installed services are \
+                 allowed 50.",
+            )
+            .with_command(limits_line("rtprio", &priority.to_string()))
+        }
     }
 }
 
@@ -118,10 +118,12 @@ fn memory_lock(configured: &[&Scheduling], rights: &Rights) -> Finding {
         return Finding::ok(check, "is allowed");
     }
     let found = format!("lock_memory is configured, and this user may lock {} KiB", rights.memlock / 1024);
-    Finding::warning(check, found,
-        "Page faults may delay processes that this user starts. The installed critical services may lock memory.",
-    )
-    .with_command(limits_line("memlock", "unlimited"))
+    Finding::warning(check, found)
+        .means(
+            "Page faults may delay processes that this user starts. The installed critical services may lock \
+             memory.",
+        )
+        .with_command(limits_line("memlock", "unlimited"))
 }
 
 /// Checks that the configured CPUs exist. `online` is the kernel's list of CPUs, such as `0-3,8`.
@@ -141,26 +143,19 @@ fn cpus(configured: &[&Scheduling], online: &str) -> Finding {
     if missing.is_empty() {
         return Finding::ok("CPUs", format!("{online} are online"));
     }
-    Finding::warning(
-        "CPUs",
-        format!("CPUs {} are configured, and only {online} are online", list(missing)),
-        "A process whose configured CPUs are all offline runs on every CPU.",
-    )
+    Finding::warning("CPUs", format!("CPUs {} are configured, and only {online} are online", list(missing)))
+        .means("A process whose configured CPUs are all offline runs on every CPU.")
 }
 
 fn throttling(runtime_us: i64) -> Finding {
     let check = "real-time runtime";
     match runtime_us {
-        0 => Finding::warning(
-            check,
-            "kernel.sched_rt_runtime_us is 0",
-            "No process may have a real-time policy.",
-        )
-        .with_command("sudo sysctl -w kernel.sched_rt_runtime_us=950000"),
-        runtime_us if runtime_us < 0 => Finding::note(
-            check,
-            "kernel.sched_rt_runtime_us is -1",
-            "A real-time process in an endless loop blocks its CPU; LimitRTTIME of the services prevents that.",
+        0 => Finding::warning(check, "kernel.sched_rt_runtime_us is 0")
+            .means("No process may have a real-time policy.")
+            .with_command("sudo sysctl -w kernel.sched_rt_runtime_us=950000"),
+        runtime_us if runtime_us < 0 => Finding::note(check, "kernel.sched_rt_runtime_us is -1").means(
+            "A real-time process in an endless loop blocks its CPU; LimitRTTIME of the services prevents \
+             that.",
         ),
         runtime_us => Finding::ok(check, format!("{runtime_us} us of each second")),
     }
@@ -197,7 +192,7 @@ fn idle_states(cpus: &Path) -> Option<Finding> {
         "At low rates, when CPUs go idle between samples, a sample waits for up to three such wake-ups.";
     let command = "sudo sh -c 'exec 3>/dev/cpu_dma_latency && echo 0 >&3 && exec sleep infinity' \
                    # keeps CPUs awake while it runs; draws more power";
-    Some(Finding::note("idle CPUs", found, meaning).with_command(command))
+    Some(Finding::note("idle CPUs", found).means(meaning).with_command(command))
 }
 
 fn clock_source(current: &str, available: &str) -> Finding {
@@ -208,12 +203,9 @@ fn clock_source(current: &str, available: &str) -> Finding {
         return Finding::ok(check, current);
     }
     let better = FAST.into_iter().find(|fast| available.split_whitespace().any(|name| name == *fast));
-    let finding = Finding::new(
-        check,
-        if better.is_some() { Severity::Warning } else { Severity::Note },
-        current,
-        "Each reading of the clock takes microseconds, and each sample needs several readings.",
-    );
+    let severity = if better.is_some() { Severity::Warning } else { Severity::Note };
+    let finding = Finding::new(check, severity, current)
+        .means("Each reading of the clock takes microseconds, and each sample needs several readings.");
     match better {
         Some(better) => finding.with_command(format!(
             "echo {better} | sudo tee /sys/devices/system/clocksource/clocksource0/current_clocksource"

@@ -23,8 +23,7 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let needed = pools.sum::<u64>() + OTHER_BYTES;
     let root = root_of(settings);
     let holders = RoleHolder::all(&root, &settings.instance).unwrap_or_default();
-    let mut findings = Vec::new();
-    match statvfs(SHM) {
+    let space = match statvfs(SHM) {
         Ok(found) => {
             let block = found.fragment_size();
             let space = Space {
@@ -32,22 +31,17 @@ pub(super) fn check(settings: &Settings) -> Vec<Finding> {
                 free: found.blocks_available() * block,
                 is_allocated: !holders.is_empty(),
             };
-            findings.push(free_space(needed, &space));
+            free_space(needed, &space)
         }
-        Err(error) => findings.push(
-            Finding::error("shared memory", format!("{SHM}: {error}"), "The bridge cannot start without it.")
-                .with_command(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
-        ),
-    }
+        Err(error) => Finding::error("shared memory", format!("{SHM}: {error}"))
+            .means("The bridge cannot start without it.")
+            .with_command(format!("sudo mount -t tmpfs -o mode=1777 tmpfs {SHM}")),
+    };
     let files = instance_files(&root, &settings.instance);
     let bytes: u64 = files.iter().filter_map(|file| Some(fs::metadata(file).ok()?.len())).sum();
-    findings.push(leftover_files(holders.len(), files.len(), bytes));
-    findings.push(remove_ipc(
-        geteuid().as_raw(),
-        Path::new("/run/systemd/system").exists(),
-        &logind_settings(),
-    ));
-    findings
+    let leftover = leftover_files(holders.len(), files.len(), bytes);
+    let with_logind = Path::new("/run/systemd/system").exists();
+    vec![space, leftover, remove_ipc(geteuid().as_raw(), with_logind, &logind_settings())]
 }
 
 /// The size of /dev/shm, in bytes.
@@ -67,14 +61,12 @@ fn free_space(needed: u64, space: &Space) -> Finding {
     if space.is_allocated {
         Finding::ok(check, format!("{found}; the running bridge has already allocated it"))
     } else if space.free < needed {
-        Finding::error(
-            check,
-            found,
-            "The bridge does not start, because it allocates all its pools at the start.",
-        )
-        .with_command(command)
+        Finding::error(check, found)
+            .means("The bridge does not start, because it allocates all its pools at the start.")
+            .with_command(command)
     } else if space.free < needed + needed / 2 {
-        Finding::warning(check, found, "If another program uses the rest, the bridge cannot be restarted.")
+        Finding::warning(check, found)
+            .means("If another program uses the rest, the bridge cannot be restarted.")
             .with_command(command)
     } else {
         Finding::ok(check, found)
@@ -88,8 +80,8 @@ fn leftover_files(processes: usize, files: usize, bytes: u64) -> Finding {
         (0, files) => Finding::note(
             check,
             format!("{files} files ({} KiB) in {SHM}, and no process of the bridge", bytes.div_ceil(1024)),
-            "All processes of a bridge were killed. The next start removes these files.",
-        ),
+        )
+        .means("All processes of a bridge were killed. The next start removes these files."),
         (processes, files) => {
             Finding::ok(check, format!("{processes} processes of the bridge use {files} files"))
         }
@@ -123,9 +115,9 @@ fn remove_ipc(uid: u32, with_logind: bool, logind: &str) -> Finding {
     if ["no", "false", "off", "0"].contains(&value) {
         return Finding::ok(check, "is off");
     }
-    Finding::warning(check, "is on, and this is not a system user",
-        "When you log out, logind removes your shared memory, also that of a bridge that still runs. The installed \
-         services run as a system user.",
+    Finding::warning(check, "is on, and this is not a system user").means(
+        "When you log out, logind removes your shared memory, also that of a bridge that still runs. The \
+         installed services run as a system user.",
     )
     .with_command(
         "sudo mkdir -p /etc/systemd/logind.conf.d && printf '[Login]\\nRemoveIPC=no\\n' | \

@@ -43,19 +43,14 @@ fn buffer(name: &'static str, bytes: i64, largest_sample: usize) -> Finding {
         return Finding::ok(name, found);
     }
     let severity = if largest_sample <= SMALL_SAMPLE_BYTES { Severity::Note } else { Severity::Warning };
-    Finding::new(
-        name,
-        severity,
-        found,
-        "The kernel drops fragments of large samples in a burst; their retransmission takes milliseconds.",
-    )
-    .with_command(format!(
+    let means =
+        "The kernel drops fragments of large samples in a burst; their retransmission takes milliseconds.";
+    Finding::new(name, severity, found).means(means).with_command(format!(
         "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf \
          && sudo sysctl --system"
     ))
 }
 
-/// A network interface.
 #[derive(Clone, Debug)]
 struct Interface {
     name: String,
@@ -79,7 +74,6 @@ fn interfaces() -> Vec<Interface> {
     interfaces.collect()
 }
 
-/// Checks an interface that the configuration names.
 fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
     let (name, found): (String, Option<&Interface>) = match selector {
         NetworkSelector::Name(name) => {
@@ -92,29 +86,30 @@ fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
         }
     };
     let check = "interface";
-    match found {
-        None => Finding::error(
+    let Some(Interface { name: own_name, address, flags }) = found else {
+        return Finding::error(
             check,
             format!("no interface {name}; this machine has: {}", names(interfaces)),
-            "A process that is configured to use it does not start.",
-        ),
-        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_UP) => {
-            Finding::error(check, format!("{name} is down"), "No DDS participants are discovered on it.")
-                .with_command(format!("sudo ip link set {} up", interface.name))
-        }
-        Some(interface) if interface.address.is_none() => Finding::error(
-            check,
-            format!("{name} has no IPv4 address"),
-            "No DDS participants are discovered on it.",
-        ),
-        Some(interface) if !interface.flags.contains(InterfaceFlags::IFF_MULTICAST) => Finding::error(
-            check,
-            format!("{name} carries no multicast"),
-            "DDS participants announce themselves by multicast, so none are discovered there.",
         )
-        .with_command(format!("sudo ip link set {} multicast on", interface.name)),
-        Some(_) => Finding::ok(check, format!("{name} is up")),
+        .means("A process that is configured to use it does not start.");
+    };
+    if !flags.contains(InterfaceFlags::IFF_UP) {
+        return Finding::error(check, format!("{name} is down"))
+            .means("No DDS participants are discovered on it.")
+            .with_command(format!("sudo ip link set {own_name} up"));
     }
+    if address.is_none() {
+        return Finding::error(check, format!("{name} has no IPv4 address"))
+            .means("No DDS participants are discovered on it.");
+    }
+    if !flags.contains(InterfaceFlags::IFF_MULTICAST) {
+        return Finding::error(check, format!("{name} carries no multicast"))
+            .means(
+                "DDS participants announce themselves by multicast, so none are discovered there.",
+            )
+            .with_command(format!("sudo ip link set {own_name} multicast on"));
+    }
+    Finding::ok(check, format!("{name} is up"))
 }
 
 fn names(interfaces: &[Interface]) -> String {
@@ -124,17 +119,13 @@ fn names(interfaces: &[Interface]) -> String {
     list(names)
 }
 
-/// Checks that at least one interface carries multicast.
 fn any_multicast(interfaces: &[Interface]) -> Finding {
     let carrying = interfaces.iter().filter(|found| found.carries_multicast() && found.address.is_some());
     let carrying: Vec<Interface> = carrying.cloned().collect();
     if carrying.is_empty() {
-        return Finding::warning(
-            "multicast",
-            "no interface that is up and has an address carries multicast",
-            "DDS participants on other machines are not discovered.",
-        )
-        .with_command("sudo ip link set lo multicast on");
+        return Finding::warning("multicast", "no interface that is up and has an address carries multicast")
+            .means("DDS participants on other machines are not discovered.")
+            .with_command("sudo ip link set lo multicast on");
     }
     Finding::ok("multicast", format!("carried by {}", names(&carrying)))
 }
@@ -146,10 +137,12 @@ fn multicast_route(routed: bool, interfaces: &[Interface]) -> Finding {
     }
     let carrying = interfaces.iter().find(|found| found.carries_multicast() && found.address.is_some());
     let through = carrying.map_or("eth0", |interface| interface.name.as_str());
-    Finding::warning("multicast route", format!("there is no route to {}", SPDP.0),
-        "Announcements that are not bound to an interface are not sent, so no DDS participants are discovered.",
-    )
-    .with_command(format!("sudo ip route add 239.0.0.0/8 dev {through}"))
+    Finding::warning("multicast route", format!("there is no route to {}", SPDP.0))
+        .means(
+            "Announcements that are not bound to an interface are not sent, so no DDS participants are \
+         discovered.",
+        )
+        .with_command(format!("sudo ip route add 239.0.0.0/8 dev {through}"))
 }
 
 #[cfg(test)]

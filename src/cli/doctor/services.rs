@@ -28,7 +28,7 @@ fn kernel_version(release: &str, found: String) -> Finding {
     if version >= OLDEST_KERNEL {
         return Finding::ok("versions", found);
     }
-    Finding::warning("versions", found, "The bridge is not tested with a kernel this old.")
+    Finding::warning("versions", found).means("The bridge is not tested with a kernel this old.")
 }
 
 pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
@@ -60,29 +60,20 @@ fn executables(holders: &[RoleHolder]) -> Finding {
     if old.is_empty() {
         return Finding::ok("processes", format!("{} processes of the bridge run", holders.len()));
     }
-    Finding::warning(
-        "processes",
-        format!("{} still run an executable that was replaced", list(old)),
-        "An upgrade takes effect after a restart.",
-    )
-    .with_command(format!("sudo systemctl restart {TARGET}"))
+    Finding::warning("processes", format!("{} still run an executable that was replaced", list(old)))
+        .means("An upgrade takes effect after a restart.")
+        .with_command(format!("sudo systemctl restart {TARGET}"))
 }
 
 /// Checks the state that `systemctl is-enabled` prints for the target.
 fn services(enabled: &str) -> Finding {
     match enabled {
         "enabled" | "enabled-runtime" => Finding::ok("services", format!("{TARGET} is enabled")),
-        "" | "not-found" => Finding::note(
-            "services",
-            "the service units are not installed",
-            "The bridge does not start when the machine boots.",
-        ),
-        state => Finding::warning(
-            "services",
-            format!("{TARGET} is {state}"),
-            "The bridge does not start when the machine boots.",
-        )
-        .with_command(format!("sudo systemctl enable --now {TARGET}")),
+        "" | "not-found" => Finding::note("services", "the service units are not installed")
+            .means("The bridge does not start when the machine boots."),
+        state => Finding::warning("services", format!("{TARGET} is {state}"))
+            .means("The bridge does not start when the machine boots.")
+            .with_command(format!("sudo systemctl enable --now {TARGET}")),
     }
 }
 
@@ -91,12 +82,9 @@ fn drop_ins(match_configuration: bool, file: &Path) -> Finding {
     if match_configuration {
         return Finding::ok("units", "match the configuration");
     }
-    Finding::warning(
-        "units",
-        "do not match the configuration",
-        "A lane has no service, or a service lacks a right that the configuration needs.",
-    )
-    .with_command(format!("sudo adaptive-bridge units --write --config {}", file.display()))
+    Finding::warning("units", "do not match the configuration")
+        .means("A lane has no service, or a service lacks a right that the configuration needs.")
+        .with_command(format!("sudo adaptive-bridge units --write --config {}", file.display()))
 }
 
 /// Checks the services that `systemctl list-units --state=failed` lists.
@@ -105,12 +93,9 @@ fn failed(units: &str) -> Finding {
     let Some(first) = names.first().copied() else {
         return Finding::ok("failed", "no service has failed");
     };
-    Finding::error(
-        "failed",
-        list(&names),
-        "systemd no longer restarts them: the configuration is bad, or they exited too often.",
-    )
-    .with_command(format!("journalctl -u {first} -n 50"))
+    Finding::error("failed", list(&names))
+        .means("systemd no longer restarts them: the configuration is bad, or they exited too often.")
+        .with_command(format!("journalctl -u {first} -n 50"))
 }
 
 #[cfg(test)]
