@@ -107,6 +107,11 @@ pub enum DiscoveryCommand {
   DisposeParticipant {
     guid: GUID,
   },
+  // Announces a local writer with another USER_DATA.
+  SetUserData {
+    writer: GUID,
+    user_data: Vec<u8>,
+  },
   // Lets that participant discard this one and discover it anew.
   ReintroduceTo {
     prefix: GuidPrefix,
@@ -874,6 +879,12 @@ impl Discovery {
                   self.say_goodbye_for_the_dead();
                 }
                 DiscoveryCommand::ReintroduceTo { prefix } => self.reintroduce_to(prefix),
+                DiscoveryCommand::SetUserData { writer, user_data } => {
+                  let mut db = discovery_db_write(&self.discovery_db);
+                  if let Some(announced) = db.set_user_data(writer, user_data) {
+                    self.sedp_publish_single_user_writer(announced);
+                  }
+                }
                 DiscoveryCommand::ManualAssertLiveliness => {
                   self
                     .liveliness_state

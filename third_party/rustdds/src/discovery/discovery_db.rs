@@ -599,6 +599,17 @@ impl DiscoveryDB {
       .insert(writer.writer_proxy.remote_writer_guid, writer);
   }
 
+  /// Replaces the USER_DATA of a local writer, and returns the writer, unless
+  /// it has the same or does not exist.
+  pub fn set_user_data(&mut self, guid: GUID, user_data: Vec<u8>) -> Option<&DiscoveredWriterData> {
+    let writer = self.local_topic_writers.get_mut(&guid)?;
+    if writer.user_data == user_data {
+      return None;
+    }
+    writer.user_data = user_data;
+    Some(writer)
+  }
+
   pub fn remove_local_topic_writer(&mut self, guid: GUID) {
     self.local_topic_writers.remove(&guid);
   }
@@ -884,7 +895,7 @@ impl DiscoveryDB {
       reader_proxy: ReaderProxy::from(reader_proxy),
       subscription_topic_data: subscription_data,
       content_filter,
-      user_data: Vec::new(),
+      user_data: reader.qos_policy.user_data().cloned().unwrap_or_default().value,
     }
   }
 

@@ -1,4 +1,4 @@
-use std::time::Instant;
+use std::{collections::BTreeMap, time::Instant};
 
 use serde::{Deserialize, Serialize};
 #[allow(unused_imports)]
@@ -52,6 +52,18 @@ use crate::security::EndpointSecurityInfo;
 use crate::no_security::EndpointSecurityInfo;
 #[cfg(test)]
 use crate::structure::guid::EntityKind;
+
+// The USER_DATA of an endpoint: an octet sequence (RTPS v2.5 Section 9.4.2.11),
+// without its length and padding. It concerns only applications, so a malformed
+// one does not make the endpoint unknown.
+fn user_data_from(
+  pl_map: &BTreeMap<ParameterId, Vec<&Parameter>>,
+  ctx: speedy::Endianness,
+) -> Vec<u8> {
+  let user_data: Result<Option<Vec<u8>>, PlCdrDeserializeError> =
+    get_option_from_pl_map(pl_map, ctx, ParameterId::PID_USER_DATA, "user data");
+  user_data.ok().flatten().unwrap_or_default()
+}
 
 // We need a wrapper to distinguish between Participant and Endpoint GUIDs.
 // They need to be distinguished, because the PL_CDR serialization is different:
@@ -291,6 +303,7 @@ impl SubscriptionBuiltinTopicData {
       resource_limits: None, // nor Resource Limits, see Figure 8.30 in RTPS spec 2.5
       lifespan: self.lifespan,
       data_representation: self.data_representation.clone(),
+      user_data: None, // The discovery data has a field of its own for it.
 
       #[cfg(feature = "security")]
       property: None, // TODO: no property QoS?
@@ -422,11 +435,7 @@ impl PlCdrDeserialize for DiscoveredReaderData {
 
     let qos = QosPolicies::from_parameter_list(ctx, &pl_map)?;
 
-    let user_data = pl_map
-      .get(&ParameterId::PID_USER_DATA)
-      .and_then(|v| v.first())
-      .map(|p| p.value.clone())
-      .unwrap_or_default();
+    let user_data = user_data_from(&pl_map, ctx);
 
     Ok(DiscoveredReaderData {
       reader_proxy: ReaderProxy::new(
@@ -502,7 +511,7 @@ impl ParameterListable for DiscoveredReaderData {
           security_info,
         },
       content_filter,
-      user_data: _,
+      user_data,
     } = self;
 
     let mut pl = ParameterList::new();
@@ -576,6 +585,11 @@ impl ParameterListable for DiscoveredReaderData {
       content_filter,
       ContentFilterProperty
     );
+
+    // An endpoint without USER_DATA announces none, as other implementations do.
+    if !user_data.is_empty() {
+      emit!(PID_USER_DATA, user_data, Vec<u8>);
+    }
 
     #[cfg(feature = "security")]
     emit_option!(
@@ -740,6 +754,7 @@ impl PublicationBuiltinTopicData {
       resource_limits: None, // nor Resource Limits, see Figure 8.30 in RTPS spec 2.5
       lifespan: self.lifespan,
       data_representation: self.data_representation.clone(),
+      user_data: None, // The discovery data has a field of its own for it.
       #[cfg(feature = "security")]
       property: None, // TODO: no property Qos?
     }
@@ -815,7 +830,7 @@ impl DiscoveredWriterData {
       last_updated: Instant::now(),
       writer_proxy,
       publication_topic_data,
-      user_data: Vec::new(),
+      user_data: writer.qos().user_data().cloned().unwrap_or_default().value,
     }
   }
 }
@@ -882,11 +897,7 @@ impl PlCdrDeserialize for DiscoveredWriterData {
 
     let qos = QosPolicies::from_parameter_list(ctx, &pl_map)?;
 
-    let user_data = pl_map
-      .get(&ParameterId::PID_USER_DATA)
-      .and_then(|v| v.first())
-      .map(|p| p.value.clone())
-      .unwrap_or_default();
+    let user_data = user_data_from(&pl_map, ctx);
 
     Ok(DiscoveredWriterData {
       last_updated: Instant::now(),
@@ -961,7 +972,7 @@ impl ParameterListable for DiscoveredWriterData {
           #[cfg(feature = "security")]
           security_info,
         },
-      user_data: _,
+      user_data,
     } = self;
 
     let mut pl = ParameterList::new();
@@ -1029,6 +1040,11 @@ impl ParameterListable for DiscoveredWriterData {
         &topic_alias.clone().into(),
         StringWithNul
       );
+    }
+
+    // An endpoint without USER_DATA announces none, as other implementations do.
+    if !user_data.is_empty() {
+      emit!(PID_USER_DATA, user_data, Vec<u8>);
     }
 
     #[cfg(feature = "security")]
@@ -1102,6 +1118,7 @@ impl HasQoSPolicy for TopicBuiltinTopicData {
       resource_limits: self.resource_limits,
       lifespan: self.lifespan,
       data_representation: None, // Topic-level DATA_REPRESENTATION not tracked
+      user_data: None,
       #[cfg(feature = "security")]
       property: None, // TODO: no property Qos?
     }
@@ -1461,7 +1478,7 @@ mod tests {
       last_updated: Instant::now(),
       writer_proxy,
       publication_topic_data: pub_topic_data,
-      user_data: Vec::new(),
+      user_data: b"typehash=RIHS01_00;".to_vec(),
     };
 
     let sdata = dwd
@@ -1478,6 +1495,20 @@ mod tests {
     let sdata2 =
       PlCdrSerializerAdapter::<DiscoveredWriterData, LittleEndian>::to_bytes(&dwd2).unwrap();
     assert_eq!(sdata, sdata2);
+  }
+
+  #[test]
+  fn user_data_is_read_without_length_and_padding_and_a_malformed_one_as_none() {
+    let ctx = speedy::Endianness::LittleEndian;
+    let read = |value: &[u8]| {
+      let user_data = Parameter::new(ParameterId::PID_USER_DATA, value.to_vec());
+      user_data_from(&BTreeMap::from([(ParameterId::PID_USER_DATA, vec![&user_data])]), ctx)
+    };
+    assert_eq!(read(&[3, 0, 0, 0, b'a', b'b', b'c', 0]), b"abc");
+    assert_eq!(read(&[4, 0, 0, 0, b'a']), b"");
+    assert_eq!(read(&[0xff, 0xff, 0xff, 0xff, b'a']), b"");
+    assert_eq!(read(&[1]), b"");
+    assert_eq!(user_data_from(&BTreeMap::new(), ctx), b"");
   }
 
   // Do not test ser/deser. This is never seen on the wire out of

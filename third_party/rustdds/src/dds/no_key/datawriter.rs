@@ -122,6 +122,11 @@ where
     self.keyed_datawriter.sent_through()
   }
 
+  /// Replaces the USER_DATA of the writer, and announces it.
+  pub fn set_user_data(&self, user_data: crate::dds::qos::policy::UserData) {
+    self.keyed_datawriter.set_user_data(user_data);
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.keyed_datawriter.matched_readers()

@@ -15,7 +15,7 @@ use crate::{
     ddsdata::DDSData,
     pubsub::Publisher,
     qos::{
-      policy::{Liveliness, Reliability},
+      policy::{Liveliness, Reliability, UserData},
       HasQoSPolicy, QosPolicies,
     },
     result::{CreateResult, WriteError, WriteResult},
@@ -430,6 +430,18 @@ where
   /// Later ones wait for the event loop, or for room in a socket.
   pub fn sent_through(&self) -> SequenceNumber {
     self.send_buffer.direct_send().last_sent()
+  }
+
+  /// Replaces the USER_DATA of the writer, which DDS allows at any time, and
+  /// announces it.
+  pub fn set_user_data(&self, user_data: UserData) {
+    let command = DiscoveryCommand::SetUserData {
+      writer: self.guid(),
+      user_data: user_data.value,
+    };
+    if let Err(e) = self.discovery_command.try_send(command) {
+      error!("Cannot announce another USER_DATA of a writer: {e}");
+    }
   }
 
   /// Every matched reader, with what it was offered, acknowledged and missed.
