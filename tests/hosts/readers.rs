@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, outputs};
 use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::process::signal;
@@ -251,5 +251,39 @@ fn all_samples_forwarded_by_a_critical_egress_killed_five_times_reach_every_subs
         let possible = forwarded..=forwarded + no_reader;
         assert!(possible.contains(&received.received), "{received:?} of {critical}");
     }
+    bed.end();
+}
+
+/// A Cyclone DDS reader keeps up to 16 samples of which fragments are lost, and discards the fragments of
+/// newer ones until the writer withdraws the old ones.
+#[test]
+fn best_effort_subscribers_receive_again_after_many_lost_fragments() {
+    let test = "best_effort_subscribers_receive_again_after_many_lost_fragments";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let subscribers = [Library::Cyclone, Library::Fast, Library::Rust].map(|library| {
+        let reader = || Peer::on(library).best_effort().keep_all();
+        [CRITICAL, NONCRITICAL].map(|topic| bed.subscribe("slow", reader(), topic))
+    });
+    let subscribers = subscribers.into_iter().flatten().collect::<Vec<_>>();
+    let publisher = bed.publish(Peer::cyclone().rate_hz(50.0), INPUT);
+    let all_receive = |samples| {
+        let before: Vec<u64> = subscribers.iter().map(RunningPeer::received).collect();
+        support::wait_until(format!("{samples} samples more than {before:?}"), || {
+            let now = subscribers.iter().map(RunningPeer::received);
+            now.zip(&before).all(|(now, before)| now > before + samples)
+        });
+    };
+    all_receive(20);
+    bed.host("slow").lose_incoming(0.5);
+    // Of 250 samples and 50 of the noncritical lane, in three datagrams each, an eighth arrives whole, and
+    // another eighth not at all.
+    std::thread::sleep(Duration::from_secs(5));
+    bed.host("slow").lose_incoming(0.0);
+    all_receive(20);
+    let _: Sent = publisher.end();
+    for subscriber in subscribers {
+        subscriber.end::<Received>().assert_sound();
+    }
+    bed.wait_accounted();
     bed.end();
 }

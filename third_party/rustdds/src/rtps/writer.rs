@@ -958,6 +958,11 @@ impl Writer {
           } else {
             TrafficClass::Bulk
           };
+          if self.sample_cursor == SampleCursor::Fresh
+            && cc.data_value.payload_size() > self.max_unfragmented_serialized_payload(None)
+          {
+            self.withdraw_from_best_effort_readers(sequence_number);
+          }
           let is_split = target_reader_opt.is_none() && self.is_split(cc.data_value.payload_size());
           let audiences = match (is_split, self.audience) {
             (false, _) => &[Audience::All][..],
@@ -2638,6 +2643,34 @@ impl Writer {
     );
   }
 
+  // Withdraws older samples from the BEST_EFFORT readers of a RELIABLE writer, before
+  // a sample in fragments is sent.
+  //
+  // Cyclone DDS (0.10) keeps the fragments of incomplete samples of a RELIABLE writer
+  // until a GAP, or a HEARTBEAT to one of its RELIABLE readers, withdraws them. Once it
+  // has 16 incomplete samples it discards the fragments of all newer ones, so that a
+  // BEST_EFFORT reader behind a lossy link would get nothing any more.
+  //
+  // The state is one for all readers of a participant: a RELIABLE one still needs what
+  // it lacks, and gets HEARTBEATs. A late joiner still needs the history.
+  fn withdraw_from_best_effort_readers(&self, next: SequenceNumber) {
+    let before = next - SequenceNumber::from(SAMPLES_LEFT_TO_BEST_EFFORT);
+    if !self.is_reliable() || self.like_stateless || before <= SequenceNumber::from(1) {
+      return;
+    }
+    for (guid, reader) in &self.readers {
+      let mut siblings = self.readers.range(guid.prefix.range());
+      if siblings.any(|(_, sibling)| sibling.qos().is_reliable() || sibling.repair_mode) {
+        continue;
+      }
+      let message = MessageBuilder::new()
+        .dst_submessage(self.endianness, guid.prefix)
+        .gap_msg_before(before, self.entity_id(), self.endianness, *guid)
+        .add_header_and_build(self.my_guid.prefix);
+      self.send_control_to_readers(DeliveryMode::Unicast, message, &mut std::iter::once(reader));
+    }
+  }
+
   // With each sample, so that a joining reader has a HEARTBEAT as soon as it knows the
   // Writer. Fast DDS repeats its own request each 140 ms.
   fn offer_to_joining_readers(&self) {
@@ -2811,6 +2844,11 @@ const DATA_SUBMESSAGE_OVERHEAD: usize = 48;
 
 // Submessage header and GUID prefix.
 const INFO_DST_SUBMESSAGE_SIZE: usize = 16;
+
+// How many of the newest samples are not withdrawn from BEST_EFFORT readers, because
+// their fragments may still be on the way. Half of the 16 incomplete samples that
+// Cyclone DDS keeps.
+const SAMPLES_LEFT_TO_BEST_EFFORT: i64 = 8;
 
 // An invalidating INFO_TS is a bare submessage header.
 const SUBMESSAGE_INFO_TS_INVALIDATE_SIZE: usize = 4;
@@ -4208,6 +4246,51 @@ mod tests {
         .unwrap();
       let mut buffer = [0; 4096];
       std::iter::from_fn(|| socket.recv(&mut buffer).ok()).count()
+    }
+
+    // The sample numbers that GAPs withdraw at `socket`, each range up to its end.
+    fn withdrawn(socket: &std::net::UdpSocket) -> Vec<(i64, i64)> {
+      socket
+        .set_read_timeout(Some(StdDuration::from_millis(200)))
+        .unwrap();
+      let mut buffer = [0; 65_536];
+      let mut ranges = Vec::new();
+      while let Ok(len) = socket.recv(&mut buffer) {
+        let datagram = bytes::Bytes::copy_from_slice(&buffer[..len]);
+        for submessage in Message::read_from_buffer(&datagram).unwrap().submessages {
+          if let SubmessageBody::Writer(WriterSubmessage::Gap(gap, _)) = submessage.body {
+            ranges.push((gap.gap_start.into(), gap.gap_list.base().into()));
+          }
+        }
+      }
+      ranges
+    }
+
+    #[test]
+    fn a_best_effort_reader_without_a_reliable_sibling_gets_a_gap_before_each_fragmented_sample() {
+      let mut f = keep_last();
+      let sockets = [(); 2].map(|()| std::net::UdpSocket::bind("127.0.0.1:0").unwrap());
+      let alone = GUID::new(GuidPrefix::new(&[8; 12]), EntityId::UNKNOWN);
+      let beside_reliable = GUID::new(f.reader_guid.prefix, EntityId::UNKNOWN);
+      let best_effort = QosPolicyBuilder::new().reliability(Reliability::BestEffort).build();
+      for (guid, socket) in [alone, beside_reliable].into_iter().zip(&sockets) {
+        let mut proxy = RtpsReaderProxy::new(guid, best_effort.clone(), false);
+        proxy.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+        f.writer.update_reader_proxy(&proxy, &best_effort);
+        // As if it were no loopback locator, which is not used before the route is resolved.
+        let reader = f.writer.readers.get_mut(&guid).unwrap();
+        reader.unicast_locator_list = proxy.unicast_locator_list;
+      }
+      let mut send = |samples, payload_len| {
+        let last_sent = f.writer.last_sent();
+        write(&f, samples, payload_len);
+        f.writer.set_last_sent(last_sent);
+        f.writer.process_pending();
+        sockets.each_ref().map(withdrawn)
+      };
+      assert_eq!(send(20, 8), [vec![], vec![]], "samples of one datagram");
+      assert_eq!(send(1, 200_000), [vec![(1, 13)], vec![]]);
+      assert_eq!(send(1, 200_000), [vec![(1, 14)], vec![]]);
     }
 
     #[test]
