@@ -141,6 +141,11 @@ pub const PENDING_TURN_MAX_BYTES: usize = 256 << 10;
 // what a joining reader may list as missing.
 pub const MAX_ADVERTISED_EVICTED_SAMPLES: usize = 8192;
 
+// After a match, when a writer sends its history to a BEST_EFFORT late joiner. The writer
+// matches a reader before the reader matches the writer, and nothing says when that has
+// happened; discovery of both directions takes some 100 ms on a local network.
+pub const HISTORY_SETTLING: Duration = Duration::from_secs(1);
+
 // Memory-safety backstop for the per-matched-reader set of sequence numbers a
 // Writer still intends to send (`RtpsReaderProxy::unsent_changes`). In normal
 // operation this set is pruned as samples are pushed or acknowledged, but a

@@ -285,13 +285,6 @@ impl RtpsReaderProxy {
     false
   }
 
-  /// Sends the samples `first..=last` with the next repair.
-  pub fn send_all(&mut self, first: SequenceNumber, last: SequenceNumber) {
-    self
-      .unsent_changes
-      .extend(SequenceNumber::range_inclusive(first, last));
-  }
-
   /// The first sample that the reader is offered.
   pub fn first_offered(&self) -> SequenceNumber {
     self
@@ -758,6 +751,15 @@ impl RtpsReaderProxy {
   /// The reader asks for this sample.
   pub fn request_change(&mut self, sequence_number: SequenceNumber) {
     self.unsent_changes.insert(sequence_number);
+  }
+
+  /// These samples are to be sent to the reader.
+  pub fn request_changes(&mut self, range: std::ops::Range<SequenceNumber>) {
+    let mut next = range.start;
+    while next < range.end {
+      self.unsent_changes.insert(next);
+      next = next.plus_1();
+    }
   }
 
   /// Whether everything for this reader goes over loopback.

@@ -32,6 +32,7 @@ use crate::{
     constant::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
+      HISTORY_SETTLING,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, PENDING_TURN_MAX_BYTES, REPAIR_BATCH_MAX_BYTES,
       REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
       REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
@@ -531,8 +532,16 @@ impl Writer {
       TimedEvent::SendRepairData {
         to_reader: reader_guid,
       } => {
+        let history = self.send_buffer.history_first()..self.last_sent().plus_1();
         match self.lookup_reader_proxy_mut(reader_guid) {
-          Some(rp) => rp.repair_data_scheduled = false,
+          Some(rp) => {
+            rp.repair_data_scheduled = false;
+            if !rp.qos().is_reliable() && !rp.repair_mode {
+              // The history for a late joiner, see `update_reader_proxy`.
+              rp.request_changes(history);
+              rp.repair_mode = true;
+            }
+          }
           None => return, // reader is gone
         }
         // Do not add to a send socket that already holds queued control
@@ -2485,6 +2494,16 @@ impl Writer {
           {
             self.offer_to_new_reader(reader_proxy.remote_reader_guid);
           }
+          // A BEST_EFFORT late joiner requests nothing. It is sent the history unasked,
+          // when it knows this writer.
+          if self.is_reliable()
+            && !self.my_guid.entity_id.kind().is_built_in()
+            && !self.qos_policies.is_volatile()
+            && !reader_proxy.qos().is_reliable()
+            && !reader_proxy.qos().is_volatile()
+          {
+            self.schedule_repair_data(reader_proxy.remote_reader_guid, HISTORY_SETTLING);
+          }
           info!(
             "Matched new remote reader on topic={:?} reader={:?}",
             self.topic_name(),
@@ -2688,7 +2707,7 @@ impl Writer {
     let first_retained = send_buffer.first_change_sequence_number();
     if let Some(reader) = self.readers.get_mut(&reader_guid) {
       let first = max(first_retained, reader.all_acked_before);
-      reader.send_all(first, last);
+      reader.request_changes(first..last.plus_1());
     }
     *no_other_sender = self.direct_plan();
   }

@@ -506,14 +506,26 @@ impl WriterSendBuffer {
     let first_offered = if !wants_history {
       self.shared.direct_send.last_sent().plus_1().min(next)
     } else {
-      match self.shared.keep_last {
-        Some(depth) => max(inner.first_seq, next - SequenceNumber::from(depth)),
-        None => inner.first_seq,
-      }
+      Self::history_first_locked(&self.shared, &inner)
     };
     let progress = Arc::new(ReaderProgress::new(reader, reliable, first_offered));
     inner.readers.insert(reader, progress.clone());
     progress
+  }
+
+  /// The first sample of the history that a late joiner is offered.
+  pub fn history_first(&self) -> SequenceNumber {
+    Self::history_first_locked(&self.shared, &self.shared.inner.lock().unwrap())
+  }
+
+  fn history_first_locked(shared: &Shared, inner: &Inner) -> SequenceNumber {
+    match shared.keep_last {
+      Some(depth) => max(
+        inner.first_seq,
+        inner.last_seq.plus_1() - SequenceNumber::from(depth),
+      ),
+      None => inner.first_seq,
+    }
   }
 
   /// Forgets a reader that is gone.
