@@ -84,6 +84,9 @@ struct Inner {
   // send window / unsent-backlog and must retain samples for repair.
   max_retain: usize,
 
+  // How many evicted samples a HEARTBEAT still offers.
+  max_advertised_evicted: usize,
+
   // Wakers of async producers / ack-waiters parked because the window was full
   // or acknowledgements were still pending. Drained (woken) on any advance.
   wakers: Vec<Waker>,
@@ -104,7 +107,7 @@ impl Inner {
     if !self.reliable_readers_present {
       return self.first_seq;
     }
-    let furthest_back = self.first_seq - SequenceNumber::from(MAX_ADVERTISED_EVICTED_SAMPLES);
+    let furthest_back = self.first_seq - SequenceNumber::from(self.max_advertised_evicted);
     let unacknowledged = max(self.acked_before, furthest_back);
     max(unacknowledged, SequenceNumber::new(1)).min(self.first_seq)
   }
@@ -174,6 +177,7 @@ impl WriterSendBuffer {
           backlog_limit: backlog_limit.max(1),
           sent_frontier: SequenceNumber::new(0),
           max_retain: max_retain.max(1),
+          max_advertised_evicted: MAX_ADVERTISED_EVICTED_SAMPLES,
           wakers: Vec::new(),
           parked_threads: 0,
         }),
@@ -205,6 +209,12 @@ impl WriterSendBuffer {
       None => error!("WriterSendBuffer: KEEP_LAST was set after the buffer was shared"),
     }
     self
+  }
+
+  /// From now on a HEARTBEAT begins with the oldest sample retained, so that a reader
+  /// skips what is gone without a request and a GAP, each of which may be lost.
+  pub fn offer_only_retained(&self) {
+    self.shared.inner.lock().unwrap().max_advertised_evicted = 0;
   }
 
   // --- predicates (must be called while holding the lock) ---
@@ -909,5 +919,30 @@ mod tests {
       assert!(admit_now(&buf, WriteOptions::default()));
     }
     assert_eq!(buf.retained_len(), max_retain + 10);
+  }
+
+  // A reader that has acknowledged nothing skips what is gone.
+  #[test]
+  fn a_writer_can_offer_only_what_it_retains() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      true,
+      false,
+      true,
+      5,
+      1000,
+      2,
+    )
+    .keep_last(2);
+    buf.set_acked_frontier(Some(SequenceNumber::new(1)));
+    for _ in 0..10 {
+      assert!(admit_now(&buf, WriteOptions::default()));
+    }
+    assert_eq!(buf.retained_len(), 5);
+    assert_eq!(buf.history_first(), SequenceNumber::new(9));
+    assert_eq!(buf.advertised_first(), SequenceNumber::new(1));
+    buf.offer_only_retained();
+    assert_eq!(buf.advertised_first(), SequenceNumber::new(6));
   }
 }

@@ -127,6 +127,12 @@ where
     self.keyed_datawriter.set_user_data(user_data);
   }
 
+  /// From now on a reader that lacks evicted samples skips them at the next HEARTBEAT
+  /// instead of requesting them. Those that it has not acknowledged count as missed.
+  pub fn offer_only_retained(&self) {
+    self.keyed_datawriter.offer_only_retained();
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.keyed_datawriter.matched_readers()

@@ -444,6 +444,12 @@ where
     }
   }
 
+  /// From now on a reader that lacks evicted samples skips them at the next HEARTBEAT
+  /// instead of requesting them. Those that it has not acknowledged count as missed.
+  pub fn offer_only_retained(&self) {
+    self.send_buffer.offer_only_retained();
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.send_buffer.matched_readers()
