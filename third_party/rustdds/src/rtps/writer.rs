@@ -32,10 +32,10 @@ use crate::{
     constant::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
-      HISTORY_SETTLING,
+      HISTORY_SETTLING, NACK_FRAG_RESPONSE_DELAY,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, PENDING_TURN_MAX_BYTES, REPAIR_BATCH_MAX_BYTES,
-      REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_MAX_BYTES, REPAIR_INTERVAL_DEFAULT,
-      REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
+      REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_INTERVAL, REPAIR_FRAGS_MAX_BYTES,
+      REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
     },
     direct_send::{Offer, Plan},
     outbound::{SocketId, TrafficClass},
@@ -361,7 +361,7 @@ impl Writer {
       heartbeat_period_fast,
       cache_cleaning_period,
       nack_response_delay: NACK_RESPONSE_DELAY, // default value from dp_event_loop
-      nackfrag_response_delay: NACK_RESPONSE_DELAY, // default value from dp_event_loop
+      nackfrag_response_delay: NACK_FRAG_RESPONSE_DELAY,
       nack_suppression_duration: NACK_SUPPRESSION_DURATION,
       // Conservative fallback for any discovery advertisement of max sample size.
       data_max_size_serialized: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
@@ -572,7 +572,7 @@ impl Writer {
           .get(&reader_guid)
           .is_some_and(RtpsReaderProxy::repair_frags_requested)
         {
-          self.schedule_repair_frags(reader_guid, self.repair_interval());
+          self.schedule_repair_frags(reader_guid, REPAIR_FRAGS_INTERVAL);
         }
       } // SendRepairFrags
     } // match
@@ -682,9 +682,12 @@ impl Writer {
     } else {
       0
     };
+    // A DATAFRAG whose fragment size exceeds the sample is invalid (RTPS v2.5 Section
+    // 8.3.8.3.3), so such a sample is sent whole whatever the MTU is.
     budget
       .saturating_sub(hb_reserve)
       .saturating_sub(DATA_SUBMESSAGE_OVERHEAD)
+      .max(FRAGMENT_SIZE)
   }
 
   fn num_frags_and_frag_size(&self, payload_size: usize) -> (u32, u16) {
@@ -3727,10 +3730,10 @@ mod tests {
     // no datagram, and no panic.
     #[test]
     fn fragments_that_do_not_exist_are_not_requested() {
-      let mut f = Fixture::user(2, 20_000, None); // 79 fragments
+      let mut f = Fixture::user(2, 20_000, None); // 15 fragments
       for (count, (sn, base)) in [
         (1, 0),
-        (1, 80),
+        (1, 16),
         (1, u32::MAX),
         (1, u32::MAX - 255),
         (0, 1),
@@ -3746,26 +3749,38 @@ mod tests {
       }
       assert!(!f.reader_proxy().repair_frags_scheduled);
 
-      nack_frag(&mut f, 2, all_from(79), 100);
-      let only_the_last = Some((SequenceNumber::new(2), 79, 1));
+      nack_frag(&mut f, 2, all_from(15), 100);
+      let only_the_last = Some((SequenceNumber::new(2), 15, 1));
       assert_eq!(f.reader_proxy().first_requested_frags(1000), only_the_last);
       f.writer.handle_repair_frags_send(f.reader_guid);
       assert!(!f.reader_proxy().repair_frags_requested());
     }
 
-    // A round answers all that one NACK_FRAG can ask for, and is bounded.
+    // A fragment size above the sample's size is invalid. A WireGuard interface has an
+    // MTU of 1,420, that of others 1,280.
+    #[test]
+    fn a_sample_that_is_smaller_than_a_fragment_is_sent_whole() {
+      let f = Fixture::user(0, 8, None);
+      for mtu in [68, 576, 1_280, 1_420, 1_500] {
+        let budget = crate::rtps::constant::payload_budget_for_mtu(mtu);
+        assert!(f.writer.max_unfragmented_in(budget) >= FRAGMENT_SIZE, "{mtu}");
+      }
+    }
+
+    // A round is bounded, and a few rounds answer what several NACK_FRAGs ask for.
     #[test]
     fn a_round_repairs_what_several_nack_frags_ask_for() {
-      let mut f = Fixture::user(1, 600_000, None); // 2,344 fragments
-      for (count, base) in (1..=2_344).step_by(256).enumerate() {
-        nack_frag(&mut f, 1, frags(base..=(base + 255).min(2_344)), count as i32);
+      let mut f = Fixture::user(1, 600_000, None); // 447 fragments
+      for (count, base) in (1..=447).step_by(256).enumerate() {
+        nack_frag(&mut f, 1, frags(base..=(base + 255).min(447)), count as i32);
       }
       let per_round = (REPAIR_FRAGS_MAX_BYTES / FRAGMENT_SIZE) as u32;
       f.writer.handle_repair_frags_send(f.reader_guid);
       let (_, start, _) = f.reader_proxy().first_requested_frags(1).unwrap();
       assert!(start > per_round / 2 && start <= per_round + 1, "{start}");
-      f.writer.handle_repair_frags_send(f.reader_guid);
-      f.writer.handle_repair_frags_send(f.reader_guid);
+      for _ in 1..5 {
+        f.writer.handle_repair_frags_send(f.reader_guid);
+      }
       assert!(!f.reader_proxy().repair_frags_requested());
     }
 
