@@ -4,7 +4,9 @@ use super::environment::Environment;
 use super::field::Field;
 use super::qos::{PartialQos, Profiles};
 use super::rates::{self, RoutingPolicy};
-use super::settings::{DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy};
+use super::settings::{
+    DEFAULT_WINDOW_SAMPLES, DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy,
+};
 use crate::model::{LaneName, TrafficClass};
 
 /// The most lanes. Each is a process with its own DDS participant, and a domain allows 120 participants on a
@@ -89,11 +91,11 @@ struct LaneReader<'a> {
 impl LaneReader<'_> {
     fn read(&self, name: LaneName, field: &Field<'_>) -> LaneDraft {
         field.entries();
-        let (class, queue_depth, forwarding) = if name == LaneName::critical() {
+        let (class, queue_depth, window_samples, forwarding) = if name == LaneName::critical() {
             rates::refuse_rates(field);
-            (TrafficClass::Critical, 64, Forwarding::Everything)
+            (TrafficClass::Critical, 64, Some(DEFAULT_WINDOW_SAMPLES), Forwarding::Everything)
         } else {
-            (TrafficClass::Noncritical, 4, Forwarding::Limited(self.policy.lane_rates(field)))
+            (TrafficClass::Noncritical, 4, None, Forwarding::Limited(self.policy.lane_rates(field)))
         };
         let qos = field.get("qos");
         let lane = Lane {
@@ -104,7 +106,7 @@ impl LaneReader<'_> {
             queue_depth: field.get("queue_depth").count().unwrap_or(queue_depth),
             max_borrowed: field.get("max_borrowed").count_or_default(),
             by_reference_min_bytes: field.get("by_reference_min_bytes").count_or_default(),
-            window_samples: field.get("window_samples").count_or_default(),
+            window_samples: field.get("window_samples").count().or(window_samples),
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
         };
         let qos =

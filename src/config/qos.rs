@@ -46,11 +46,12 @@ impl PartialQos {
         }
     }
 
-    /// The profile of a writer: missing policies are the paper's for the lane's class.
+    /// The profile of a writer: missing policies are those of the lane's class.
     pub fn complete(self, class: TrafficClass) -> QosProfile {
-        let default = match class {
-            TrafficClass::Critical => QosProfile::CRITICAL,
-            TrafficClass::Noncritical => QosProfile::NONCRITICAL,
+        let default = match (class, self.reliability) {
+            (TrafficClass::Critical, _) => QosProfile::CRITICAL,
+            (TrafficClass::Noncritical, Some(Reliability::BestEffort)) => QosProfile::NONCRITICAL,
+            (TrafficClass::Noncritical, _) => QosProfile::NONCRITICAL_RELIABLE,
         };
         QosProfile {
             reliability: self.reliability.unwrap_or(default.reliability),

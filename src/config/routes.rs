@@ -190,7 +190,7 @@ impl<'f> RouteReader<'_, 'f> {
         let depths = durable.map(|output| match output.qos.depth() {
             Some(depth) => depth as usize,
             // KEEP_ALL keeps as many samples as the writer's window.
-            None => self.lanes[output.lane].lane.window_samples,
+            None => self.lanes[output.lane].lane.window_samples_of(&output.qos),
         });
         depths.max().unwrap_or(RETAINED_SAMPLES)
     }

@@ -135,6 +135,9 @@ pub struct InputQos {
     pub deadline_ms: Option<u64>,
 }
 
+/// The default of `window_samples` where the depth of the history does not give it.
+pub(super) const DEFAULT_WINDOW_SAMPLES: usize = 256;
+
 /// What a lane forwards of the samples of its routes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Forwarding {
@@ -161,8 +164,9 @@ pub struct Lane {
     pub max_borrowed: usize,
     /// Samples of at least this size are passed to DDS by reference, smaller ones are copied.
     pub by_reference_min_bytes: usize,
-    /// The most unacknowledged samples of a RELIABLE writer of the lane.
-    pub window_samples: usize,
+    /// The most unacknowledged samples of a RELIABLE writer of the lane; `None` for the default of
+    /// [`Lane::window_samples_of`].
+    pub window_samples: Option<usize>,
     /// Scheduling of the lane's process.
     pub scheduling: Scheduling,
 }
@@ -180,6 +184,22 @@ impl Lane {
     /// output has no process.
     pub fn is_used(&self) -> bool {
         !self.outputs.is_empty()
+    }
+
+    /// Whether the samples of an output with this QoS supersede each other: those of a noncritical lane,
+    /// unless they are state (TRANSIENT_LOCAL).
+    pub fn supersedes(&self, qos: &QosProfile) -> bool {
+        self.class() == TrafficClass::Noncritical && qos.durability == Durability::Volatile
+    }
+
+    /// The most unacknowledged samples of a RELIABLE writer with this QoS. Of samples that supersede each
+    /// other only the history is repaired, so that a subscriber behind a bad link continues with fresh ones.
+    pub fn window_samples_of(&self, qos: &QosProfile) -> usize {
+        let default = match qos.depth() {
+            Some(depth) if self.supersedes(qos) => depth as usize,
+            _ => DEFAULT_WINDOW_SAMPLES,
+        };
+        self.window_samples.unwrap_or(default)
     }
 
     /// The most samples of each route that the lane holds in shared memory: a noncritical lane also holds

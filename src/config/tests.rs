@@ -52,7 +52,7 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
     assert_eq!(critical.outputs[0].topic.as_str(), "/adaptive_bridge/critical/scan");
     assert_eq!(critical.outputs[0].qos, QosProfile::CRITICAL);
     assert_eq!(noncritical.outputs[0].topic.as_str(), "/adaptive_bridge/noncritical/scan");
-    assert_eq!(noncritical.outputs[0].qos, QosProfile::NONCRITICAL);
+    assert_eq!(noncritical.outputs[0].qos, QosProfile::NONCRITICAL_RELIABLE);
     let normal = RatePolicy {
         max_rate_hz: 10.0,
         max_bytes_per_s: None,
@@ -91,17 +91,40 @@ fn qos_comes_from_override_then_profile_then_lane_then_class() {
     let map = QosProfile {
         durability: Durability::TransientLocal,
         history: History::KeepLast { depth: 1 },
-        ..QosProfile::NONCRITICAL
+        ..QosProfile::NONCRITICAL_RELIABLE
     };
     assert_eq!(rviz(0), map);
-    assert_eq!(rviz(1), QosProfile { history: History::KeepAll, ..QosProfile::NONCRITICAL });
+    assert_eq!(rviz(1), QosProfile { history: History::KeepAll, ..QosProfile::NONCRITICAL_RELIABLE });
     let deadline_ms = Some(9);
     assert_eq!(rviz(2), QosProfile { history: History::KeepLast { depth: 7 }, deadline_ms, ..map });
     let fleet = lane(&settings, "fleet").outputs[0].qos;
     let reliability = Reliability::Reliable;
-    assert_eq!(fleet, QosProfile { reliability, lifespan_ms: Some(50), ..QosProfile::NONCRITICAL });
+    assert_eq!(fleet, QosProfile { reliability, lifespan_ms: Some(50), ..QosProfile::NONCRITICAL_RELIABLE });
     // The deepest TRANSIENT_LOCAL output of each route, else 8.
     assert_eq!(settings.routes.iter().map(|route| route.retained_samples).collect::<Vec<_>>(), [1, 8, 7]);
+}
+
+#[test]
+fn a_file_that_says_best_effort_gets_the_papers_profile() {
+    let of = |text: &str| lane(&with(text), "noncritical").outputs[0].qos;
+    assert_eq!(of("lanes: {noncritical: {qos: {reliability: BEST_EFFORT}}}\n"), QosProfile::NONCRITICAL);
+    let depth = QosProfile { history: History::KeepLast { depth: 9 }, ..QosProfile::NONCRITICAL };
+    assert_eq!(of("lanes: {noncritical: {qos: {reliability: best_effort, depth: 9}}}\n"), depth);
+}
+
+#[test]
+fn a_noncritical_lane_retains_for_repair_only_what_it_offers() {
+    let window = |name: &str, text: &str| {
+        let settings = with(&format!("lanes: {{{name}: {{{text}}}}}\n"));
+        let lane = lane(&settings, name);
+        lane.window_samples_of(&lane.outputs[0].qos)
+    };
+    assert_eq!(window("critical", "qos: {depth: 7}"), 256);
+    assert_eq!(window("noncritical", "qos: {depth: 7}"), 7);
+    assert_eq!(window("noncritical", "qos: {depth: 7}, window_samples: 9"), 9);
+    assert_eq!(window("noncritical", "qos: {history: KEEP_ALL}"), 256);
+    // State does not supersede state.
+    assert_eq!(window("noncritical", "qos: {depth: 7, durability: TRANSIENT_LOCAL}"), 256);
 }
 
 #[test]

@@ -113,6 +113,12 @@ impl RawWriter {
         self.inner.sent_through().into()
     }
 
+    /// Makes readers skip samples that were evicted from the history, instead of requesting them: for samples
+    /// that the next ones supersede. Those that a reader has not acknowledged count as its overrun.
+    pub fn skip_evicted(&self) {
+        self.inner.offer_only_retained();
+    }
+
     /// Lists the matched readers, with the samples that each was offered, has acknowledged and has missed.
     pub fn matched_readers(&self) -> impl Iterator<Item = ReaderRecord> {
         self.inner.matched_readers().into_iter().map(|reader| ReaderRecord {

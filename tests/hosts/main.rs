@@ -15,6 +15,7 @@ mod hostile_readers;
 mod interop;
 mod intruders;
 mod networks;
+mod noncritical_readers;
 mod original_probes;
 mod readers;
 mod responder;

@@ -467,7 +467,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("lanes.rviz.queue_depth", "4", "5"),
     ("lanes.rviz.max_borrowed", "8", "9"),
     ("lanes.rviz.by_reference_min_bytes", "65536", "0"),
-    ("lanes.rviz.window_samples", "256", "255"),
+    ("lanes.rviz.window_samples", "null", "255"),
     ("lanes.rviz.scheduling.nice", "10", "19"),
     ("lanes.rviz.scheduling.slice_ms", "10", "5"),
     ("lanes.rviz.scheduling.cpus", "[]", "[1]"),

@@ -137,7 +137,7 @@ pub(super) const ROWS: &[Row] = &[
     restarts(
         &["lanes.<lane>.window_samples"],
         Whole(1, 100_000, " samples"),
-        "256",
+        "256; on a noncritical lane the depth of a VOLATILE KEEP_LAST output",
     )
     .doc(
         "Samples that a RELIABLE writer of the lane retains for subscribers that have not acknowledged \

@@ -9,7 +9,7 @@ use tracing::{info, warn};
 use super::super::role::RoleError;
 use super::absences::Absences;
 use super::networks;
-use crate::config::Settings;
+use crate::config::{Lane, Settings};
 use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
 use crate::model::{
     FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
@@ -200,7 +200,9 @@ impl EndpointMonitor {
     /// Logs each reader that has missed samples since its last log message.
     fn log_overruns(&mut self, settings: &Settings, now: MonotonicNs) {
         let mut matched = Vec::new();
-        for (lane, configured) in settings.lanes.iter().enumerate() {
+        // On a noncritical lane fresher samples supersede those that are not acknowledged, by design.
+        let critical = |(_, lane): &(usize, &Lane)| lane.class() == TrafficClass::Critical;
+        for (lane, configured) in settings.lanes.iter().enumerate().filter(critical) {
             for output in &configured.outputs {
                 let readers = self.boards.output_readers(lane, output.route).unwrap_or_default();
                 for record in readers.iter() {

@@ -35,6 +35,8 @@ pub(super) struct Output {
     dds_topic: String,
     qos: QosProfile,
     window_samples: usize,
+    /// Whether a reader skips the samples that it lacks when fresher ones have evicted them.
+    supersedes: bool,
     by_reference_min_bytes: usize,
     /// The drop reason of a gap while the lane forwards.
     overwrite_reason: DropReason,
@@ -99,6 +101,7 @@ impl Output {
         let late_joiners = (output.qos.durability == Durability::TransientLocal
             && output.qos.reliability == Reliability::BestEffort)
             .then(|| LateJoiners::new(output.qos.depth().unwrap_or(1) as usize));
+        let window_samples = lane.window_samples_of(&output.qos);
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
@@ -106,14 +109,15 @@ impl Output {
             route: output.route,
             dds_topic: output.topic.to_dds(),
             qos: output.qos,
-            window_samples: lane.window_samples,
+            window_samples,
+            supersedes: lane.supersedes(&output.qos),
             by_reference_min_bytes: lane.by_reference_min_bytes,
             overwrite_reason: overwrite_reason(&lane.forwarding),
             gap_reason: overwrite_reason(&lane.forwarding),
             mode: LaneMode::Normal,
             subscriber,
             writer: None,
-            unsent: UnsentSamples::new(lane.window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
+            unsent: UnsentSamples::new(window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
             queued: 0,
             late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
@@ -435,6 +439,9 @@ impl Output {
             durability = ?self.qos.durability,
             "DDS writer created"
         );
+        if self.supersedes {
+            writer.skip_evicted();
+        }
         self.writer = Some(writer);
         Ok(())
     }

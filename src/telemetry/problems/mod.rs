@@ -220,7 +220,8 @@ fn slow_readers(
             && record.unacknowledged.saturating_sub(earlier.unacknowledged) == offered
             && earlier.unacknowledged > 0;
         let reader = now.endpoint_name("reader", record.reader);
-        let text = if missed > 0 {
+        // On a noncritical lane fresher samples supersede those that are not acknowledged, by design.
+        let text = if missed > 0 && lane.class == TrafficClass::Critical {
             format!(
                 "lane {}, {}: {reader} missed {} in the last {}: it acknowledges too slowly \
                  (reader_overrun); the other subscribers have them; raise window_samples, or move it to a slower lane",

@@ -163,11 +163,11 @@ fn configuration(scenario: &Scenario) -> String {
             workload.message_type
         );
     }
-    let own = scenario.lanes().into_iter().filter(|lane| lane != "critical" && lane != "noncritical");
-    let own: Vec<String> = own.map(|lane| format!("{lane}: {{}}")).collect();
-    if !own.is_empty() {
-        let _ = writeln!(yaml, "lanes: {{{}}}", own.join(", "));
-    }
+    // The paper's noncritical lanes repair nothing.
+    let noncritical = scenario.lanes().into_iter().filter(|lane| lane != "critical");
+    let noncritical: Vec<String> =
+        noncritical.map(|lane| format!("{lane}: {{qos: {{reliability: BEST_EFFORT}}}}")).collect();
+    let _ = writeln!(yaml, "lanes: {{{}}}", noncritical.join(", "));
     let remotes = scenario.remotes.iter();
     let remotes: Vec<String> =
         remotes.map(|remote| format!("{}: {{lane: {}}}", remote.name, remote.lane)).collect();

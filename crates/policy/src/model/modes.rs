@@ -49,7 +49,7 @@ numbered! {
     TrafficClass:
     /// Every sample, at the publisher's rate, RELIABLE by default.
     Critical = 0, "critical",
-    /// Rate-limited, the freshest first, BEST_EFFORT by default.
+    /// Rate-limited, the freshest first, with a short history by default.
     Noncritical = 1, "noncritical",
 }
 

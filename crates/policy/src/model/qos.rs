@@ -64,6 +64,11 @@ impl QosProfile {
         ..Self::CRITICAL
     };
 
+    /// The writer of a noncritical lane whose file gives no RELIABILITY: RELIABLE, because a RELIABLE reader
+    /// does not match a BEST_EFFORT writer, with a history that is 0.2 s at the lane's default rate
+    /// (docs/decisions/0017-reliable-noncritical.md).
+    pub const NONCRITICAL_RELIABLE: Self = Self { history: History::KeepLast { depth: 2 }, ..Self::CRITICAL };
+
     /// HISTORY depth in samples; `None` for KEEP_ALL.
     pub const fn depth(&self) -> Option<u32> {
         match self.history {

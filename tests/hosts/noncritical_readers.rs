@@ -1,0 +1,187 @@
+//! RELIABLE subscribers of a noncritical lane, as rclpy and RViz create them by default, beside BEST_EFFORT
+//! ones.
+
+use serde_json::Value;
+use support::bed::{Bed, INPUT, NONCRITICAL, SCAN, is_accounted_and_idle, outputs};
+use support::impairment::Impairment;
+use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::ros;
+
+const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
+/// A mean loss of 28 %, in bursts, of what a subscriber receives.
+const LOSS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 24";
+/// Of what it sends: HEARTBEATs are answered or not, independently.
+const LOSS_OF_ANSWERS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 25 --queue 1";
+const RATE_HZ: f64 = 100.0;
+const SAMPLES: u64 = 1_500;
+/// The samples that the lane forwards of those: 10 Hz for 15 s, and the first one.
+const FORWARDED: std::ops::RangeInclusive<u64> = 135..=155;
+
+fn bed(test: &str, yaml: &str) -> Option<Bed> {
+    if let Some(reason) = ros::missing() {
+        support::skip(test, &reason);
+        return None;
+    }
+    Bed::start_with(test, yaml, &["lossy"])
+}
+
+fn peer(library: Library, node: &str) -> Peer {
+    match library {
+        Library::Rclpy => Peer::rclpy(node),
+        other => Peer::on(other),
+    }
+}
+
+fn subscribers(bed: &Bed, host: &str, node: &str, change: fn(Peer) -> Peer) -> Vec<RunningPeer> {
+    LIBRARIES.map(|library| bed.subscribe(host, change(peer(library, node)), NONCRITICAL)).into()
+}
+
+/// What the lane forwarded of a flow, and what its subscribers received.
+struct Outcome {
+    forwarded: u64,
+    reliable: Vec<Received>,
+    best_effort: Vec<Received>,
+    lossy: Vec<Received>,
+}
+
+/// The output of the noncritical lane.
+fn noncritical(status: &Value) -> &Value {
+    outputs(status).find(|output| output["lane"] == "noncritical").unwrap()
+}
+
+/// Publishes for 15 s to subscribers of three libraries and both reliabilities that keep up; if `beside_bad`,
+/// beside RELIABLE ones that are stopped and others whose link loses 28 % in each direction.
+fn flow(bed: &Bed, beside_bad: bool) -> Outcome {
+    let output = noncritical(&bed.wait_accounted()).clone();
+    let [received, before] = ["received", "forwarded"].map(|key| output[key].as_u64().unwrap());
+    let reliable = subscribers(bed, "slow", "planner", |peer| peer.keep_last(100));
+    let best_effort = subscribers(bed, "slow", "viewer", Peer::best_effort);
+    let (mut lossy, mut stopped, mut links) = (Vec::new(), Vec::new(), Vec::new());
+    if beside_bad {
+        lossy = subscribers(bed, "lossy", "far", |peer| peer.keep_last(100));
+        stopped = subscribers(bed, "critical", "hung", |peer| peer.keep_last(100));
+        for subscriber in &stopped {
+            subscriber.stop();
+        }
+        let [far, bridge] = ["lossy", "bridge"].map(|name| bed.host(name));
+        links = vec![Impairment::start(far, bridge, LOSS), Impairment::start(bridge, far, LOSS_OF_ANSWERS)];
+    }
+    let publisher = bed.publish(Peer::cyclone().rate_hz(RATE_HZ).count(SAMPLES), INPUT);
+    publisher.finish::<Sent>().assert_not_blocked();
+    let arrived = received + SAMPLES;
+    let status = bed.bridge.wait_status("all samples accounted for", |status| {
+        noncritical(status)["received"].as_u64() == Some(arrived) && is_accounted_and_idle(status)
+    });
+    let forwarded = noncritical(&status)["forwarded"].as_u64().unwrap() - before;
+    for subscriber in &reliable {
+        subscriber.wait_received(forwarded);
+    }
+    for link in links {
+        link.end();
+    }
+    for subscriber in &stopped {
+        subscriber.cont();
+    }
+    let end = |subscribers: Vec<RunningPeer>| subscribers.into_iter().map(RunningPeer::end).collect();
+    let _: Vec<Received> = end(stopped);
+    Outcome { forwarded, reliable: end(reliable), best_effort: end(best_effort), lossy: end(lossy) }
+}
+
+/// The age in milliseconds that 95 % of the samples did not exceed.
+fn p95_ms(received: &Received) -> f64 {
+    received.latency_us.map_or(f64::MAX, |latency| latency.p95 / 1e3)
+}
+
+fn print(kind: &str, subscribers: &[Received]) {
+    for received in subscribers {
+        let latency = received.latency_us.unwrap();
+        let [p50, p95, max] = [latency.p50, latency.p95, latency.max].map(|us| us / 1e3);
+        println!(
+            "  {kind}: {} received, age p50 {p50:.1}, p95 {p95:.1}, max {max:.1} ms, longest gap {:.0} ms",
+            received.received, received.max_gap_ms
+        );
+    }
+}
+
+#[test]
+fn bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others() {
+    let test = "bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others";
+    let Some(bed) = bed(test, SCAN) else { return };
+    let [alone, beside] = [false, true].map(|beside_bad| flow(&bed, beside_bad));
+    for (name, flow) in [("alone", &alone), ("beside bad ones", &beside)] {
+        println!("{name}: {} forwarded", flow.forwarded);
+        print("RELIABLE", &flow.reliable);
+        print("BEST_EFFORT", &flow.best_effort);
+        print("RELIABLE, lossy", &flow.lossy);
+    }
+    for flow in [&alone, &beside] {
+        assert!(FORWARDED.contains(&flow.forwarded), "{} forwarded", flow.forwarded);
+        for received in flow.reliable.iter().chain(&flow.best_effort) {
+            received.assert_sound();
+            assert_eq!(received.received, flow.forwarded);
+        }
+    }
+    let pairs = alone.reliable.iter().zip(&beside.reliable);
+    for (alone, beside) in pairs.chain(alone.best_effort.iter().zip(&beside.best_effort)) {
+        let (alone, beside) = (p95_ms(alone), p95_ms(beside));
+        assert!(beside <= alone + 20.0, "the age of 95 % of the samples rose from {alone} to {beside} ms");
+    }
+    // Without repair some 40 % arrive: a sample is three packets. The history is 0.2 s.
+    for received in &beside.lossy {
+        received.assert_sound();
+        assert!(received.received * 10 >= beside.forwarded * 6, "{received:?}");
+        assert!(p95_ms(received) <= 500.0, "{received:?}");
+    }
+    bed.end();
+}
+
+/// The DDS topic of a lane that the file makes BEST_EFFORT.
+const PLAIN: &str = "rt/adaptive_bridge/plain/scan";
+
+#[test]
+fn best_effort_subscribers_get_what_a_best_effort_lane_gives_them() {
+    let test = "best_effort_subscribers_get_what_a_best_effort_lane_gives_them";
+    // At the default rate of 10 Hz a lossy subscriber receives 60 of 150 samples, and the two lanes lose
+    // different ones: 46 and 64 were seen.
+    let yaml = format!(
+        "{SCAN}lanes: {{plain: {{qos: {{reliability: BEST_EFFORT}}}}}}\n\
+         routing_policy: {{noncritical_max_rate_hz: 50}}\n"
+    );
+    let Some(bed) = bed(test, &yaml) else { return };
+    bed.up.wait_for_log("egress is up lane=\"plain\"");
+    let join = |host, topic| -> Vec<RunningPeer> {
+        LIBRARIES.map(|library| bed.subscribe(host, peer(library, "viewer").best_effort(), topic)).into()
+    };
+    let [near, plain_near] = [NONCRITICAL, PLAIN].map(|topic| join("slow", topic));
+    let [far, plain_far] = [NONCRITICAL, PLAIN].map(|topic| join("lossy", topic));
+    let [lossy, bridge] = ["lossy", "bridge"].map(|name| bed.host(name));
+    let links = [Impairment::start(lossy, bridge, LOSS), Impairment::start(bridge, lossy, LOSS_OF_ANSWERS)];
+    let publisher = bed.publish(Peer::cyclone().rate_hz(RATE_HZ).count(SAMPLES), INPUT);
+    publisher.finish::<Sent>().assert_not_blocked();
+    bed.wait_accounted();
+    for link in links {
+        link.end();
+    }
+    let end = |subscribers: Vec<RunningPeer>| -> Vec<Received> {
+        subscribers.into_iter().map(RunningPeer::end).collect()
+    };
+    let [near, plain_near, far, plain_far] = [near, plain_near, far, plain_far].map(end);
+    print("default lane", &near);
+    print("BEST_EFFORT lane", &plain_near);
+    print("default lane, lossy", &far);
+    print("BEST_EFFORT lane, lossy", &plain_far);
+    for (received, plain) in near.iter().zip(&plain_near) {
+        received.assert_sound();
+        assert!(received.received.abs_diff(plain.received) <= 3, "{received:?}\n{plain:?}");
+    }
+    for (received, plain) in far.iter().zip(&plain_far) {
+        received.assert_sound();
+        // Of 750 samples some 40 % arrive: a sample is three packets.
+        assert!(received.received * 4 >= plain.received * 3, "{received:?}\n{plain:?}");
+    }
+    for (received, plain) in near.iter().chain(&far).zip(plain_near.iter().chain(&plain_far)) {
+        let (age, plain) = (p95_ms(received), p95_ms(plain));
+        assert!(age <= plain + 20.0, "the age of 95 % of the samples rose from {plain} to {age} ms");
+    }
+    bed.end();
+}
