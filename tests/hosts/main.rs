@@ -14,6 +14,7 @@ mod hostile;
 mod hostile_readers;
 mod interop;
 mod intruders;
+mod large_samples;
 mod networks;
 mod noncritical_readers;
 mod original_probes;

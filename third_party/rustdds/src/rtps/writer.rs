@@ -32,7 +32,7 @@ use crate::{
     constant::{
       DEFAULT_WRITER_MAX_SAMPLES, FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE, FRAGMENT_SIZE,
       HEARTBEAT_PERIOD_FAST, HEARTBEAT_PERIOD_SLOW, HEARTBEAT_SUBMESSAGE_SERIALIZED_SIZE,
-      HISTORY_SETTLING, NACK_FRAG_RESPONSE_DELAY,
+      HISTORY_SETTLING, LARGE_SAMPLE_BYTES, NACK_FRAG_RESPONSE_DELAY,
       NACK_RESPONSE_DELAY, NACK_SUPPRESSION_DURATION, PENDING_TURN_MAX_BYTES, REPAIR_BATCH_MAX_BYTES,
       REPAIR_BATCH_MAX_BYTES_LOOPBACK, REPAIR_FRAGS_INTERVAL, REPAIR_FRAGS_MAX_BYTES,
       REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
@@ -91,12 +91,9 @@ pub(crate) enum SampleCursor {
 enum Audience {
   /// Every reader.
   All,
-  /// Those whose path takes datagrams of at least twice the smallest path's size:
-  /// readers of this host, by loopback. One remote reader would else make a local one
-  /// receive 1 MiB in 780 datagrams in place of 17.
-  LargeDatagrams,
-  /// The others.
-  SmallDatagrams,
+  /// Those that get datagrams with this many bytes of submessages. One remote reader
+  /// would else make a local one receive 1 MiB in 780 datagrams in place of 17.
+  Datagrams(usize),
 }
 
 /// Item 1 (DATA aggregation): outcome of attempting to coalesce one or more
@@ -628,15 +625,10 @@ impl Writer {
     target_reader_opt: Option<&RtpsReaderProxy>,
     audience: Audience,
   ) -> usize {
-    if audience != Audience::LargeDatagrams {
-      return self.datagram_budget(target_reader_opt);
+    match audience {
+      Audience::All => self.datagram_budget(target_reader_opt),
+      Audience::Datagrams(budget) => budget,
     }
-    let readers = self.readers.values();
-    let large = readers.filter(|reader| self.is_in_audience(reader, audience));
-    large
-      .map(RtpsReaderProxy::max_datagram_payload)
-      .min()
-      .unwrap_or(self.min_datagram_payload)
   }
 
   // The readers that a sample is sent to when it is written.
@@ -644,25 +636,20 @@ impl Writer {
     self.readers.values().filter(|reader| !reader.is_joining())
   }
 
-  fn takes_large_datagrams(&self, reader: &RtpsReaderProxy) -> bool {
-    reader.max_datagram_payload() >= 2 * self.min_datagram_payload
-  }
-
-  fn is_in_audience(&self, reader: &RtpsReaderProxy, audience: Audience) -> bool {
-    match audience {
-      Audience::All => true,
-      Audience::LargeDatagrams => self.takes_large_datagrams(reader),
-      Audience::SmallDatagrams => !self.takes_large_datagrams(reader),
+  // The parts of the readers that a sample is written to one after the other, those
+  // with the largest datagrams first.
+  fn audiences(&self, payload_size: usize) -> Vec<Audience> {
+    if payload_size <= self.max_unfragmented_serialized_payload(None) {
+      return vec![Audience::All];
     }
-  }
-
-  // Whether a sample goes to the readers in two parts.
-  fn is_split(&self, payload_size: usize) -> bool {
-    payload_size > self.max_unfragmented_serialized_payload(None)
-      && self
-        .readers
-        .values()
-        .any(|reader| self.takes_large_datagrams(reader))
+    let budgets = self.receivers().map(|reader| reader.written_budget(payload_size));
+    let mut budgets: Vec<usize> = budgets.collect();
+    budgets.sort_unstable_by(|one, other| other.cmp(one));
+    budgets.dedup();
+    if budgets.is_empty() {
+      return vec![Audience::All];
+    }
+    budgets.into_iter().map(Audience::Datagrams).collect()
   }
 
   /// Largest serialized payload that fits in one unfragmented DATA submessage
@@ -910,7 +897,8 @@ impl Writer {
         .partly_sent
         .take()
         .filter(|cc| cc.sequence_number == sequence_number);
-      if partly_sent.is_none() {
+      let is_resumed = partly_sent.is_some();
+      if !is_resumed {
         self.audience = Audience::All;
       }
       let Some(cc) = partly_sent.or_else(|| self.send_buffer.get_by_sn(sequence_number)) else {
@@ -927,8 +915,14 @@ impl Writer {
 
       // Notify reader proxies once per sample (only when starting it fresh).
       if self.sample_cursor == SampleCursor::Fresh && !self.like_stateless {
+        let is_large = cc.data_value.payload_size() >= LARGE_SAMPLE_BYTES;
+        // Within a sample the readers stay in the groups that it is written to.
+        let now = (is_large && !is_resumed).then(Instant::now);
         for reader in self.readers.values_mut() {
           reader.notify_new_cache_change(sequence_number);
+          if let Some(now) = now {
+            reader.retry_large_datagrams(now);
+          }
 
           // If the data is meant for a single reader only, set others as pending
           // GAP for this sequence number.
@@ -950,6 +944,7 @@ impl Writer {
         // every DATA). Only reliable writers piggyback a heartbeat here;
         // best-effort skips it entirely.
         let send_also_heartbeat = self.is_reliable();
+        let is_begun;
         let progress = {
           let target_reader_opt = match write_options.to_single_reader() {
             Some(guid) => self.readers.get(&guid), // Sending only to this reader
@@ -975,13 +970,23 @@ impl Writer {
           {
             self.withdraw_from_best_effort_readers(sequence_number);
           }
-          let is_split = target_reader_opt.is_none() && self.is_split(cc.data_value.payload_size());
-          let audiences = match (is_split, self.audience) {
-            (false, _) => &[Audience::All][..],
-            (true, Audience::SmallDatagrams) => &[Audience::SmallDatagrams],
-            (true, _) => &[Audience::LargeDatagrams, Audience::SmallDatagrams],
+          let mut audiences = match target_reader_opt {
+            Some(_) => vec![Audience::All],
+            None => self.audiences(cc.data_value.payload_size()),
           };
-          let mut cursor = self.sample_cursor;
+          if let Audience::Datagrams(current) = self.audience {
+            // The sample was sent to those before.
+            audiences.retain(
+              |audience| matches!(audience, Audience::Datagrams(budget) if *budget <= current),
+            );
+          }
+          let first_audience = audiences.first().copied();
+          // The cursor is within the datagrams for the group that blocked. All of its readers
+          // may have left it meanwhile.
+          let mut cursor = match self.audience {
+            Audience::Datagrams(_) if first_audience != Some(self.audience) => SampleCursor::Fresh,
+            _ => self.sample_cursor,
+          };
           let mut progress = SendProgress::Complete;
           let mut blocked_audience = Audience::All;
           for audience in audiences {
@@ -989,18 +994,19 @@ impl Writer {
               &cc,
               send_also_heartbeat,
               target_reader_opt,
-              *audience,
+              audience,
               cursor,
               push_class,
             );
             progress = outcome;
             if let SendProgress::Blocked { .. } = progress {
-              blocked_audience = *audience;
+              blocked_audience = audience;
               break;
             }
             cursor = SampleCursor::Fresh;
           }
           self.audience = blocked_audience;
+          is_begun = is_resumed || Some(blocked_audience) != first_audience;
           progress
         };
         match progress {
@@ -1020,7 +1026,7 @@ impl Writer {
               // Stop here; resume on write readiness. Back-pressure to the
               // application follows from `sent_frontier` not advancing.
               self.sample_cursor = cursor;
-              if cursor != SampleCursor::Fresh || self.audience == Audience::SmallDatagrams {
+              if cursor != SampleCursor::Fresh || is_begun {
                 self.partly_sent = Some(cc);
               }
               self.blocked_sockets.extend(blocked);
@@ -1144,6 +1150,7 @@ impl Writer {
       cursor,
     );
     let fragmentation_needed = messages_to_send.fragmentation_needed();
+    let payload_size = cc.data_value.payload_size();
 
     // Send the messages, either to all readers or just one, stopping at the
     // first message that a socket could not accept.
@@ -1154,7 +1161,10 @@ impl Writer {
           msg,
           &mut self
             .receivers()
-            .filter(|reader| self.is_in_audience(reader, audience)),
+            .filter(|reader| match audience {
+              Audience::All => true,
+              Audience::Datagrams(budget) => reader.written_budget(payload_size) == budget,
+            }),
           class,
         ),
         Some(reader_proxy) => self.send_message_to_readers(
@@ -1439,6 +1449,9 @@ impl Writer {
         // together are served by one repair round. If a round is already
         // pending, it also serves what this ACKNACK requested.
         if start_repair {
+          if self.requests_large_sample(an) {
+            self.send_small_datagrams_to(reader_guid_prefix);
+          }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
         }
 
@@ -1559,8 +1572,13 @@ impl Writer {
           return;
         }
         reader_proxy.last_nackfrag_count = Some(nackfrag.count);
-        // Of a sample that was not sent yet everything is still to come.
-        if nackfrag.writer_sn > self.last_sent() && self.push_mode {
+        // Of a sample that was not sent yet everything is still to come, unless a group of
+        // readers has it and others do not.
+        let is_partly_sent = self
+          .partly_sent
+          .as_ref()
+          .is_some_and(|cc| cc.sequence_number == nackfrag.writer_sn);
+        if nackfrag.writer_sn > self.last_sent() && self.push_mode && !is_partly_sent {
           return;
         }
         let Some(cc) = self.send_buffer.get_by_sn(nackfrag.writer_sn) else {
@@ -1577,6 +1595,9 @@ impl Writer {
           return;
         };
         let (fragment_count, _) = self.num_frags_and_frag_size(cc.data_value.payload_size());
+        if RtpsReaderProxy::shows_loss(&nackfrag.fragment_number_state, fragment_count) {
+          self.send_small_datagrams_to(reader_guid_prefix);
+        }
         if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
           reader_proxy.mark_frags_requested(
             nackfrag.writer_sn,
@@ -1589,6 +1610,27 @@ impl Writer {
         }
       }
     }
+  }
+
+  // Whether the first sample that is requested as a whole is a large one: none of its
+  // datagrams has arrived, as where the path drops every packet of a split datagram.
+  fn requests_large_sample(&self, an: &AckNack) -> bool {
+    let first = (an.reader_sn_state.base() <= self.last_sent())
+      .then(|| an.reader_sn_state.iter().next())
+      .flatten();
+    first
+      .and_then(|sn| self.send_buffer.get_by_sn(sn))
+      .is_some_and(|cc| cc.data_value.payload_size() >= LARGE_SAMPLE_BYTES)
+  }
+
+  // All readers of a participant are reached over the same path, and those at the same
+  // address share datagrams.
+  fn send_small_datagrams_to(&mut self, participant: GuidPrefix) {
+    let now = Instant::now();
+    let readers = self.readers.values_mut();
+    readers
+      .filter(|reader| reader.remote_reader_guid.prefix == participant)
+      .for_each(|reader| reader.send_small_datagrams(now));
   }
 
   // Recompute the reliable acknowledgement frontier (the smallest
@@ -3754,6 +3796,40 @@ mod tests {
       assert_eq!(f.reader_proxy().first_requested_frags(1000), only_the_last);
       f.writer.handle_repair_frags_send(f.reader_guid);
       assert!(!f.reader_proxy().repair_frags_requested());
+    }
+
+    // A reader on another host gets a sample of 1 MB in 75 datagrams, one of 60 KB as the
+    // MTU has it. Once it has requested most of the first fragments of a large sample, it
+    // gets such samples as the MTU has it, too, for a while.
+    #[test]
+    fn a_large_sample_is_written_in_large_datagrams_unless_the_path_loses_packets() {
+      let mut f = Fixture::user(1, 1_000_000, None);
+      let budget = |f: &Fixture, payload_size| f.reader_proxy().written_budget(payload_size);
+      let per_datagram = |f: &Fixture, payload_size| {
+        let (num_frags, size) = f.writer.num_frags_and_frag_size(payload_size);
+        let header = INFO_DST_SUBMESSAGE_SIZE;
+        frags_per_datafrag(header, budget(f, payload_size), 1, num_frags, size, payload_size)
+      };
+      assert_eq!((per_datagram(&f, 60_000), per_datagram(&f, 1_000_000)), (1, 10));
+      // What does not fit the reader's receive buffer, and what does not exist.
+      nack_frag(&mut f, 1, frags(100..=300), 1);
+      nack_frag(&mut f, 1, all_from(u32::MAX - 3), 3);
+      assert_eq!(per_datagram(&f, 1_000_000), 10);
+      nack_frag(&mut f, 1, frags(10..=30), 2);
+      assert_eq!(per_datagram(&f, 1_000_000), 1);
+      let later = Instant::now() + crate::rtps::constant::SMALL_DATAGRAMS_PERIOD;
+      f.writer.readers.values_mut().for_each(|reader| reader.retry_large_datagrams(later));
+      assert_eq!(per_datagram(&f, 1_000_000), 10);
+      // Where no packet of a split datagram arrives, the whole sample is requested.
+      f.ack_nack(1..=1, 1);
+      assert_eq!(per_datagram(&f, 1_000_000), 1);
+    }
+
+    #[test]
+    fn a_request_for_a_small_sample_says_nothing_of_large_datagrams() {
+      let mut f = Fixture::user(1, 20_000, None);
+      f.ack_nack(1..=1, 1);
+      assert!(f.reader_proxy().written_budget(1_000_000) >= 10 * FRAGMENT_SIZE);
     }
 
     // A fragment size above the sample's size is invalid. A WireGuard interface has an

@@ -1,0 +1,64 @@
+//! Large samples between stock nodes: Fast DDS leaves its receive buffer at the kernel's 208 KiB, a fifth of
+//! a sample, and loses some of most samples, also without the bridge.
+
+use support::bed::Bed;
+use support::peer::{Library, Peer, Received, Sent};
+use support::ros;
+
+const YAML: &str = "topics:\n  - {id: cloud, input_topic: /cloud, message_type: sensor_msgs/msg/PointCloud2, \
+                    max_sample_bytes: 2097152}\nrouting_policy: {noncritical_max_rate_hz: 30}\n";
+const DIRECT: &str = "rt/direct";
+const INPUT: &str = "rt/cloud";
+const OUTPUTS: [&str; 2] = ["rt/adaptive_bridge/critical/cloud", "rt/adaptive_bridge/noncritical/cloud"];
+const SAMPLES: u64 = 100;
+
+fn peer(library: Library, node: &str) -> Peer {
+    let peer = match library {
+        Library::Rclpy => Peer::rclpy(node),
+        other => Peer::on(other),
+    };
+    peer.type_name("sensor_msgs::msg::dds_::PointCloud2_").size(1_000_000).keep_last(10)
+}
+
+fn print(what: &str, received: &Received) {
+    let latency = received.latency_us.unwrap();
+    let [p50, p95, max] = [latency.p50, latency.p95, latency.max].map(|us| us / 1e3);
+    println!("{what}: {} received, age p50 {p50:.1}, p95 {p95:.1}, max {max:.1} ms", received.received);
+}
+
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
+
+    #[test]
+    fn samples_of_1_mb_reach_stock_nodes_of_both_lanes() {
+        let test = "samples_of_1_mb_reach_stock_nodes_of_both_lanes";
+        if let Some(reason) = ros::missing() {
+            return support::skip(test, &reason);
+        }
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, YAML) else { return };
+        for library in [Library::Rclpy, Library::Fast, Library::Cyclone] {
+            let publish = |topic| -> Sent {
+                let publisher = peer(library, "camera").rate_hz(10.0).count(SAMPLES);
+                bed.publish(publisher, topic).finish()
+            };
+            let direct = peer(library, "viewer").subscriber().topic(DIRECT).start_on(bed.host("critical"));
+            let sent = publish(DIRECT);
+            direct.wait_received(sent.ok);
+            print(&format!("{library:?}, without the bridge"), &direct.end());
+            let subscribers =
+                OUTPUTS.map(|topic| (topic, bed.subscribe("critical", peer(library, "viewer"), topic)));
+            let sent = publish(INPUT);
+            assert_eq!(sent.ok, SAMPLES);
+            for (topic, subscriber) in subscribers {
+                subscriber.wait_received(sent.ok);
+                let received: Received = subscriber.end();
+                print(&format!("{library:?}, {topic}"), &received);
+                received.assert_all_of(&sent);
+            }
+        }
+        bed.wait_accounted();
+        bed.end();
+    }
+}
