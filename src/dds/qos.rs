@@ -1,8 +1,9 @@
 //! Converts between the bridge's QoS and the QoS policies of RustDDS.
 
 use super::rustdds::policy;
+use super::rustdds::qos::QosPolicyId;
 use super::rustdds::{Duration, QosPolicies, QosPolicyBuilder};
-use crate::model::{Durability, History, QosProfile, Reliability};
+use crate::model::{Durability, History, QosProfile, Reliability, UnmatchedPolicy};
 
 /// Data representation identifiers (XTypes 1.3 clause 7.6.3.1.1).
 const XCDR1: i16 = 0;
@@ -97,6 +98,22 @@ pub(super) fn durability_of(qos: &QosPolicies) -> Durability {
     match qos.durability() {
         Some(policy::Durability::Volatile) | None => Durability::Volatile,
         Some(_) => Durability::TransientLocal,
+    }
+}
+
+/// The policy for which endpoints do not match.
+pub(super) fn unmatched_policy(policy: QosPolicyId) -> UnmatchedPolicy {
+    match policy {
+        QosPolicyId::Reliability => UnmatchedPolicy::Reliability,
+        QosPolicyId::Durability => UnmatchedPolicy::Durability,
+        QosPolicyId::Deadline => UnmatchedPolicy::Deadline,
+        QosPolicyId::Liveliness => UnmatchedPolicy::Liveliness,
+        QosPolicyId::Ownership => UnmatchedPolicy::Ownership,
+        QosPolicyId::Presentation => UnmatchedPolicy::Presentation,
+        QosPolicyId::LatencyBudget => UnmatchedPolicy::LatencyBudget,
+        QosPolicyId::DestinationOrder => UnmatchedPolicy::DestinationOrder,
+        QosPolicyId::Representation => UnmatchedPolicy::DataRepresentation,
+        _ => UnmatchedPolicy::Other,
     }
 }
 

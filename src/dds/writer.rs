@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::qos;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
     DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp, UnmatchedPolicy};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -48,6 +49,8 @@ pub enum WriterEvent {
     Incompatible {
         /// The reader.
         reader: Guid,
+        /// The first policy for which it does not match.
+        policy: UnmatchedPolicy,
     },
 }
 
@@ -147,8 +150,11 @@ impl RawWriter {
                         readers: u64::try_from(current.count()).unwrap_or(0),
                     });
                 }
-                DataWriterStatus::OfferedIncompatibleQos { reader, .. } => {
-                    return Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()) });
+                DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {
+                    return Some(WriterEvent::Incompatible {
+                        reader: Guid(reader.to_bytes()),
+                        policy: qos::unmatched_policy(last_policy_id),
+                    });
                 }
                 _ => {}
             }

@@ -12,8 +12,8 @@ use std::sync::atomic::{Ordering, fence};
 use super::segment::Segment;
 use crate::model::{
     AbsenceRecord, ControlRecord, DropReason, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
-    LatencyHistogram, MAX_OUTPUT_READERS, NamedEndpoint, OutputReaders, ProbeRefusal, ProcessHealth,
-    PublisherAccount, RouteInfo, SubscriberRecord,
+    LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, OutputReaders, ProbeRefusal,
+    ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -62,7 +62,7 @@ plain! {
     RouteInfo: 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 3 + 2 + 3,
-    OutputReaders: MAX_OUTPUT_READERS * 6,
+    OutputReaders: MAX_OUTPUT_READERS * 6 + MAX_UNMATCHED_READERS * 3,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
 }
 

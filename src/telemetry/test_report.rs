@@ -5,7 +5,7 @@ use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
     ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport,
-    SubscriberReport,
+    SubscriberReport, UnmatchedReport,
 };
 use super::snapshot::ProcessReading;
 use crate::model::{
@@ -42,6 +42,11 @@ pub(super) fn wide_report() -> Report {
             },
             origin: EndpointOrigin { node: Some("/a_node".into()), host: None },
             reliability: "BEST_EFFORT",
+        }],
+        unmatched_readers: vec![UnmatchedReport {
+            guid: "0".repeat(33),
+            origin: EndpointOrigin { node: Some("/a_node".into()), host: None },
+            policy: "DATA_REPRESENTATION",
         }],
         received: u64::MAX,
         counters: LaneCounters {

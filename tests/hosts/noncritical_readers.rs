@@ -135,6 +135,38 @@ fn bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others(
     bed.end();
 }
 
+#[test]
+fn a_reliable_subscriber_of_a_lane_that_the_file_makes_best_effort_is_named_in_status() {
+    let test = "a_reliable_subscriber_of_a_lane_that_the_file_makes_best_effort_is_named_in_status";
+    let yaml = format!("{SCAN}lanes: {{noncritical: {{qos: {{reliability: BEST_EFFORT}}}}}}\n");
+    let Some(bed) = bed(test, &yaml) else { return };
+    let viewer = bed.subscribe("slow", Peer::rclpy("viewer").best_effort(), NONCRITICAL);
+    let rviz = Peer::rclpy("rviz").subscriber().topic(NONCRITICAL).start_on(bed.host("slow"));
+    let publisher = bed.publish(Peer::cyclone().rate_hz(RATE_HZ), INPUT);
+    viewer.wait_received(5);
+    let named = bed.bridge.wait_status("a problem that names the RELIABLE subscriber", |status| {
+        let problems = status["problems"].as_array().unwrap();
+        problems.iter().any(|problem| {
+            let problem = problem.as_str().unwrap();
+            problem.contains("/rviz on") && problem.contains("gets nothing: it requests RELIABLE")
+        })
+    });
+    let [unmatched] = noncritical(&named)["unmatched_readers"].as_array().unwrap().as_slice() else {
+        panic!("{named}")
+    };
+    assert_eq!((&unmatched["node"], &unmatched["policy"]), (&"/rviz".into(), &"RELIABILITY".into()));
+    assert_eq!(noncritical(&named)["readers"], 1);
+    assert_eq!(rviz.received(), 0);
+    let _: Received = rviz.end();
+    bed.bridge.wait_status("no problem once the subscriber is gone", |status| {
+        noncritical(status)["unmatched_readers"].as_array().is_some_and(Vec::is_empty)
+            && status["problems"].as_array().is_some_and(Vec::is_empty)
+    });
+    let _: Sent = publisher.end();
+    viewer.end::<Received>().assert_sound();
+    bed.end();
+}
+
 /// The DDS topic of a lane that the file makes BEST_EFFORT.
 const PLAIN: &str = "rt/adaptive_bridge/plain/scan";
 

@@ -23,8 +23,8 @@ use super::role::{Role, RoleError, lane_index, namespace};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Forwarding, Settings};
-use crate::dds::{Participant, ParticipantOptions};
-use crate::model::{LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
+use crate::dds::{Discovery, Participant, ParticipantOptions};
+use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::{critical_drop, mode_and_source};
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use arena::CopyArena;
@@ -219,10 +219,18 @@ impl Egress {
     }
 
     fn housekeeping(&mut self, now: MonotonicNs) {
-        // The lane uses no discovery events, but the list of them grows unless it is emptied.
-        while self.participant.poll_discovery().is_some() {}
+        let mut gone = Vec::new();
+        while let Some(change) = self.participant.poll_discovery() {
+            if matches!(change, Discovery::ReaderGone(_) | Discovery::ParticipantGone { .. }) {
+                gone.push(change);
+            }
+        }
         for output in &mut self.outputs {
             output.housekeeping(&mut self.participant, now);
+            // Afterwards: housekeeping may only now learn that a reader did not match.
+            if !gone.is_empty() {
+                output.forget_unmatched(|reader| gone.iter().any(|change| takes_away(change, reader)));
+            }
         }
         self.reload(now);
         // A turn of this thread forwards nothing if a thread of the DDS library hangs.
@@ -286,6 +294,15 @@ impl Egress {
         for output in &mut self.outputs {
             output.drop_unsent();
         }
+    }
+}
+
+/// Whether a change of discovery is the end of a reader.
+fn takes_away(change: &Discovery, reader: Guid) -> bool {
+    match change {
+        Discovery::ReaderGone(gone) => *gone == reader,
+        Discovery::ParticipantGone { prefix, .. } => *prefix == reader.prefix(),
+        _ => false,
     }
 }
 

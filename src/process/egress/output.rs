@@ -12,8 +12,8 @@ use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, QosProfile,
-    Reliability, SampleHeader, TrafficClass,
+    DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs, OutputReaders,
+    QosProfile, Reliability, SampleHeader, TrafficClass, UnmatchedPolicy, UnmatchedReader,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -56,6 +56,8 @@ pub(super) struct Output {
     /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
     /// receive the samples written until they match.
     former_readers: Vec<Guid>,
+    /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
+    unmatched: Vec<(Guid, UnmatchedPolicy)>,
     /// When this process opened the output. Samples published before were missed by its predecessor.
     started_at: MonotonicNs,
     /// Whether a sample published since `started_at` has been taken.
@@ -125,6 +127,7 @@ impl Output {
             counters,
             readers,
             former_readers,
+            unmatched: Vec::new(),
             started_at: clock::monotonic(),
             caught_up: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
@@ -333,6 +336,11 @@ impl Output {
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
     }
 
+    /// Forgets the readers without a match for which `is_gone` holds.
+    pub fn forget_unmatched(&mut self, is_gone: impl Fn(Guid) -> bool) {
+        self.unmatched.retain(|(reader, _)| !is_gone(*reader));
+    }
+
     fn follow_matching(&mut self, now: MonotonicNs) {
         let Some(writer) = &self.writer else {
             return;
@@ -343,6 +351,7 @@ impl Output {
                     self.counters.update(|counters| counters.readers = readers);
                     if joined {
                         self.former_readers.retain(|former| *former != reader);
+                        self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
                     if let Some(late_joiners) = &mut self.late_joiners {
@@ -358,12 +367,21 @@ impl Output {
                         }
                     }
                 }
-                WriterEvent::Incompatible { reader } => {
+                WriterEvent::Incompatible { reader, policy } => {
+                    // The DDS library repeats the event with each announcement of the reader.
+                    if self.unmatched.contains(&(reader, policy)) {
+                        continue;
+                    }
+                    self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
+                    if self.unmatched.len() < MAX_UNMATCHED_READERS {
+                        self.unmatched.push((reader, policy));
+                    }
                     warn!(
                         route = self.id,
                         lane = self.lane,
                         topic = self.dds_topic,
                         ?reader,
+                        %policy,
                         "a reader requests a stricter QoS than this lane offers and receives nothing: change \
                          its QoS or the lane's"
                     );
@@ -386,6 +404,9 @@ impl Output {
             let former = self.readers.get().iter().find(|record| record.reader == reader.reader);
             overrun += reader.overrun.saturating_sub(former.map_or(0, |record| record.overrun));
             *place = reader;
+        }
+        for (place, (reader, policy)) in current.unmatched.iter_mut().zip(&self.unmatched) {
+            *place = UnmatchedReader { reader: *reader, policy: *policy as u64 };
         }
         self.readers.set(current);
         if overrun > 0 {

@@ -3,6 +3,7 @@
 mod control;
 mod processes;
 mod publishers;
+mod readers;
 
 use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
@@ -45,6 +46,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         dropped(route, now, before, &mut problems);
     }
     for (route, output) in outputs(now) {
+        problems.extend(readers::unmatched(route, output, now));
         slow_readers(route, output, now, before, &mut problems);
     }
     problems.extend(control::settings(now, before));

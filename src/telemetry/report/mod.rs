@@ -13,6 +13,7 @@ use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, 
 use super::text::printable;
 use crate::model::{
     DropCounts, Guid, IngressCounters, LaneCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
+    UnmatchedPolicy,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
@@ -112,6 +113,8 @@ pub struct OutputReport {
     pub(crate) topic: String,
     /// The matched readers, 32 at most.
     pub(crate) matched_readers: Vec<ReaderReport>,
+    /// Readers of the topic that request a stricter QoS than the lane offers, 8 at most.
+    pub(crate) unmatched_readers: Vec<UnmatchedReport>,
     /// Samples offered to the lane since it first started.
     pub(crate) received: u64,
     #[serde(flatten)]
@@ -131,6 +134,17 @@ pub struct OutputReport {
     pub(crate) dds_out: Latency,
     /// Age of the samples when the DDS writer gets them, by their source timestamp.
     pub(crate) age: Latency,
+}
+
+/// A reader of an output's topic that gets nothing, because it requests a stricter QoS than the lane offers.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct UnmatchedReport {
+    /// Its GUID, in hexadecimal.
+    pub(crate) guid: String,
+    #[serde(flatten)]
+    pub(crate) origin: EndpointOrigin,
+    /// The QoS policy for which it does not match.
+    pub(crate) policy: &'static str,
 }
 
 /// One reader of an output.
@@ -257,6 +271,11 @@ impl Snapshot {
             lane: self.lanes[now.lane].name.to_string(),
             topic: now.topic.to_string(),
             matched_readers: now.readers.iter().map(|record| self.reader_report(record)).collect(),
+            unmatched_readers: now
+                .readers
+                .unmatched()
+                .map(|unmatched| self.unmatched_report(unmatched))
+                .collect(),
             received: counters.received(),
             counters: *counters,
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
@@ -277,6 +296,10 @@ impl Snapshot {
             origin: self.origin(record.reader),
             reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
         }
+    }
+
+    fn unmatched_report(&self, (reader, policy): (Guid, UnmatchedPolicy)) -> UnmatchedReport {
+        UnmatchedReport { guid: reader.to_string(), origin: self.origin(reader), policy: policy.label() }
     }
 
     fn origin(&self, endpoint: Guid) -> EndpointOrigin {
@@ -356,11 +379,14 @@ mod tests {
         let report = serde_json::to_value(crate::telemetry::test_report::wide_report()).unwrap();
         let page = include_str!("../../../docs/status-json.md");
         let publisher = &report["routes"][0]["publishers"][0];
+        let lanes = report["routes"][0]["lanes"].as_array().unwrap();
+        let unmatched = lanes.iter().find_map(|lane| lane["unmatched_readers"].get(0)).unwrap();
         for (list, item) in [
             ("subscribers", &report["subscribers"][0]),
             ("intruders", &report["intruders"][0]),
             ("absences", &report["absences"][0]),
             ("routes[].publishers", publisher),
+            ("routes[].lanes[].unmatched_readers", unmatched),
         ] {
             let item = item.as_object().unwrap();
             let documented = page.matches(&format!("\n| `{list}[].")).count();

@@ -4,6 +4,7 @@
 use serde::Serialize;
 
 use super::drops::DropCounts;
+use super::modes::UnmatchedPolicy;
 use super::network::NetworkRefusals;
 use super::sample::Guid;
 use super::time::MonotonicNs;
@@ -185,18 +186,42 @@ pub struct ReaderRecord {
     pub reliable: u64,
 }
 
-/// The readers that are matched with one output.
+/// The most readers of one output that are listed as not matched.
+pub const MAX_UNMATCHED_READERS: usize = 8;
+
+/// A reader of an output's topic that requests a stricter QoS than the output offers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct UnmatchedReader {
+    /// The reader; all zero for none.
+    pub reader: Guid,
+    /// The number of the [`UnmatchedPolicy`](super::UnmatchedPolicy).
+    pub policy: u64,
+}
+
+/// The readers of one output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct OutputReaders {
-    /// The records, those in use first.
+    /// The records of matched readers, those in use first.
     pub records: [ReaderRecord; MAX_OUTPUT_READERS],
+    /// Readers that are not matched, those in use first.
+    pub unmatched: [UnmatchedReader; MAX_UNMATCHED_READERS],
 }
 
 impl OutputReaders {
     /// The records in use.
     pub fn iter(&self) -> impl Iterator<Item = &ReaderRecord> {
         self.records.iter().filter(|record| record.reader != Guid::default())
+    }
+
+    /// The readers that are not matched, each with the policy.
+    pub fn unmatched(&self) -> impl Iterator<Item = (Guid, UnmatchedPolicy)> {
+        let used = self.unmatched.iter().filter(|record| record.reader != Guid::default());
+        used.map(|record| {
+            let number = u8::try_from(record.policy).unwrap_or(0);
+            (record.reader, UnmatchedPolicy::from_u8(number).unwrap_or_default())
+        })
     }
 }
 

@@ -27,9 +27,10 @@ pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS,
-    MAX_PUBLISHERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord, RouteInfo,
+    MAX_PUBLISHERS, MAX_UNMATCHED_READERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord,
+    RouteInfo, UnmatchedReader,
 };
-pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass};
+pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
 pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};

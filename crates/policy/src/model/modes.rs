@@ -1,4 +1,5 @@
-//! The class and mode of a lane, the state of a subscriber and the safety mode of the bridge.
+//! The class and mode of a lane, the state of a subscriber, the QoS policy for which one does not match, and
+//! the safety mode of the bridge.
 
 use serde::{Deserialize, Serialize};
 
@@ -96,6 +97,33 @@ numbered! {
     Critical = 1, "CRITICAL",
     /// Degraded.
     Noncritical = 2, "NONCRITICAL",
+}
+
+numbered! {
+    /// The QoS policy for which a reader does not match a writer (DDS 1.4 clause 2.2.3).
+    #[derive(Default)]
+    UnmatchedPolicy:
+    /// None of the others.
+    #[default]
+    Other = 0, "QoS",
+    /// RELIABILITY: the reader requests RELIABLE, the writer offers BEST_EFFORT.
+    Reliability = 1, "RELIABILITY",
+    /// DURABILITY: the reader requests TRANSIENT_LOCAL or more, the writer offers less.
+    Durability = 2, "DURABILITY",
+    /// DEADLINE: the reader requests a shorter period than the writer offers.
+    Deadline = 3, "DEADLINE",
+    /// LIVELINESS: the reader requests another kind or a shorter lease than the writer offers.
+    Liveliness = 4, "LIVELINESS",
+    /// OWNERSHIP: the kinds differ.
+    Ownership = 5, "OWNERSHIP",
+    /// PRESENTATION: the reader requests coherent or ordered access.
+    Presentation = 6, "PRESENTATION",
+    /// LATENCY_BUDGET: the reader requests a shorter delay.
+    LatencyBudget = 7, "LATENCY_BUDGET",
+    /// DESTINATION_ORDER: the reader requests the order of the source timestamps.
+    DestinationOrder = 8, "DESTINATION_ORDER",
+    /// DATA_REPRESENTATION: the reader does not accept that of the writer.
+    DataRepresentation = 9, "DATA_REPRESENTATION",
 }
 
 numbered! {
