@@ -2,7 +2,7 @@
 
 use super::qos::{durability_of, reliability_of};
 use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription, LostReason};
-use crate::model::{Durability, Guid, Reliability};
+use crate::model::{Durability, Guid, Reliability, TypeHash};
 use crate::policy::Location;
 
 /// The most announced addresses of an endpoint that are kept. A host has fewer.
@@ -17,6 +17,8 @@ pub struct Endpoint {
     pub topic: String,
     /// DDS type, such as `sensor_msgs::msg::dds_::LaserScan_`.
     pub dds_type: String,
+    /// The hash of the type's definition, if it announces one.
+    pub type_hash: TypeHash,
     /// The RELIABILITY that it offers or requests.
     pub reliability: Reliability,
     /// The DURABILITY that it offers or requests.
@@ -97,6 +99,7 @@ fn endpoint(description: EndpointDescription, default_reliability: Reliability) 
                 .map(|address| address.ip())
                 .collect(),
         },
+        type_hash: TypeHash::find_in(&description.user_data),
         topic: description.topic_name,
         dds_type: description.type_name,
     }

@@ -5,7 +5,7 @@
 //! its readers and writers decode payloads; so this module encodes the entry of the raw endpoints. Each
 //! process of the bridge is one node.
 
-use crate::model::{Encapsulation, Guid};
+use crate::model::{DdsType, Encapsulation, Guid, TypeHash};
 
 /// The most nodes of one participant that are accepted; a component container has tens of them.
 const MAX_NODES: usize = 256;
@@ -16,7 +16,10 @@ const MAX_NAME_BYTES: usize = 255;
 
 pub(super) const TOPIC: &str = "ros_discovery_info";
 /// The DDS type of the graph entries.
-pub(super) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
+pub(super) const TYPE: DdsType = DdsType {
+    name: "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_",
+    hash: TypeHash::from_hex(b"91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"),
+};
 
 /// Encodes the entry of a participant with one node in plain little-endian CDR (RTPS 2.5 clause 10), without
 /// the encapsulation header.

@@ -22,8 +22,8 @@ use super::rustdds::{
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
 use crate::model::{
-    Durability, Encapsulation, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile, Reliability,
-    SourceTimestamp,
+    DdsType, Durability, Encapsulation, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile,
+    Reliability, SourceTimestamp,
 };
 
 /// The settings of a participant.
@@ -222,13 +222,13 @@ impl Participant {
     ///
     /// # Errors
     /// The DDS library cannot create it.
-    pub fn create_reader(
+    pub fn create_reader<'t>(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: impl Into<DdsType<'t>>,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
-        let reader = self.make_reader(topic, dds_type, reader_qos, DomainParticipant::begin_now)?;
+        let reader = self.make_reader(topic, dds_type.into(), reader_qos, DomainParticipant::begin_now)?;
         Ok(self.add_to_graph(reader))
     }
 
@@ -241,7 +241,7 @@ impl Participant {
     pub fn create_reader_after(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
         taken: impl IntoIterator<Item = (Guid, i64)>,
     ) -> Result<RawReader, DdsError> {
@@ -263,7 +263,7 @@ impl Participant {
     pub fn create_reader_beside_reliable(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
         let reader = self.make_reader(topic, dds_type, reader_qos, DomainParticipant::begin_now)?;
@@ -293,12 +293,12 @@ impl Participant {
     fn make_reader(
         &self,
         topic: &str,
-        dds_type: &str,
+        dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
         begin: impl FnOnce(&DomainParticipant, &Topic) -> CreateResult<()>,
     ) -> Result<RawReader, DdsError> {
-        let policies = qos::of_reader(reader_qos);
-        let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
+        let policies = qos::of_reader(reader_qos).with_user_data(qos::user_data(dds_type.hash));
+        let made_topic = make_topic(&self.participant, topic, dds_type.name, &policies)?;
         let inner = begin(&self.participant, &made_topic)
             .and_then(|()| self.subscriber.create_simple_datareader_no_key(&made_topic, Some(policies)))
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
@@ -312,14 +312,14 @@ impl Participant {
     ///
     /// # Errors
     /// The DDS library cannot create it.
-    pub fn create_writer(
+    pub fn create_writer<'t>(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: impl Into<DdsType<'t>>,
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        self.add_writer(topic, dds_type, qos::of_writer(writer_qos, window_samples))
+        self.add_writer(topic, dds_type.into(), qos::of_writer(writer_qos, window_samples))
     }
 
     /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
@@ -328,22 +328,22 @@ impl Participant {
     ///
     /// # Errors
     /// The DDS library cannot create it.
-    pub fn create_blocking_writer(
+    pub fn create_blocking_writer<'t>(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: impl Into<DdsType<'t>>,
         writer_qos: &QosProfile,
         window_samples: usize,
         max_blocking: Duration,
     ) -> Result<RawWriter, DdsError> {
         let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
-        self.add_writer(topic, dds_type, policies)
+        self.add_writer(topic, dds_type.into(), policies)
     }
 
     fn add_writer(
         &mut self,
         topic: &str,
-        dds_type: &str,
+        dds_type: DdsType<'_>,
         policies: QosPolicies,
     ) -> Result<RawWriter, DdsError> {
         let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, policies)?;
@@ -400,10 +400,11 @@ fn make_writer(
     participant: &DomainParticipant,
     publisher: &Publisher,
     topic: &str,
-    dds_type: &str,
+    dds_type: DdsType<'_>,
     policies: QosPolicies,
 ) -> Result<RawWriter, DdsError> {
-    let made_topic = make_topic(participant, topic, dds_type, &policies)?;
+    let made_topic = make_topic(participant, topic, dds_type.name, &policies)?;
+    let policies = policies.with_user_data(qos::user_data(dds_type.hash));
     let inner = publisher
         .create_datawriter_no_key(&made_topic, Some(policies))
         .map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;

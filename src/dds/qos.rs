@@ -3,7 +3,7 @@
 use super::rustdds::policy;
 use super::rustdds::qos::QosPolicyId;
 use super::rustdds::{Duration, QosPolicies, QosPolicyBuilder};
-use crate::model::{Durability, History, QosProfile, Reliability, UnmatchedPolicy};
+use crate::model::{Durability, History, QosProfile, Reliability, TypeHash, UnmatchedPolicy};
 
 /// Data representation identifiers (XTypes 1.3 clause 7.6.3.1.1).
 const XCDR1: i16 = 0;
@@ -81,6 +81,12 @@ pub(super) fn of_blocking_writer(
         Reliability::Reliable => builder.reliable(Duration::from_std(max_blocking)),
     }
     .build()
+}
+
+/// The USER_DATA with the hash of the endpoint's type, as ROS 2 announces it; empty if it is unknown.
+pub(super) fn user_data(type_hash: TypeHash) -> policy::UserData {
+    let pair = type_hash.is_known().then(|| format!("typehash={type_hash};"));
+    policy::UserData { value: pair.unwrap_or_default().into_bytes() }
 }
 
 /// The RELIABILITY that an endpoint announced; `default` if it announced none, because the DDS default (DDS

@@ -11,7 +11,7 @@ use super::rustdds::{
     DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
     dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp, UnmatchedPolicy};
+use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp, TypeHash, UnmatchedPolicy};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -73,6 +73,12 @@ impl RawWriter {
     /// The writer's GUID.
     pub fn guid(&self) -> Guid {
         self.guid
+    }
+
+    /// Announces the hash of the type's definition. Nodes that have discovered the writer before may still
+    /// show the former one.
+    pub fn set_type_hash(&self, hash: TypeHash) {
+        self.inner.set_user_data(qos::user_data(hash));
     }
 
     /// Writes a sample. Returns at once; a blocking writer returns within its blocking time. The DDS library

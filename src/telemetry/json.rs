@@ -8,10 +8,13 @@ use serde::Serialize;
 
 use super::report::Report;
 use super::text::{printable, shortened};
-use crate::model::{SubscriberState, WallNs};
+use crate::model::{DdsType, SubscriberState, TypeHash, WallNs};
 
 /// The DDS type of `std_msgs/String`.
-pub const STRING_TYPE: &str = "std_msgs::msg::dds_::String_";
+pub const STRING_TYPE: DdsType = DdsType {
+    name: "std_msgs::msg::dds_::String_",
+    hash: TypeHash::from_hex(b"df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+};
 
 /// The topic of the classifier's decisions, as in the original package.
 pub const DECISION_TOPIC: &str = "/adaptive_bridge/classifier/state";

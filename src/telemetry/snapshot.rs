@@ -12,7 +12,7 @@ use crate::model::{
     AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
     LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
     MAX_PUBLISHERS, MAX_SUBSCRIBERS, ModeReason, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
-    PublisherAccount, RouteId, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
+    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
 };
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -107,6 +107,8 @@ pub struct RouteReading {
     pub input_topic: TopicName,
     /// The message type if it is known; the ROS 2 name if it is a ROS 2 type.
     pub message_type: Option<String>,
+    /// What the publishers announce of the type.
+    pub info: RouteInfo,
     /// The counters of ingress.
     pub counters: IngressCounters,
     /// The accounts of its publishers; a publisher that has sent no sample has none.
@@ -284,10 +286,7 @@ fn mode_of(
 fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<RouteReading, ShmError> {
     let route = &settings.routes[index];
     let info = consistent(boards.route_info(index))?;
-    let discovered_type = match info.dds_type.as_str() {
-        "" => None,
-        dds_type => Some(TypeName::from_dds(dds_type).map_or(dds_type.to_owned(), |name| name.to_string())),
-    };
+    let discovered_type = info.announced_type().map(|dds_type| type_name(dds_type.name));
     let mut outputs = Vec::new();
     for (lane, configured) in settings.lanes.iter().enumerate() {
         for output in configured.outputs.iter().filter(|output| output.route == index) {
@@ -309,9 +308,15 @@ fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<Rout
         id: route.id.clone(),
         input_topic: route.input_topic.clone(),
         message_type: discovered_type.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
+        info,
         dds_in: boards.histogram(Stage::DdsIn, index),
         outputs,
     })
+}
+
+/// The name of a type; the ROS 2 name if it is a ROS 2 type.
+pub(super) fn type_name(dds_name: &str) -> String {
+    TypeName::from_dds(dds_name).map_or(dds_name.to_owned(), |name| name.to_string())
 }
 
 fn read_publishers(

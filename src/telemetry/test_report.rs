@@ -98,6 +98,7 @@ pub(super) fn wide_report() -> Report {
             id: "scan".into(),
             input_topic: topic,
             message_type: None,
+            type_hash: None,
             counters: IngressCounters {
                 writers: 99_999,
                 lost_upstream: 9_999_999_999_999,

@@ -8,7 +8,7 @@ use std::time::Duration;
 use adaptive_bridge::config::MetricsListener;
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId,
+    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, RouteInfo,
     SubscriberRecord, SubscriberState, TopicName, TrafficClass, WallNs,
 };
 use adaptive_bridge::shm::ProcessRole;
@@ -105,6 +105,7 @@ fn report() -> Report {
             id: RouteId::try_from("scan").unwrap(),
             input_topic: TopicName::try_from("/scan").unwrap(),
             message_type: None,
+            info: RouteInfo::default(),
             counters: ingress,
             publishers: Vec::new(),
             dds_in: latency,

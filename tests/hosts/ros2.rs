@@ -1,11 +1,104 @@
 //! What ROS 2 nodes (rclpy) see of the bridge, beyond the samples.
 
-use support::bed::{Bed, CRITICAL, INPUT, SCAN};
-use support::peer::{Peer, Received};
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::process::signal;
 use support::ros;
 
 /// Nodes that publish one sample each.
 const NODES: u64 = 50;
+
+/// SCAN, and a route whose type is known only when its publisher is discovered.
+const IMU: &str = "  - {id: imu, input_topic: /imu, max_sample_bytes: 8192}\n";
+
+/// Waits until a query lists `count` endpoints of a topic that are not of the test's own nodes, each with
+/// this hash.
+fn wait_hash(query: &RunningPeer, topic: &str, kind: &str, count: usize, hash: &str) {
+    query.wait_for(&format!("{count} {kind} of {topic} with {hash}"), |event| {
+        let endpoints = event["endpoints"].as_array().into_iter().flatten();
+        let is_own = |node: &Value| ["lidar", "imu", "info"].iter().any(|name| node == name);
+        let found =
+            endpoints.filter(|one| one["topic"] == topic && one["kind"] == kind && !is_own(&one["node"]));
+        let hashes: Vec<_> = found.map(|endpoint| endpoint["type_hash"].as_str().unwrap()).collect();
+        hashes == vec![hash; count]
+    });
+}
+
+#[test]
+fn nodes_see_the_type_hash_of_the_publisher_on_the_outputs() {
+    let test = "nodes_see_the_type_hash_of_the_publisher_on_the_outputs";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
+    let Some(bed) = Bed::start(test, &format!("{SCAN}{IMU}")) else { return };
+    let scan = bed.publish(Peer::rclpy("lidar").rate_hz(10.0), INPUT);
+    let imu = Peer::rclpy("imu").type_name("sensor_msgs::msg::dds_::Imu_").rate_hz(10.0);
+    let imu = bed.publish(imu, "rt/imu");
+    let [scan_hash, imu_hash] =
+        ["LaserScan", "Imu"].map(|name| ros::type_hash(&format!("sensor_msgs/msg/{name}")));
+    bed.bridge.wait_status("the hashes of both types", |status| {
+        let routes = status["routes"].as_array().unwrap();
+        routes.iter().map(|route| route["type_hash"].as_str()).eq([Some(&*scan_hash), Some(&*imu_hash)])
+    });
+    let topics = [
+        (INPUT, "reader", 1, scan_hash.as_str()),
+        (CRITICAL, "writer", 1, &scan_hash),
+        (NONCRITICAL, "writer", 1, &scan_hash),
+        ("rt/imu", "reader", 1, &imu_hash),
+        ("rt/adaptive_bridge/critical/imu", "writer", 1, &imu_hash),
+        ("rt/adaptive_bridge/noncritical/imu", "writer", 1, &imu_hash),
+        ("rt/diagnostics", "writer", 1, &ros::type_hash("diagnostic_msgs/msg/DiagnosticArray")),
+        ("rt/adaptive_bridge/diagnostics", "writer", 1, &ros::type_hash("std_msgs/msg/String")),
+        ("rt/adaptive_bridge/probe_req", "writer", 1, &ros::type_hash("std_msgs/msg/String")),
+        // Of the bridge's four processes and of three nodes; the nodes of these writers are unknown.
+        ("ros_discovery_info", "writer", 7, &ros::type_hash("rmw_dds_common/msg/ParticipantEntitiesInfo")),
+    ];
+    let query = Peer::info(&topics.map(|(topic, ..)| topic)).start_on(bed.host("critical"));
+    for (topic, kind, count, hash) in topics {
+        wait_hash(&query, topic, kind, count, hash);
+    }
+    // A restarted lane announces the hash with its new writers.
+    let pid = bed.pid("egress-critical");
+    signal(pid, Signal::SIGKILL);
+    support::wait_until("a restarted critical lane", || bed.pid("egress-critical") != pid);
+    let query = Peer::info(&[CRITICAL]).start_on(bed.host("slow"));
+    wait_hash(&query, CRITICAL, "writer", 1, &scan_hash);
+    for publisher in [scan, imu] {
+        let _: Sent = publisher.end();
+    }
+    bed.end();
+}
+
+#[test]
+fn a_publisher_of_another_type_or_definition_is_a_problem_while_it_is_there() {
+    let test = "a_publisher_of_another_type_or_definition_is_a_problem_while_it_is_there";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let peer = |hash: &str| Peer::on(Library::Rust).option("--type-hash", hash.repeat(32)).rate_hz(10.0);
+    let first = bed.publish(peer("a1"), INPUT);
+    let hash = format!("RIHS01_{}", "a1".repeat(32));
+    bed.bridge.wait_status("the first hash", |status| status["routes"][0]["type_hash"] == *hash);
+    let problems = |status: &Value, text: &str| {
+        let problems = status["problems"].as_array().unwrap().clone();
+        problems.iter().filter(|problem| problem.as_str().unwrap().contains(text)).count()
+    };
+    let begin = |peer: Peer| peer.publisher().topic(INPUT).start_on(bed.host("slow"));
+    let other_definition = begin(peer("b2"));
+    let text = format!("another definition of sensor_msgs/msg/LaserScan (RIHS01_{}) than", "b2".repeat(32));
+    bed.bridge.wait_status("the other definition", |status| problems(status, &text) == 1);
+    // The outputs keep the hash that they announced first.
+    assert_eq!(bed.bridge.status()["routes"][0]["type_hash"], hash);
+    let _: Sent = other_definition.end();
+    bed.bridge.wait_status("no problem", |status| problems(status, "another definition") == 0);
+    let other_type = begin(peer("a1").type_name("sensor_msgs::msg::dds_::Imu_"));
+    let text = "with the type sensor_msgs/msg/Imu, not sensor_msgs/msg/LaserScan";
+    bed.bridge.wait_status("the other type", |status| problems(status, text) == 1);
+    for publisher in [other_type, first] {
+        let _: Sent = publisher.end();
+    }
+    bed.end();
+}
 
 #[test]
 fn the_sample_of_a_node_that_publishes_once_and_ends_reaches_the_subscriber() {

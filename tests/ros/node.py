@@ -1,4 +1,4 @@
-"""A ROS 2 node of the tests (rclpy): publishes or subscribes one topic.
+"""A ROS 2 node of the tests (rclpy): publishes or subscribes one topic, or lists endpoints of topics.
 
 It has the command line, the samples and the output of the peers in tests/peers (README.md there). Samples are
 published and taken in serialized form, so that Python keeps up with 1 kHz of 2.9 KB.
@@ -33,6 +33,7 @@ MAX_PADDING = 3
 SOURCE_TOLERANCE_NS = 10
 PROGRESS_PERIOD_S = 0.1
 MATCH_PERIOD_S = 0.02
+INFO_PERIOD_S = 0.2
 ACKNOWLEDGEMENT_S = 10
 MAX_MISSING_RANGES = 1000
 MASK = 2**64 - 1
@@ -46,10 +47,10 @@ def emit(event, **fields):
 def parse():
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     option = parser.add_argument
-    option("--role", choices=["pub", "sub"], required=True)
+    option("--role", choices=["pub", "sub", "info"], required=True)
     option("--node", default="", help="node name (default: peer_pub or peer_sub)")
     option("--domain", type=int, default=0)
-    option("--topic", default="rt/scan", help="DDS name")
+    option("--topic", default="rt/scan", help="DDS name; of role info: DDS names, separated by commas")
     option("--type", default="sensor_msgs::msg::dds_::LaserScan_", help="DDS name")
     option("--reliability", choices=["r", "be"], default="r")
     option("--durability", choices=["v", "tl"], default="v")
@@ -72,7 +73,7 @@ def parse():
     options.sizes = [int(size) for size in options.size.split(",")] if options.size else []
     if any(size < FRONT for size in options.sizes):
         parser.error(f"--size: a node's samples have {FRONT} bytes at least")
-    if not options.topic.startswith("rt/"):
+    if options.role in ("pub", "sub") and not options.topic.startswith("rt/"):
         parser.error(f"--topic {options.topic}: the DDS name of a ROS 2 topic begins with rt/")
     options.ros_topic = options.topic.removeprefix("rt")
     return options
@@ -396,6 +397,32 @@ class Subscriber:
         )
 
 
+class Info:
+    """Reports the endpoints of the topics as `ros2 topic info --verbose` shows them."""
+
+    def __init__(self, node, options, signals):
+        self.node = node
+        self.topics = options.topic.split(",")
+        self.signals = signals
+
+    def run(self):
+        while not self.signals.stop:
+            # DDS names: those of ROS 2 topics begin with rt/, which others do not have.
+            endpoints = [
+                {"topic": topic, "kind": kind, "node": endpoint.node_name,
+                 "namespace": endpoint.node_namespace, "type": endpoint.topic_type,
+                 "type_hash": str(endpoint.topic_type_hash)}
+                for topic in self.topics
+                for kind, list_endpoints in (
+                    ("writer", self.node.get_publishers_info_by_topic),
+                    ("reader", self.node.get_subscriptions_info_by_topic))
+                for endpoint in list_endpoints(topic, no_mangle=True)
+            ]
+            emit("endpoints", endpoints=endpoints)
+            time.sleep(INFO_PERIOD_S)
+        emit("summary")
+
+
 def main():
     options = parse()
     signals = Signals()
@@ -404,8 +431,8 @@ def main():
         args=["--ros-args", "--disable-external-lib-logs"], domain_id=options.domain,
         signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(options.node or f"peer_{options.role}")
-    role = Publisher if options.role == "pub" else Subscriber
-    peer = role(node, options, signals)
+    peers = {"pub": Publisher, "sub": Subscriber, "info": Info}
+    peer = peers[options.role](node, options, signals)
     emit("ready", library=f"rclpy, {rclpy.get_rmw_implementation_identifier()}")
     peer.run()
     # The participant says goodbye.

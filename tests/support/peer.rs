@@ -112,6 +112,11 @@ impl Peer {
         Peer { role: "graph".to_owned(), ..self }.option("--gid-bytes", gid_bytes)
     }
 
+    /// Makes a ROS 2 node report the endpoints of these topics, which are DDS names.
+    pub fn info(topics: &[&str]) -> Peer {
+        Peer { role: "info".to_owned(), ..Peer::rclpy("info") }.topic(&topics.join(","))
+    }
+
     /// Makes the peer a publisher of `std_msgs/msg/String` with the generated type, one sample for each
     /// [`RunningPeer::say`]; Cyclone DDS only. It ends at [`RunningPeer::finish`], after sending all samples.
     pub fn say(mut self) -> Peer {

@@ -29,6 +29,17 @@ pub fn original_probes() -> PathBuf {
     sources().join("original_probes.py")
 }
 
+/// The hash of a message type's definition as its ROS 2 package states it, such as
+/// `sensor_msgs/msg/LaserScan`.
+pub fn type_hash(message_type: &str) -> String {
+    let path = environment().join("share").join(format!("{message_type}.json"));
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let description: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let hashes = description["type_hashes"].as_array().unwrap();
+    let hash = hashes.iter().find(|hash| hash["type_name"] == message_type).unwrap();
+    hash["hash_string"].as_str().unwrap().to_owned()
+}
+
 /// Returns why a node cannot be started: rclpy is not installed, or not in the required versions.
 pub fn missing() -> Option<String> {
     let wanted = std::fs::read(sources().join(REQUIREMENTS)).unwrap();

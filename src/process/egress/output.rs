@@ -12,8 +12,9 @@ use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs, OutputReaders,
-    QosProfile, Reliability, SampleHeader, TrafficClass, UnmatchedPolicy, UnmatchedReader,
+    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
+    OutputReaders, QosProfile, Reliability, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
+    UnmatchedReader,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -46,6 +47,8 @@ pub(super) struct Output {
     subscriber: SampleSubscriber,
     /// Created once the message type is known.
     pub writer: Option<RawWriter>,
+    /// The hash that the writer announces.
+    type_hash: TypeHash,
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
@@ -119,6 +122,7 @@ impl Output {
             mode: LaneMode::Normal,
             subscriber,
             writer: None,
+            type_hash: TypeHash::UNKNOWN,
             unsent: UnsentSamples::new(window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
             queued: 0,
             late_joiners,
@@ -137,8 +141,12 @@ impl Output {
             boards,
         };
         match &route.message_type {
-            Some(message_type) => opened.make_writer(participant, &message_type.to_dds())?,
-            None => opened.try_make_writer(participant),
+            Some(message_type) => {
+                let known = opened.boards.route_info(output.route).unwrap_or_default();
+                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash };
+                opened.make_writer(participant, dds_type)?;
+            }
+            None => opened.announce_type(participant),
         }
         Ok(opened)
     }
@@ -187,7 +195,7 @@ impl Output {
     /// Writes a taken sample to DDS and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
         if self.writer.is_none() {
-            self.try_make_writer(participant);
+            self.announce_type(participant);
         }
         if !self.former_readers.is_empty() {
             // Former readers may have matched since the last housekeeping.
@@ -320,11 +328,9 @@ impl Output {
         }
     }
 
-    /// Creates the writer if its type is known by now, follows matching, serves late joiners, logs drops.
+    /// Announces the type as far as it is known by now, follows matching, serves late joiners, logs drops.
     pub fn housekeeping(&mut self, participant: &mut Participant, now: MonotonicNs) {
-        if self.writer.is_none() {
-            self.try_make_writer(participant);
-        }
+        self.announce_type(participant);
         if let Some(health) = self.boards.health(ProcessRole::Ingress) {
             self.ingress_starts = health.starts;
         }
@@ -435,27 +441,34 @@ impl Output {
         }
     }
 
-    /// Creates the writer if ingress has recorded the type by now.
-    fn try_make_writer(&mut self, participant: &mut Participant) {
+    /// Creates the writer if ingress has published the type by now, and lets it announce the type's hash.
+    fn announce_type(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else {
             return;
         };
-        let dds_type = info.dds_type.as_str();
-        if dds_type.is_empty() {
-            return;
-        }
-        if let Err(failure) = self.make_writer(participant, dds_type) {
-            error!(route = self.id, lane = self.lane, dds_type, %failure, "cannot create the DDS writer");
+        let Some(dds_type) = info.announced_type() else { return };
+        match &self.writer {
+            None => {
+                if let Err(failure) = self.make_writer(participant, dds_type) {
+                    let (route, lane, dds_type) = (&self.id, &self.lane, dds_type.name);
+                    error!(route, lane, dds_type, %failure, "cannot create the DDS writer");
+                }
+            }
+            Some(writer) if dds_type.hash != self.type_hash => {
+                writer.set_type_hash(dds_type.hash);
+                self.type_hash = dds_type.hash;
+            }
+            Some(_) => {}
         }
     }
 
-    fn make_writer(&mut self, participant: &mut Participant, dds_type: &str) -> Result<(), RoleError> {
+    fn make_writer(&mut self, participant: &mut Participant, dds_type: DdsType) -> Result<(), RoleError> {
         let writer = participant.create_writer(&self.dds_topic, dds_type, &self.qos, self.window_samples)?;
         info!(
             route = self.id,
             lane = self.lane,
             topic = self.dds_topic,
-            dds_type,
+            dds_type = dds_type.name,
             reliability = ?self.qos.reliability,
             durability = ?self.qos.durability,
             "DDS writer created"
@@ -464,6 +477,7 @@ impl Output {
             writer.skip_evicted();
         }
         self.writer = Some(writer);
+        self.type_hash = dds_type.hash;
         Ok(())
     }
 

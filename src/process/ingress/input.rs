@@ -16,8 +16,8 @@ use crate::dds::{
     ArrivalFlag, Endpoint, Inbox, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload,
 };
 use crate::model::{
-    AgeBasis, DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs, Reliability,
-    RouteInfo, SampleHeader,
+    AgeBasis, DdsType, DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
+    Reliability, RouteInfo, SampleHeader,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
@@ -44,8 +44,6 @@ pub(super) struct Input {
     dds_in: HistogramWriter,
     pub publishers: Publishers,
     drop_log: DropLog,
-    /// The type conflict that was logged last.
-    conflict: Option<(String, String)>,
     remind_at: MonotonicNs,
 }
 
@@ -90,7 +88,6 @@ impl Input {
             info: role.boards.route_info_writer(index),
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             publishers,
-            conflict: None,
             remind_at: MonotonicNs(0),
             route,
         })
@@ -236,26 +233,26 @@ impl Input {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
-        if let Some(dds_type) = known_type
-            && let Some(other) = self.source.find_other_type(dds_type)
-        {
-            let conflict = (dds_type.to_owned(), other.dds_type.clone());
-            self.report_conflict(conflict);
-        }
-        let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
         let plan = self.source.plan(known_type, &self.route.input_qos, self.route.max_sample_bytes);
         match plan {
             ReaderPlan::Readers { dds_type, reliable, best_effort } => {
+                // Before the readers are created: a lane must be able to create its writer before it gets a
+                // sample.
+                self.update_info(&dds_type, true);
                 // The RELIABLE reader first: until it exists, the BEST_EFFORT reader takes the samples of a
                 // RELIABLE publisher that has joined BEST_EFFORT ones.
                 self.update_reader(participant, Reliability::Reliable, &dds_type, reliable)?;
                 self.update_reader(participant, Reliability::BestEffort, &dds_type, best_effort)
             }
-            ReaderPlan::TypeConflict(one, other) => {
-                self.report_conflict((one, other));
+            ReaderPlan::TypeConflict(first_type) => {
+                self.update_info(&first_type, false);
                 Ok(())
             }
             ReaderPlan::Unknown => {
+                // Also names a publisher of another type than the configured one.
+                if let Some(dds_type) = known_type.map(ToOwned::to_owned) {
+                    self.update_info(&dds_type, true);
+                }
                 self.retire(participant, Reliability::Reliable);
                 self.retire(participant, Reliability::BestEffort);
                 if now >= self.remind_at {
@@ -270,6 +267,46 @@ impl Input {
                 Ok(())
             }
         }
+    }
+
+    /// Publishes the type to the lanes unless the publishers announce several and the configuration sets none
+    /// (`is_settled`), and names a publisher that announces another one.
+    fn update_info(&mut self, dds_type: &str, is_settled: bool) {
+        let type_hash = self.source.type_hash(dds_type, self.info.get().type_hash);
+        let mut info = RouteInfo { type_hash, ..RouteInfo::default() };
+        if is_settled {
+            info.dds_type = FixedText::new(dds_type);
+        }
+        if let Some(other) = self.source.find_other_type(DdsType { name: dds_type, hash: type_hash }) {
+            info.other_writer = other.guid;
+            info.other_type = FixedText::new(&other.dds_type);
+            info.other_hash = other.type_hash;
+        }
+        if info == *self.info.get() {
+            return;
+        }
+        if info.other_writer != Guid::default() && info.other_writer != self.info.get().other_writer {
+            let (route, topic, writer) = (&self.id, &self.dds_topic, info.other_writer);
+            let other = info.other_type.as_str();
+            if other == dds_type {
+                let other_hash = info.other_hash;
+                error!(
+                    route, topic, ?writer, dds_type, %type_hash, %other_hash,
+                    "a publisher announces another definition of the type: build all nodes with the same version \
+                     of its package"
+                );
+            } else {
+                error!(
+                    route,
+                    topic,
+                    ?writer,
+                    one = dds_type,
+                    other,
+                    "two types claim the topic: set message_type of the route, or stop one of the publishers"
+                );
+            }
+        }
+        self.info.update(|current| *current = info);
     }
 
     /// Creates, replaces or retires the reader of this reliability, so that it matches `required`.
@@ -318,18 +355,22 @@ impl Input {
         qos: ReaderQos,
     ) -> Result<(), RoleError> {
         self.remove_reader(participant, qos.reliability);
-        // Before the reader is created: a lane must be able to create its writer before it gets a sample.
-        self.info.update(|info| info.dds_type = FixedText::new(dds_type));
         let topic = self.dds_topic.as_str();
+        let announced_type = DdsType { name: dds_type, hash: self.info.get().type_hash };
         let reader = match qos.reliability {
-            Reliability::Reliable => {
-                participant.create_reader_after(topic, dds_type, &qos, self.publishers.last_sequences())?
-            }
+            Reliability::Reliable => participant.create_reader_after(
+                topic,
+                announced_type,
+                &qos,
+                self.publishers.last_sequences(),
+            )?,
             // A BEST_EFFORT reader takes what arrives from now on; it cannot request earlier samples.
             Reliability::BestEffort if !self.readers.contains_key(&Reliability::Reliable) => {
-                participant.create_reader(topic, dds_type, &qos)?
+                participant.create_reader(topic, announced_type, &qos)?
             }
-            Reliability::BestEffort => participant.create_reader_beside_reliable(topic, dds_type, &qos)?,
+            Reliability::BestEffort => {
+                participant.create_reader_beside_reliable(topic, announced_type, &qos)?
+            }
         };
         info!(
             route = self.id,
@@ -409,19 +450,6 @@ impl Input {
                     }
                 }
             }
-        }
-    }
-
-    fn report_conflict(&mut self, conflict: (String, String)) {
-        if self.conflict.as_ref() != Some(&conflict) {
-            error!(
-                route = self.id,
-                topic = self.dds_topic,
-                one = conflict.0,
-                other = conflict.1,
-                "two types claim the topic: set message_type of the route, or stop one of the publishers"
-            );
-            self.conflict = Some(conflict);
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::config::InputQos;
 use crate::dds::{Endpoint, ReaderQos};
-use crate::model::{Durability, Guid, History, Reliability};
+use crate::model::{DdsType, Durability, Guid, History, Reliability, TypeHash};
 
 /// Bytes that may wait in the DDS library for ingress on one route. The library limits the number of samples,
 /// so the history depth is this divided by the size of the largest sample allowed.
@@ -19,8 +19,9 @@ pub(super) struct Source {
 pub(super) enum ReaderPlan {
     /// No publisher is known, and the configuration does not set type, reliability and durability.
     Unknown,
-    /// Two publishers use the topic with different types, and the configuration sets none.
-    TypeConflict(String, String),
+    /// Two publishers use the topic with different types, of which this is one, and the configuration sets
+    /// none.
+    TypeConflict(String),
     /// At least one of these readers. A RELIABLE reader does not match BEST_EFFORT publishers, and a
     /// BEST_EFFORT one does not recover lost samples, so publishers of both kinds need both readers.
     Readers { dds_type: String, reliable: Option<ReaderQos>, best_effort: Option<ReaderQos> },
@@ -52,9 +53,20 @@ impl Source {
         self.writers.len() < before
     }
 
-    /// Returns a publisher of another type than `dds_type`, if there is one.
-    pub fn find_other_type(&self, dds_type: &str) -> Option<&Endpoint> {
-        self.writers.iter().find(|writer| writer.dds_type != dds_type)
+    /// Returns a publisher of another type than `dds_type`, or of another definition of it, if there is one.
+    pub fn find_other_type(&self, dds_type: DdsType) -> Option<&Endpoint> {
+        self.writers
+            .iter()
+            .find(|writer| writer.dds_type != dds_type.name || writer.type_hash.contradicts(&dds_type.hash))
+    }
+
+    /// The hash of this type: `current` as long as a publisher announces it, or none announces any; else that
+    /// of the first publisher that announces one.
+    pub fn type_hash(&self, dds_type: &str, current: TypeHash) -> TypeHash {
+        let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+        let mut hashes = writers.map(|writer| writer.type_hash).filter(TypeHash::is_known);
+        let first = hashes.clone().next().unwrap_or(current);
+        if hashes.any(|hash| hash == current) { current } else { first }
     }
 
     pub fn reliability_of(&self, writer: Guid) -> Option<Reliability> {
@@ -78,10 +90,8 @@ impl Source {
     ) -> ReaderPlan {
         let dds_type = match (configured_type, self.writers.first()) {
             (Some(configured), _) => configured,
-            (None, Some(first)) => match self.find_other_type(&first.dds_type) {
-                Some(other) => {
-                    return ReaderPlan::TypeConflict(first.dds_type.clone(), other.dds_type.clone());
-                }
+            (None, Some(first)) => match self.find_other_type(first.dds_type.as_str().into()) {
+                Some(_) => return ReaderPlan::TypeConflict(first.dds_type.clone()),
                 None => &first.dds_type,
             },
             (None, None) => return ReaderPlan::Unknown,
@@ -139,6 +149,7 @@ mod tests {
             guid: Guid([id; 16]),
             topic: "rt/x".into(),
             dds_type: dds_type.into(),
+            type_hash: TypeHash::UNKNOWN,
             reliability,
             durability,
             location: Location::default(),
@@ -216,7 +227,7 @@ mod tests {
         source.insert(&writer(2, "U", Reliability::Reliable, Durability::Volatile));
         assert!(!source.remove_participant([3; 12]));
         assert!(source.remove_participant([1; 12]));
-        assert!(source.find_other_type("U").is_none());
+        assert!(source.find_other_type("U".into()).is_none());
     }
 
     #[test]
@@ -224,10 +235,35 @@ mod tests {
         let mut source = Source::default();
         source.insert(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
         source.insert(&writer(2, "U", Reliability::BestEffort, Durability::Volatile));
-        assert_eq!(plan(&source, None), ReaderPlan::TypeConflict("T".into(), "U".into()));
+        assert_eq!(plan(&source, None), ReaderPlan::TypeConflict("T".into()));
         let decided = plan(&source, Some("T"));
         assert!(matches!(&decided, ReaderPlan::Readers { dds_type, .. } if dds_type == "T"), "{decided:?}");
         assert_eq!(durabilities(decided), [Some(Durability::Volatile), None]);
+    }
+
+    #[test]
+    fn the_type_hash_in_force_changes_only_when_no_publisher_announces_it_any_more() {
+        let mut source = Source::default();
+        assert_eq!(source.type_hash("T", TypeHash([1; 32])), TypeHash([1; 32]));
+        for (id, hash) in [(1, TypeHash::UNKNOWN), (2, TypeHash([2; 32])), (3, TypeHash([3; 32]))] {
+            let writer = writer(id, "T", Reliability::Reliable, Durability::Volatile);
+            source.insert(&Endpoint { type_hash: hash, ..writer });
+        }
+        let other = writer(4, "U", Reliability::Reliable, Durability::Volatile);
+        source.insert(&Endpoint { type_hash: TypeHash([4; 32]), ..other });
+        assert_eq!(source.type_hash("T", TypeHash::UNKNOWN), TypeHash([2; 32]));
+        assert_eq!(source.type_hash("T", TypeHash([3; 32])), TypeHash([3; 32]));
+        assert_eq!(source.type_hash("T", TypeHash([4; 32])), TypeHash([2; 32]));
+        let find = |source: &Source, hash| {
+            let found = source.find_other_type(DdsType { name: "T", hash: TypeHash([hash; 32]) });
+            found.map(|writer| writer.guid)
+        };
+        assert_eq!(find(&source, 2), Some(Guid([3; 16])));
+        source.remove(Guid([4; 16]));
+        assert_eq!(find(&source, 0), None);
+        source.remove(Guid([3; 16]));
+        assert_eq!(find(&source, 2), None);
+        assert_eq!(source.type_hash("T", TypeHash([3; 32])), TypeHash([2; 32]));
     }
 
     #[test]

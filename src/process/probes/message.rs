@@ -5,11 +5,11 @@
 use bytes::Bytes;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::model::{Encapsulation, ProbeRefusal, WallNs, is_probe_id};
+use crate::model::{DdsType, Encapsulation, ProbeRefusal, WallNs, is_probe_id};
 use crate::telemetry::{STRING_TYPE, string_message};
 
 /// The DDS type of both topics.
-pub const PROBE_TYPE: &str = STRING_TYPE;
+pub const PROBE_TYPE: DdsType = STRING_TYPE;
 
 /// The largest message that is decoded, in bytes of its serialized payload.
 pub const MAX_MESSAGE_BYTES: usize = 4096;

@@ -13,13 +13,17 @@ use super::json::cdr;
 use super::problem::Level;
 use super::report::Report;
 use super::text::{printable, shortened};
+use crate::model::{DdsType, TypeHash};
 use parts::Part;
 
 /// The topic of the diagnostics.
 pub const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
 
 /// The DDS type of `diagnostic_msgs/DiagnosticArray`.
-pub const DIAGNOSTIC_ARRAY_TYPE: &str = "diagnostic_msgs::msg::dds_::DiagnosticArray_";
+pub const DIAGNOSTIC_ARRAY_TYPE: DdsType = DdsType {
+    name: "diagnostic_msgs::msg::dds_::DiagnosticArray_",
+    hash: TypeHash::from_hex(b"5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
+};
 
 /// The maximum size of an array, so that each fits in one UDP datagram. A larger report is split into several
 /// arrays; an aggregator identifies statuses by their names.

@@ -55,6 +55,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems.extend(control::intruders(now));
     problems.extend(control::refusals(now, before));
     problems.extend(now.routes.iter().filter_map(|route| publishers::clock_offset(now, route)));
+    problems.extend(now.routes.iter().filter_map(|route| publishers::other_type(now, route)));
     problems.extend(now.routes.iter().filter_map(|route| publishers::unrepaired(now, route)));
     problems.extend(now.routes.iter().filter_map(publishers::no_publisher));
     problems
@@ -260,7 +261,7 @@ pub(super) mod tests {
     use super::*;
     use crate::model::{
         ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
-        ModeReason, MonotonicNs, OutputReaders, ProcessHealth, RouteId, TopicName, WallNs,
+        ModeReason, MonotonicNs, OutputReaders, ProcessHealth, RouteId, RouteInfo, TopicName, WallNs,
     };
 
     /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.
@@ -309,6 +310,7 @@ pub(super) mod tests {
                 id: RouteId::try_from("scan").unwrap(),
                 input_topic: TopicName::try_from("/scan").unwrap(),
                 message_type: None,
+                info: RouteInfo::default(),
                 counters: IngressCounters {
                     received: 100,
                     published: 100,

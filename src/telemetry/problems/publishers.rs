@@ -1,8 +1,9 @@
 //! Problems of a route's publishers.
 
-use super::super::snapshot::{RouteReading, Snapshot};
+use super::super::snapshot::{RouteReading, Snapshot, type_name};
+use super::super::text::printable;
 use super::{Level, Problem};
-use crate::model::PublisherAccount;
+use crate::model::{Guid, PublisherAccount};
 
 /// A problem names at most this many publishers.
 const MAX_NAMED_PUBLISHERS: usize = 3;
@@ -42,6 +43,44 @@ pub(super) fn clock_offset(now: &Snapshot, route: &RouteReading) -> Option<Probl
         offset_s.abs()
     );
     Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
+}
+
+/// A publisher that announces another type than the others, or another definition of the same type.
+pub(super) fn other_type(now: &Snapshot, route: &RouteReading) -> Option<Problem> {
+    let info = &route.info;
+    if info.other_writer == Guid::default() {
+        return None;
+    }
+    let publisher = now.endpoint_name("writer", info.other_writer);
+    let its_type = printable(&type_name(info.other_type.as_str()));
+    let (level, text) = match info.announced_type() {
+        None => (
+            Level::Error,
+            format!(
+                "publishers of {} announce different types, {publisher} {its_type}, so no sample is taken; set \
+                 message_type of the route, or stop a publisher",
+                route.input_topic
+            ),
+        ),
+        Some(announced) if announced.name != info.other_type.as_str() => (
+            Level::Warn,
+            format!(
+                "{publisher} publishes {} with the type {its_type}, not {}, so none of its samples is taken; stop \
+                 it, or correct message_type of the route and restart the bridge",
+                route.input_topic,
+                printable(&type_name(announced.name))
+            ),
+        ),
+        Some(announced) => (
+            Level::Warn,
+            format!(
+                "{publisher} publishes {} with another definition of {its_type} ({}) than the outputs announce ({}), \
+                 so subscribers may misread its samples; build all nodes with the same version of that package",
+                route.input_topic, info.other_hash, announced.hash
+            ),
+        ),
+    };
+    Some(Problem::new(format!("route {}", route.id), level, format!("route {}: {text}", route.id)))
 }
 
 /// BEST_EFFORT publishers of a topic that also has RELIABLE ones. Where all are BEST_EFFORT, that is the
@@ -91,7 +130,7 @@ pub(super) fn no_publisher(route: &RouteReading) -> Option<Problem> {
 mod tests {
     use super::super::tests::problems_after;
     use super::*;
-    use crate::model::{FixedText, Guid, NamedEndpoint};
+    use crate::model::{FixedText, NamedEndpoint, RouteInfo, TypeHash};
 
     #[test]
     fn best_effort_publishers_beside_reliable_ones_are_a_problem() {
@@ -112,5 +151,44 @@ mod tests {
         let [problem] = problems.as_slice() else { panic!("{problems:?}") };
         let named = format!("RELIABLE ones of /scan: /imu on 10.0.0.7, writer {};", Guid([2; 16]));
         assert!(problem.contains(&named), "{problem}");
+    }
+
+    #[test]
+    fn a_publisher_that_announces_another_type_is_a_problem() {
+        let scan = FixedText::new("sensor_msgs::msg::dds_::LaserScan_");
+        let problem = |dds_type, other_type, other_hash| {
+            let problems = problems_after(|now| {
+                now.routes[0].info = RouteInfo {
+                    dds_type,
+                    type_hash: TypeHash([1; 32]),
+                    other_writer: Guid([1; 16]),
+                    other_type,
+                    other_hash: TypeHash([other_hash; 32]),
+                    ..RouteInfo::default()
+                };
+                let (node, host) = (FixedText::new("/imu"), FixedText::new("10.0.0.7"));
+                now.named_endpoints.push(NamedEndpoint { endpoint: Guid([1; 16]), node, host });
+            });
+            let [problem] = problems.as_slice() else { panic!("{problems:?}") };
+            problem.clone()
+        };
+        let cloud = FixedText::new("sensor_msgs::msg::dds_::PointCloud2_");
+        let disputed = problem(FixedText::default(), cloud, 2);
+        assert!(
+            disputed.contains("/imu on 10.0.0.7 sensor_msgs/msg/PointCloud2, so no sample"),
+            "{disputed}"
+        );
+        let other_type = problem(scan, cloud, 2);
+        assert!(
+            other_type
+                .contains("/scan with the type sensor_msgs/msg/PointCloud2, not sensor_msgs/msg/LaserScan"),
+            "{other_type}"
+        );
+        let other_definition = problem(scan, scan, 2);
+        let (its, announced) = (TypeHash([2; 32]), TypeHash([1; 32]));
+        let named = format!(
+            "definition of sensor_msgs/msg/LaserScan ({its}) than the outputs announce ({announced})"
+        );
+        assert!(other_definition.contains(&named), "{other_definition}");
     }
 }

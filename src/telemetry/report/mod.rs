@@ -13,7 +13,7 @@ use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, 
 use super::text::printable;
 use crate::model::{
     DropCounts, Guid, IngressCounters, LaneCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
-    UnmatchedPolicy,
+    TypeHash, UnmatchedPolicy,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
@@ -75,6 +75,8 @@ pub struct RouteReport {
     pub(crate) input_topic: String,
     /// The message type; null until it is known.
     pub(crate) message_type: Option<String>,
+    /// The hash of the message type's definition that the outputs announce; null while it is unknown.
+    pub(crate) type_hash: Option<String>,
     #[serde(flatten)]
     pub(crate) counters: IngressCounters,
     /// The publishers that have sent samples.
@@ -225,6 +227,7 @@ impl Snapshot {
             id: now.id.to_string(),
             input_topic: now.input_topic.to_string(),
             message_type: now.message_type.as_deref().map(printable),
+            type_hash: Some(now.info.type_hash).filter(TypeHash::is_known).map(|hash| hash.to_string()),
             counters: *counters,
             publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use adaptive_bridge::config::{DdsNetwork, NetworkSelector};
 use adaptive_bridge::dds::{DdsError, Participant, ParticipantOptions};
-use adaptive_bridge::model::{Durability, Encapsulation, History, Reliability};
+use adaptive_bridge::model::{DdsType, Durability, Encapsulation, History, Reliability, TypeHash};
 use clap::{Parser, ValueEnum};
 
 /// A DDS peer on RustDDS: publishes and subscribes serialized samples of any type (see tests/peers/README.md)
@@ -21,6 +21,8 @@ pub struct Options {
     pub topic: String,
     #[arg(long = "type", default_value = "sensor_msgs::msg::dds_::LaserScan_")]
     pub type_name: String,
+    #[arg(long, default_value = "")]
+    pub type_hash: String,
     #[arg(long, default_value = "r", value_parser = reliability)]
     pub reliability: Reliability,
     #[arg(long, default_value = "v", value_parser = durability)]
@@ -97,6 +99,10 @@ const DEFAULT_SIZE: usize = 2948;
 const WAITING_BYTES: usize = 64 << 20;
 
 impl Options {
+    pub fn dds_type(&self) -> DdsType<'_> {
+        DdsType { name: &self.type_name, hash: TypeHash::from_hex(self.type_hash.as_bytes()) }
+    }
+
     /// The size of a publisher's sample; sizes take turns.
     pub fn size_to_send(&self, sequence: u64) -> usize {
         self.expected_size(sequence).unwrap_or(DEFAULT_SIZE)

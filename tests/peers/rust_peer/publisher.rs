@@ -36,7 +36,7 @@ pub fn publish(options: &Options, signals: &Signals) -> Result<(), String> {
     let writer = participant
         .create_blocking_writer(
             &options.topic,
-            &options.type_name,
+            options.dds_type(),
             &qos,
             options.max_samples,
             options.max_blocking_ms,

@@ -34,7 +34,7 @@ pub fn subscribe(options: &Options, signals: &Signals) -> Result<(), String> {
         deadline_ms: None,
     };
     let reader = participant
-        .create_reader(&options.topic, &options.type_name, &qos)
+        .create_reader(&options.topic, options.dds_type(), &qos)
         .map_err(|error| error.to_string())?;
     let record = Record::create(options.record.as_deref(), "seq,time_ns,latency_ns")?;
     emit_ready();

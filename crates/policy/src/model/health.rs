@@ -8,6 +8,7 @@ use super::modes::UnmatchedPolicy;
 use super::network::NetworkRefusals;
 use super::sample::Guid;
 use super::time::MonotonicNs;
+use super::type_hash::{DdsType, TypeHash};
 
 /// The most publishers of one route that have an account each.
 pub const MAX_PUBLISHERS: usize = 64;
@@ -355,11 +356,29 @@ impl Default for FixedText {
 }
 
 /// The message type that ingress has discovered for a route, for lanes that cannot discover the publisher.
+/// Publishers of a topic should agree on it; the other fields name one that does not.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct RouteInfo {
     /// The DDS type name of the input topic; empty while unknown.
     pub dds_type: FixedText,
+    /// The hash of the type's definition, which a publisher has announced.
+    pub type_hash: TypeHash,
+    /// The DDS writer of a publisher that announces another type or another definition of it; all zero for
+    /// none.
+    pub other_writer: Guid,
+    /// The type that it announces.
+    pub other_type: FixedText,
+    /// The hash that it announces.
+    pub other_hash: TypeHash,
+}
+
+impl RouteInfo {
+    /// The type that the outputs of the route announce; `None` while it is unknown.
+    pub fn announced_type(&self) -> Option<DdsType<'_>> {
+        let name = self.dds_type.as_str();
+        (!name.is_empty()).then_some(DdsType { name, hash: self.type_hash })
+    }
 }
 
 /// Buckets of each octave: each is at most 1/16 wide, so that a quantile is at most 6.3 % too large.

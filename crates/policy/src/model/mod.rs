@@ -17,6 +17,7 @@ mod rates;
 mod sample;
 mod thresholds;
 mod time;
+mod type_hash;
 
 pub use control::{
     AbsenceKind, AbsenceRecord, ControlRecord, IntruderRecord, MAX_ABSENCES, MAX_INTRUDERS,
@@ -39,3 +40,4 @@ pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use sample::{AgeBasis, Encapsulation, Guid, SampleHeader};
 pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
+pub use type_hash::{DdsType, TypeHash};
