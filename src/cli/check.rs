@@ -212,10 +212,20 @@ fn problems(error: &ConfigError) -> serde_json::Value {
             Place::Environment => ("environment", None),
             Place::File => ("file", None),
             Place::Line(line) => ("file", Some(line)),
+            Place::Parameter { line: 0, .. } => ("parameter", None),
+            Place::Parameter { line, .. } => ("parameter", Some(line)),
+        };
+        let file = match problem.place {
+            Place::Environment => None,
+            Place::File | Place::Line(_) => Some(error.file.clone()),
+            Place::Parameter { source, .. } => {
+                error.parameter_files.get(source).and_then(|file| Some(file.as_ref()?.display().to_string()))
+            }
         };
         let Problem { key, value, allowed, hint, .. } = problem;
         json!({
-            "place": place, "line": line, "key": key, "value": value, "allowed": allowed, "hint": hint
+            "place": place, "file": file, "line": line, "key": key, "value": value, "allowed": allowed,
+            "hint": hint
         })
     };
     let problems: Vec<_> = error.problems.iter().map(problem).collect();

@@ -13,6 +13,7 @@ mod mode;
 mod reload;
 mod responder;
 mod roles;
+mod ros_args;
 mod status;
 mod tap;
 mod units;
@@ -25,7 +26,7 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand};
 
 use crate::clock;
-use crate::config::{self, ConfigError, Configuration, Settings};
+use crate::config::{self, ConfigError, Configuration, Parameters, Settings};
 use crate::model::TopicName;
 use crate::process::{InForce, Stop};
 use crate::shm::ShmError;
@@ -100,6 +101,10 @@ struct ConfigArguments {
     /// Configuration file [default: $ADAPTIVE_BRIDGE_CONFIG, then /etc/adaptive-bridge/config.yaml]
     #[arg(long, short, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// A value in place of the file's, such as `probes.rate_hz:=4`, or a file of ROS 2 parameters;
+    /// repeatable. `--ros-args -p`, `--params-file`, `-r __ns:=`, `-r __node:=` and `--log-level` do the same
+    #[arg(long = "parameter", value_name = "KEY:=VALUE|FILE")]
+    parameters: Vec<Parameters>,
 }
 
 impl ConfigArguments {
@@ -110,7 +115,9 @@ impl ConfigArguments {
     /// The absolute path of the configuration file, which may not exist.
     fn file(&self) -> PathBuf {
         let from_environment = || std::env::var_os(config::PATH_VARIABLE).filter(|path| !path.is_empty());
-        let path = self.config.clone().or_else(|| from_environment().map(PathBuf::from));
+        // Files of parameters that cannot be read are reported when the configuration is loaded.
+        let named = config::named_path(self.path(), &self.parameters).unwrap_or_default();
+        let path = named.or_else(|| from_environment().map(PathBuf::from));
         let path = path.unwrap_or_else(|| config::DEFAULT_PATH.into());
         std::path::absolute(&path).unwrap_or(path)
     }
@@ -125,7 +132,7 @@ impl ConfigArguments {
     }
 
     fn try_load_configuration(&self) -> Result<Configuration, ConfigError> {
-        config::load_configuration(self.path(), &|name| std::env::var(name).ok())
+        config::load_configuration(self.path(), &self.parameters, &|name| std::env::var(name).ok())
     }
 
     /// The settings in force in the running bridge; `None` when no bridge runs.
@@ -151,8 +158,15 @@ fn bad_configuration(error: &ConfigError) -> ExitCode {
 
 /// Runs the subcommand that the command line names.
 pub fn main() -> ExitCode {
+    let arguments = match ros_args::translate(std::env::args_os()) {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            failed(&error);
+            return ExitCode::from(EXIT_USAGE);
+        }
+    };
     // clap prints help and errors itself and exits with 0 or 2.
-    let cli = Cli::parse();
+    let cli = Cli::parse_from(arguments);
     telemetry::start_logs();
     let ended = match cli.command {
         Command::Check(arguments) => check::run(&arguments),

@@ -75,7 +75,7 @@ fn outcome(result: Option<&ReloadResult>, fingerprint: u64) -> String {
             if *file_fingerprint == fingerprint {
                 what.to_owned()
             } else {
-                format!("{what}; it reads a different file or has different environment variables")
+                format!("{what}; it reads a different file, or has other environment variables or parameters")
             }
         }
     }
@@ -106,7 +106,7 @@ mod tests {
             "changed: policy_hold_s: 1 -> 2\n\
              waits for a restart of the whole bridge: ros.domain_id: 1 -> 2\n\
              egress-a (pid 7): reloaded\n\
-             egress-b (pid 7): reloaded; it reads a different file or has different environment variables\n\
+             egress-b (pid 7): reloaded; it reads a different file, or has other environment variables or parameters\n\
              egress-c (pid 7): nothing differs\n\
              egress-d (pid 7): refused; its settings are unchanged:\nf.yaml:1: x: must be y\n\
              ingress (pid 7): no answer: it is stopped or has exited\n"

@@ -41,7 +41,9 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
-    let loaded = config::load_or_default(arguments.config.path(), &|name| std::env::var(name).ok());
+    let loaded = config::load_or_default(arguments.config.path(), &arguments.config.parameters, &|name| {
+        std::env::var(name).ok()
+    });
     let Configuration { settings, inline_secret } = loaded.map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(settings.diagnostics.verbosity);
     let request_topic = arguments.request_topic.as_ref().unwrap_or(&settings.probes.request_topic);
@@ -66,6 +68,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
         id: &arguments.id,
         network: &network,
         graph_gid_bytes: settings.graph_gid_bytes,
+        namespace: &settings.node_namespace,
+        node_name: settings.node_name.as_ref(),
         request_topic,
         response_topic,
         trust,

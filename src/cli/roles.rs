@@ -63,10 +63,13 @@ pub(super) fn up(arguments: &UpArguments) -> Result<ExitCode, ExitCode> {
     let configuration =
         arguments.config.try_load_configuration().map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
-    let child_arguments: Vec<OsString> = match arguments.config.path() {
+    let mut child_arguments: Vec<OsString> = match arguments.config.path() {
         Some(path) => vec!["--config".into(), path.into()],
         None => Vec::new(),
     };
+    for parameter in &arguments.config.parameters {
+        child_arguments.extend(["--parameter".into(), parameter.to_string().into()]);
+    }
     let watchdog = !arguments.no_watchdog;
     run(|stop| {
         process::up(configuration, &arguments.config.file(), &child_arguments, watchdog, &hang_up, stop)

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, failed, print};
+use super::{ConfigArguments, EXIT_USAGE, failed, print};
 use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
 use crate::model::TrafficClass;
 
@@ -44,6 +44,10 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
+    if !arguments.config.parameters.is_empty() {
+        failed(&"--parameter: services read the configuration file only; write the value into it");
+        return Err(ExitCode::from(EXIT_USAGE));
+    }
     let settings = arguments.config.load()?;
     let wanted = DropIns::of(&settings, &arguments.config.file());
     let text = if arguments.write {

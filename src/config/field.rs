@@ -280,7 +280,7 @@ impl<'a> Field<'a> {
     }
 
     fn add(&self, value: Option<String>, allowed: String, hint: Option<String>) {
-        let place = Place::Line(self.line);
+        let place = Place::of(self.line);
         self.problems.report(Problem { place, key: self.path.clone(), value, allowed, hint });
     }
 

@@ -1,17 +1,18 @@
 //! Finds, reads and validates a configuration file.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use super::environment::Environment;
 use super::field::Field;
 use super::in_force::{Configuration, InlineSecret};
+use super::parameters::{self, Parameters};
 use super::problem::{ConfigError, Place, Problem, Problems};
 use super::qos::Profiles;
 use super::settings::{SecretSource, Settings, SharedMemory};
+use super::yaml::Node;
 use super::{control, keys, lanes, routes, yaml};
-use crate::model::{InstanceName, TrafficClass};
+use crate::model::{InstanceName, NodeName, TopicName, TrafficClass};
 
 /// The environment variable that names the file if the command line does not.
 pub const PATH_VARIABLE: &str = "ADAPTIVE_BRIDGE_CONFIG";
@@ -26,21 +27,29 @@ pub const DEFAULT_PATH: &str = "/etc/adaptive-bridge/config.yaml";
 /// Every problem of the file and of the environment at once; one problem when there is no file or it cannot
 /// be read.
 pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<Settings, ConfigError> {
-    load_configuration(path, env).map(|configuration| configuration.settings)
+    load_configuration(path, &[], env).map(|configuration| configuration.settings)
 }
 
-/// As [`load`], with the secret if the file contains one.
+/// As [`load`], with the values of `parameters` in place of those of the file, and with the secret if there
+/// is one.
 ///
 /// # Errors
 /// As for [`load`].
 pub fn load_configuration(
     path: Option<&Path>,
+    parameters: &[Parameters],
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Configuration, ConfigError> {
-    let path = find_or_fail(path, env)?;
+    let path = find(path, parameters, env)?.ok_or_else(|| {
+        let what = format!(
+            "this file does not exist, and neither --config nor ${PATH_VARIABLE} names another; create one with \
+             `topics: [{{id: scan, input_topic: /scan}}]`"
+        );
+        failure(DEFAULT_PATH, Place::File, what)
+    })?;
     let name = path.display().to_string();
-    let bytes = read(&path).map_err(|what| failure(&name, Place::File, what))?;
-    parse_configuration(&bytes, &name, env)
+    let bytes = yaml::read(&path).map_err(|what| failure(&name, Place::File, what))?;
+    parse_configuration(&bytes, &name, parameters, env)
 }
 
 /// As [`load_configuration`], for a program that does not need a file: without one, loads the defaults with
@@ -50,52 +59,46 @@ pub fn load_configuration(
 /// As for [`load`], except that a missing default file is no error.
 pub fn load_or_default(
     path: Option<&Path>,
+    parameters: &[Parameters],
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Configuration, ConfigError> {
-    match find(path, env, Path::new(DEFAULT_PATH)) {
-        Some(path) => load_configuration(Some(&path), env),
-        None => parse_configuration(b"topics: [{id: none, input_topic: /none}]", "the defaults", env),
+    const DEFAULTS: &[u8] = b"topics: [{id: none, input_topic: /none}]";
+    match find(path, parameters, env)? {
+        Some(path) => load_configuration(Some(&path), parameters, env),
+        None => parse_configuration(DEFAULTS, "the defaults", parameters, env),
     }
+}
+
+/// The path of the configuration file: `path`, else that of the parameter `config_path`.
+///
+/// # Errors
+/// A file of parameters cannot be read.
+pub fn named_path(path: Option<&Path>, parameters: &[Parameters]) -> Result<Option<PathBuf>, ConfigError> {
+    if path.is_some() {
+        return Ok(path.map(Path::to_owned));
+    }
+    let values = parameters::read(parameters);
+    values.map(|values| values.config_path).map_err(|problem| bad_parameter(parameters, problem))
+}
+
+fn bad_parameter(parameters: &[Parameters], problem: Problem) -> ConfigError {
+    ConfigError::new("", parameters::files(parameters), vec![problem])
 }
 
 /// The file to read; `None` if none is named and the default file does not exist.
-fn find(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>, default: &Path) -> Option<PathBuf> {
-    if let Some(path) = path {
-        return Some(path.to_owned());
-    }
-    if let Some(path) = env(PATH_VARIABLE).filter(|path| !path.is_empty()) {
-        return Some(path.into());
-    }
-    default.exists().then(|| default.to_owned())
-}
-
-fn find_or_fail(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result<PathBuf, ConfigError> {
-    find(path, env, Path::new(DEFAULT_PATH)).ok_or_else(|| {
-        let what = format!(
-            "this file does not exist, and neither --config nor ${PATH_VARIABLE} names another; create one with \
-             `topics: [{{id: scan, input_topic: /scan}}]`"
-        );
-        failure(DEFAULT_PATH, Place::File, what)
-    })
-}
-
-/// Reads a regular file. A pipe or a device is refused, because it may never end.
-fn read(path: &Path) -> Result<Vec<u8>, String> {
-    let cannot = |error: std::io::Error| format!("cannot be read: {error}");
-    let metadata = std::fs::metadata(path).map_err(cannot)?;
-    if !metadata.is_file() {
-        return Err("must be a regular file".to_owned());
-    }
-    let mut bytes = Vec::new();
-    // One byte more than allowed distinguishes a file that is too long from one of the largest size.
-    let limit = yaml::MAX_BYTES as u64 + 1;
-    File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes)).map_err(cannot)?;
-    Ok(bytes)
+fn find(
+    path: Option<&Path>,
+    parameters: &[Parameters],
+    env: &dyn Fn(&str) -> Option<String>,
+) -> Result<Option<PathBuf>, ConfigError> {
+    let named = || env(PATH_VARIABLE).filter(|path| !path.is_empty()).map(PathBuf::from);
+    let default = || Some(PathBuf::from(DEFAULT_PATH)).filter(|path| path.exists());
+    Ok(named_path(path, parameters)?.or_else(named).or_else(default))
 }
 
 fn failure(file: &str, place: Place, allowed: String) -> ConfigError {
     let problem = Problem { place, key: String::new(), value: None, allowed, hint: None };
-    ConfigError::new(file, vec![problem])
+    ConfigError::new(file, Vec::new(), vec![problem])
 }
 
 /// Parses the settings from the content of a file; `file_name` is for messages. It has no side effects except
@@ -108,17 +111,23 @@ pub fn parse(
     file_name: &str,
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Settings, ConfigError> {
-    parse_configuration(text.as_ref(), file_name, env).map(|configuration| configuration.settings)
+    parse_configuration(text.as_ref(), file_name, &[], env).map(|configuration| configuration.settings)
 }
 
 fn parse_configuration(
     text: &[u8],
     file_name: &str,
+    parameters: &[Parameters],
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Configuration, ConfigError> {
-    let document = yaml::parse(text)
+    let mut document = yaml::parse(text)
         .map_err(|error| failure(file_name, error.line.map_or(Place::File, Place::Line), error.message))?;
     let problems = Problems::default();
+    if !parameters.is_empty() {
+        let values = parameters::read(parameters).map_err(|problem| bad_parameter(parameters, problem))?;
+        let root = Rc::make_mut(document.get_or_insert_with(|| Rc::new(Node::null())));
+        values.merge_into(root, &problems);
+    }
     let document = document.as_deref();
     let root = Field::root(document, &problems);
     if !root.is_given() {
@@ -136,7 +145,7 @@ fn parse_configuration(
     }
     let settings = settings(&root, &Environment::read(env, &problems));
     if !problems.is_empty() {
-        return Err(ConfigError::new(file_name, problems.into_inner()));
+        return Err(ConfigError::new(file_name, parameters::files(parameters), problems.into_inner()));
     }
     let inline_secret = match settings.security.secret {
         Some(SecretSource::ConfigFile) => root.get("security").get("hmac_secret").text(),
@@ -173,9 +182,18 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let security = control::security(root);
     let policy_hold_s = root.get("policy_hold_s").decimal_or_default();
     let ros = root.get("ros");
+    let namespace = |text: &str| text == "/" || TopicName::try_from(text).is_ok();
+    let allowed = "an absolute namespace such as /robot1, or /";
+    let node_namespace =
+        ros.get("namespace").parsed(allowed, |text| namespace(text).then(|| text.to_owned()));
     let gid_bytes = ros.get("graph_gid_bytes");
     let gid_bytes = gid_bytes.whole_where("must be 16 or 24", |bytes| matches!(bytes, 16 | 24));
     Settings {
+        node_namespace: node_namespace.unwrap_or_else(|| match instance.as_str() {
+            "default" => "/adaptive_bridge".to_owned(),
+            instance => format!("/adaptive_bridge/{instance}"),
+        }),
+        node_name: ros.get("node_name").parsed(NodeName::ALLOWED, |text| NodeName::try_from(text).ok()),
         instance,
         input,
         graph_gid_bytes: gid_bytes.map_or(environment.graph_gid_bytes, |bytes| bytes as usize),

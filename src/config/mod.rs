@@ -12,6 +12,7 @@ mod in_force;
 mod keys;
 mod lanes;
 mod load;
+mod parameters;
 mod problem;
 mod qos;
 mod rates;
@@ -25,7 +26,8 @@ mod yaml;
 
 pub use in_force::{Configuration, DecodeError, InlineSecret};
 pub use keys::{KEYS, Kind, Row, keys_at, nearest_key, rows};
-pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, parse};
+pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, named_path, parse};
+pub use parameters::Parameters;
 pub use problem::{ConfigError, Place, Problem};
 pub use reload::{Change, Reload};
 pub use settings::{

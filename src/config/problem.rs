@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::collections::HashSet;
 use std::fmt;
+use std::path::PathBuf;
 
 /// Where a problem is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -13,6 +14,40 @@ pub enum Place {
     File,
     /// This line of the file, counted from 1.
     Line(usize),
+    /// A parameter of the command line.
+    Parameter {
+        /// Its index in [`ConfigError::parameter_files`].
+        source: usize,
+        /// The line in its file, counted from 1; 0 for the file as a whole.
+        line: usize,
+    },
+}
+
+/// The nodes of the tree have numbers of lines. Those of parameters have the index of their source, plus 1,
+/// above these bits.
+const LINE_BITS: u32 = 32;
+
+impl Place {
+    /// The place of a node with this number.
+    pub(super) fn of(number: usize) -> Self {
+        match (number >> LINE_BITS).checked_sub(1) {
+            None => Self::Line(number),
+            Some(source) => Self::Parameter { source, line: number & ((1 << LINE_BITS) - 1) },
+        }
+    }
+
+    /// The place of a node with this number, as a noun.
+    pub(super) fn noun(number: usize) -> String {
+        match Self::of(number) {
+            Self::Line(line) => format!("line {line}"),
+            _ => "a parameter".to_owned(),
+        }
+    }
+
+    /// The number of nodes in this line of a source of parameters.
+    pub(super) fn number_of_parameter(source: usize, line: usize) -> usize {
+        (source + 1) << LINE_BITS | line
+    }
 }
 
 /// One problem of a configuration.
@@ -38,15 +73,17 @@ pub struct ConfigError {
     pub file: String,
     /// The problems, in the order of the file; those of the environment come first.
     pub problems: Vec<Problem>,
+    /// The file of each source of parameters on the command line; `None` for a single parameter.
+    pub parameter_files: Vec<Option<PathBuf>>,
 }
 
 impl ConfigError {
     /// An error with at least one problem. Sorts the problems by their place, and removes repetitions.
-    pub(super) fn new(file: &str, mut problems: Vec<Problem>) -> Self {
+    pub(super) fn new(file: &str, parameter_files: Vec<Option<PathBuf>>, mut problems: Vec<Problem>) -> Self {
         let mut seen = HashSet::new();
         problems.retain(|problem| seen.insert((problem.place, problem.key.clone(), problem.allowed.clone())));
         problems.sort_by_key(|problem| problem.place);
-        Self { file: file.to_owned(), problems }
+        Self { file: file.to_owned(), problems, parameter_files }
     }
 }
 
@@ -61,6 +98,11 @@ impl fmt::Display for ConfigError {
                 Place::Environment => f.write_str("environment: ")?,
                 Place::File => write!(f, "{}: ", self.file)?,
                 Place::Line(line) => write!(f, "{}:{line}: ", self.file)?,
+                Place::Parameter { source, line } => match self.parameter_files.get(source) {
+                    Some(Some(path)) if line > 0 => write!(f, "{}:{line}: ", path.display())?,
+                    Some(Some(path)) => write!(f, "{}: ", path.display())?,
+                    _ => f.write_str("parameter: ")?,
+                },
             }
             write!(f, "{problem}")?;
         }
@@ -174,7 +216,11 @@ mod tests {
         };
         let error = ConfigError::new(
             "a.yaml",
+            vec![None, Some("b.yaml".into())],
             vec![
+                problem(Place::Parameter { source: 1, line: 3 }, "e", None, None),
+                problem(Place::Parameter { source: 1, line: 0 }, "", None, None),
+                problem(Place::Parameter { source: 0, line: 1 }, "d", Some("1"), None),
                 problem(Place::Line(7), "b.c", Some("5"), Some("did you mean `6`?")),
                 problem(Place::Line(2), "a", None, None),
                 problem(Place::File, "", None, None),
@@ -186,7 +232,10 @@ mod tests {
             "environment: ROS_DOMAIN_ID = x: must be right\n\
              a.yaml: must be right\n\
              a.yaml:2: a: must be right\n\
-             a.yaml:7: b.c = 5: must be right (did you mean `6`?)"
+             a.yaml:7: b.c = 5: must be right (did you mean `6`?)\n\
+             parameter: d = 1: must be right\n\
+             b.yaml: must be right\n\
+             b.yaml:3: e: must be right"
         );
     }
 

@@ -63,6 +63,8 @@ impl Settings {
         let reloaded = Self {
             instance: old.instance,
             input: old.input,
+            node_namespace: old.node_namespace,
+            node_name: old.node_name,
             graph_gid_bytes: old.graph_gid_bytes,
             routes: old.routes,
             lanes: self.lanes.iter().map(|lane| reload_lane(lane, &new)).collect(),
@@ -144,10 +146,13 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
     }
     compare!(d, "", old, new, Settings {
         instance;
-        input, graph_gid_bytes, routes, lanes, shared_memory, policy_hold_ms, ingress_scheduling,
-        control_scheduling, classifier, probes, safety, security, diagnostics, overrides, subscribers
+        input, node_namespace, node_name, graph_gid_bytes, routes, lanes, shared_memory, policy_hold_ms,
+        ingress_scheduling, control_scheduling, classifier, probes, safety, security, diagnostics, overrides,
+        subscribers
     });
     compare_network(d, "ros", &old.input, &new.input);
+    d.add("ros.namespace", &old.node_namespace, &new.node_namespace);
+    d.add("ros.node_name", &old.node_name, &new.node_name);
     d.add("ros.graph_gid_bytes", &old.graph_gid_bytes, &new.graph_gid_bytes);
     compare!(d, "shared_memory", old.shared_memory, new.shared_memory, SharedMemory { root_path, max_taps; });
     d.add("policy_hold_s", &seconds(old.policy_hold_ms), &seconds(new.policy_hold_ms));

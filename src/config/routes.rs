@@ -6,6 +6,7 @@ use std::hash::Hash;
 use super::environment::Environment;
 use super::field::Field;
 use super::lanes::{self, LaneDraft};
+use super::problem::Place;
 use super::qos::{PartialQos, Profiles};
 use super::settings::{DdsNetwork, Lane, Output, Route};
 use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
@@ -276,7 +277,7 @@ fn first_of<'m, K: Eq + Hash>(
     (!std::ptr::eq(first, field)).then_some(first)
 }
 
-/// The key path and line of a field, for a message.
+/// The key path and place of a field, for a message.
 fn at(field: &Field<'_>) -> String {
-    format!("{}, line {}", field.path, field.line)
+    format!("{}, {}", field.path, Place::noun(field.line))
 }

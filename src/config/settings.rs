@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 pub use crate::model::{ClassifierThresholds, DropPolicy, LaneRates, RatePolicy, SafetyRules};
 use crate::model::{
-    Durability, History, InstanceName, LaneName, QosProfile, Reliability, RouteId, SubscriberState,
+    Durability, History, InstanceName, LaneName, NodeName, QosProfile, Reliability, RouteId, SubscriberState,
     TopicName, TrafficClass, TypeName,
 };
 
@@ -23,6 +23,10 @@ pub struct Settings {
     pub instance: InstanceName,
     /// The network of the publishers.
     pub input: DdsNetwork,
+    /// The namespace of the bridge's nodes.
+    pub node_namespace: String,
+    /// What the names of the bridge's nodes begin with, if anything.
+    pub node_name: Option<NodeName>,
     /// The bytes of a graph identifier in `ros_discovery_info`: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
     /// The routes, in the order of the file.
@@ -54,6 +58,11 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// The name of the node of a process.
+    pub fn node_name_of(&self, process: &str) -> String {
+        self.node_name.as_ref().map_or_else(|| process.to_owned(), |name| format!("{name}_{process}"))
+    }
+
     /// The lane with that name.
     pub fn lane(&self, name: &LaneName) -> Option<&Lane> {
         self.lanes.iter().find(|lane| lane.name == *name)

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::choices::Choice;
 use super::settings::{MetricsListener, NetworkSelector, SecretSource};
-use crate::model::{History, InstanceName, LaneName, TopicName, TypeName};
+use crate::model::{History, InstanceName, LaneName, NodeName, TopicName, TypeName};
 
 /// A value that can be shown as in the file. Secrets do not implement it.
 pub(super) trait Shown {
@@ -23,7 +23,7 @@ macro_rules! shown_as_displayed {
 }
 
 shown_as_displayed!(bool, u8, u16, u32, u64, usize, f64, String);
-shown_as_displayed!(InstanceName, LaneName, TopicName, TypeName, NetworkSelector);
+shown_as_displayed!(InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
 
 impl<T: Choice> Shown for T {
     fn shown(&self) -> String {

@@ -17,7 +17,9 @@ use super::stop::Stop;
 use crate::clock;
 use crate::config::DdsNetwork;
 use crate::dds::{Inbox, Participant, ParticipantOptions, RawWriter, TakePayload};
-use crate::model::{Encapsulation, MonotonicNs, ProbeRefusal, RefusalCounts, SourceTimestamp, TopicName};
+use crate::model::{
+    Encapsulation, MonotonicNs, NodeName, ProbeRefusal, RefusalCounts, SourceTimestamp, TopicName,
+};
 use crate::telemetry;
 
 /// How long the responder waits for a probe request before it logs a warning.
@@ -39,6 +41,10 @@ pub struct ResponderOptions<'a> {
     pub network: &'a DdsNetwork,
     /// Length in bytes of a graph identifier: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
+    /// The namespace of its node.
+    pub namespace: &'a str,
+    /// The name of its node; else one that is made from the id.
+    pub node_name: Option<&'a NodeName>,
     /// Topic of the requests.
     pub request_topic: &'a TopicName,
     /// Topic of the responses.
@@ -106,8 +112,8 @@ impl Responder {
     fn open(options: ResponderOptions<'_>) -> Result<Self, RoleError> {
         let mut participant = Participant::open(&ParticipantOptions {
             network: options.network,
-            namespace: "/adaptive_bridge".to_owned(),
-            node_name: node_name(options.id),
+            namespace: options.namespace.to_owned(),
+            node_name: options.node_name.map_or_else(|| node_name(options.id), NodeName::to_string),
             graph_gid_bytes: options.graph_gid_bytes,
         })?;
         // The writer first, so that the first request can be answered at once.

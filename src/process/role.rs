@@ -7,7 +7,7 @@ use super::notify::Notifier;
 use super::reload::{ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
-use crate::config::{Configuration, Scheduling, Settings};
+use crate::config::{Configuration, DdsNetwork, Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
 use crate::model::{Guid, MonotonicNs, NetworkRefusals, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
@@ -189,10 +189,16 @@ impl Drop for Role {
     }
 }
 
-/// The ROS 2 namespace of the bridge's nodes; the default instance has no name in it.
-pub(super) fn namespace(settings: &Settings) -> String {
-    match settings.instance.as_str() {
-        "default" => "/adaptive_bridge".to_owned(),
-        instance => format!("/adaptive_bridge/{instance}"),
+/// The options of the participant of a process.
+pub(super) fn participant_options<'a>(
+    settings: &Settings,
+    network: &'a DdsNetwork,
+    process: &str,
+) -> ParticipantOptions<'a> {
+    ParticipantOptions {
+        network,
+        namespace: settings.node_namespace.clone(),
+        node_name: settings.node_name_of(process),
+        graph_gid_bytes: settings.graph_gid_bytes,
     }
 }

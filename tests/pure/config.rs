@@ -7,7 +7,8 @@ use std::path::Path;
 
 use adaptive_bridge::config::{
     self, Classifier, ClassifierThresholds, ConfigError, Diagnostics, DropPolicy, Forwarding, KEYS, Kind,
-    LaneRates, Place, Probes, RatePolicy, Row, Safety, SafetyRules, Security, Settings, TrustMode, Verbosity,
+    LaneRates, Parameters, Place, Probes, RatePolicy, Row, Safety, SafetyRules, Security, Settings,
+    TrustMode, Verbosity,
 };
 use adaptive_bridge::model::{QosProfile, TopicName, TypeName};
 use proptest::prelude::*;
@@ -447,6 +448,8 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("ros.domain_id", "0", "7"),
     ("ros.networks", "[]", r#"["lo"]"#),
     ("ros.graph_gid_bytes", "16", "24"),
+    ("ros.namespace", r#""/robot1""#, r#""/""#),
+    ("ros.node_name", r#""front""#, r#""rear_2""#),
     ("topics.0.input_topic", r#""/scan""#, r#""/scan_2""#),
     ("topics.0.message_type", "null", r#""sensor_msgs/msg/LaserScan""#),
     ("topics.0.lanes", "null", r#"["critical", "noncritical"]"#),
@@ -780,7 +783,7 @@ proptest! {
         let quoted = serde_json::to_string(&secret).unwrap();
         let text = format!("topics: [{{id: scan, input_topic: /scan}}]\nsecurity: {{hmac_secret: {quoted}}}\n");
         std::fs::write(file.path(), text).unwrap();
-        let loaded = config::load_configuration(Some(file.path()), &no_env).unwrap();
+        let loaded = config::load_configuration(Some(file.path()), &[], &no_env).unwrap();
         let shown = format!("{loaded:?}");
         prop_assert!(secret.len() < 8 || !shown.contains(&secret));
         let read = config::Configuration::decode(&loaded.encode().unwrap()).unwrap();
@@ -810,5 +813,124 @@ proptest! {
         if let Ok(read) = config::Configuration::decode(&bytes) {
             prop_assert_eq!(read.settings, whole.settings);
         }
+    }
+}
+
+/// Loads a file with parameters.
+fn load_with(file: &str, parameters: &[&str]) -> Result<Settings, String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bridge.yaml");
+    std::fs::write(&path, file).unwrap();
+    let parameters: Vec<Parameters> = parameters.iter().map(|text| text.parse().unwrap()).collect();
+    let loaded = config::load_configuration(Some(&path), &parameters, &no_env);
+    let folder = folder.path().display().to_string();
+    loaded.map(|loaded| loaded.settings).map_err(|error| error.to_string().replace(&folder, ""))
+}
+
+#[test]
+fn parameters_replace_values_of_the_file() {
+    let file = "topics: [{id: scan, input_topic: /scan}]\nprobes: {rate_hz: 2, timeout_ms: 300}\n";
+    let parameters =
+        ["probes.rate_hz:=4", "safety.silent_ms:=2500", "ros.namespace:='/r1'", "probes.rate_hz:=3"];
+    let settings = load_with(file, &parameters).unwrap();
+    assert_eq!((settings.probes.rate_hz, settings.probes.timeout_ms), (3.0, 300));
+    assert_eq!(settings.node_namespace, "/r1");
+    assert_eq!(settings.node_name_of("ingress"), "ingress");
+    let named = load_with(file, &["ros.node_name:='front'"]).unwrap();
+    assert_eq!(named.node_namespace, "/adaptive_bridge");
+    assert_eq!(named.node_name_of("egress_rviz"), "front_egress_rviz");
+    assert_eq!(load_with(file, &["use_sim_time:=true"]), load_with(file, &[]));
+    let deep = format!("{}a:=1", "a.".repeat(400_000));
+    assert!(load_with(file, &[&deep]).is_err());
+    let replaced = load_with(file, &["topics:=[{id: b, input_topic: /b}]"]).unwrap();
+    assert_eq!(replaced.routes[0].id.as_str(), "b");
+}
+
+#[test]
+fn a_wrong_parameter_is_reported_with_its_key_and_value() {
+    let file = "topics: [{id: scan, input_topic: /scan}]\nprobes: {rate_hz: 2}\n";
+    for (parameters, expected) in [
+        (&["probes.rate_hz:=often"][..], "parameter: probes.rate_hz = often: must be a number"),
+        (&["probes.rate:=4"], "parameter: probes.rate: must be a known key: enabled, rate_hz"),
+        (&["probes.rate_hz:=[4"], "parameter: probes.rate_hz: not YAML: "),
+        (&["ros.namespace:=robot1"], "parameter: ros.namespace = robot1: must be an absolute namespace"),
+        (&["ros.node_name:='2d'"], "parameter: ros.node_name = \"2d\": must be a ROS 2 node name"),
+        (&["probes:=4"], "parameter: probes = 4: must be a mapping"),
+        (
+            &["probes:={rate_hz: 1, rate_hz: 2}"],
+            "parameter: probes.rate_hz: must be given only once; a parameter",
+        ),
+        (&["topics.id:=a"], "parameter: topics: must be set as a whole"),
+        (&["a.b.c.d.e.f.g.h.i.j:=4"], "parameter: a.b.c: must be a known key"),
+        (&["/no/such/file.yaml"], "/no/such/file.yaml: cannot be read"),
+    ] {
+        let error = load_with(file, parameters).unwrap_err();
+        assert!(error.starts_with(expected), "{error}");
+    }
+}
+
+#[test]
+fn a_file_of_parameters_applies_to_the_nodes_that_it_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let bridge = folder.path().join("other.yaml");
+    std::fs::write(&bridge, "topics: [{id: other, input_topic: /other}]\n").unwrap();
+    let path = folder.path().join("params.yaml");
+    let load = |text: &str, more: &[&str]| {
+        std::fs::write(&path, text).unwrap();
+        let mut parameters: Vec<Parameters> = more.iter().map(|text| text.parse().unwrap()).collect();
+        parameters.push(Parameters::File(path.clone()));
+        let loaded = config::load_configuration(None, &parameters, &|name| {
+            (name == config::PATH_VARIABLE).then(|| bridge.display().to_string())
+        });
+        loaded.map(|loaded| loaded.settings).map_err(|error| error.to_string())
+    };
+    let file = "/**:\n  ros__parameters: {use_sim_time: true, probes: {rate_hz: 3}}\n\
+                /adaptive_bridge:\n  ros__parameters: {probes.timeout_ms: 250}\n\
+                amcl:\n  ros__parameters: {alpha1: 0.2}\n";
+    let settings = load(file, &[]).unwrap();
+    assert_eq!((settings.probes.rate_hz, settings.probes.timeout_ms), (3.0, 250));
+
+    // The forms in which rcl takes the name of a node.
+    for (node, applies) in [
+        ("/*/front", true),
+        ("/r1/front", true),
+        ("/r1/**", true),
+        ("/**/front", true),
+        ("/*", false),
+        ("/r2/front", false),
+        ("front", false),
+    ] {
+        let file = format!("{node}: {{ros__parameters: {{probes.rate_hz: 3}}}}\n");
+        let named = ["ros.node_name:='front'", "ros.namespace:='/r1'"];
+        let rate_hz = load(&file, &named).unwrap().probes.rate_hz;
+        assert_eq!(rate_hz == 3.0, applies, "{node}");
+    }
+    let nested = "r1:\n  front: {ros__parameters: {probes: {rate_hz: 3}}}\n";
+    assert_eq!(
+        load(nested, &["ros.node_name:='front'", "ros.namespace:='/r1'"]).unwrap().probes.rate_hz,
+        3.0
+    );
+    let root = "/front: {ros__parameters: {probes: {rate_hz: 3}}}\n";
+    assert_eq!(load(root, &["ros.node_name:='front'", "ros.namespace:='/'"]).unwrap().probes.rate_hz, 3.0);
+
+    // As a launch file's `Node` with a name and `parameters` writes it.
+    let file = format!(
+        "/r1/adaptive_bridge_proxy: {{ros__parameters: {{config_path: {}}}}}\n/adaptive_bridge: {{}}\n",
+        bridge.display()
+    );
+    let renamed = ["ros.node_name:='adaptive_bridge_proxy'", "ros.namespace:='/r1'"];
+    assert_eq!(load(&file, &renamed).unwrap().routes[0].id.as_str(), "other");
+
+    for (text, expected) in [
+        ("/**: {ros__parameters: {probes: {rate_hz: x}}}", ":1: probes.rate_hz = x: must be a number"),
+        ("\nadaptive_bridge:\n  ros__parameters:\n    prob: 1", ":4: prob: must be a known key"),
+        ("/**: {probes: {rate_hz: 4}}", ":1: must have the form `NODE: {ros__parameters: {KEY: VALUE}}`"),
+        ("/**: {ros__parameters: 4}", ":1: must be a mapping of parameters"),
+        ("[1]", ":1: must have the form"),
+        ("a: {", ":1: not YAML: "),
+    ] {
+        let error = load(text, &[]).unwrap_err();
+        let expected = format!("{}{expected}", path.display());
+        assert!(error.starts_with(&expected), "{error}\n{expected}");
     }
 }

@@ -140,10 +140,13 @@ fn walk(node: &Node, key: Option<&Key>, path: &str, problems: &Problems) {
                 let path = joined(path, &shown_key(path, &entry.key));
                 if let Some(first_line) = first_lines.get(entry.key.as_str()) {
                     problems.report(Problem {
-                        place: Place::Line(entry.line),
+                        place: Place::of(entry.line),
                         key: path.clone(),
                         value: None,
-                        allowed: format!("must be given only once; line {first_line} already has it"),
+                        allowed: format!(
+                            "must be given only once; {} already has it",
+                            Place::noun(*first_line)
+                        ),
                         hint: None,
                     });
                 }
@@ -170,7 +173,7 @@ fn unknown(entry: &Entry, path: &str, known: &[&str], problems: &Problems) -> Pr
         Some(_) => "must be a known key".to_owned(),
         None => format!("must be a known key: {}", known.join(", ")),
     };
-    Problem { place: Place::Line(entry.line), key: path.to_owned(), value: None, allowed, hint }
+    Problem { place: Place::of(entry.line), key: path.to_owned(), value: None, allowed, hint }
 }
 
 /// A key for a message. `{hmac_secret:abc}`, without a space, is a key that contains the secret, so that a

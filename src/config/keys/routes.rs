@@ -50,6 +50,17 @@ pub(super) const ROWS: &[Row] = &[
          the log, and is used as soon as it has an address.",
     ),
     restarts(
+        &["ros.namespace"],
+        Other("absolute namespace"),
+        "`/adaptive_bridge`, and `/` and the instance unless that is `default`",
+    )
+    .doc("Namespace of the bridge's nodes. `--ros-args -r __ns:=` sets it."),
+    restarts(&["ros.node_name"], Other("node name"), "none").doc(
+        "What the names of the bridge's nodes begin with: with `front` they are `front_ingress`, \
+         `front_control`, `front_egress_critical`, …, and that of a responder is `front`. `--ros-args -r \
+         __node:=` sets it.",
+    ),
+    restarts(
         &["ros.graph_gid_bytes"],
         Other("16, 24"),
         "by `$ROS_DISTRO`: 24 for `foxy`, `galactic`, `humble`, else 16",

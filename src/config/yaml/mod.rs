@@ -14,6 +14,9 @@ mod outline;
 use std::cell::Cell;
 use std::collections::HashSet;
 use std::fmt;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
 use std::rc::Rc;
 
 use serde::de::{DeserializeSeed, Error as _, MapAccess, SeqAccess, Visitor};
@@ -40,16 +43,16 @@ const MAX_TEXT_BYTES: usize = 2 * MAX_BYTES;
 /// have 2,621 aliases.
 const MAX_ALIASED_BYTES: usize = 1 << 29;
 
-/// One value of the file.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Node {
-    /// The line, counted from 1, of the key of this value, or of this item of a list.
+    /// The line, counted from 1, of the key of this value, or of this item of a list; or a parameter, see
+    /// `Place::of`.
     pub line: usize,
     pub content: Content,
 }
 
 /// The content of a value. Values that a merge key repeats are shared.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) enum Content {
     /// A text, number, boolean or null; the reader of the field interprets it.
     Scalar {
@@ -71,6 +74,10 @@ pub(super) struct Entry {
 }
 
 impl Node {
+    pub fn null() -> Self {
+        Self { line: 1, content: Content::Scalar { text: String::new(), plain: true } }
+    }
+
     /// Whether this is null: an empty value, `~` or `null`.
     pub fn is_null(&self) -> bool {
         match &self.content {
@@ -99,6 +106,20 @@ impl SyntaxError {
     fn of_file(message: impl Into<String>) -> Self {
         Self { line: None, message: message.into() }
     }
+}
+
+/// Reads a regular file. A pipe or a device is refused, because it may never end.
+pub(super) fn read(path: &Path) -> Result<Vec<u8>, String> {
+    let cannot = |error: std::io::Error| format!("cannot be read: {error}");
+    let metadata = std::fs::metadata(path).map_err(cannot)?;
+    if !metadata.is_file() {
+        return Err("must be a regular file".to_owned());
+    }
+    let mut bytes = Vec::new();
+    // One byte more than allowed distinguishes a file that is too long from one of the largest size.
+    let limit = MAX_BYTES as u64 + 1;
+    File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes)).map_err(cannot)?;
+    Ok(bytes)
 }
 
 /// Parses the only document of a file; `None` for a file without a document.

@@ -21,11 +21,11 @@ use super::count_log::RefusalLog;
 use super::notify::write_list;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, namespace};
+use super::role::{Role, RoleError, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, DdsNetwork, InlineSecret, Settings};
-use crate::dds::{Participant, ParticipantOptions};
+use crate::dds::Participant;
 use crate::model::{
     ControlRecord, FixedText, LaneMode, LanePolicy, MonotonicNs, NetworkRefusals, ProbeRefusal,
     RefusalCounts, SafetyMode,
@@ -108,12 +108,7 @@ impl Control {
         let (networks, link_of_lane) = networks(settings);
         let mut participants = Vec::with_capacity(networks.len());
         for network in &networks {
-            let options = ParticipantOptions {
-                network,
-                namespace: namespace(settings),
-                node_name: "control".to_owned(),
-                graph_gid_bytes: settings.graph_gid_bytes,
-            };
+            let options = participant_options(settings, network, "control");
             // Only the first participant joins through the role: the health board records one participant,
             // which a restarted control disposes of if its predecessor was killed.
             let opened =

@@ -19,11 +19,11 @@ use tracing::{info, warn};
 use super::HOUSEKEEPING_MS;
 use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, lane_index, namespace};
+use super::role::{Role, RoleError, lane_index, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Forwarding, Settings};
-use crate::dds::{Discovery, Participant, ParticipantOptions};
+use crate::dds::{Discovery, Participant};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::{critical_drop, mode_and_source};
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
@@ -115,12 +115,8 @@ impl Egress {
         let role_name = format!("egress-{}", lane.name);
         let process = ProcessRole::Egress(index);
         let mut role = Role::open(settings, reloads, process, &role_name, &lane.scheduling)?;
-        let mut participant = role.join(&ParticipantOptions {
-            network: &lane.network,
-            namespace: namespace(settings),
-            node_name: format!("egress_{}", lane.name),
-            graph_gid_bytes: settings.graph_gid_bytes,
-        })?;
+        let node = format!("egress_{}", lane.name);
+        let mut participant = role.join(&participant_options(settings, &lane.network, &node))?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         for output in &lane.outputs {
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);

@@ -20,11 +20,11 @@ use tracing::{debug, info};
 use super::HOUSEKEEPING_MS;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, namespace};
+use super::role::{Role, RoleError, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
-use crate::dds::{ArrivalFlag, Discovery, Participant, ParticipantOptions};
+use crate::dds::{ArrivalFlag, Discovery, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::ProcessRole;
 use early_waker::EarlyWaker;
@@ -110,12 +110,7 @@ impl Ingress {
         }
         let receiving = Arc::new(Receiving::new(inputs, lanes));
         let (on_arriving, on_received) = receiving.hooks();
-        let options = ParticipantOptions {
-            network: &settings.input,
-            namespace: namespace(settings),
-            node_name: "ingress".to_owned(),
-            graph_gid_bytes: settings.graph_gid_bytes,
-        };
+        let options = participant_options(settings, &settings.input, "ingress");
         let participant = role.join_receiving(&options, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let early_waker = EarlyWaker::start(&participant, &receiving, settings);

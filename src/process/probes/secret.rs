@@ -195,7 +195,7 @@ mod tests {
         let path = folder.path().join("config.yaml");
         let topics = "topics: [{id: scan, input_topic: /scan}]\n";
         std::fs::write(&path, format!("{topics}security: {{hmac_secret: swordfish}}\n")).unwrap();
-        let configuration = crate::config::load_configuration(Some(&path), &|_| None).unwrap();
+        let configuration = crate::config::load_configuration(Some(&path), &[], &|_| None).unwrap();
         let source = configuration.settings.security.secret.unwrap();
         let secret = Secret::load(&source, configuration.inline_secret.as_ref()).unwrap();
         assert_eq!(secret.sign("x"), Secret::new(b"swordfish").unwrap().sign("x"));

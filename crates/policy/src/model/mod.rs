@@ -32,7 +32,7 @@ pub use health::{
     RouteInfo, UnmatchedReader,
 };
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
-pub use names::{InstanceName, LaneName, NameError, RouteId, TopicName, TypeName};
+pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};

@@ -88,6 +88,13 @@ checked_name! {
     topic_name
 }
 
+checked_name! {
+    /// The name of a ROS 2 node, without its namespace.
+    NodeName, "node name",
+    "a ROS 2 node name of at most 200 characters of A-Z, a-z, 0-9 and _, not beginning with a digit",
+    node_name
+}
+
 impl LaneName {
     /// The name of the lane of the critical subscribers.
     pub fn critical() -> Self {
@@ -145,6 +152,11 @@ fn topic_name(text: &str) -> Option<String> {
     let is_valid =
         text.len() <= 246 && text.strip_prefix('/').is_some_and(|rest| rest.split('/').all(is_token));
     is_valid.then(|| text.to_owned())
+}
+
+/// ROS 2 allows 255 characters; 200 leave room for `_egress_` and a lane.
+fn node_name(text: &str) -> Option<String> {
+    (text.len() <= 200 && is_token(text)).then(|| text.to_owned())
 }
 
 /// The name with `msg`, which a user may omit.
