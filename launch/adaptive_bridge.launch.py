@@ -1,7 +1,7 @@
 """
 Runs a bridge: ingress, an egress for each lane of the configuration, and control.
 
-    ros2 launch adaptive_bridge adaptive_bridge.launch.py config:=/path/to/my.yaml
+    ros2 launch adaptive_bridge adaptive_bridge.launch.py config_path:=/path/to/my.yaml
 
 `adaptive-bridge up` starts these processes and starts again those that die. launch's own `respawn` would also try
 again, without an end, what a bad configuration or a wrong command line has ended.
@@ -21,13 +21,13 @@ def generate_launch_description():
     example = prefix / 'share' / 'adaptive_bridge' / 'config' / 'minimal.yaml'
     return LaunchDescription([
         DeclareLaunchArgument(
-            'config',
+            'config_path',
             default_value=EnvironmentVariable('ADAPTIVE_BRIDGE_CONFIG', default_value=str(example)),
             description='Configuration file. The example bridges /scan.',
         ),
-        # Not a Node: the program takes no --ros-args. Its topics, domain and QoS are in the configuration.
+        # Not a Node, which would name one node: the bridge has several.
         ExecuteProcess(
-            cmd=[str(program), 'up', '--config', LaunchConfiguration('config')],
+            cmd=[str(program), 'up', '--config', LaunchConfiguration('config_path')],
             name='adaptive_bridge',
             output='screen',
         ),

@@ -10,6 +10,7 @@ mod demo;
 mod doctor;
 mod man;
 mod mode;
+mod original;
 mod reload;
 mod responder;
 mod roles;
@@ -84,6 +85,9 @@ enum Command {
     Units(units::Arguments),
     /// Print the script with which a shell completes command lines
     Completions(completions::Arguments),
+    /// Wait for a signal, in place of a node of the original package: `up` does its work
+    #[command(hide = true)]
+    Companion(ConfigArguments),
     /// Write the manual pages to a folder
     #[command(hide = true)]
     Man(man::Arguments),
@@ -158,7 +162,7 @@ fn bad_configuration(error: &ConfigError) -> ExitCode {
 
 /// Runs the subcommand that the command line names.
 pub fn main() -> ExitCode {
-    let arguments = match ros_args::translate(std::env::args_os()) {
+    let arguments = match ros_args::translate(original::translate(std::env::args_os())) {
         Ok(arguments) => arguments,
         Err(error) => {
             failed(&error);
@@ -182,6 +186,7 @@ pub fn main() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Units(arguments) => units::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        Command::Companion(_) => original::companion(),
         Command::Man(arguments) => man::run(&arguments),
         Command::Demo(arguments) => Ok(demo::run(&arguments)),
         Command::DemoPublisher(arguments) => Ok(demo::publisher(&arguments)),

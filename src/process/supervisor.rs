@@ -7,7 +7,7 @@
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::io::{self, BufRead, BufReader, Write};
-use std::os::unix::process::ExitStatusExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
@@ -307,7 +307,10 @@ impl Supervised {
     }
 
     fn start(&mut self) -> io::Result<()> {
-        let mut command = Command::new(std::env::current_exe()?);
+        let program = std::env::current_exe()?;
+        let mut command = Command::new(&program);
+        // A copy of the program may have the name of an executable of the original package.
+        command.arg0(program.with_file_name("adaptive-bridge"));
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
         command.env(FOLDER_VARIABLE, &self.folder);
         // The service manager supervises this process only; without these the children send it no

@@ -1,10 +1,14 @@
 //! What ROS 2 nodes (rclpy) see of the bridge, beyond the samples.
 
+use std::os::unix::fs::symlink;
+
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::bridge::{self, Bridge};
+use support::netns::Net;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
-use support::process::signal;
+use support::process::{Process, signal};
 use support::ros;
 
 /// Nodes that publish one sample each.
@@ -124,4 +128,62 @@ fn the_sample_of_a_node_that_publishes_once_and_ends_reaches_the_subscriber() {
     received.assert_sound();
     bed.wait_accounted();
     bed.end();
+}
+
+#[test]
+fn a_launch_file_of_the_original_package_starts_a_bridge_whose_nodes_have_its_names() {
+    let test = "a_launch_file_of_the_original_package_starts_a_bridge_whose_nodes_have_its_names";
+    if let Some(reason) = ros::missing().or_else(support::testbed_missing) {
+        return support::skip(test, &reason);
+    }
+    let net = Net::new(&["bridge", "critical"]);
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{SCAN}"));
+    let file = |name: &str| bridge.folder().join(name);
+    // As launch_ros writes it for `Node(name="adaptive_bridge_proxy", namespace="r1", parameters=[…])`.
+    let parameters = format!(
+        "/r1/adaptive_bridge_proxy:\n  ros__parameters:\n    config_path: {}\n    diagnostics:\n      \
+         topic: /r1/diagnostics_json\n",
+        bridge.config().display()
+    );
+    std::fs::write(file("launch_params_1"), parameters).unwrap();
+    let start = |executable: &str, arguments: &[&str]| {
+        symlink(bridge::program(), file(executable)).unwrap();
+        let mut command = net.host("bridge").command(file(executable));
+        command.args(arguments).args(["--ros-args", "--log-level", "debug"]).env("NO_COLOR", "1");
+        Process::spawn(executable, command)
+    };
+    let names = ["-r", "__node:=adaptive_bridge_proxy", "-r", "__ns:=/r1", "--params-file"];
+    let parameters = file("launch_params_1").display().to_string();
+    let arguments = [&["--ros-args"][..], &names, &[&*parameters, "--"]].concat();
+    let mut proxy = start("proxy_node", &arguments);
+    let mut others = ["classifier_node", "diagnostics_node", "probe_responder"].map(|name| start(name, &[]));
+
+    let topics = [CRITICAL, "rt/r1/diagnostics_json", "rt/adaptive_bridge/probe_resp"];
+    let query = Peer::info(&topics).start_on(net.host("critical"));
+    for (topic, node) in topics.iter().zip([
+        "/r1/adaptive_bridge_proxy_egress_critical",
+        "/r1/adaptive_bridge_proxy_control",
+        "/adaptive_bridge/responder_adaptive_bridge_probe_responder",
+    ]) {
+        query.wait_for(&format!("{node}, which writes {topic}"), |event| {
+            event["endpoints"].as_array().into_iter().flatten().any(|endpoint| {
+                let name = |key: &str| endpoint[key].as_str().unwrap_or_default().to_owned();
+                endpoint["topic"] == **topic
+                    && endpoint["kind"] == "writer"
+                    && format!("{}/{}", name("namespace"), name("node")) == node
+            })
+        });
+    }
+    // The responder answers the control process.
+    bridge.wait_status("a subscriber that answers", |status| {
+        status["subscribers"].as_array().is_some_and(|subscribers| !subscribers.is_empty())
+    });
+    // The parameter is part of the configuration in force, also after a reload.
+    let reload = bridge.run("reload");
+    assert!(reload.status.success(), "{}", String::from_utf8_lossy(&reload.stderr));
+    for process in others.iter_mut().chain([&mut proxy]) {
+        process.signal(Signal::SIGINT);
+        let ended = process.wait();
+        assert!(ended.success(), "{ended}: {}", process.log());
+    }
 }

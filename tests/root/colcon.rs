@@ -160,7 +160,8 @@ fn the_launch_file_of_a_built_workspace_starts_a_bridge_through_which_samples_fl
     let bridge = Bridge::new(&format!("instance: {{instance}}\n{SCAN}"));
     let launch_file = prefix.join("share/adaptive_bridge/launch/adaptive_bridge.launch.py");
     let mut command = net.host("bridge").command("sh");
-    let launch = format!("{index} -c \"$1\" {} config:={}", launch_file.display(), bridge.config().display());
+    let launch =
+        format!("{index} -c \"$1\" {} config_path:={}", launch_file.display(), bridge.config().display());
     command.args(["-c", &workspace.sourced(&launch), "sh", LAUNCH]);
     // Behind what the workspace has: where there is a real one, that is taken.
     command.env("PYTHONPATH", source().join("tests/ros")).env("PYTHONDONTWRITEBYTECODE", "1");
