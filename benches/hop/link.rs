@@ -159,7 +159,7 @@ fn join(arguments: &[String], name: &str) -> Result<Participant, String> {
     place.lock_memory();
     let domain_id = argument(arguments, 0)?.parse().map_err(|_| "the first argument must be the domain")?;
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(domain_id),
         namespace: "/bench".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,

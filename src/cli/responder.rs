@@ -89,6 +89,7 @@ impl Arguments {
                 [] => configured.interfaces.clone(),
                 given => given.to_vec(),
             },
+            static_peers: configured.static_peers.clone(),
         }
     }
 }

@@ -4,7 +4,7 @@
 use std::net::Ipv4Addr;
 
 use super::problem::{Place, Problem, Problems, shown};
-use super::settings::NetworkSelector;
+use super::settings::{DdsNetwork, NetworkSelector};
 
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Environment {
@@ -13,6 +13,8 @@ pub(super) struct Environment {
     /// The bytes of a graph identifier in the distribution that `ROS_DISTRO` names.
     pub graph_gid_bytes: usize,
     localhost_only: bool,
+    /// `ROS_STATIC_PEERS`.
+    pub static_peers: Vec<Ipv4Addr>,
 }
 
 const DDS_IMPLEMENTATIONS: [&str; 5] = [
@@ -86,29 +88,35 @@ impl Environment {
                 _ => refuse("ROS_LOCALHOST_ONLY", &value, "must be 0 or 1"),
             }
         }
-        if let Some(value) = variable("ROS_AUTOMATIC_DISCOVERY_RANGE") {
+        let range = "ROS_AUTOMATIC_DISCOVERY_RANGE";
+        if let Some(value) = variable(range) {
             match value.as_str() {
                 "SUBNET" | "SYSTEM_DEFAULT" => {}
                 "LOCALHOST" => localhost_only = true,
                 "OFF" => refuse(
-                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+                    range,
                     &value,
                     "must not be OFF: a bridge without discovery finds neither publishers nor subscribers",
                 ),
-                _ => refuse(
-                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
-                    &value,
-                    "must be one of SUBNET, LOCALHOST, SYSTEM_DEFAULT",
-                ),
+                _ => refuse(range, &value, "must be one of SUBNET, LOCALHOST, SYSTEM_DEFAULT"),
             }
         }
+        let mut static_peers = Vec::new();
         if let Some(value) = variable("ROS_STATIC_PEERS") {
-            refuse(
-                "ROS_STATIC_PEERS",
-                &value,
-                "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces \
-                 with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
-            );
+            let addresses = value.split(';').map(str::trim).filter(|address| !address.is_empty());
+            let addresses: Result<Vec<_>, _> = addresses.map(str::parse).collect();
+            match addresses {
+                Ok(addresses) if addresses.len() <= DdsNetwork::MAX_STATIC_PEERS => static_peers = addresses,
+                _ => refuse(
+                    "ROS_STATIC_PEERS",
+                    &value,
+                    &format!(
+                        "must be at most {} IPv4 addresses separated by `;`: the bridge does not look up \
+                         names of hosts",
+                        DdsNetwork::MAX_STATIC_PEERS
+                    ),
+                ),
+            }
         }
         for (name, hides, consequence) in NOT_SUPPORTED {
             if let Some(value) = variable(name).filter(|value| hides(value)) {
@@ -120,7 +128,7 @@ impl Environment {
             Some("foxy" | "galactic" | "humble") => 24,
             _ => 16,
         };
-        Self { domain_id, graph_gid_bytes, localhost_only }
+        Self { domain_id, graph_gid_bytes, localhost_only, static_peers }
     }
 
     /// The interfaces to use if the file names none: all (an empty list), or only loopback.

@@ -115,7 +115,7 @@ impl LaneReader<'_> {
     }
 }
 
-/// Reads `domain_id` and `networks` of a section; missing values are those of `base`.
+/// Reads `domain_id`, `networks` and `static_peers` of a section; missing values are those of `base`.
 pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {
     let domain = section.get("domain_id").count();
     let interfaces = section.get("networks").items().map(|items| {
@@ -124,7 +124,15 @@ pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Envi
         selectors.collect()
     });
     let interfaces = interfaces.unwrap_or_else(|| base.interfaces.clone());
+    let peers = section.get("static_peers");
+    let static_peers = peers.items().map(|items| {
+        if items.len() > DdsNetwork::MAX_STATIC_PEERS {
+            peers.report_key(&format!("must be at most {} addresses", DdsNetwork::MAX_STATIC_PEERS));
+        }
+        items.iter().filter_map(|item| item.parsed("an IPv4 address", |text| text.parse().ok())).collect()
+    });
     DdsNetwork {
+        static_peers: static_peers.unwrap_or_else(|| base.static_peers.clone()),
         domain_id: domain.unwrap_or(base.domain_id),
         interfaces: if interfaces.is_empty() { environment.default_interfaces() } else { interfaces },
     }

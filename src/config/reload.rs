@@ -169,7 +169,7 @@ fn seconds(ms: u64) -> f64 {
 }
 
 fn compare_network(d: &mut Differences, of: &str, old: &DdsNetwork, new: &DdsNetwork) {
-    compare!(d, of, old, new, DdsNetwork { domain_id, interfaces: "networks"; });
+    compare!(d, of, old, new, DdsNetwork { domain_id, interfaces: "networks", static_peers; });
 }
 
 fn compare_scheduling(d: &mut Differences, of: &str, old: &Scheduling, new: &Scheduling) {

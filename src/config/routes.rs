@@ -18,7 +18,10 @@ const MAX_ROUTES: usize = 1_024;
 const RETAINED_SAMPLES: usize = 8;
 
 pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
-    let base = DdsNetwork { domain_id: environment.domain_id, interfaces: Vec::new() };
+    let base = DdsNetwork {
+        static_peers: environment.static_peers.clone(),
+        ..DdsNetwork::of_domain(environment.domain_id)
+    };
     lanes::network(&root.section("ros"), &base, environment)
 }
 

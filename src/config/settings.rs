@@ -76,6 +76,18 @@ pub struct DdsNetwork {
     pub domain_id: u16,
     /// Interfaces or addresses to use; empty for all.
     pub interfaces: Vec<NetworkSelector>,
+    /// Hosts to which the participants are also announced by unicast, for networks without multicast.
+    pub static_peers: Vec<Ipv4Addr>,
+}
+
+impl DdsNetwork {
+    /// The most static peers. Each process announces itself to 32 ports of each, every 2 s.
+    pub const MAX_STATIC_PEERS: usize = 16;
+
+    /// A domain, over all interfaces.
+    pub fn of_domain(domain_id: u16) -> Self {
+        Self { domain_id, interfaces: Vec::new(), static_peers: Vec::new() }
+    }
 }
 
 /// A network interface, by name or by one of its addresses.

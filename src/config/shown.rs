@@ -1,5 +1,6 @@
 //! Formats settings for operators, as they are written in the file.
 
+use std::net::Ipv4Addr;
 use std::path::PathBuf;
 
 use super::choices::Choice;
@@ -23,7 +24,7 @@ macro_rules! shown_as_displayed {
 }
 
 shown_as_displayed!(bool, u8, u16, u32, u64, usize, f64, String);
-shown_as_displayed!(InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
+shown_as_displayed!(Ipv4Addr, InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
 
 impl<T: Choice> Shown for T {
     fn shown(&self) -> String {

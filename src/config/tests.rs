@@ -1,6 +1,7 @@
 //! Tests of the loader for each key: the values that it accepts and the messages that it reports.
 
 use std::fmt::Write;
+use std::net::Ipv4Addr;
 
 use super::*;
 use crate::model::{Durability, History, LaneName, QosProfile, Reliability, SubscriberState};
@@ -237,14 +238,14 @@ fn lanes_have_their_own_networks_and_scheduling() {
     );
     let name = |name: &str| NetworkSelector::Name(name.to_owned());
     let address = NetworkSelector::Address([10, 0, 0, 7].into());
-    let input = DdsNetwork { domain_id: 4, interfaces: vec![name("eth0"), address] };
+    let input = DdsNetwork { interfaces: vec![name("eth0"), address], ..DdsNetwork::of_domain(4) };
     assert_eq!(settings.input, input);
     assert_eq!(lane(&settings, "critical").network, input);
     assert_eq!(
         lane(&settings, "noncritical").network,
-        DdsNetwork { domain_id: 9, interfaces: vec![name("wlan0")] }
+        DdsNetwork { interfaces: vec![name("wlan0")], ..DdsNetwork::of_domain(9) }
     );
-    assert_eq!(lane(&settings, "fleet").network, DdsNetwork { domain_id: 4, interfaces: vec![] });
+    assert_eq!(lane(&settings, "fleet").network, DdsNetwork::of_domain(4));
     let fifo = Scheduling {
         policy: SchedulingPolicy::Fifo,
         priority: 80,
@@ -506,6 +507,12 @@ fn environment_variables_supply_values_missing_in_the_file() {
     let named = parse_in("ros: {networks: [eth0]}\nlanes: {a: {networks: []}}", range, "LOCALHOST");
     assert_eq!(named.input.interfaces, [NetworkSelector::Name("eth0".to_owned())]);
     assert_eq!(lane(&named, "a").network.interfaces, loopback);
+    let peers = parse_in("", "ROS_STATIC_PEERS", "10.0.0.1;10.0.0.2;");
+    assert_eq!(peers.input.static_peers, [[10, 0, 0, 1], [10, 0, 0, 2]].map(Ipv4Addr::from));
+    let own = "ros: {static_peers: [10.0.0.9]}\nlanes: {a: {static_peers: []}}";
+    let own = parse_in(own, "ROS_STATIC_PEERS", "10.0.0.1");
+    assert_eq!(own.lanes[0].network.static_peers, [Ipv4Addr::new(10, 0, 0, 9)]);
+    assert!(lane(&own, "a").network.static_peers.is_empty());
     for (distro, bytes) in [("humble", 24), ("galactic", 24), ("foxy", 24), ("iron", 16), ("jazzy", 16)] {
         assert_eq!(parse_in("", "ROS_DISTRO", distro).graph_gid_bytes, bytes, "{distro}");
     }
@@ -526,9 +533,8 @@ fn a_wrong_environment_variable_is_reported() {
         ),
         (
             "ROS_STATIC_PEERS",
-            "10.0.0.1",
-            "must not be set: the DDS library has no list of peers; unset it, and choose the interfaces \
-             with ros.networks or ROS_AUTOMATIC_DISCOVERY_RANGE",
+            "10.0.0.1;laptop",
+            "must be at most 16 IPv4 addresses separated by `;`: the bridge does not look up names of hosts",
         ),
     ] {
         let found = messages_in(TOPIC, &|asked: &str| (asked == name).then(|| value.to_owned()));

@@ -119,6 +119,7 @@ impl Participant {
         if !interfaces.is_empty() {
             builder = builder.with_only_interfaces(network::selectors(interfaces));
         }
+        builder = builder.with_discovery_peers(options.network.static_peers.iter().copied());
         for absent in network::absent_interfaces(interfaces)? {
             tracing::warn!(node = options.node_name, domain_id = options.network.domain_id, "{absent}");
         }

@@ -166,7 +166,7 @@ fn receiving_thread() -> i32 {
 
 fn participant(name: &str) -> Participant {
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id: DOMAIN_ID, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(DOMAIN_ID),
         namespace: "/test".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,

@@ -38,7 +38,7 @@ fn bridge(domain_id: u16) -> Bridge {
 
 fn participant(name: &str, domain_id: u16) -> Participant {
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(domain_id),
         namespace: "/cli".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,

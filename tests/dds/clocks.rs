@@ -21,7 +21,7 @@ const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
 fn participant(name: &str) -> Participant {
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id: DOMAIN_ID, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(DOMAIN_ID),
         namespace: "/clocks".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,

@@ -24,7 +24,7 @@ fn options<'a>(name: &str, network: &'a DdsNetwork) -> ParticipantOptions<'a> {
 }
 
 fn participant(name: &str, domain_id: u16) -> Participant {
-    Participant::open(&options(name, &DdsNetwork { domain_id, interfaces: Vec::new() })).unwrap()
+    Participant::open(&options(name, &DdsNetwork::of_domain(domain_id))).unwrap()
 }
 
 fn reader_qos(reliability: Reliability, durability: Durability) -> ReaderQos {
@@ -110,7 +110,7 @@ fn a_sample_is_told_of_before_it_is_there() {
             false
         }
     };
-    let network = DdsNetwork { domain_id: 69, interfaces: Vec::new() };
+    let network = DdsNetwork::of_domain(69);
     let mut there =
         Participant::open_receiving(&options("there", &network), on_arriving, on_received).unwrap();
     let mut here = participant("here", 69);
@@ -181,7 +181,7 @@ impl Drop for Lent {
 
 #[test]
 fn an_onlooker_sees_samples_come_and_takes_none() {
-    let network = DdsNetwork { domain_id: 66, interfaces: Vec::new() };
+    let network = DdsNetwork::of_domain(66);
     // The thread that receives is held up here, so that the onlooker is in time.
     let hold = Arc::new(Mutex::new(()));
     let on_received = {

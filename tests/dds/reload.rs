@@ -55,7 +55,7 @@ fn up(bridge: &Bridge) -> (Process, [ProcessHealth; 3]) {
 
 fn participant(name: &str, domain_id: u16) -> Participant {
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(domain_id),
         namespace: "/reload".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,

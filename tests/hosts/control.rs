@@ -182,7 +182,7 @@ fn output<'a>(status: &'a Value, lane: &str) -> &'a Value {
 /// Opens a ROS 2 node on a host.
 fn node_on(host: &Host, name: &str) -> Participant {
     let options = ParticipantOptions {
-        network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(0),
         namespace: "/fleet".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,

@@ -88,7 +88,7 @@ fn responder(host: &Host, arguments: &[&str], environment: &[(&str, String)]) ->
 /// Opens a participant on a host.
 fn join(host: &Host, name: &str) -> Participant {
     let options = ParticipantOptions {
-        network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(0),
         namespace: "/test".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,

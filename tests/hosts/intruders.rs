@@ -41,7 +41,7 @@ fn robot_and_laptop(test: &str) -> Option<(Net, Host, Host)> {
 
 fn node_on(host: &Host, name: &str, graph_gid_bytes: usize) -> Participant {
     let options = ParticipantOptions {
-        network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+        network: &DdsNetwork::of_domain(0),
         namespace: "/fleet".into(),
         node_name: name.into(),
         graph_gid_bytes,

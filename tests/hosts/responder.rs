@@ -62,7 +62,7 @@ impl Asker {
         let joined = std::thread::spawn(move || {
             setns(File::open(namespace).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
             let mut participant = Participant::open(&ParticipantOptions {
-                network: &DdsNetwork { domain_id: 0, interfaces: Vec::new() },
+                network: &DdsNetwork::of_domain(0),
                 namespace: "/test".to_owned(),
                 node_name: name.to_owned(),
                 graph_gid_bytes: 16,

@@ -187,3 +187,61 @@ fn a_launch_file_of_the_original_package_starts_a_bridge_whose_nodes_have_its_na
         assert!(ended.success(), "{ended}: {}", process.log());
     }
 }
+
+#[test]
+fn nodes_and_the_bridge_find_each_other_without_multicast() {
+    let test = "nodes_and_the_bridge_find_each_other_without_multicast";
+    if let Some(reason) = ros::missing().or_else(support::testbed_missing) {
+        return support::skip(test, &reason);
+    }
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    for host in ["publisher", "bridge", "critical", "slow"] {
+        net.host(host).run("iptables", &["-A", "OUTPUT", "-d", "224.0.0.0/4", "-j", "DROP"]);
+    }
+    // The bridge lists the hosts of the publisher and of the critical subscribers; those of the slow host
+    // list the bridge.
+    let [publisher, bridge, critical] =
+        ["publisher", "bridge", "critical"].map(|host| net.host(host).address().to_string());
+    let yaml = format!("instance: {{instance}}\n{SCAN}ros: {{static_peers: [{publisher}, {critical}]}}\n");
+    let configuration = Bridge::new(&yaml);
+    let mut up = configuration.start_on(net.host("bridge"), "up");
+    let mut responder = net.host("slow").command(bridge::program());
+    responder.args(["responder", "--id", "laptop"]).env("ROS_STATIC_PEERS", &bridge);
+    let mut responder = Process::spawn("the responder", responder);
+    let node = |peer: Peer| peer.env("ROS_STATIC_PEERS", &bridge);
+    // Cyclone DDS takes discovery by unicast only if it has peers itself; this is what rmw_cyclonedds_cpp
+    // makes of ROS_STATIC_PEERS.
+    let cyclone = || {
+        let uri = format!(
+            "<General><AllowMulticast>false</AllowMulticast></General><Discovery>\
+             <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>\
+             <Peers><Peer address='{bridge}'/></Peers></Discovery>"
+        );
+        Peer::cyclone().env("CYCLONEDDS_URI", &uri)
+    };
+    let subscribers = [
+        Peer::rclpy("planner").subscriber().topic(CRITICAL).start_on(net.host("critical")),
+        cyclone().subscriber().topic(CRITICAL).start_on(net.host("critical")),
+        Peer::fast().subscriber().topic(NONCRITICAL).start_on(net.host("critical")),
+        node(Peer::rclpy("rviz")).subscriber().topic(NONCRITICAL).start_on(net.host("slow")),
+    ];
+    for library in [Peer::rclpy("lidar"), cyclone()] {
+        let goals = subscribers.iter().map(|subscriber| subscriber.received() + 5).collect::<Vec<_>>();
+        let publisher = library.publisher().topic(INPUT).rate_hz(30.0).start_on(net.host("publisher"));
+        for (subscriber, goal) in subscribers.iter().zip(goals) {
+            subscriber.wait_received(goal);
+        }
+        let _: Sent = publisher.end();
+    }
+    configuration.wait_status("the responder's answers", |status| {
+        let subscribers = status["subscribers"].as_array().into_iter().flatten();
+        subscribers.filter(|subscriber| subscriber["id"] == "laptop").count() == 1
+    });
+    for subscriber in subscribers {
+        let _: Received = subscriber.end();
+    }
+    for process in [&mut responder, &mut up] {
+        process.signal(Signal::SIGINT);
+        assert!(process.wait().success(), "{}", process.log());
+    }
+}

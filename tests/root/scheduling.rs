@@ -146,7 +146,7 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
     let node = ShmNode::open(&root, &settings.instance, "test").unwrap();
     let boards = node.boards(&BridgeShape::of(&settings)).unwrap();
     let published = || boards.ingress(0).unwrap().published;
-    let network = DdsNetwork { domain_id: DOMAIN_ID, interfaces: Vec::new() };
+    let network = DdsNetwork::of_domain(DOMAIN_ID);
     let (namespace, node_name) = ("/test".into(), "source".into());
     let options = ParticipantOptions { network: &network, namespace, node_name, graph_gid_bytes: 16 };
     let mut source = Participant::open(&options).unwrap();

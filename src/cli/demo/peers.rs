@@ -129,7 +129,10 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<Infallible, Box<dyn Erro
 
 fn join(domain_id: u16, name: &str) -> Result<Participant, DdsError> {
     Participant::open(&ParticipantOptions {
-        network: &DdsNetwork { domain_id, interfaces: vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)] },
+        network: &DdsNetwork {
+            interfaces: vec![NetworkSelector::Address(Ipv4Addr::LOCALHOST)],
+            ..DdsNetwork::of_domain(domain_id)
+        },
         namespace: "/demo".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,

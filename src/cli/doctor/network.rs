@@ -105,7 +105,8 @@ fn selected(selector: &NetworkSelector, interfaces: &[Interface]) -> Finding {
     if !flags.contains(InterfaceFlags::IFF_MULTICAST) {
         return Finding::error(check, format!("{name} carries no multicast"))
             .means(
-                "DDS participants announce themselves by multicast, so none are discovered there.",
+                "DDS participants announce themselves by multicast, so none are discovered there, except \
+                 those of `static_peers`.",
             )
             .with_command(format!("sudo ip link set {own_name} multicast on"));
     }

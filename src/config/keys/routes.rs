@@ -50,6 +50,12 @@ pub(super) const ROWS: &[Row] = &[
          the log, and is used as soon as it has an address.",
     ),
     restarts(
+        &["ros.static_peers"],
+        Other("list of at most 16 IPv4 addresses"),
+        "`$ROS_STATIC_PEERS`, else none",
+    )
+    .doc("Hosts to which the bridge is also announced by unicast, for networks without multicast."),
+    restarts(
         &["ros.namespace"],
         Other("absolute namespace"),
         "`/adaptive_bridge`, and `/` and the instance unless that is `default`",
@@ -125,13 +131,15 @@ pub(super) const ROWS: &[Row] = &[
         .doc("The profile of all routes of the lane: a name, or the policies themselves."),
     restarts(&["lanes.<lane>.domain_id"], Whole(0, 232, ""), "that of the publishers")
         .doc("DDS domain of the lane's subscribers."),
+    restarts(&["lanes.<lane>.networks"], Other("list of names or IPv4 addresses"), "`ros.networks`")
+        .doc("Network interfaces to use there; an empty list for all."),
     restarts(
-        &["lanes.<lane>.networks"],
-        Other("list of names or IPv4 addresses"),
-        "`ros.networks`",
+        &["lanes.<lane>.static_peers"],
+        Other("list of at most 16 IPv4 addresses"),
+        "`ros.static_peers`",
     )
     .doc(
-        "Network interfaces to use there; an empty list for all.",
+        "Hosts to which the lane is also announced by unicast.",
     ),
     // Each sample occupies `max_sample_bytes`.
     restarts(&["lanes.<lane>.queue_depth"], Whole(1, 4_096, " samples"), "64 critical, 4 noncritical").doc(

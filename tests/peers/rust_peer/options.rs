@@ -129,7 +129,7 @@ impl Options {
     pub fn join(&self) -> Result<Participant, DdsError> {
         let interfaces = self.interface.into_iter().map(NetworkSelector::Address).collect();
         Participant::open(&ParticipantOptions {
-            network: &DdsNetwork { domain_id: self.domain, interfaces },
+            network: &DdsNetwork { interfaces, ..DdsNetwork::of_domain(self.domain) },
             namespace: "/peers".to_owned(),
             node_name: "rust_peer".to_owned(),
             graph_gid_bytes: if self.gid_bytes == "16" { 16 } else { 24 },

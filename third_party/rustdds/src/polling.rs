@@ -10,6 +10,7 @@
 
 use std::{
   collections::BTreeMap,
+  net::Ipv4Addr,
   sync::{
     atomic::{AtomicU64, Ordering},
     mpsc, Arc, OnceLock,
@@ -81,13 +82,15 @@ pub struct ThreadTurns {
   pub discovery: u64,
 }
 
-/// What an application lets the event loop of its participant do.
+/// What an application sets of the event loop of its participant.
 #[derive(Default)]
 pub(crate) struct Hooks {
   /// See `DomainParticipantBuilder::on_received`.
   pub on_received: Option<Box<dyn FnMut() -> bool + Send>>,
   /// See `DomainParticipantBuilder::on_sample_arriving`.
   pub on_sample_arriving: Option<Box<dyn FnMut([u8; 16], i64, usize) + Send>>,
+  /// See `DomainParticipantBuilder::with_discovery_peers`.
+  pub discovery_peers: Vec<Ipv4Addr>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

@@ -138,6 +138,15 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Announces the participant also to these hosts by unicast, for networks without
+  /// multicast: to the ports of their first [`SPDP_PEER_COUNT`] participants.
+  ///
+  /// [`SPDP_PEER_COUNT`]: crate::network::constant::SPDP_PEER_COUNT
+  pub fn with_discovery_peers(mut self, addresses: impl IntoIterator<Item = Ipv4Addr>) -> Self {
+    self.hooks.discovery_peers = addresses.into_iter().collect();
+    self
+  }
+
   /// Enable/disable same-host communication over loopback (default: enabled).
   ///
   /// When enabled, the participant (a) additionally announces SPDP to the

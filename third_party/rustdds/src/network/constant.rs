@@ -32,3 +32,7 @@ pub const fn user_traffic_unicast_port(domain_id: u16, participant_id: u16) -> u
 /// multicast on the loopback interface is unavailable (the Linux default for
 /// `lo`). See `src/rtps/loopback_same_host_design.md`.
 pub const SPDP_LOCALHOST_PEER_COUNT: u16 = 12;
+
+/// The same for each host of `DomainParticipantBuilder::with_discovery_peers`. Cyclone
+/// DDS in ROS 2 gives a participant one of 32 numbers.
+pub const SPDP_PEER_COUNT: u16 = 32;

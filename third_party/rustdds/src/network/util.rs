@@ -205,15 +205,16 @@ pub fn localhost_spdp_peer_locators(
   own_participant_id: u16,
   max_participants: u16,
 ) -> Vec<Locator> {
-  (0..max_participants)
-    .filter(|pid| *pid != own_participant_id)
-    .map(|pid| {
-      Locator::from(SocketAddr::new(
-        IpAddr::V4(Ipv4Addr::LOCALHOST),
-        crate::network::constant::spdp_well_known_unicast_port(domain_id, pid),
-      ))
-    })
+  let others = (0..max_participants).filter(|pid| *pid != own_participant_id);
+  others
+    .map(|pid| spdp_peer_locator(Ipv4Addr::LOCALHOST, domain_id, pid))
     .collect()
+}
+
+/// Where participant `participant_id` of a host takes SPDP by unicast.
+pub(crate) fn spdp_peer_locator(host: Ipv4Addr, domain_id: u16, participant_id: u16) -> Locator {
+  let port = crate::network::constant::spdp_well_known_unicast_port(domain_id, participant_id);
+  Locator::from(SocketAddr::new(IpAddr::V4(host), port))
 }
 
 /// The locators at which a listener with that port can be reached.

@@ -24,10 +24,10 @@ use crate::{
   },
   messages::{submessages::submessages::AckSubmessage, vendor_id::VendorId},
   network::{
-    constant::SPDP_LOCALHOST_PEER_COUNT,
+    constant::{SPDP_LOCALHOST_PEER_COUNT, SPDP_PEER_COUNT},
     udp_listener::UDPListener,
     udp_sender::UDPSender,
-    util::{localhost_spdp_peer_locators, IfAddr, NetworkSelector},
+    util::{localhost_spdp_peer_locators, spdp_peer_locator, IfAddr, NetworkSelector},
   },
   polling::{
     new_shared_timer, timeout_until, wake_channel, Hooks, LoopWaker, ReadyReceiver,
@@ -1342,14 +1342,17 @@ impl DPEventLoop {
     // - every writer may route a confirmed same-host peer over loopback.
     // See `src/rtps/loopback_same_host_design.md`.
     new_writer.set_prefer_loopback_same_host(self.same_host_loopback);
-    if self.same_host_loopback
-      && new_writer.guid().entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
-    {
-      new_writer.set_extra_unicast_destinations(localhost_spdp_peer_locators(
-        self.domain_info.domain_id,
-        self.domain_info.participant_id,
-        SPDP_LOCALHOST_PEER_COUNT,
-      ));
+    if new_writer.guid().entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER {
+      let domain_id = self.domain_info.domain_id;
+      let mut peers = Vec::new();
+      if self.same_host_loopback {
+        let own_id = self.domain_info.participant_id;
+        peers = localhost_spdp_peer_locators(domain_id, own_id, SPDP_LOCALHOST_PEER_COUNT);
+      }
+      for host in &self.hooks.discovery_peers {
+        peers.extend((0..SPDP_PEER_COUNT).map(|id| spdp_peer_locator(*host, domain_id, id)));
+      }
+      new_writer.set_extra_unicast_destinations(peers);
     }
 
     // The doorbell is a shared ready-queue plus the poll waker, not a
