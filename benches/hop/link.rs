@@ -163,6 +163,7 @@ fn join(arguments: &[String], name: &str) -> Result<Participant, String> {
         namespace: "/bench".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
     .map_err(|error| error.to_string())
 }

@@ -98,7 +98,12 @@ impl LaneReader<'_> {
             (TrafficClass::Noncritical, 4, None, Forwarding::Limited(self.policy.lane_rates(field)))
         };
         let qos = field.get("qos");
+        let default_dscp = match class {
+            TrafficClass::Critical => EXPEDITED_FORWARDING,
+            TrafficClass::Noncritical => 0,
+        };
         let lane = Lane {
+            dscp: field.get("dscp").count().unwrap_or(default_dscp),
             name,
             forwarding,
             network: network(field, self.input, self.environment),
@@ -114,6 +119,9 @@ impl LaneReader<'_> {
         LaneDraft { lane, qos }
     }
 }
+
+/// The DSCP of what must arrive soon (RFC 3246). Wi-Fi sends it before the rest, in the queue for video.
+const EXPEDITED_FORWARDING: u8 = 46;
 
 /// Reads `domain_id`, `networks` and `static_peers` of a section; missing values are those of `base`.
 pub(super) fn network(section: &Field<'_>, base: &DdsNetwork, environment: &Environment) -> DdsNetwork {

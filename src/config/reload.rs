@@ -228,7 +228,7 @@ fn compare_output(
 fn compare_lane(d: &mut Differences, old: &Lane, new: &Lane) {
     let of = &format!("lanes.{}", old.name);
     compare!(d, of, old, new, Lane {
-        queue_depth, max_borrowed, by_reference_min_bytes, window_samples;
+        dscp, queue_depth, max_borrowed, by_reference_min_bytes, window_samples;
         name, forwarding, network, outputs, scheduling
     });
     // A lane of the same name has the same class.

@@ -177,6 +177,8 @@ pub struct Lane {
     pub forwarding: Forwarding,
     /// The network of its subscribers.
     pub network: DdsNetwork,
+    /// The Differentiated Services Code Point of what the lane sends by unicast, 0 to 63.
+    pub dscp: u8,
     /// Its outputs, one for each route that it serves, in the order of the routes.
     pub outputs: Vec<Output>,
     /// The most samples of each route that wait for the lane in shared memory.

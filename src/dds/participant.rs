@@ -37,6 +37,8 @@ pub struct ParticipantOptions<'a> {
     pub node_name: String,
     /// The bytes of an identifier in the ROS 2 graph: 24 up to ROS 2 Humble, 16 since Iron.
     pub graph_gid_bytes: usize,
+    /// The Differentiated Services Code Point of what it sends by unicast, 0 to 63.
+    pub dscp: u8,
 }
 
 /// A DDS participant with its node's entry in the ROS 2 graph.
@@ -120,6 +122,7 @@ impl Participant {
             builder = builder.with_only_interfaces(network::selectors(interfaces));
         }
         builder = builder.with_discovery_peers(options.network.static_peers.iter().copied());
+        builder = builder.with_dscp(options.dscp);
         for absent in network::absent_interfaces(interfaces)? {
             tracing::warn!(node = options.node_name, domain_id = options.network.domain_id, "{absent}");
         }

@@ -115,6 +115,7 @@ impl Responder {
             namespace: options.namespace.to_owned(),
             node_name: options.node_name.map_or_else(|| node_name(options.id), NodeName::to_string),
             graph_gid_bytes: options.graph_gid_bytes,
+            dscp: 0,
         })?;
         // The writer first, so that the first request can be answered at once.
         let responses = participant.create_writer(

@@ -200,5 +200,6 @@ pub(super) fn participant_options<'a>(
         namespace: settings.node_namespace.clone(),
         node_name: settings.node_name_of(process),
         graph_gid_bytes: settings.graph_gid_bytes,
+        dscp: 0,
     }
 }

@@ -170,6 +170,7 @@ fn participant(name: &str) -> Participant {
         namespace: "/test".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
     .unwrap()
 }

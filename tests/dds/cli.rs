@@ -42,6 +42,7 @@ fn participant(name: &str, domain_id: u16) -> Participant {
         namespace: "/cli".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
     .unwrap()
 }

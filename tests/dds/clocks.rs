@@ -25,6 +25,7 @@ fn participant(name: &str) -> Participant {
         namespace: "/clocks".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
     .unwrap()
 }

@@ -20,7 +20,7 @@ const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
 fn options<'a>(name: &str, network: &'a DdsNetwork) -> ParticipantOptions<'a> {
     let (namespace, node_name) = ("/adaptive_bridge".into(), name.into());
-    ParticipantOptions { network, namespace, node_name, graph_gid_bytes: 16 }
+    ParticipantOptions { network, namespace, node_name, graph_gid_bytes: 16, dscp: 0 }
 }
 
 fn participant(name: &str, domain_id: u16) -> Participant {

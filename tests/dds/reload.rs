@@ -59,6 +59,7 @@ fn participant(name: &str, domain_id: u16) -> Participant {
         namespace: "/reload".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
     .unwrap()
 }

@@ -186,6 +186,7 @@ fn node_on(host: &Host, name: &str) -> Participant {
         namespace: "/fleet".into(),
         node_name: name.into(),
         graph_gid_bytes: 16,
+        dscp: 0,
     };
     host.within(|| Participant::open(&options).unwrap())
 }

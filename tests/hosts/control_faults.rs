@@ -92,6 +92,7 @@ fn join(host: &Host, name: &str) -> Participant {
         namespace: "/test".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,
+        dscp: 0,
     };
     host.within(|| Participant::open(&options).unwrap())
 }

@@ -425,3 +425,30 @@ fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
         bed.end();
     }
 }
+
+#[test]
+fn each_lane_marks_its_datagrams_with_its_dscp() {
+    let test = "each_lane_marks_its_datagrams_with_its_dscp";
+    let Some(bed) = Bed::start(test, &format!("{SCAN}lanes: {{noncritical: {{dscp: 10}}}}\n")) else {
+        return;
+    };
+    let bridge = bed.host("bridge").address().to_string();
+    let lanes = [("critical", CRITICAL, "46"), ("slow", NONCRITICAL, "10")];
+    for (host, _, dscp) in lanes {
+        let counted = ["-A", "INPUT", "-p", "udp", "-s", &bridge, "-m", "dscp", "--dscp", dscp];
+        bed.host(host).run("iptables", &counted);
+    }
+    let subscribers = lanes.map(|(host, topic, _)| bed.subscribe(host, Peer::cyclone(), topic));
+    let publisher = bed.publish(Peer::cyclone().rate_hz(30.0), INPUT);
+    for subscriber in &subscribers {
+        subscriber.wait_received(20);
+    }
+    let _: Sent = publisher.end();
+    for ((host, ..), subscriber) in lanes.into_iter().zip(subscribers) {
+        let received = subscriber.end::<Received>().received;
+        let rules = bed.host(host).run("iptables", &["-L", "INPUT", "-v", "-n", "-x"]);
+        let packets: u64 = rules.lines().nth(2).unwrap().split_whitespace().next().unwrap().parse().unwrap();
+        assert!(packets >= received, "{received} samples, but with the DSCP of the lane: {rules}");
+    }
+    bed.end();
+}

@@ -45,6 +45,7 @@ fn node_on(host: &Host, name: &str, graph_gid_bytes: usize) -> Participant {
         namespace: "/fleet".into(),
         node_name: name.into(),
         graph_gid_bytes,
+        dscp: 0,
     };
     host.within(|| Participant::open(&options).unwrap())
 }

@@ -66,6 +66,7 @@ impl Asker {
                 namespace: "/test".to_owned(),
                 node_name: name.to_owned(),
                 graph_gid_bytes: 16,
+                dscp: 0,
             })
             .unwrap();
             let responses = participant

@@ -467,6 +467,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("topics.0.qos_overrides.critical.lifespan_ms", "null", "100"),
     ("topics.0.qos_overrides.critical.deadline_ms", "null", "100"),
     ("lanes.rviz.domain_id", "0", "9"),
+    ("lanes.rviz.dscp", "0", "34"),
     ("lanes.rviz.static_peers", "[]", r#"["10.0.0.7"]"#),
     ("lanes.rviz.networks", "[]", r#"["192.168.0.7"]"#),
     ("lanes.rviz.queue_depth", "4", "5"),

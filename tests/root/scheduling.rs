@@ -148,7 +148,8 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
     let published = || boards.ingress(0).unwrap().published;
     let network = DdsNetwork::of_domain(DOMAIN_ID);
     let (namespace, node_name) = ("/test".into(), "source".into());
-    let options = ParticipantOptions { network: &network, namespace, node_name, graph_gid_bytes: 16 };
+    let options =
+        ParticipantOptions { network: &network, namespace, node_name, graph_gid_bytes: 16, dscp: 0 };
     let mut source = Participant::open(&options).unwrap();
     let writer =
         source.create_writer("rt/scan", "std_msgs::msg::dds_::String_", &QosProfile::CRITICAL, 64).unwrap();

@@ -136,6 +136,7 @@ fn join(domain_id: u16, name: &str) -> Result<Participant, DdsError> {
         namespace: "/demo".to_owned(),
         node_name: name.to_owned(),
         graph_gid_bytes: 16,
+        dscp: 0,
     })
 }
 

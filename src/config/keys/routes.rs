@@ -138,8 +138,10 @@ pub(super) const ROWS: &[Row] = &[
         Other("list of at most 16 IPv4 addresses"),
         "`ros.static_peers`",
     )
-    .doc(
-        "Hosts to which the lane is also announced by unicast.",
+    .doc("Hosts to which the lane is also announced by unicast."),
+    restarts(&["lanes.<lane>.dscp"], Whole(0, 63, ""), "46 (EF) critical, else 0").doc(
+        "Differentiated Services Code Point of what the lane sends by unicast. Networks with priorities, \
+         such as Wi-Fi, send higher classes first.",
     ),
     // Each sample occupies `max_sample_bytes`.
     restarts(&["lanes.<lane>.queue_depth"], Whole(1, 4_096, " samples"), "64 critical, 4 noncritical").doc(

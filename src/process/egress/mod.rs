@@ -23,7 +23,7 @@ use super::role::{Role, RoleError, lane_index, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Forwarding, Settings};
-use crate::dds::{Discovery, Participant};
+use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::{critical_drop, mode_and_source};
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
@@ -116,7 +116,9 @@ impl Egress {
         let process = ProcessRole::Egress(index);
         let mut role = Role::open(settings, reloads, process, &role_name, &lane.scheduling)?;
         let node = format!("egress_{}", lane.name);
-        let mut participant = role.join(&participant_options(settings, &lane.network, &node))?;
+        let options =
+            ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
+        let mut participant = role.join(&options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         for output in &lane.outputs {
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);

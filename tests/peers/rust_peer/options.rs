@@ -133,6 +133,7 @@ impl Options {
             namespace: "/peers".to_owned(),
             node_name: "rust_peer".to_owned(),
             graph_gid_bytes: if self.gid_bytes == "16" { 16 } else { 24 },
+            dscp: 0,
         })
     }
 }

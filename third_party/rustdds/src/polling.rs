@@ -91,6 +91,8 @@ pub(crate) struct Hooks {
   pub on_sample_arriving: Option<Box<dyn FnMut([u8; 16], i64, usize) + Send>>,
   /// See `DomainParticipantBuilder::with_discovery_peers`.
   pub discovery_peers: Vec<Ipv4Addr>,
+  /// See `DomainParticipantBuilder::with_dscp`.
+  pub dscp: u8,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

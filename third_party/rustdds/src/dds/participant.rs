@@ -147,6 +147,13 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Sets the Differentiated Services Code Point (RFC 2474), 0 to 63, of all datagrams
+  /// that the participant sends by unicast.
+  pub fn with_dscp(mut self, dscp: u8) -> Self {
+    self.hooks.dscp = dscp;
+    self
+  }
+
   /// Enable/disable same-host communication over loopback (default: enabled).
   ///
   /// When enabled, the participant (a) additionally announces SPDP to the

@@ -199,6 +199,15 @@ impl UDPSender {
     Self::new(0)
   }
 
+  /// Sets the DSCP of datagrams that are sent by unicast: the upper six bits of the
+  /// field that was type of service.
+  pub(crate) fn set_dscp(&self, dscp: u8) -> io::Result<()> {
+    if dscp == 0 {
+      return Ok(());
+    }
+    socket2::SockRef::from(&*self.unicast_socket).set_tos_v4(u32::from(dscp) << 2)
+  }
+
   pub(crate) fn unicast_socket(&self) -> Arc<UdpSocket> {
     Arc::clone(&self.unicast_socket)
   }

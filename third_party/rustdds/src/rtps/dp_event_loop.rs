@@ -243,6 +243,7 @@ impl DPEventLoop {
       ),
       "UDPSender construction fail"
     );
+    try_init!(udp_sender.set_dscp(hooks.dscp), "cannot set the DSCP");
 
     #[cfg(not(feature = "security"))]
     let security_plugins_opt = security_plugins_opt.and(None); // make sure it is None an consume value
