@@ -22,8 +22,8 @@ use super::rustdds::{
 use super::writer::RawWriter;
 use crate::config::DdsNetwork;
 use crate::model::{
-    DdsType, Durability, Encapsulation, Guid, History, NetworkRefusal, NetworkRefusals, QosProfile,
-    Reliability, SourceTimestamp,
+    DdsType, Durability, Encapsulation, Guid, History, MonotonicNs, NetworkRefusal, NetworkRefusals,
+    QosProfile, Reliability, SourceTimestamp,
 };
 
 /// The settings of a participant.
@@ -55,8 +55,9 @@ pub struct Participant {
     graph_gid_bytes: usize,
     readers: Vec<Guid>,
     writers: Vec<Guid>,
-    /// The turns of the library's threads at the last call of `have_threads_turned` that returned true.
+    /// The turns of the library's threads at the last check of `have_threads_turned` that succeeded.
     turns_seen: ThreadTurns,
+    check_turns_at: MonotonicNs,
     network_counters: Arc<NetworkCounters>,
 }
 
@@ -81,6 +82,10 @@ const GRAPH_READER_QOS: ReaderQos = ReaderQos {
 
 /// The most unacknowledged graph entries; one is written for each endpoint that is created or dropped.
 const GRAPH_WINDOW_SAMPLES: usize = 1024;
+
+/// An eighth of the shortest time of a watchdog. A check wakes two threads, and housekeeping runs up to 100
+/// times a second.
+const CHECK_TURNS_MS: u64 = 250;
 
 impl Participant {
     /// Joins the domain and announces the node.
@@ -154,6 +159,7 @@ impl Participant {
             readers: Vec::new(),
             writers: Vec::new(),
             turns_seen: ThreadTurns::default(),
+            check_turns_at: MonotonicNs::default(),
             network_counters,
         };
         opened.publish_graph_entry();
@@ -170,14 +176,20 @@ impl Participant {
         self.participant.wake_event_loop();
     }
 
-    /// Whether the receiving thread and the discovery thread have each begun a turn since the last call that
-    /// returned true. Wakes both, so that the next call, some milliseconds later, returns true unless one of
-    /// them hangs or has ended: then the participant receives nothing or finds no peer, without an error.
-    pub fn have_threads_turned(&mut self) -> bool {
+    /// Whether the receiving thread and the discovery thread turn: false if one of them hangs or has ended.
+    /// Then the participant receives nothing or finds no peer, without an error.
+    ///
+    /// It checks that both have begun a turn since the last check, and wakes them for the next one. After a
+    /// check that has succeeded it returns true for a quarter of a second without another.
+    pub fn have_threads_turned(&mut self, now: MonotonicNs) -> bool {
+        if now < self.check_turns_at {
+            return true;
+        }
         let (seen, turns) = (self.turns_seen, self.participant.wake_threads());
         let turned = turns.event_loop != seen.event_loop && turns.discovery != seen.discovery;
         if turned {
             self.turns_seen = turns;
+            self.check_turns_at = now.plus_ms(CHECK_TURNS_MS);
         }
         turned
     }

@@ -202,7 +202,7 @@ impl Responder {
         telemetry::log_left_out(now);
         // Reports readiness at the first housekeeping, when all endpoints exist.
         self.notifier.ready();
-        if self.participant.have_threads_turned() {
+        if self.participant.have_threads_turned(now) {
             self.notifier.feed_watchdog(now);
         }
         let (handler, answered) = (&self.handler, &mut self.answered);

@@ -309,7 +309,7 @@ impl Control {
         self.accepted_log.log_accepted(&self.invalid_responses.accepted, now);
         self.write_record();
         // Asks every participant, because that wakes its threads.
-        let turned = self.participants.iter_mut().map(Participant::have_threads_turned);
+        let turned = self.participants.iter_mut().map(|participant| participant.have_threads_turned(now));
         if turned.fold(true, |all, one| all & one) {
             let mut refusals = NetworkRefusals::default();
             for participant in &self.participants {

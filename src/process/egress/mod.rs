@@ -232,7 +232,7 @@ impl Egress {
         }
         self.reload(now);
         // A turn of this thread forwards nothing if a thread of the DDS library hangs.
-        if self.participant.have_threads_turned() {
+        if self.participant.have_threads_turned(now) {
             let refusals = self.participant.network_refusals();
             self.role.report_turn(self.policy.mode as u8, self.policy.policy.epoch, refusals);
         }

@@ -170,10 +170,12 @@ impl Ingress {
             self.role.dispose_former(&self.participant);
         }
         self.role.reload();
-        self.role.status(now, |line| describe(&self.receiving, &mut self.received, line, now));
-        // After the last lock of an input, because this wakes the receiving thread, which may have skipped a
-        // locked one.
-        if self.participant.have_threads_turned() {
+        let mut ring = false;
+        self.role.status(now, |line| ring = describe(&self.receiving, &mut self.received, line, now));
+        if ring {
+            self.participant.ring();
+        }
+        if self.participant.have_threads_turned(now) {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
         self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
@@ -188,12 +190,12 @@ impl Ingress {
     }
 }
 
-/// Writes the status line of ingress for the service manager. The caller has to ring the receiving thread
-/// afterwards, because this locks the inputs.
-fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) {
+/// Writes the status line of ingress for the service manager. Returns whether the caller has to ring the
+/// receiving thread, because this locks the inputs.
+fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) -> bool {
     let (mut routes, mut connected, mut total) = (0, 0, 0);
     let (mut drops, mut without) = (Vec::new(), Vec::new());
-    receiving.for_each_input(|input| {
+    let ring = receiving.for_each_input(|input| {
         routes += 1;
         total += input.counters.get().received;
         drops.push(input.counters.get().drops);
@@ -208,4 +210,5 @@ fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now:
     let _ = write!(line, "reading {connected} of {routes} routes, {per_s:.1} samples/s");
     write_drops(line, drops.iter());
     write_list(line, "; no publisher found yet for", without.iter());
+    ring
 }
