@@ -10,6 +10,9 @@ use crate::model::{Durability, History, QosProfile, Reliability, TrafficClass};
 /// The depth of KEEP_LAST without a depth in the file: that of ROS 2's default profile.
 const DEFAULT_DEPTH: u32 = 10;
 
+/// The depth of an output that follows TRANSIENT_LOCAL publishers.
+const LATCHED_DEPTH: u32 = 1;
+
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct PartialQos {
     reliability: Option<Reliability>,
@@ -66,6 +69,13 @@ impl PartialQos {
         }
     }
 
+    /// The profile of a writer that follows TRANSIENT_LOCAL publishers; `None` if a durability is given.
+    /// Discovery does not tell their depth. Where none is given, it is that of the latched topics of ROS 2.
+    pub fn latched(self, class: TrafficClass) -> Option<QosProfile> {
+        let (durability, depth) = (Some(Durability::TransientLocal), self.depth.or(Some(LATCHED_DEPTH)));
+        self.durability.is_none().then(|| Self { durability, depth, ..self }.complete(class))
+    }
+
     /// The QoS that ingress requests: missing policies follow the publisher's offer.
     pub fn input(self) -> InputQos {
         let history = match (self.history, self.depth) {
@@ -95,5 +105,24 @@ impl<'a> Profiles<'a> {
         }
         let names: Vec<&str> = self.0.keys().copied().collect();
         field.reference("the name of a profile in qos_profiles", &names, |name| self.0.get(name).copied())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_output_follows_latched_publishers_unless_the_file_gives_its_durability() {
+        let latched = |given: PartialQos| given.latched(TrafficClass::Critical);
+        let history = |depth| History::KeepLast { depth };
+        let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::CRITICAL };
+        let none = PartialQos::default();
+        assert_eq!(latched(none), Some(QosProfile { history: history(1), ..qos }));
+        let deep = PartialQos { depth: Some(7), ..none };
+        assert_eq!(latched(deep), Some(QosProfile { history: history(7), ..qos }));
+        for given in [Durability::Volatile, Durability::TransientLocal] {
+            assert_eq!(latched(PartialQos { durability: Some(given), ..none }), None);
+        }
     }
 }

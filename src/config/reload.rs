@@ -216,12 +216,19 @@ fn compare_output(
     // The lanes that serve a route determine the size of its pool in shared memory.
     d.add(&format!("topics[{id}].lanes.{lane}"), &old.is_some(), &new.is_some());
     if let (Some(old), Some(new)) = (old, new) {
-        let Output { route: _, topic, qos } = old;
+        let Output { route: _, topic, qos, latched_qos } = old;
         d.add(&format!("topics[{id}].outputs.{lane}"), topic, &new.topic);
         let of = &format!("topics[{id}].qos_overrides.{lane}");
         compare!(d, of, qos, new.qos, QosProfile {
-            reliability, history, durability, lifespan_ms, deadline_ms;
+            reliability, history, lifespan_ms, deadline_ms; durability
         });
+        let given = |output: &Output| output.latched_qos.is_none().then_some(output.qos.durability);
+        d.add(&format!("{of}.durability"), &given(old), &given(new));
+        if let (Some(latched), Some(other)) = (latched_qos, new.latched_qos)
+            && qos.history == new.qos.history
+        {
+            d.add(&format!("{of}.depth"), &latched.history, &other.history);
+        }
     }
 }
 

@@ -14,7 +14,7 @@ use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
 /// The most routes. Each has a pool in shared memory, a reader, and a writer on each of its lanes.
 const MAX_ROUTES: usize = 1_024;
 
-/// Samples retained for a restarted lane when no output is TRANSIENT_LOCAL.
+/// Samples retained for a restarted lane when no output is configured TRANSIENT_LOCAL.
 const RETAINED_SAMPLES: usize = 8;
 
 pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
@@ -55,8 +55,8 @@ pub(super) fn read(
     let mut lanes: Vec<Lane> = drafts.into_iter().map(|draft| draft.lane).collect();
     for draft in read {
         let Some(route) = draft.route else { continue };
-        for OutputDraft { lane, topic, qos, .. } in draft.outputs {
-            lanes[lane].outputs.push(Output { route: routes.len(), topic, qos });
+        for OutputDraft { lane, topic, qos, latched_qos, .. } in draft.outputs {
+            lanes[lane].outputs.push(Output { route: routes.len(), topic, qos, latched_qos });
         }
         routes.push(route);
     }
@@ -78,6 +78,7 @@ struct OutputDraft<'a> {
     /// The field of the topic, given or not.
     field: Field<'a>,
     qos: QosProfile,
+    latched_qos: Option<QosProfile>,
 }
 
 struct RouteReader<'a, 'f> {
@@ -163,8 +164,9 @@ impl<'f> RouteReader<'_, 'f> {
                 topic
             };
             let Some(topic) = topic.or_else(default) else { continue };
-            let qos = override_qos.over(profile.unwrap_or(*lane_qos)).complete(lane.class());
-            outputs.push(OutputDraft { lane: index, topic, field: given, qos });
+            let given_qos = override_qos.over(profile.unwrap_or(*lane_qos));
+            let (qos, latched_qos) = (given_qos.complete(lane.class()), given_qos.latched(lane.class()));
+            outputs.push(OutputDraft { lane: index, topic, field: given, qos, latched_qos });
         }
         outputs
     }
@@ -188,7 +190,9 @@ impl<'f> RouteReader<'_, 'f> {
         serving
     }
 
-    /// The samples that a restarted lane needs: the largest history of the TRANSIENT_LOCAL outputs.
+    /// The samples that a restarted lane needs: the largest history of the TRANSIENT_LOCAL outputs. Outputs
+    /// that follow the publishers count with their depth, and never with a KEEP_ALL window, because most stay
+    /// VOLATILE.
     fn retained_samples(&self, outputs: &[OutputDraft<'_>]) -> usize {
         let durable = outputs.iter().filter(|output| output.qos.durability == Durability::TransientLocal);
         let depths = durable.map(|output| match output.qos.depth() {
@@ -196,7 +200,9 @@ impl<'f> RouteReader<'_, 'f> {
             // KEEP_ALL keeps as many samples as the writer's window.
             None => self.lanes[output.lane].lane.window_samples_of(&output.qos),
         });
-        depths.max().unwrap_or(RETAINED_SAMPLES)
+        let following = outputs.iter().filter_map(|output| output.latched_qos?.depth());
+        let following = following.max().map_or(0, |depth| depth as usize);
+        depths.max().unwrap_or(RETAINED_SAMPLES).max(following)
     }
 
     fn lane_names(&self) -> Vec<&str> {

@@ -245,6 +245,9 @@ pub struct Output {
     pub topic: TopicName,
     /// The QoS of its writer.
     pub qos: QosProfile,
+    /// The QoS of its writer once the publishers offer TRANSIENT_LOCAL; `None` if the configuration gives the
+    /// DURABILITY.
+    pub latched_qos: Option<QosProfile>,
 }
 
 /// The shared memory of one bridge.

@@ -133,6 +133,14 @@ fn a_keep_all_transient_local_output_retains_the_window_of_its_lane() {
     let text =
         "lanes: {noncritical: {window_samples: 30, qos: {history: KEEP_ALL, durability: TRANSIENT_LOCAL}}}\n";
     assert_eq!(with(text).routes[0].retained_samples, 30);
+    // Without a durability the output may follow TRANSIENT_LOCAL publishers, with the depth that is given.
+    let retained =
+        |qos: &str| with(&format!("lanes: {{critical: {{qos: {{{qos}}}}}}}\n")).routes[0].retained_samples;
+    assert_eq!(retained("depth: 30"), 30);
+    assert_eq!(
+        [retained("depth: 3"), retained("history: KEEP_ALL"), retained("depth: 30, durability: VOLATILE")],
+        [8; 3]
+    );
 }
 
 #[test]

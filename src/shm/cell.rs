@@ -59,7 +59,7 @@ plain! {
     NamedEndpoint: 2 + 2 * 16,
     PublisherAccount: 9,
     LanePolicy: 5,
-    RouteInfo: 2 * (16 + 4) + 2,
+    RouteInfo: 2 * (16 + 4) + 3,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 3 + 2 + 3,
     OutputReaders: MAX_OUTPUT_READERS * 6 + MAX_UNMATCHED_READERS * 3,

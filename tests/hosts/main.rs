@@ -15,6 +15,7 @@ mod hostile_readers;
 mod interop;
 mod intruders;
 mod large_samples;
+mod latched;
 mod networks;
 mod noncritical_readers;
 mod original_probes;

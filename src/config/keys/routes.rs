@@ -98,7 +98,7 @@ pub(super) const ROWS: &[Row] = &[
         &["topics[].retained_samples"],
         Whole(1, 10_000, " samples"),
         "the largest depth among the route's TRANSIENT_LOCAL outputs (KEEP_ALL counts as the lane's \
-         `window_samples`), else 8",
+         `window_samples`), else 8; at least the depth given for an output without a durability",
     )
     .doc(
         "Samples retained in shared memory for a lane that restarts, which it then forwards, and which its \
@@ -111,7 +111,7 @@ pub(super) const ROWS: &[Row] = &[
     // DDS allows 2^31; with 10,000 a route of 1 KiB samples takes 10 MiB on each lane.
     restarts(qos!("depth"), Whole(1, 10_000, " samples"), "as above; 10 for an input with KEEP_LAST")
         .doc("Depth of KEEP_LAST."),
-    restarts(qos!("durability"), Choice(words::<Durability>), "as above")
+    restarts(qos!("durability"), Choice(words::<Durability>), "what the publishers offer")
         .doc("DURABILITY: whether late joiners get the history."),
     restarts(
         &[

@@ -8,6 +8,7 @@
 mod arena;
 mod late_joiners;
 mod noncritical;
+mod offer;
 mod output;
 mod unsent;
 
@@ -229,6 +230,14 @@ impl Egress {
             if !gone.is_empty() {
                 output.forget_unmatched(|reader| gone.iter().any(|change| takes_away(change, reader)));
             }
+        }
+        if let Some(lane) = &mut self.noncritical
+            && self
+                .outputs
+                .iter_mut()
+                .fold(false, |changed, output| output.durability.take_change() | changed)
+        {
+            lane.follow_durability(&mut self.outputs, now);
         }
         self.reload(now);
         // A turn of this thread forwards nothing if a thread of the DDS library hangs.

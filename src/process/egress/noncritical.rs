@@ -40,10 +40,15 @@ impl Noncritical {
         self.rates = rates;
         self.budget.set_mode(&rates, self.mode, now);
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            let rates = rates_of(rates, output.durability());
+            let rates = rates_of(rates, output.durability.get());
             shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(shaper.waiting());
         }
+    }
+
+    /// Applies the rates again after the durability of an output has changed.
+    pub fn follow_durability(&mut self, outputs: &mut [Output], now: MonotonicNs) {
+        self.set_rates(self.rates, outputs, now);
     }
 
     /// Queues the samples that wait in shared memory and forwards as many as the tokens allow.
@@ -63,7 +68,7 @@ impl Noncritical {
             }
         }
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output);
+            fill_queue(shaper, output, self.rates, now);
         }
         let now = clock::monotonic();
         let now_wall = clock::wall();
@@ -106,24 +111,30 @@ impl Noncritical {
     }
 
     pub fn shut_down(&mut self, outputs: &mut [Output]) {
+        let now = clock::monotonic();
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output);
+            fill_queue(shaper, output, self.rates, now);
             shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(0);
         }
     }
 }
 
-/// Moves the route's samples from the channel in shared memory to the lane's own queue.
-fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output) {
+/// Moves the route's samples from the channel in shared memory to the lane's own queue. The first sample of a
+/// publisher may change the durability, and with it the rates that apply to this sample.
+fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output, rates: LaneRates, now: MonotonicNs) {
     while let Some(sample) = output.take() {
+        if output.durability.take_change() {
+            let rates = rates_of(rates, output.durability.get());
+            shaper.set_rates(rates, now, |dropped, _, reason| output.drop_sample(&dropped, reason));
+        }
         let stamps = SampleStamps::new(sample.header(), sample.payload().len() as u64);
         shaper.offer(sample, stamps, |dropped, _, reason| output.drop_sample(&dropped, reason));
     }
 }
 
-/// The rates of an output. A TRANSIENT_LOCAL output carries state (a map, static transforms): its samples do
-/// not become stale and do not supersede each other, so they are sent in order, at the lane's rate.
+/// The rates of an output. TRANSIENT_LOCAL publishers publish state (a map, static transforms): their samples
+/// do not become stale and do not supersede each other, so they are sent in order, at the lane's rate.
 fn rates_of(lane: LaneRates, durability: Durability) -> LaneRates {
     let mut rates = lane;
     if durability == Durability::TransientLocal {

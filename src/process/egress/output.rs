@@ -7,14 +7,14 @@ use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::late_joiners::{KeptSample, LateJoiners};
+use super::offer::{Offer, RouteDurability};
 use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
 use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
-    OutputReaders, QosProfile, Reliability, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
-    UnmatchedReader,
+    OutputReaders, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -34,10 +34,11 @@ pub(super) struct Output {
     class: TrafficClass,
     route: usize,
     dds_topic: String,
-    qos: QosProfile,
-    window_samples: usize,
-    /// Whether a reader skips the samples that it lacks when fresher ones have evicted them.
-    supersedes: bool,
+    offer: Offer,
+    /// What the output offers once the publishers offer TRANSIENT_LOCAL and no reader is matched; `None` when
+    /// it does, and where the configuration gives the DURABILITY.
+    latched_offer: Option<Offer>,
+    pub durability: RouteDurability,
     by_reference_min_bytes: usize,
     /// The drop reason of a gap while the lane forwards.
     overwrite_reason: DropReason,
@@ -59,6 +60,8 @@ pub(super) struct Output {
     /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
     /// receive the samples written until they match.
     former_readers: Vec<Guid>,
+    /// The publisher of the last sample taken.
+    last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
     unmatched: Vec<(Guid, UnmatchedPolicy)>,
     /// When this process opened the output. Samples published before were missed by its predecessor.
@@ -103,19 +106,19 @@ impl Output {
             SubscriberRole::Lane(QueueLimits::of(lane)),
             true,
         )?;
-        let late_joiners = (output.qos.durability == Durability::TransientLocal
-            && output.qos.reliability == Reliability::BestEffort)
-            .then(|| LateJoiners::new(output.qos.depth().unwrap_or(1) as usize));
-        let window_samples = lane.window_samples_of(&output.qos);
+        let offer = Offer::of(lane, output.qos);
+        let latched_offer = output.latched_qos.map(|qos| Offer::of(lane, qos));
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
             class: lane.class(),
             route: output.route,
             dds_topic: output.topic.to_dds(),
-            qos: output.qos,
-            window_samples,
-            supersedes: lane.supersedes(&output.qos),
+            late_joiners: offer.late_joiners(),
+            unsent: UnsentSamples::new(offer.most_unsent()),
+            durability: RouteDurability::new(&offer, latched_offer.is_some()),
+            offer,
+            latched_offer,
             by_reference_min_bytes: lane.by_reference_min_bytes,
             overwrite_reason: overwrite_reason(&lane.forwarding),
             gap_reason: overwrite_reason(&lane.forwarding),
@@ -123,14 +126,13 @@ impl Output {
             subscriber,
             writer: None,
             type_hash: TypeHash::UNKNOWN,
-            unsent: UnsentSamples::new(window_samples.max(output.qos.depth().unwrap_or(1) as usize)),
             queued: 0,
-            late_joiners,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             drop_log: DropLog::new(former.drops),
             counters,
             readers,
             former_readers,
+            last_publisher: Guid::default(),
             unmatched: Vec::new(),
             started_at: clock::monotonic(),
             caught_up: false,
@@ -143,16 +145,14 @@ impl Output {
         match &route.message_type {
             Some(message_type) => {
                 let known = opened.boards.route_info(output.route).unwrap_or_default();
+                opened.durability.set(known.durability());
+                opened.follow_durability(participant);
                 let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash };
                 opened.make_writer(participant, dds_type)?;
             }
             None => opened.announce_type(participant),
         }
         Ok(opened)
-    }
-
-    pub fn durability(&self) -> Durability {
-        self.qos.durability
     }
 
     /// Takes the next sample that is not accounted for yet, and counts the ones missing before it. Samples
@@ -179,7 +179,7 @@ impl Output {
                 SequenceOutcome::InOrder => {}
                 SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),
                 SequenceOutcome::Duplicate => {
-                    if self.qos.durability == Durability::TransientLocal && !self.caught_up {
+                    if self.offer.qos.durability == Durability::TransientLocal && !self.caught_up {
                         self.restore(&sample);
                     }
                     continue;
@@ -188,13 +188,14 @@ impl Output {
             if sample.header().published_at >= self.started_at {
                 self.caught_up = true;
             }
+            self.follow_publisher(sample.header().writer_guid);
             return Some(sample);
         }
     }
 
     /// Writes a taken sample to DDS and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
-        if self.writer.is_none() {
+        if self.writer.is_none() || (self.is_to_latch() && self.counters.get().readers == 0) {
             self.announce_type(participant);
         }
         if !self.former_readers.is_empty() {
@@ -441,12 +442,57 @@ impl Output {
         }
     }
 
+    /// Reads the durability with the first sample of each publisher: ingress publishes type and durability
+    /// before it takes that sample, and the next housekeeping would be too late for it.
+    fn follow_publisher(&mut self, publisher: Guid) {
+        if publisher == self.last_publisher || !self.durability.follows_publishers() {
+            return;
+        }
+        self.last_publisher = publisher;
+        if let Some(info) = self.boards.route_info(self.route) {
+            self.durability.set(info.durability());
+        }
+    }
+
+    /// Whether the publishers offer TRANSIENT_LOCAL and the output does not, though it follows them.
+    fn is_to_latch(&self) -> bool {
+        self.durability.get() == Durability::TransientLocal && self.latched_offer.is_some()
+    }
+
+    /// Offers TRANSIENT_LOCAL when the publishers do, unless the configuration gives the DURABILITY. A writer
+    /// cannot change it (DDS 1.4 clause 2.2.3), and a reader misses what is written until it has matched the
+    /// next writer, so the present one stays as long as it has a reader.
+    fn follow_durability(&mut self, participant: &mut Participant) {
+        if !self.is_to_latch() {
+            return;
+        }
+        if let Some(writer) = &self.writer
+            && (self.unsent.len() > 0 || writer.matched_readers().next().is_some())
+        {
+            return;
+        }
+        let Some(latched) = self.latched_offer.take() else { return };
+        if let Some(volatile) = self.writer.take() {
+            self.unmatched.clear();
+            self.readers.set(OutputReaders::default());
+            self.counters.update(|counters| counters.readers = 0);
+            let guid = volatile.guid();
+            drop(volatile);
+            participant.remove_endpoint(guid);
+        }
+        self.late_joiners = latched.late_joiners();
+        self.unsent = UnsentSamples::new(latched.most_unsent());
+        self.offer = latched;
+    }
+
     /// Creates the writer if ingress has published the type by now, and lets it announce the type's hash.
     fn announce_type(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else {
             return;
         };
         let Some(dds_type) = info.announced_type() else { return };
+        self.durability.set(info.durability());
+        self.follow_durability(participant);
         match &self.writer {
             None => {
                 if let Err(failure) = self.make_writer(participant, dds_type) {
@@ -463,17 +509,18 @@ impl Output {
     }
 
     fn make_writer(&mut self, participant: &mut Participant, dds_type: DdsType) -> Result<(), RoleError> {
-        let writer = participant.create_writer(&self.dds_topic, dds_type, &self.qos, self.window_samples)?;
+        let Offer { qos, window_samples, supersedes } = &self.offer;
+        let writer = participant.create_writer(&self.dds_topic, dds_type, qos, *window_samples)?;
         info!(
             route = self.id,
             lane = self.lane,
             topic = self.dds_topic,
             dds_type = dds_type.name,
-            reliability = ?self.qos.reliability,
-            durability = ?self.qos.durability,
+            reliability = ?qos.reliability,
+            durability = ?qos.durability,
             "DDS writer created"
         );
-        if self.supersedes {
+        if *supersedes {
             writer.skip_evicted();
         }
         self.writer = Some(writer);

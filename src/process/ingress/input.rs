@@ -16,7 +16,7 @@ use crate::dds::{
     ArrivalFlag, Endpoint, Inbox, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload,
 };
 use crate::model::{
-    AgeBasis, DdsType, DropReason, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
+    AgeBasis, DdsType, DropReason, Durability, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
     Reliability, RouteInfo, SampleHeader,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
@@ -274,6 +274,8 @@ impl Input {
     fn update_info(&mut self, dds_type: &str, is_settled: bool) {
         let type_hash = self.source.type_hash(dds_type, self.info.get().type_hash);
         let mut info = RouteInfo { type_hash, ..RouteInfo::default() };
+        let durability = self.source.durability(dds_type, self.info.get().durability());
+        info.transient_local = u64::from(durability == Durability::TransientLocal);
         if is_settled {
             info.dds_type = FixedText::new(dds_type);
         }

@@ -69,6 +69,13 @@ impl Source {
         if hashes.any(|hash| hash == current) { current } else { first }
     }
 
+    /// The durability of outputs of this type for which the configuration gives none: what all present
+    /// publishers offer, or `current` if there is none.
+    pub fn durability(&self, dds_type: &str, current: Durability) -> Durability {
+        let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+        writers.map(|writer| writer.durability).min().unwrap_or(current)
+    }
+
     pub fn reliability_of(&self, writer: Guid) -> Option<Reliability> {
         self.writers.iter().find(|known| known.guid == writer).map(|known| known.reliability)
     }
@@ -218,6 +225,21 @@ mod tests {
         source.remove(Guid([1; 16]));
         source.remove(Guid([3; 16]));
         assert_eq!(durabilities(plan(&source, None)), [None, Some(Durability::Volatile)]);
+    }
+
+    #[test]
+    fn outputs_are_transient_local_while_all_present_publishers_of_the_type_are() {
+        let (volatile, latched) = (Durability::Volatile, Durability::TransientLocal);
+        let mut source = Source::default();
+        assert_eq!([volatile, latched].map(|last| source.durability("T", last)), [volatile, latched]);
+        source.insert(&writer(1, "T", Reliability::Reliable, latched));
+        source.insert(&writer(2, "U", Reliability::Reliable, volatile));
+        assert_eq!(source.durability("T", volatile), latched);
+        source.insert(&writer(3, "T", Reliability::Reliable, volatile));
+        assert_eq!(source.durability("T", volatile), volatile);
+        assert_eq!(source.durability("T", latched), volatile);
+        source.remove(Guid([3; 16]));
+        assert_eq!(source.durability("T", volatile), latched);
     }
 
     #[test]

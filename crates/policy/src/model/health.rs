@@ -6,6 +6,7 @@ use serde::Serialize;
 use super::drops::DropCounts;
 use super::modes::UnmatchedPolicy;
 use super::network::NetworkRefusals;
+use super::qos::Durability;
 use super::sample::Guid;
 use super::time::MonotonicNs;
 use super::type_hash::{DdsType, TypeHash};
@@ -371,9 +372,16 @@ pub struct RouteInfo {
     pub other_type: FixedText,
     /// The hash that it announces.
     pub other_hash: TypeHash,
+    /// 1 if all present publishers offer TRANSIENT_LOCAL, or the last ones did, else 0.
+    pub transient_local: u64,
 }
 
 impl RouteInfo {
+    /// What the publishers offer: it applies to outputs for which the configuration gives no DURABILITY.
+    pub fn durability(&self) -> Durability {
+        if self.transient_local == 0 { Durability::Volatile } else { Durability::TransientLocal }
+    }
+
     /// The type that the outputs of the route announce; `None` while it is unknown.
     pub fn announced_type(&self) -> Option<DdsType<'_>> {
         let name = self.dds_type.as_str();
