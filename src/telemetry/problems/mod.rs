@@ -45,6 +45,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     for route in &now.routes {
         dropped(route, now, before, &mut problems);
     }
+    problems.extend(now.routes.iter().filter_map(publishers::never_served));
     for (route, output) in outputs(now) {
         problems.extend(readers::unmatched(route, output, now));
         slow_readers(route, output, now, before, &mut problems);

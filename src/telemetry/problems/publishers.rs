@@ -1,9 +1,9 @@
 //! Problems of a route's publishers.
 
 use super::super::snapshot::{RouteReading, Snapshot, type_name};
-use super::super::text::printable;
+use super::super::text::{counted, printable};
 use super::{Level, Problem};
-use crate::model::{Guid, PublisherAccount};
+use crate::model::{DropReason, Guid, PublisherAccount};
 
 /// A problem names at most this many publishers.
 const MAX_NAMED_PUBLISHERS: usize = 3;
@@ -29,6 +29,20 @@ pub(super) fn lost_by_publisher(now: &Snapshot, route: &RouteReading, former: &R
     let named = named.map(|(lost, writer)| format!("{lost} from {}", now.endpoint_name("writer", *writer)));
     let and_others = if losses.len() > MAX_NAMED_PUBLISHERS { ", and others" } else { "" };
     format!(": {}{and_others}", named.collect::<Vec<_>>().join(", "))
+}
+
+/// A route of which ingress has refused every sample as too large. The problem stays: the only sample of a
+/// latched topic may have been refused long ago.
+pub(super) fn never_served(route: &RouteReading) -> Option<Problem> {
+    let refused = route.counters.drops.get(DropReason::TooLarge);
+    (refused > 0 && route.counters.published == 0).then(|| {
+        let (id, refused) = (&route.id, counted(refused, "sample"));
+        let text = format!(
+            "route {id}: nothing is forwarded: each of {refused} so far was {} (too_large), and restart the bridge",
+            DropReason::TooLarge.meaning()
+        );
+        Problem::new(format!("route {id}"), Level::Error, text)
+    })
 }
 
 /// A publisher whose clock does not agree with this computer's.
@@ -128,7 +142,7 @@ pub(super) fn no_publisher(route: &RouteReading) -> Option<Problem> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::problems_after;
+    use super::super::tests::{healthy, problems_after};
     use super::*;
     use crate::model::{FixedText, NamedEndpoint, RouteInfo, TypeHash};
 
@@ -151,6 +165,21 @@ mod tests {
         let [problem] = problems.as_slice() else { panic!("{problems:?}") };
         let named = format!("RELIABLE ones of /scan: /imu on 10.0.0.7, writer {};", Guid([2; 16]));
         assert!(problem.contains(&named), "{problem}");
+    }
+
+    #[test]
+    fn a_route_of_which_all_samples_were_too_large_is_a_problem_until_one_is_published() {
+        let of = |published| {
+            let mut now = healthy();
+            let counters = &mut now.routes[0].counters;
+            counters.drops.add(DropReason::TooLarge, 3);
+            (counters.published, counters.received) = (published, published + 3);
+            never_served(&now.routes[0]).map(|problem| problem.text)
+        };
+        let expected = "route scan: nothing is forwarded: each of 3 samples so far was larger than the route's \
+                        max_sample_bytes; raise it (too_large), and restart the bridge";
+        assert_eq!(of(0).as_deref(), Some(expected));
+        assert_eq!(of(1), None);
     }
 
     #[test]
