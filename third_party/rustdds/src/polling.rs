@@ -9,7 +9,7 @@
 // `Evented` source; user-visible sample and status channels stay mio-extras.
 
 use std::{
-  collections::BTreeMap,
+  collections::{BTreeMap, BTreeSet},
   net::Ipv4Addr,
   sync::{
     atomic::{AtomicU64, Ordering},
@@ -93,6 +93,8 @@ pub(crate) struct Hooks {
   pub discovery_peers: Vec<Ipv4Addr>,
   /// See `DomainParticipantBuilder::with_dscp`.
   pub dscp: u8,
+  /// See `DomainParticipantBuilder::with_urgent_topics`.
+  pub urgent_topics: BTreeSet<String>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

@@ -1,6 +1,6 @@
 // use mio::Token;
 use std::{
-  collections::HashMap,
+  collections::{BTreeSet, HashMap},
   io,
   io::ErrorKind,
   net::{IpAddr, Ipv4Addr},
@@ -151,6 +151,15 @@ impl DomainParticipantBuilder {
   /// that the participant sends by unicast.
   pub fn with_dscp(mut self, dscp: u8) -> Self {
     self.hooks.dscp = dscp;
+    self
+  }
+
+  /// Gives the readers of these topics a UDP port of their own, which they announce
+  /// without a multicast address. A datagram that arrives there is handled before those
+  /// that wait in other sockets, so a small sample does not wait for the fragments of
+  /// large ones that arrived before it.
+  pub fn with_urgent_topics(mut self, names: impl IntoIterator<Item = String>) -> Self {
+    self.hooks.urgent_topics = names.into_iter().collect();
     self
   }
 
@@ -807,6 +816,10 @@ impl DomainParticipant {
     self.dpi.lock().unwrap().self_locators()
   }
 
+  pub(crate) fn urgent_topics(&self) -> Arc<BTreeSet<String>> {
+    Arc::clone(&self.dpi.lock().unwrap().dpi.urgent_topics)
+  }
+
   /// Announces from now on the addresses that these interfaces have.
   pub(crate) fn follow_interfaces(&self, interfaces: &[IfAddr]) {
     self.dpi.lock().unwrap().dpi.follow_interfaces(interfaces);
@@ -1358,6 +1371,8 @@ pub(crate) struct DomainParticipantInner {
 
   // RTPS locators describing how to reach this DP
   self_locators: HashMap<mio1::Token, Vec<Locator>>,
+  // Topics whose readers announce the listener for urgent traffic.
+  urgent_topics: Arc<BTreeSet<String>>,
   // Port of each listener, and whether it is one to multicast.
   listener_kinds: HashMap<mio1::Token, (u16, bool)>,
 
@@ -1411,7 +1426,7 @@ impl DomainParticipantInner {
     only_networks: Option<Vec<NetworkSelector>>,
     same_host_loopback: bool,
     dp_waker: LoopWaker,
-    hooks: Hooks,
+    mut hooks: Hooks,
     discovery_sample_sender: ReadySender<mio1::Token>,
   ) -> CreateResult<Self> {
     #[cfg(not(feature = "security"))]
@@ -1509,13 +1524,32 @@ impl DomainParticipantInner {
 
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
 
+    let mut urgent_topics = std::mem::take(&mut hooks.urgent_topics);
+    if !urgent_topics.is_empty() {
+      let size = socket_receive_buffer_size;
+      match UDPListener::new_unicast_with_buf_size("0.0.0.0", 0, size, &interfaces) {
+        Ok(listener) => {
+          listeners.insert(URGENT_TRAFFIC_LISTENER_TOKEN, listener);
+        }
+        // They are received as all others are.
+        Err(e) => {
+          warn!("Cannot open a socket for urgent topics: {e}");
+          urgent_topics.clear();
+        }
+      }
+    }
+
     #[cfg(unix)]
     let onlooker_sockets = hooks.on_sample_arriving.is_some().then(|| {
-      [USER_TRAFFIC_LISTENER_TOKEN, USER_TRAFFIC_MUL_LISTENER_TOKEN]
-        .iter()
-        .filter_map(|token| listeners.get(token))
-        .map(UDPListener::onlooker)
-        .collect()
+      [
+        USER_TRAFFIC_LISTENER_TOKEN,
+        USER_TRAFFIC_MUL_LISTENER_TOKEN,
+        URGENT_TRAFFIC_LISTENER_TOKEN,
+      ]
+      .iter()
+      .filter_map(|token| listeners.get(token))
+      .map(UDPListener::onlooker)
+      .collect()
     });
 
     // construct our own Locators
@@ -1659,6 +1693,7 @@ impl DomainParticipantInner {
       discovery_db_event_receiver,
       status_receiver,
       self_locators,
+      urgent_topics: Arc::new(urgent_topics),
       listener_kinds,
       security_plugins_handle,
       only_networks,

@@ -1,5 +1,5 @@
 use std::{
-  collections::HashMap,
+  collections::{BTreeSet, HashMap},
   sync::{Arc, RwLock},
   time::Duration as StdDuration,
 };
@@ -40,7 +40,7 @@ use crate::{
     new_shared_timer, timeout_until, LoopWaker, ReadyReceiver, SharedTimer, WakeReceiver,
     WakeSender,
   },
-  rtps::constant::*,
+  rtps::{constant::*, rtps_reader_proxy::RtpsReaderProxy},
   serialization::{pl_cdr_adapters::*, CDRDeserializerAdapter, CDRSerializerAdapter},
   structure::{
     duration::Duration,
@@ -291,6 +291,7 @@ pub(crate) struct Discovery {
   // Those of this participant. A copy, since the participant must not be locked while
   // the database is.
   locators: HashMap<Token, Vec<Locator>>,
+  urgent_topics: Arc<BTreeSet<String>>,
   #[cfg(target_os = "linux")]
   interface_watch: Option<InterfaceWatch>,
   is_follow_scheduled: bool,
@@ -770,6 +771,7 @@ impl Discovery {
       // Not as the participant has them: what has changed since is followed then.
       interfaces: Vec::new(),
       locators: HashMap::new(),
+      urgent_topics: Arc::default(),
       #[cfg(target_os = "linux")]
       interface_watch: None,
       is_follow_scheduled: false,
@@ -1115,6 +1117,7 @@ impl Discovery {
     dp.follow_interfaces(&interfaces);
     let after = dp.self_locators();
     self.locators.clone_from(&after);
+    self.urgent_topics = dp.urgent_topics();
     info!("Network interfaces now: {interfaces:?}");
     self.send_discovery_notification(DiscoveryNotificationType::InterfacesChanged { interfaces });
     if before != after {
@@ -2135,10 +2138,13 @@ impl Discovery {
 
     if do_nonsecure_write {
       let mut current = reader_data.clone();
-      if let Some(unicast) = self.locators.get(&USER_TRAFFIC_LISTENER_TOKEN) {
-        let multicast = self.locators.get(&USER_TRAFFIC_MUL_LISTENER_TOKEN).cloned();
-        current.reader_proxy.unicast_locator_list = unicast.clone();
-        current.reader_proxy.multicast_locator_list = multicast.unwrap_or_default();
+      if self.locators.contains_key(&USER_TRAFFIC_LISTENER_TOKEN) {
+        let topic_name = reader_data.subscription_topic_data.topic_name();
+        let is_urgent = self.urgent_topics.contains(topic_name);
+        let (unicast, multicast) =
+          RtpsReaderProxy::user_traffic_locators(&self.locators, is_urgent);
+        current.reader_proxy.unicast_locator_list = unicast;
+        current.reader_proxy.multicast_locator_list = multicast;
       }
       match self.announced_readers.announce(
         &self.dcps_subscription.writer,

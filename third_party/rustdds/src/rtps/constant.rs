@@ -464,10 +464,12 @@ pub const DISCOVERY_MUL_LISTENER_TOKEN: Token = Token(7 + PTB);
 pub const USER_TRAFFIC_LISTENER_TOKEN: Token = Token(8 + PTB);
 pub const USER_TRAFFIC_MUL_LISTENER_TOKEN: Token = Token(9 + PTB);
 
+// User traffic of urgent topics, see `DomainParticipantBuilder::with_urgent_topics`.
+pub const URGENT_TRAFFIC_LISTENER_TOKEN: Token = Token(12 + PTB);
+
 pub const ADD_READER_TOKEN: Token = Token(10 + PTB);
 pub const REMOVE_READER_TOKEN: Token = Token(11 + PTB);
 
-// pub const READER_CHANGE_TOKEN: Token = Token(12 + PTB);
 // pub const DATAREADER_CHANGE_TOKEN: Token = Token(13 + PTB);
 
 // pub const ADD_DATAREADER_TOKEN: Token = Token(14 + PTB);

@@ -158,8 +158,13 @@ pub struct DPEventLoop {
   hooks: Hooks,
 }
 
-// Datagrams of one socket that are handled before timers and commands.
+// Datagrams of one socket that are handled before timers and commands; with urgent
+// topics up to URGENT_DATAGRAMS_AHEAD more go before each of them.
 const DATAGRAMS_PER_TURN: usize = 64;
+
+// Urgent datagrams that are handled before one of another socket, so that a flood of
+// them keeps no other socket from its turn.
+const URGENT_DATAGRAMS_AHEAD: usize = 4;
 
 impl DPEventLoop {
   // This pub(crate) , because it should be constructed only by DomainParticipant.
@@ -382,6 +387,7 @@ impl DPEventLoop {
               DISCOVERY_LISTENER_TOKEN
               | DISCOVERY_MUL_LISTENER_TOKEN
               | USER_TRAFFIC_LISTENER_TOKEN
+              | URGENT_TRAFFIC_LISTENER_TOKEN
               | USER_TRAFFIC_MUL_LISTENER_TOKEN => {
                 if !readable.contains(&token) {
                   readable.push(token);
@@ -446,30 +452,45 @@ impl DPEventLoop {
   // Readiness is edge-triggered: nobody says again what was left.
   //
   // Each datagram is handled before the next one is read, so that the first of
-  // many does not wait for all others.
+  // many does not wait for all others. Before each one those of the urgent topics have
+  // their turn: the fragments of one large sample take milliseconds.
   fn receive(&mut self, token: Token) -> bool {
+    let has_urgent = token != URGENT_TRAFFIC_LISTENER_TOKEN
+      && self
+        .udp_listeners
+        .contains_key(&URGENT_TRAFFIC_LISTENER_TOKEN);
     for _ in 0..DATAGRAMS_PER_TURN {
-      let Some(listener) = self.udp_listeners.get_mut(&token) else {
-        error!("No listener with token {token:?}");
+      let ahead = if has_urgent { URGENT_DATAGRAMS_AHEAD } else { 0 };
+      let _ = (0..ahead).all(|_| self.receive_one(URGENT_TRAFFIC_LISTENER_TOKEN));
+      if !self.receive_one(token) {
         return false;
-      };
-      let Some((packet, origin)) = listener.next_message() else {
-        return false;
-      };
-      if let Some(hook) = &mut self.hooks.on_sample_arriving {
-        if let Some(arriving) = sample_in(&packet) {
-          hook(
-            arriving.writer,
-            arriving.number.into(),
-            arriving.left_bytes as usize,
-          );
-        }
       }
-      self
-        .message_receiver
-        .handle_received_packet(&packet, origin);
-      self.call_application();
     }
+    true
+  }
+
+  // Receives one datagram from that socket, if one waits there.
+  fn receive_one(&mut self, token: Token) -> bool {
+    let Some(listener) = self.udp_listeners.get_mut(&token) else {
+      error!("No listener with token {token:?}");
+      return false;
+    };
+    let Some((packet, origin)) = listener.next_message() else {
+      return false;
+    };
+    if let Some(hook) = &mut self.hooks.on_sample_arriving {
+      if let Some(arriving) = sample_in(&packet) {
+        hook(
+          arriving.writer,
+          arriving.number.into(),
+          arriving.left_bytes as usize,
+        );
+      }
+    }
+    self
+      .message_receiver
+      .handle_received_packet(&packet, origin);
+    self.call_application();
     true
   }
 

@@ -1,6 +1,6 @@
 use std::{
   cmp::max,
-  collections::{BTreeMap, BTreeSet},
+  collections::{BTreeMap, BTreeSet, HashMap},
   net::{Ipv4Addr, SocketAddr},
   time::Instant,
 };
@@ -8,6 +8,7 @@ use std::{
 use bit_vec::BitVec;
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
+use mio1::Token;
 
 use crate::{
   dds::{participant::DomainParticipant, qos::QosPolicies},
@@ -387,15 +388,37 @@ impl RtpsReaderProxy {
     self.unsent_changes = self.unsent_changes.split_off(&before_seq_num);
   }
 
+  /// The unicast and multicast addresses that a reader of a user's topic announces.
+  pub fn user_traffic_locators(
+    self_locators: &HashMap<Token, Vec<Locator>>,
+    is_urgent: bool,
+  ) -> (Vec<Locator>, Vec<Locator>) {
+    let of = |token| self_locators.get(&token).cloned().unwrap_or_default();
+    if is_urgent {
+      (of(URGENT_TRAFFIC_LISTENER_TOKEN), Vec::new())
+    } else {
+      (
+        of(USER_TRAFFIC_LISTENER_TOKEN),
+        of(USER_TRAFFIC_MUL_LISTENER_TOKEN),
+      )
+    }
+  }
+
   pub fn from_reader(reader: &ReaderIngredients, domain_participant: &DomainParticipant) -> Self {
     let mut self_locators = domain_participant.self_locators(); // This clones a map of locator lists.
-    let (unicast_token, multicast_token) = if reader.guid.entity_id.kind().is_user_defined() {
-      (USER_TRAFFIC_LISTENER_TOKEN, USER_TRAFFIC_MUL_LISTENER_TOKEN)
-    } else {
-      (DISCOVERY_LISTENER_TOKEN, DISCOVERY_MUL_LISTENER_TOKEN)
-    };
-    let unicast_locator_list = self_locators.remove(&unicast_token).unwrap_or_default();
-    let multicast_locator_list = self_locators.remove(&multicast_token).unwrap_or_default();
+    let (unicast_locator_list, multicast_locator_list) =
+      if reader.guid.entity_id.kind().is_user_defined() {
+        let is_urgent = domain_participant
+          .urgent_topics()
+          .contains(&reader.topic_name);
+        Self::user_traffic_locators(&self_locators, is_urgent)
+      } else {
+        let mut take = |token| self_locators.remove(&token).unwrap_or_default();
+        (
+          take(DISCOVERY_LISTENER_TOKEN),
+          take(DISCOVERY_MUL_LISTENER_TOKEN),
+        )
+      };
     Self {
       remote_reader_guid: reader.guid,
       remote_group_entity_id: EntityId::UNKNOWN, // TODO
