@@ -198,7 +198,7 @@ fn routes(d: &mut Differences, old: &Settings, new: &Settings) {
 fn compare_route(d: &mut Differences, old: &Route, new: &Route) {
     let of = &format!("topics[{}]", old.id);
     compare!(d, of, old, new, Route {
-        input_topic, message_type, max_sample_bytes, retained_samples; id, input_qos
+        input_topic, message_type, max_sample_bytes, priority, retained_samples; id, input_qos
     });
     let of = &format!("{of}.qos_overrides.input");
     compare!(d, of, old.input_qos, new.input_qos, InputQos {

@@ -1,5 +1,6 @@
 //! Reads the routes and their outputs, and checks them against each other.
 
+use std::cmp::Reverse;
 use std::collections::{HashMap, HashSet};
 use std::hash::Hash;
 
@@ -60,6 +61,9 @@ pub(super) fn read(
         }
         routes.push(route);
     }
+    for lane in &mut lanes {
+        lane.outputs.sort_by_key(|output| Reverse(routes[output.route].priority));
+    }
     (routes, lanes)
 }
 
@@ -102,6 +106,7 @@ impl<'f> RouteReader<'_, 'f> {
         let message_type =
             field.get("message_type").parsed(TypeName::ALLOWED, |text| TypeName::try_from(text).ok());
         let max_sample_bytes = field.get("max_sample_bytes").count();
+        let priority = field.get("priority").count_or_default();
         let retained_samples = field.get("retained_samples").count();
 
         let overrides = field.section("qos_overrides");
@@ -116,6 +121,7 @@ impl<'f> RouteReader<'_, 'f> {
                 message_type,
                 input_qos,
                 max_sample_bytes: max_sample_bytes.unwrap_or(self.max_sample_bytes),
+                priority,
                 retained_samples: retained_samples.unwrap_or_else(|| self.retained_samples(&outputs)),
             }),
             _ => None,

@@ -138,6 +138,8 @@ pub struct Route {
     pub input_qos: InputQos,
     /// The largest sample that ingress accepts, in bytes of serialized payload.
     pub max_sample_bytes: usize,
+    /// Samples of routes with a higher priority go first.
+    pub priority: u8,
     /// Samples kept in shared memory for a restarted lane: those that it catches up with, and those that a
     /// `TRANSIENT_LOCAL` lane offers to late joiners.
     pub retained_samples: usize,

@@ -103,6 +103,9 @@ impl Participant {
     /// thread calls `on_arriving` with the writer's GUID, the sequence number, and the bytes of the sample
     /// that are still missing after this datagram, as the datagram claims.
     ///
+    /// Readers of `urgent_topics`, which are DDS topic names, get a UDP port of their own. What arrives there
+    /// is received before what waits on other ports.
+    ///
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
     /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
     /// true if it has left work undone; it is then called again soon.
@@ -111,10 +114,14 @@ impl Participant {
     /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
+        urgent_topics: impl IntoIterator<Item = String>,
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        Self::build(options, |builder| builder.on_sample_arriving(on_arriving).on_received(on_received))
+        Self::build(options, |builder| {
+            let builder = builder.with_urgent_topics(urgent_topics);
+            builder.on_sample_arriving(on_arriving).on_received(on_received)
+        })
     }
 
     fn build(

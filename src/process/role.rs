@@ -123,10 +123,11 @@ impl Role {
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
+        urgent_topics: impl IntoIterator<Item = String>,
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
-        let participant = Participant::open_receiving(options, on_arriving, on_received)?;
+        let participant = Participant::open_receiving(options, urgent_topics, on_arriving, on_received)?;
         self.record_participant(&participant);
         Ok(participant)
     }

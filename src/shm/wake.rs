@@ -116,6 +116,11 @@ impl LaneSleeper {
         Self { words, seen_count, trusts_announcements: true, spin_until: None }
     }
 
+    /// The number of wakes so far. While it is the same, no sample has arrived.
+    pub fn wakes(&self) -> u32 {
+        self.words.wake_count().load(Ordering::Acquire)
+    }
+
     /// Sleeps until a wake, or for `timeout` at most. Returns at once if there was a wake since the last
     /// return, and at the first call in a lane process. A signal also ends the sleep.
     pub fn sleep(&mut self, timeout: Duration) -> Woken {

@@ -112,7 +112,7 @@ fn a_sample_is_told_of_before_it_is_there() {
     };
     let network = DdsNetwork::of_domain(69);
     let mut there =
-        Participant::open_receiving(&options("there", &network), on_arriving, on_received).unwrap();
+        Participant::open_receiving(&options("there", &network), [], on_arriving, on_received).unwrap();
     let mut here = participant("here", 69);
     let reader = there
         .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
@@ -184,15 +184,9 @@ fn an_onlooker_sees_samples_come_and_takes_none() {
     let network = DdsNetwork::of_domain(66);
     // The thread that receives is held up here, so that the onlooker is in time.
     let hold = Arc::new(Mutex::new(()));
-    let on_received = {
-        let hold = Arc::clone(&hold);
-        move || {
-            drop(hold.lock());
-            false
-        }
-    };
+    let on_received = support::waits_for(&hold);
     let mut there =
-        Participant::open_receiving(&options("there", &network), |_, _, _| {}, on_received).unwrap();
+        Participant::open_receiving(&options("there", &network), [], |_, _, _| {}, on_received).unwrap();
     let mut here = participant("here", 66);
     // A RELIABLE one would get what the onlooker took once more.
     let reader = there

@@ -9,4 +9,5 @@ mod cli;
 mod clocks;
 mod demo;
 mod metrics;
+mod priority;
 mod reload;

@@ -456,6 +456,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("topics.0.lanes", "null", r#"["critical", "noncritical"]"#),
     ("topics.0.outputs.critical", r#""/critical""#, r#""/critical_2""#),
     ("topics.0.max_sample_bytes", "1000", "2000"),
+    ("topics.0.priority", "0", "5"),
     ("topics.0.retained_samples", "8", "9"),
     ("topics.0.qos_overrides.input.reliability", "null", r#""RELIABLE""#),
     ("topics.0.qos_overrides.input.history", "null", r#""KEEP_ALL""#),

@@ -28,6 +28,7 @@ use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use nix::fcntl::{Flock, FlockArg};
@@ -53,6 +54,15 @@ pub fn wait_for<T>(what: impl Display, mut probe: impl FnMut() -> Option<T>) -> 
 /// Like [`wait_for`], for a condition.
 pub fn wait_until(what: impl Display, mut condition: impl FnMut() -> bool) {
     wait_for(what, || condition().then_some(()));
+}
+
+/// A callback of a participant that holds up its receiving thread while `hold` is locked.
+pub fn waits_for(hold: &Arc<Mutex<()>>) -> impl FnMut() -> bool + Send + 'static {
+    let hold = Arc::clone(hold);
+    move || {
+        drop(hold.lock());
+        false
+    }
 }
 
 /// The root of this source tree.

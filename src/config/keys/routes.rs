@@ -94,6 +94,12 @@ pub(super) const ROWS: &[Row] = &[
         "The largest serialized sample; ingress drops a larger one as `too_large`. Shared memory is \
          reserved for samples of this size.",
     ),
+    restarts(&["topics[].priority"], Whole(0, 99, ""), "0").doc(
+        "Which routes go first: each lane sends waiting samples of a higher number first, and ingress \
+         receives critical routes above the lowest number in use on a UDP port of their own; a route on \
+         noncritical lanes alone has none. A noncritical lane does not interrupt what its tokens allow of a \
+         lower number.",
+    ),
     restarts(
         &["topics[].retained_samples"],
         Whole(1, 10_000, " samples"),

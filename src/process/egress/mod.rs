@@ -23,16 +23,17 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, participant_options};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{Configuration, Forwarding, Settings};
+use crate::config::{self, Configuration, Forwarding, Settings};
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::{critical_drop, mode_and_source};
-use crate::shm::{Boards, LaneSleeper, ProcessRole};
+use crate::shm::{Boards, LaneSleeper, ProcessRole, ShmSample};
 use arena::CopyArena;
 use noncritical::Noncritical;
 use output::Output;
 
-/// Samples that a critical lane takes from one route before it serves the next one.
+/// Samples that a critical lane takes from one route before it serves the next one, and the samples of higher
+/// priorities that it sends meanwhile. Both are limited, so that each route has its turn.
 const SAMPLES_PER_TURN: usize = 32;
 
 /// At shutdown, how long a critical lane continues to forward samples that wait or still arrive.
@@ -95,8 +96,11 @@ pub fn end_unused(name: &str) {
 
 struct Egress {
     index: usize,
-    /// Before the participant: the DDS library wants its readers and writers gone first.
+    /// Those of the highest priority first. Before the participant: the DDS library wants its readers and
+    /// writers gone first.
     outputs: Vec<Output>,
+    /// For each output, how many before it have a higher priority.
+    more_urgent: Vec<usize>,
     participant: Participant,
     role: Role,
     /// Chooses which samples to send, and when; `None` in a critical lane.
@@ -121,13 +125,16 @@ impl Egress {
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
         let mut participant = role.join(&options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
+        let mut more_urgent = Vec::with_capacity(lane.outputs.len());
+        let priority = |output: &config::Output| settings.routes[output.route].priority;
         for output in &lane.outputs {
+            more_urgent.push(lane.outputs.partition_point(|other| priority(other) > priority(output)));
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
         }
         let now = clock::monotonic();
         let noncritical = match &lane.forwarding {
             Forwarding::Everything => None,
-            Forwarding::Limited(rates) => Some(Noncritical::new(lane, *rates, now)),
+            Forwarding::Limited(rates) => Some(Noncritical::new(lane, &more_urgent, *rates, now)),
         };
         let sleeper = role.boards.sleeper(index);
         let mut egress = Self {
@@ -143,6 +150,7 @@ impl Egress {
             role,
             participant,
             outputs,
+            more_urgent,
             noncritical,
             arena: CopyArena::new(),
             sleeper,
@@ -172,17 +180,38 @@ impl Egress {
             return lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode);
         }
         let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
-        for output in &mut self.outputs {
+        for place in 0..self.outputs.len() {
+            // How many samples of higher priorities may go ahead of these, and the wakes at the last look.
+            let (mut ahead, mut seen) = (SAMPLES_PER_TURN, None);
             for _ in 0..SAMPLES_PER_TURN {
-                let Some(sample) = output.take() else { break };
+                let Some(sample) = self.outputs[place].take() else { break };
                 turn = Turn::Busy;
-                match critical_drop(mode) {
-                    Some(reason) => output.drop_sample(&sample, reason),
-                    None => output.send(sample, &mut self.participant, &mut self.arena),
+                let wakes = Some(self.sleeper.wakes());
+                if std::mem::replace(&mut seen, wakes) != wakes {
+                    for urgent in 0..self.more_urgent[place] {
+                        while ahead > 0
+                            && let Some(sample) = self.outputs[urgent].take()
+                        {
+                            ahead -= 1;
+                            self.forward(urgent, sample, mode);
+                        }
+                    }
+                }
+                self.forward(place, sample, mode);
+                if ahead == 0 {
+                    break;
                 }
             }
         }
         turn
+    }
+
+    fn forward(&mut self, place: usize, sample: ShmSample, mode: LaneMode) {
+        let output = &mut self.outputs[place];
+        match critical_drop(mode) {
+            Some(reason) => output.drop_sample(&sample, reason),
+            None => output.send(sample, &mut self.participant, &mut self.arena),
+        }
     }
 
     fn sleep(&mut self, turn: &Turn) {

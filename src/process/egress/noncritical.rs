@@ -1,5 +1,7 @@
 //! Noncritical lanes: forward as many samples as their tokens allow, chosen by the lane's drop policy.
 
+use std::ops::Range;
+
 use super::Turn;
 use super::arena::CopyArena;
 use super::output::Output;
@@ -14,23 +16,32 @@ pub(super) struct Noncritical {
     rates: LaneRates,
     mode: LaneMode,
     budget: ByteBudget,
-    turn_order: PollOrder,
-    /// One for each output.
+    /// The outputs of each priority, the highest first; those of one take turns.
+    turn_orders: Vec<(Range<usize>, PollOrder)>,
     shapers: Vec<RouteShaper<ShmSample>>,
 }
 
 impl Noncritical {
-    pub fn new(lane: &Lane, rates: LaneRates, now: MonotonicNs) -> Self {
+    /// `more_urgent` has for each output how many before it have a higher priority.
+    pub fn new(lane: &Lane, more_urgent: &[usize], rates: LaneRates, now: MonotonicNs) -> Self {
         let shapers = lane
             .outputs
             .iter()
             .map(|output| RouteShaper::new(rates_of(rates, output.qos.durability), now))
             .collect();
+        let turn_orders = more_urgent
+            .chunk_by(|one, other| one == other)
+            .scan(0, |start, chunk| {
+                let outputs = *start..*start + chunk.len();
+                *start = outputs.end;
+                Some((outputs, PollOrder::default()))
+            })
+            .collect();
         Self {
             rates,
             mode: LaneMode::Normal,
             budget: ByteBudget::new(rates.normal.max_bytes_per_s, now),
-            turn_order: PollOrder::default(),
+            turn_orders,
             shapers,
         }
     }
@@ -75,30 +86,33 @@ impl Noncritical {
         let mut token_at = MonotonicNs(u64::MAX);
         let mut waits_for_sample = false;
         let mut sent = false;
-        for index in self.turn_order.order(outputs.len()) {
-            let (shaper, output) = (&mut self.shapers[index], &mut outputs[index]);
-            loop {
-                let decision = shaper.poll(&mut self.budget, now, now_wall, |sample, _, reason| {
-                    output.drop_sample(&sample, reason);
-                });
-                match decision {
-                    Decision::Send(sample, _) => {
-                        output.send(sample, participant, arena);
-                        self.turn_order.sent(index);
-                        sent = true;
+        for (same_priority, turn_order) in &mut self.turn_orders {
+            for place in turn_order.order(same_priority.len()) {
+                let index = same_priority.start + place;
+                let (shaper, output) = (&mut self.shapers[index], &mut outputs[index]);
+                loop {
+                    let decision = shaper.poll(&mut self.budget, now, now_wall, |sample, _, reason| {
+                        output.drop_sample(&sample, reason);
+                    });
+                    match decision {
+                        Decision::Send(sample, _) => {
+                            output.send(sample, participant, arena);
+                            turn_order.sent(place);
+                            sent = true;
+                        }
+                        Decision::SleepUntil(at) => {
+                            token_at = MonotonicNs(token_at.0.min(at.0));
+                            break;
+                        }
+                        Decision::WaitForSample => {
+                            waits_for_sample = true;
+                            break;
+                        }
+                        Decision::Closed => break,
                     }
-                    Decision::SleepUntil(at) => {
-                        token_at = MonotonicNs(token_at.0.min(at.0));
-                        break;
-                    }
-                    Decision::WaitForSample => {
-                        waits_for_sample = true;
-                        break;
-                    }
-                    Decision::Closed => break,
                 }
+                output.set_queued(shaper.waiting());
             }
-            output.set_queued(shaper.waiting());
         }
         if sent {
             // More samples may have arrived meanwhile, and tokens may be left.

@@ -108,10 +108,12 @@ impl Ingress {
                 lanes.push(ServedLane { waker: role.boards.waker(index), class, serves });
             }
         }
-        let receiving = Arc::new(Receiving::new(inputs, lanes));
+        let urgent: Vec<_> = urgent_routes(settings).collect();
+        let receiving = Arc::new(Receiving::new(inputs, lanes, !urgent.is_empty()));
         let (on_arriving, on_received) = receiving.hooks();
         let options = participant_options(settings, &settings.input, "ingress");
-        let participant = role.join_receiving(&options, on_arriving, on_received)?;
+        let urgent_topics = urgent.into_iter().map(|route| settings.routes[route].input_topic.to_dds());
+        let participant = role.join_receiving(&options, urgent_topics, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let early_waker = EarlyWaker::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
@@ -190,6 +192,20 @@ impl Ingress {
     }
 }
 
+/// The routes that ingress receives before all others: those on a critical lane with a priority above the
+/// lowest of all routes. A route on noncritical lanes alone never goes before a critical one.
+fn urgent_routes(settings: &Settings) -> impl Iterator<Item = usize> {
+    let lowest = settings.routes.iter().map(|route| route.priority).min().unwrap_or(0);
+    let is_critical = |index| {
+        let mut lanes = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Critical);
+        lanes.any(|lane| lane.outputs.iter().any(|output| output.route == index))
+    };
+    let routes = settings.routes.iter().enumerate();
+    routes
+        .filter(move |(index, route)| route.priority > lowest && is_critical(*index))
+        .map(|(index, _)| index)
+}
+
 /// Writes the status line of ingress for the service manager. Returns whether the caller has to ring the
 /// receiving thread, because this locks the inputs.
 fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now: MonotonicNs) -> bool {
@@ -211,4 +227,30 @@ fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now:
     write_drops(line, drops.iter());
     write_list(line, "; no publisher found yet for", without.iter());
     ring
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::parse;
+
+    fn urgent(routes: &[(&str, u8)]) -> Vec<usize> {
+        let mut text = "topics:\n".to_owned();
+        for (index, (lanes, priority)) in routes.iter().enumerate() {
+            let _ = writeln!(
+                text,
+                "- {{id: r{index}, input_topic: /r{index}, lanes: {lanes}, priority: {priority}}}"
+            );
+        }
+        urgent_routes(&parse(&text, "f.yaml", &|_| None).unwrap()).collect()
+    }
+
+    #[test]
+    fn only_routes_on_a_critical_lane_are_urgent() {
+        let (both, noncritical) = ("[critical, noncritical]", "[noncritical]");
+        assert_eq!(urgent(&[(both, 0), (noncritical, 9), (both, 1), ("[critical]", 2)]), [2, 3]);
+        assert_eq!(urgent(&[(both, 0), (noncritical, 9)]), [] as [usize; 0]);
+        assert_eq!(urgent(&[(both, 5), (both, 5)]), [] as [usize; 0], "none is above the lowest");
+        assert_eq!(urgent(&[(both, 5), (noncritical, 0)]), [0]);
+    }
 }

@@ -23,8 +23,12 @@ const LEFT_BYTES: usize = 64 << 10;
 /// Turns within which the missing fragments must arrive: one for each datagram, and the smallest fragments
 /// that publishers choose by default have 1.3 KB.
 const TURNS: u64 = 64;
-/// The same for a whole sample: its own turn, and one that was under way when the early waker woke the lanes.
+/// The same for a whole sample, whose own turn does not count: one that was under way when the early waker
+/// woke the lanes.
 const TURNS_WHOLE: u64 = 1;
+/// The datagrams of urgent topics that the DDS library receives before each other one, each with a turn:
+/// `URGENT_DATAGRAMS_AHEAD` in `dp_event_loop.rs`.
+const TURNS_URGENT: u64 = 4;
 
 const NONE: u64 = u64::MAX;
 const IN_VAIN: u64 = u64::MAX - 1;
@@ -59,7 +63,8 @@ pub(super) struct Receiving {
 }
 
 impl Receiving {
-    pub fn new(inputs: Vec<(Input, Arc<ArrivalFlag>)>, lanes: Vec<ServedLane>) -> Self {
+    /// `has_urgent`: whether topics are urgent, so that their datagrams go before others.
+    pub fn new(inputs: Vec<(Input, Arc<ArrivalFlag>)>, lanes: Vec<ServedLane>, has_urgent: bool) -> Self {
         let is_critical = |route: usize| {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
         };
@@ -73,7 +78,7 @@ impl Receiving {
         Self {
             routes: inputs.into_iter().enumerate().map(shared).collect(),
             lanes,
-            pending_wake: PendingWake::new(),
+            pending_wake: PendingWake::new(has_urgent),
             cpu: AtomicU32::new(0),
         }
     }
@@ -212,11 +217,14 @@ pub(super) struct PendingWake {
     /// The route and the turns that are left; [`NONE`]; or [`IN_VAIN`] if the lanes were woken and no sample
     /// followed. Any thread may replace `NONE` with a route; only the receiving thread changes a route.
     state: AtomicU64,
+    /// The turns within which a whole sample must arrive.
+    turns_whole: u64,
 }
 
 impl PendingWake {
-    pub fn new() -> Self {
-        Self { state: AtomicU64::new(NONE) }
+    pub fn new(has_urgent: bool) -> Self {
+        let turns_whole = TURNS_WHOLE + if has_urgent { TURNS_URGENT } else { 0 };
+        Self { state: AtomicU64::new(NONE), turns_whole }
     }
 
     /// Whether [`claim`](Self::claim) would return true, unless another thread calls it first.
@@ -231,7 +239,7 @@ impl PendingWake {
         if left_bytes > LEFT_BYTES {
             return false;
         }
-        let turns = if left_bytes == 0 { TURNS_WHOLE } else { TURNS };
+        let turns = if left_bytes == 0 { self.turns_whole } else { TURNS };
         let state = ((route as u64) << ROUTE_SHIFT) | turns;
         self.state.compare_exchange(NONE, state, Ordering::AcqRel, Ordering::Relaxed).is_ok()
     }
@@ -268,7 +276,7 @@ mod tests {
 
     #[test]
     fn a_claimed_wake_up_is_not_repeated() {
-        let pending = PendingWake::new();
+        let pending = PendingWake::new(false);
         for _ in 0..3 {
             assert!(pending.claim(7, 0));
             assert!(!pending.claim(7, 0), "claimed already");
@@ -283,7 +291,7 @@ mod tests {
 
     #[test]
     fn a_datagram_that_becomes_no_sample_wakes_once() {
-        let pending = PendingWake::new();
+        let pending = PendingWake::new(false);
         assert!(pending.claim(7, 0));
         for _ in 0..=TURNS_WHOLE {
             pending.count_turn();
@@ -298,8 +306,18 @@ mod tests {
     }
 
     #[test]
+    fn urgent_datagrams_may_go_before_a_claimed_sample() {
+        let pending = PendingWake::new(true);
+        assert!(pending.claim(7, 0));
+        for _ in 0..TURNS_WHOLE + TURNS_URGENT {
+            pending.count_turn();
+        }
+        assert!(!pending.take_pending(7), "in time");
+    }
+
+    #[test]
     fn the_early_waker_may_claim_during_a_turn() {
-        let pending = PendingWake::new();
+        let pending = PendingWake::new(false);
         assert!(pending.claim(7, 0));
         pending.count_turn();
         assert!(!pending.take_pending(7), "claimed, and awake");
@@ -312,7 +330,7 @@ mod tests {
 
     #[test]
     fn the_missing_fragments_may_take_64_turns() {
-        let pending = PendingWake::new();
+        let pending = PendingWake::new(false);
         assert!(!pending.may_claim(LEFT_BYTES + 1) && !pending.claim(7, LEFT_BYTES + 1));
         assert!(pending.claim(7, LEFT_BYTES));
         for _ in 0..TURNS {
