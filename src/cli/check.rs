@@ -10,7 +10,7 @@ use clap::{Arg, Args, Command};
 use serde::Serialize;
 use serde_json::json;
 
-use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, failed, print};
+use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed, print};
 use crate::config::{self, ConfigError, Place, Problem, Route, Row, Settings};
 use crate::model::{InstanceName, LaneName, RouteId, TopicName, TypeName};
 use crate::process::InForce;
@@ -49,7 +49,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let summary = Summary::of(&settings).to_string();
     let differences = match running {
         Some(running) => {
-            differences(&running, settings)
+            let file = arguments.config.try_load_with(&running.set_parameters);
+            differences(&running, file.map_err(|error| bad_configuration(&error))?.settings)
         }
         None => String::new(),
     };

@@ -27,7 +27,7 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand};
 
 use crate::clock;
-use crate::config::{self, ConfigError, Configuration, Parameters, Settings};
+use crate::config::{self, ConfigError, Configuration, Parameters, SetParameters, Settings};
 use crate::model::TopicName;
 use crate::process::{InForce, Stop};
 use crate::shm::ShmError;
@@ -136,7 +136,18 @@ impl ConfigArguments {
     }
 
     fn try_load_configuration(&self) -> Result<Configuration, ConfigError> {
-        config::load_configuration(self.path(), &self.parameters, &|name| std::env::var(name).ok())
+        self.try_load_with(&SetParameters::new())
+    }
+
+    /// Reads the configuration with parameters that were set while the bridge runs.
+    fn try_load_with(&self, set: &SetParameters) -> Result<Configuration, ConfigError> {
+        let one =
+            |(key, value): (&String, &String)| Parameters::One { key: key.clone(), value: value.clone() };
+        let parameters = [&self.parameters[..], &set.iter().map(one).collect::<Vec<_>>()].concat();
+        let env = |name: &str| std::env::var(name).ok();
+        let mut configuration = config::load_configuration(self.path(), &parameters, &env)?;
+        configuration.settings.set_parameters = set.clone();
+        Ok(configuration)
     }
 
     /// The settings in force in the running bridge; `None` when no bridge runs.

@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 use std::process::ExitCode;
 
-use super::{ConfigArguments, EXIT_WAITS, failed, no_bridge, print};
-use crate::config::Reload;
+use super::{ConfigArguments, EXIT_WAITS, bad_configuration, failed, no_bridge, print};
+use crate::config::{Reload, SetParameters};
 use crate::process::{InForce, ReloadAnswer, ReloadResult, reload_all};
 use crate::shm::root_of;
 
@@ -13,13 +13,31 @@ pub(super) fn run(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
     let file = arguments.load()?;
     // The file may have a new instance name since the bridge was started with it.
     let settings = InForce::find(&arguments.file(), Some(&file)).unwrap_or_else(|| file.clone());
+    let set = &settings.set_parameters;
+    let file = arguments.try_load_with(set).map_err(|error| {
+        let code = bad_configuration(&error);
+        eprintln!("{}", set_is_the_cause(set));
+        code
+    });
+    let file = file?.settings;
     let root = root_of(&settings);
     let answers = reload_all(&root, &settings.instance).map_err(|error| failed(&error))?;
     if answers.is_empty() {
         return Err(no_bridge(&settings, &root));
     }
-    print(&summary(&answers, file.fingerprint()))?;
+    let kept = set.iter().map(|(key, value)| format!("stays as set by a ROS 2 parameter: {key}: {value}\n"));
+    print(kept.collect::<String>() + &summary(&answers, file.fingerprint()))?;
     Ok(exit_code(&answers))
+}
+
+/// Why a file that is good by itself is bad in the running bridge, and what to do.
+fn set_is_the_cause(set: &SetParameters) -> String {
+    let set: Vec<String> = set.iter().map(|(key, value)| format!("{key}: {value}")).collect();
+    format!(
+        "The file alone is good. The likely cause is a parameter that a ROS 2 node has set in place of a value of the \
+         file: {}. Remove the one that does not fit: ros2 param delete NODE KEY, where NODE is a node of the bridge.",
+        set.join(", ")
+    )
 }
 
 fn exit_code(answers: &[ReloadAnswer]) -> ExitCode {

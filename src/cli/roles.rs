@@ -82,10 +82,10 @@ fn role(
     role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
 ) -> Result<ExitCode, ExitCode> {
     let reload_arguments = arguments.clone();
-    let reloads = ReloadRequests::on_signal(move || reload_arguments.try_load_configuration())
+    let reloads = ReloadRequests::on_signal(move |set| reload_arguments.try_load_with(set))
         .map_err(|error| failed(&error))?;
     process::end_with_supervisor();
-    let in_force = match InForce::join(&arguments.file(), arguments.try_load_configuration()) {
+    let in_force = match InForce::join(&arguments.file(), |set| arguments.try_load_with(set)) {
         Ok(in_force) => in_force,
         Err(InForceError::Config(error)) => return Err(bad_configuration(&error)),
         Err(InForceError::Shm(error)) => return run(|_| Err(error)),

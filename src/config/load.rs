@@ -9,7 +9,7 @@ use super::in_force::{Configuration, InlineSecret};
 use super::parameters::{self, Parameters};
 use super::problem::{ConfigError, Place, Problem, Problems};
 use super::qos::Profiles;
-use super::settings::{SecretSource, Settings, SharedMemory};
+use super::settings::{SecretSource, SetParameters, Settings, SharedMemory};
 use super::yaml::Node;
 use super::{control, keys, lanes, routes, yaml};
 use crate::model::{InstanceName, NodeName, TopicName, TrafficClass};
@@ -209,6 +209,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         diagnostics: control::diagnostics(root),
         overrides: control::overrides(root),
         subscribers: control::subscribers(root, &lanes),
+        set_parameters: SetParameters::new(),
         lanes,
     }
 }

@@ -11,6 +11,7 @@ mod field;
 mod in_force;
 mod keys;
 mod lanes;
+mod listed;
 mod load;
 mod parameters;
 mod problem;
@@ -26,6 +27,7 @@ mod yaml;
 
 pub use in_force::{Configuration, DecodeError, InlineSecret};
 pub use keys::{KEYS, Kind, Row, keys_at, nearest_key, rows};
+pub use listed::Listed;
 pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, named_path, parse};
 pub use parameters::Parameters;
 pub use problem::{ConfigError, Place, Problem};
@@ -33,5 +35,7 @@ pub use reload::{Change, Reload};
 pub use settings::{
     Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, Forwarding, InputQos, Lane,
     LaneRates, MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules,
-    Scheduling, SchedulingPolicy, SecretSource, Security, Settings, SharedMemory, TrustMode, Verbosity,
+    Scheduling, SchedulingPolicy, SecretSource, Security, SetParameters, Settings, SharedMemory, TrustMode,
+    Verbosity,
 };
+pub use shown::Value;

@@ -15,7 +15,7 @@ use super::settings::{
     Classifier, DdsNetwork, Diagnostics, Forwarding, InputQos, Lane, LaneRates, Output, Probes, RatePolicy,
     Route, Safety, Scheduling, Security, Settings, SharedMemory,
 };
-use super::shown::Shown;
+use super::shown::{Shown, Value};
 use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, fnv1a};
 
 /// One setting that differs between the configuration in force and a file, with its values as in the file.
@@ -87,6 +87,13 @@ impl Settings {
         let reload = Reload { changed: differences(self, &reloaded), waits: differences(&reloaded, &new) };
         (reloaded, reload)
     }
+
+    /// Every setting with its value, by the key path that a [`Change`] of it has.
+    pub(super) fn values(&self) -> Vec<(String, Value)> {
+        let mut every = Differences { all: true, found: Vec::new() };
+        compare_settings(&mut every, self, self);
+        every.found.into_iter().map(|(key, value, _)| (key, value)).collect()
+    }
 }
 
 /// The lane with the rates in `new`, which are all that a running bridge can change of it.
@@ -107,13 +114,16 @@ fn reload_lane(lane: &Lane, new: &Settings) -> Lane {
 
 #[derive(Default)]
 struct Differences {
-    found: Vec<Change>,
+    /// Whether settings that are equal are found, too.
+    all: bool,
+    /// The key path, the old value and the new one.
+    found: Vec<(String, Value, Value)>,
 }
 
 impl Differences {
     fn add<T: PartialEq + Shown>(&mut self, key: &str, old: &T, new: &T) {
-        if old != new {
-            self.found.push(Change { key: key.to_owned(), old: old.shown(), new: new.shown() });
+        if self.all || old != new {
+            self.found.push((key.to_owned(), old.value(), new.value()));
         }
     }
 }
@@ -132,7 +142,9 @@ macro_rules! compare {
 fn differences(old: &Settings, new: &Settings) -> Vec<Change> {
     let mut differences = Differences::default();
     compare_settings(&mut differences, old, new);
-    differences.found
+    let change =
+        |(key, old, new): (String, Value, Value)| Change { key, old: old.to_string(), new: new.to_string() };
+    differences.found.into_iter().map(change).collect()
 }
 
 fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
@@ -148,7 +160,7 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
         instance;
         input, node_namespace, node_name, graph_gid_bytes, routes, lanes, shared_memory, policy_hold_ms,
         ingress_scheduling, control_scheduling, classifier, probes, safety, security, diagnostics, overrides,
-        subscribers
+        subscribers, set_parameters
     });
     compare_network(d, "ros", &old.input, &new.input);
     d.add("ros.namespace", &old.node_namespace, &new.node_namespace);

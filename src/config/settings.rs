@@ -55,7 +55,12 @@ pub struct Settings {
     pub overrides: BTreeMap<String, SubscriberState>,
     /// The lanes of the listed subscribers, by subscriber id.
     pub subscribers: BTreeMap<String, LaneName>,
+    /// The parameters that were set while the bridge runs, each in place of the file's.
+    pub set_parameters: SetParameters,
 }
+
+/// Parameters that were set while the bridge runs, by key path; the values are YAML.
+pub type SetParameters = BTreeMap<String, String>;
 
 impl Settings {
     /// The name of the node of a process.

@@ -1,5 +1,6 @@
-//! Formats settings for operators, as they are written in the file.
+//! The values of settings as they are written in the file: for operators as text, for ROS 2 with their type.
 
+use std::fmt;
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
 
@@ -7,75 +8,122 @@ use super::choices::Choice;
 use super::settings::{MetricsListener, NetworkSelector, SecretSource};
 use crate::model::{History, InstanceName, LaneName, NodeName, TopicName, TypeName};
 
-/// A value that can be shown as in the file. Secrets do not implement it.
-pub(super) trait Shown {
-    /// The value as it is written in the file.
-    fn shown(&self) -> String;
+/// A value as in the file. It is displayed as text for operators.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value {
+    /// No value.
+    None,
+    /// A boolean.
+    Flag(bool),
+    /// A whole number.
+    Whole(u64),
+    /// A number.
+    Decimal(f64),
+    /// A text.
+    Text(String),
+    /// A list.
+    List(Vec<Value>),
 }
 
-macro_rules! shown_as_displayed {
-    ($($type:ty),+) => {
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::None => f.write_str("none"),
+            Self::Flag(flag) => flag.fmt(f),
+            Self::Whole(number) => number.fmt(f),
+            Self::Decimal(number) => number.fmt(f),
+            Self::Text(text) => f.write_str(text),
+            Self::List(items) => {
+                let items: Vec<String> = items.iter().map(Self::to_string).collect();
+                write!(f, "[{}]", items.join(", "))
+            }
+        }
+    }
+}
+
+/// A value that can be shown as in the file. Secrets do not implement it.
+pub(super) trait Shown {
+    fn value(&self) -> Value;
+}
+
+macro_rules! shown_as {
+    ($($type:ty: $kind:ident),+) => {
         $(impl Shown for $type {
-            fn shown(&self) -> String {
-                self.to_string()
+            fn value(&self) -> Value {
+                Value::$kind((*self).into())
             }
         })+
     };
 }
 
-shown_as_displayed!(bool, u8, u16, u32, u64, usize, f64, String);
-shown_as_displayed!(Ipv4Addr, InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
+macro_rules! shown_as_displayed {
+    ($($type:ty),+) => {
+        $(impl Shown for $type {
+            fn value(&self) -> Value {
+                Value::Text(self.to_string())
+            }
+        })+
+    };
+}
+
+shown_as!(bool: Flag, u8: Whole, u16: Whole, u32: Whole, u64: Whole, f64: Decimal);
+shown_as_displayed!(String, Ipv4Addr, InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
+
+impl Shown for usize {
+    fn value(&self) -> Value {
+        Value::Whole(*self as u64)
+    }
+}
 
 impl<T: Choice> Shown for T {
-    fn shown(&self) -> String {
+    fn value(&self) -> Value {
         let word = T::WORDS.iter().find(|(_, value)| value == self);
-        word.map_or_else(String::new, |(word, _)| (*word).to_owned())
+        Value::Text(word.map_or_else(String::new, |(word, _)| (*word).to_owned()))
     }
 }
 
 impl Shown for History {
-    fn shown(&self) -> String {
-        match self {
+    fn value(&self) -> Value {
+        Value::Text(match self {
             Self::KeepLast { depth } => format!("KEEP_LAST {depth}"),
             Self::KeepAll => "KEEP_ALL".to_owned(),
-        }
+        })
     }
 }
 
 impl Shown for SecretSource {
-    fn shown(&self) -> String {
-        match self {
+    fn value(&self) -> Value {
+        Value::Text(match self {
             Self::File(path) => format!("the file {}", path.display()),
             Self::Environment(variable) => format!("the variable {variable}"),
             Self::ConfigFile => "in this file".to_owned(),
-        }
+        })
     }
 }
 
 impl Shown for MetricsListener {
-    fn shown(&self) -> String {
-        match self {
+    fn value(&self) -> Value {
+        Value::Text(match self {
             Self::Tcp(address, port) => std::net::SocketAddr::new(*address, *port).to_string(),
             Self::Unix(path) => format!("unix:{}", path.display()),
-        }
+        })
     }
 }
 
 impl Shown for PathBuf {
-    fn shown(&self) -> String {
-        self.display().to_string()
+    fn value(&self) -> Value {
+        Value::Text(self.display().to_string())
     }
 }
 
 impl<T: Shown> Shown for Option<T> {
-    fn shown(&self) -> String {
-        self.as_ref().map_or_else(|| "none".to_owned(), Shown::shown)
+    fn value(&self) -> Value {
+        self.as_ref().map_or(Value::None, Shown::value)
     }
 }
 
 impl<T: Shown> Shown for Vec<T> {
-    fn shown(&self) -> String {
-        let items: Vec<String> = self.iter().map(Shown::shown).collect();
-        format!("[{}]", items.join(", "))
+    fn value(&self) -> Value {
+        Value::List(self.iter().map(Shown::value).collect())
     }
 }

@@ -38,9 +38,11 @@ impl Payload {
     }
 }
 
-/// Of topics with samples of at most some KiB: graph entries, probes and their responses. Anyone on the
-/// network can send fragments that claim more.
-struct SmallSamples;
+/// Of topics with samples of at most some KiB: graph entries, probes and their responses, requests. Anyone on
+/// the network can send fragments that claim more.
+struct SmallSamples {
+    max_bytes: usize,
+}
 
 impl SampleMemory for SmallSamples {
     fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
@@ -48,7 +50,7 @@ impl SampleMemory for SmallSamples {
     }
 
     fn limits(&self) -> AssemblyLimits {
-        AssemblyLimits { max_sample_bytes: 1 << 20, max_total_bytes: 4 << 20 }
+        AssemblyLimits { max_sample_bytes: self.max_bytes, max_total_bytes: 4 * self.max_bytes }
     }
 }
 
@@ -148,7 +150,13 @@ impl RawReader {
 
     /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all.
     pub fn expect_small_samples(&self) {
-        self.lend_memory(Arc::new(SmallSamples));
+        self.expect_samples_up_to(1 << 20);
+    }
+
+    /// Limits the memory for unfinished samples of the topic to `max_bytes` a sample and four times that in
+    /// all.
+    pub fn expect_samples_up_to(&self, max_bytes: usize) {
+        self.lend_memory(Arc::new(SmallSamples { max_bytes }));
     }
 
     /// Takes the next sample, if one waits, and calls `read` once with its payload and encapsulation.

@@ -6,10 +6,11 @@ use std::time::Duration;
 use bytes::Bytes;
 
 use super::qos;
+use super::reader::SampleOrigin;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
-    DataWriterStatus, GUID, RepresentationIdentifier, StatusEvented, Timestamp, WriteOptionsBuilder,
-    dds::result::WriteError as DdsWriteError,
+    DataWriterStatus, GUID, RepresentationIdentifier, SampleIdentity, SequenceNumber, StatusEvented,
+    Timestamp, WriteOptionsBuilder, dds::result::WriteError as DdsWriteError,
 };
 use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp, TypeHash, UnmatchedPolicy};
 
@@ -112,6 +113,29 @@ impl RawWriter {
     ) -> Result<(), WriteError> {
         let payload = RawPayload { bytes: payload, encapsulation };
         let options = stamped(timestamp).to_single_reader(GUID::from_bytes(reader.0));
+        self.inner.write_counting_readers(payload, options.build())?;
+        Ok(())
+    }
+
+    /// Writes the reply of a service to one matched reader of the client that sent `request`, in plain
+    /// little-endian CDR. The inline QoS names the request, as DDS-RPC 1.0 clause 7.8.2 defines.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn write_reply(
+        &self,
+        reader: Guid,
+        request: &SampleOrigin,
+        payload: Bytes,
+    ) -> Result<(), WriteError> {
+        let payload = RawPayload { bytes: payload, encapsulation: Encapsulation::CDR_LE };
+        let request = SampleIdentity {
+            writer_guid: GUID::from_bytes(request.writer.0),
+            sequence_number: SequenceNumber::from(request.sequence),
+        };
+        let options = WriteOptionsBuilder::new()
+            .related_sample_identity(request)
+            .to_single_reader(GUID::from_bytes(reader.0));
         self.inner.write_counting_readers(payload, options.build())?;
         Ok(())
     }

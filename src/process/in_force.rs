@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use tracing::{info, warn};
 
-use crate::config::{ConfigError, Configuration, Settings};
+use super::parameter_store::read_parameters;
+use crate::config::{ConfigError, Configuration, SetParameters, Settings};
 use crate::model::InstanceName;
 use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root, root_of};
 use crate::telemetry::Snapshot;
@@ -33,24 +34,27 @@ pub enum InForceError {
 
 impl InForce {
     /// Chooses the configuration of a process that starts: the one in force if its bridge runs, else that of
-    /// the file, which is in force from then on. `loaded` is the result of reading `file`.
+    /// the file, which is in force from then on. `load` reads `file`, with parameters that were set.
     ///
     /// # Errors
     /// The bridge does not run and the file is bad, or the folder of the instance cannot be used.
-    pub fn join(file: &Path, loaded: Result<Configuration, ConfigError>) -> Result<Self, InForceError> {
+    pub fn join(
+        file: &Path,
+        load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
+    ) -> Result<Self, InForceError> {
         let by_file = || BridgeAddress::find(&own_root(), file).map(|found| (found.root, found.instance));
         let address = supervised_folder().or_else(by_file);
         if let Some((root, instance)) = address
             && let Some((share, bytes)) = InForceShare::join_running(&root, &instance)?
         {
-            return Self::of_running_bridge(share, &bytes, loaded);
+            return Self::of_running_bridge(share, &bytes, load);
         }
-        let configuration = loaded?;
+        let configuration = load(&SetParameters::new())?;
         let (root, instance) = (root_of(&configuration.settings), configuration.settings.instance.clone());
         let own = encode(&configuration)?;
         let (share, bytes) = InForceShare::join(&root, &instance, &own)?;
         if bytes != own {
-            return Self::of_running_bridge(share, &bytes, Ok(configuration));
+            return Self::of_running_bridge(share, &bytes, load);
         }
         write_address(file, &root, &instance);
         Ok(Self { configuration, share })
@@ -70,17 +74,21 @@ impl InForce {
     fn of_running_bridge(
         share: InForceShare,
         bytes: &[u8],
-        loaded: Result<Configuration, ConfigError>,
+        load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
     ) -> Result<Self, InForceError> {
         let configuration = match Configuration::decode(bytes) {
             Ok(configuration) => configuration,
             Err(error) => {
                 warn!(%error, "cannot read the configuration in force; using the configuration file instead");
-                return Ok(Self { configuration: loaded?, share });
+                let set = read_parameters(&share.file()).unwrap_or_else(|error| {
+                    warn!(%error, "cannot read the parameters that were set");
+                    SetParameters::new()
+                });
+                return Ok(Self { configuration: load(&set)?, share });
             }
         };
         info!("using the configuration in force of the running bridge, not the configuration file");
-        match loaded {
+        match load(&configuration.settings.set_parameters) {
             Ok(file) => {
                 let (_, reload) = configuration.reloaded(file);
                 for change in &reload.changed {

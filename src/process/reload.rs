@@ -23,13 +23,12 @@ use tracing::{error, info, warn};
 
 use super::in_force::InForce;
 use super::notify;
+use super::parameter_store::{Load, ParameterStore, read_parameters};
 use crate::clock;
-use crate::config::{ConfigError, Configuration, Reload, Settings};
+use crate::config::{ConfigError, Configuration, Reload, SetParameters, Settings};
 use crate::model::{InstanceName, MonotonicNs};
 use crate::shm::{InForceFile, InForceShare, RoleHolder, ShmError};
 use crate::telemetry;
-
-type Load = Box<dyn FnMut() -> Result<Configuration, ConfigError> + Send>;
 
 /// The source of reload requests of a process. To be created before anything else: without its handler,
 /// SIGHUP ends the process.
@@ -47,16 +46,16 @@ struct Request {
 
 impl ReloadRequests {
     /// Handles SIGHUP from now on. `load` reads the configuration as at the start: from the same file, with
-    /// the same environment.
+    /// the same environment, and with the parameters that were set since.
     ///
     /// # Errors
     /// The operating system refused the signal handler.
     pub fn on_signal(
-        load: impl FnMut() -> Result<Configuration, ConfigError> + Send + 'static,
+        load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError> + Send + Sync + 'static,
     ) -> io::Result<Self> {
         let signals = Signals::new([SIGHUP])?;
         unblock()?;
-        let request = Request { signals, load: Box::new(load), terminal: Terminal::detect() };
+        let request = Request { signals, load: Arc::new(load), terminal: Terminal::detect() };
         Ok(Self { request: Some(request), in_force: None })
     }
 
@@ -143,6 +142,8 @@ pub(super) struct Reloads {
     /// The number of requests that were refused because the file was invalid.
     pub refused: u64,
     outcomes: Option<Receiver<Outcome>>,
+    /// Sets parameters of the whole bridge; `None` for a process that reads no file.
+    pub parameters: Option<ParameterStore>,
     /// Keeps the configuration in force for processes that start while this one runs.
     _share: Option<InForceShare>,
 }
@@ -158,6 +159,9 @@ impl Reloads {
             None => (settings.clone().into(), None),
         };
         let file = share.as_ref().map(InForceShare::file);
+        let parameters = requests.request.as_ref().zip(file.clone());
+        let parameters =
+            parameters.map(|(request, file)| ParameterStore::new(Arc::clone(&request.load), file));
         let outcomes = requests.request.map(|request| {
             // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
             let (sender, outcomes) = sync_channel(0);
@@ -167,7 +171,7 @@ impl Reloads {
                 .spawn(move || serve(request, reloader, &sender, &note))
                 .map(|_| outcomes)
         });
-        Ok(Self { in_force, refused: 0, outcomes: outcomes.transpose()?, _share: share })
+        Ok(Self { in_force, refused: 0, outcomes: outcomes.transpose()?, parameters, _share: share })
     }
 
     /// Takes the outcome of a request, puts its configuration in force, and returns whether the file was
@@ -216,6 +220,15 @@ impl Reloader {
         Reload { changed, waits }
     }
 
+    /// The parameters that were set; those in force if they cannot be read.
+    fn set_parameters(&self) -> SetParameters {
+        let read = self.file.as_ref().map_or_else(|| Ok(SetParameters::new()), read_parameters);
+        read.unwrap_or_else(|error| {
+            warn!(%error, "cannot read the parameters that were set; those in force stay");
+            self.current.settings.set_parameters.clone()
+        })
+    }
+
     fn store(&self, configuration: &Configuration) {
         let Some(file) = &self.file else { return };
         let encoded = configuration.encode().map_err(io::Error::from);
@@ -233,7 +246,7 @@ impl Reloader {
 /// Handles reload requests one by one until the receiver of the outcomes is dropped. Signals received while
 /// one is handled make one further request.
 fn serve(
-    Request { mut signals, mut load, terminal }: Request,
+    Request { mut signals, load, terminal }: Request,
     mut reloader: Reloader,
     outcomes: &SyncSender<Outcome>,
     note: &Path,
@@ -247,7 +260,7 @@ fn serve(
         }
         notify::reloading();
         let began_at = clock::monotonic();
-        let (outcome, result) = match load() {
+        let (outcome, result) = match load(&reloader.set_parameters()) {
             Ok(new) => {
                 let file_fingerprint = new.settings.fingerprint();
                 let reload = reloader.reload(new);
@@ -347,6 +360,18 @@ pub struct ReloadAnswer {
     pub result: Option<ReloadResult>,
 }
 
+/// Sends SIGHUP to every process of the bridge.
+pub(super) fn request_reload(root: &Path, instance: &InstanceName) -> Result<Vec<RoleHolder>, ShmError> {
+    let holders = RoleHolder::all(root, instance)?;
+    for RoleHolder { role, pid, .. } in &holders {
+        match i32::try_from(*pid).map(|pid| kill(Pid::from_raw(pid), Signal::SIGHUP)) {
+            Ok(Ok(())) => {}
+            refused => warn!(role, pid, ?refused, "cannot send SIGHUP"),
+        }
+    }
+    Ok(holders)
+}
+
 /// Sends SIGHUP to every process of the bridge and waits for the answers. Returns an empty list if the bridge
 /// does not run. `root` is the folder of its shared files.
 ///
@@ -354,15 +379,13 @@ pub struct ReloadAnswer {
 /// The processes of the bridge cannot be listed.
 pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnswer>, ShmError> {
     let asked_at = clock::monotonic();
-    let holders = RoleHolder::all(root, instance)?;
-    let mut answers = Vec::with_capacity(holders.len());
-    for RoleHolder { role, pid, .. } in &holders {
-        match i32::try_from(*pid).map(|pid| kill(Pid::from_raw(pid), Signal::SIGHUP)) {
-            Ok(Ok(())) => {}
-            refused => warn!(role, pid, ?refused, "cannot send SIGHUP"),
-        }
-        answers.push(ReloadAnswer { role: role.clone(), pid: *pid, result: None });
-    }
+    let holders = request_reload(root, instance)?;
+    let unanswered = |RoleHolder { role, pid, .. }: &RoleHolder| ReloadAnswer {
+        role: role.clone(),
+        pid: *pid,
+        result: None,
+    };
+    let mut answers: Vec<_> = holders.iter().map(unanswered).collect();
     let give_up_at = asked_at.plus_ms(ANSWER_TIMEOUT_MS);
     loop {
         for (answer, holder) in answers.iter_mut().zip(&holders).filter(|(answer, _)| answer.result.is_none())

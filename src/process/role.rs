@@ -4,6 +4,7 @@
 use tracing::info;
 
 use super::notify::Notifier;
+use super::parameter_store::ParameterStore;
 use super::reload::{ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
@@ -154,6 +155,11 @@ impl Role {
         });
         self.notifier.reloaded(!is_valid);
         is_valid.then_some(&self.reloads.in_force)
+    }
+
+    /// Sets parameters of the whole bridge; `None` for a process that reads no configuration file.
+    pub fn parameter_store(&self) -> Option<ParameterStore> {
+        self.reloads.parameters.clone()
     }
 
     /// Sends the status line of `describe`, and logs how many log lines were left out, once a second.

@@ -13,6 +13,9 @@ use crate::config::{Scheduling, SchedulingPolicy};
 /// service unit sets it.
 const DEFAULT_VARIABLE: &str = "ADAPTIVE_BRIDGE_FIFO_PRIORITY";
 
+/// The highest nice value.
+const LOWEST_PRIORITY: u8 = 19;
+
 /// Applies `scheduling` to this process and the threads that it starts from now on. A setting that the system
 /// refuses is only a warning, which names the permission it needs: a bridge with the wrong priority is better
 /// than none.
@@ -85,6 +88,17 @@ pub(super) fn apply_to_early_waker(cpus: &[usize]) -> bool {
         debug!(%error, "the early waker may preempt a running program");
     }
     true
+}
+
+/// Makes the calling thread, which has the scheduling of its process, run only when the CPUs have nothing
+/// else to do: with a fair policy that never preempts, and the lowest priority. It stays on the CPUs of the
+/// process.
+pub(super) fn apply_to_background() {
+    // The nice value of the calling thread alone: on Linux each thread has its own.
+    let outcome = set_policy(libc::SCHED_BATCH, 0).and_then(|()| set_nice(LOWEST_PRIORITY));
+    if let Err(error) = outcome {
+        warn!(%error, "a thread in the background has the scheduling of its process");
+    }
 }
 
 /// The priority in [`DEFAULT_VARIABLE`]; `None` if that is unset, empty or not 1 to 99.

@@ -52,7 +52,7 @@ macro_rules! plain {
 
 plain! {
     ProcessHealth: 16,
-    ControlRecord: 7 + ProbeRefusal::COUNT + 1 + 16,
+    ControlRecord: 7 + ProbeRefusal::COUNT + 5 + 1 + 16,
     SubscriberRecord: 16 + 9 + 1 + 16,
     IntruderRecord: 4 * 16 + 1,
     AbsenceRecord: 3 + 3 * 16,

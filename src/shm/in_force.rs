@@ -1,8 +1,9 @@
-//! The file with the configuration in force of an instance, and the lock that shows whether it is valid.
+//! The file with the configuration in force of an instance, the file with the parameters that were set while
+//! it runs, and the lock that shows whether they are valid.
 //!
 //! Every process of a running bridge holds the lock shared; a tap does not. The process that gets it
 //! exclusively is the first one, and writes the file. A file whose lock no process holds was left by a killed
-//! bridge, and is overwritten. The caller encodes and decodes the content.
+//! bridge, and is overwritten, or removed. The caller encodes and decodes the content.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -23,6 +24,7 @@ use crate::model::{InstanceName, fnv1a};
 
 const LOCK: &str = "in-force.lock";
 const FILE: &str = "in-force.json";
+const PARAMETERS: &str = "parameters.json";
 
 /// The most bytes that are read of a file. A configuration file has 1 MiB at most.
 const MAX_BYTES: u64 = 8 << 20;
@@ -111,6 +113,7 @@ impl InForceShare {
                     lock.remove();
                     return Ok(None);
                 };
+                file.remove();
                 file.write(first)?;
                 lock.write_pid()?;
                 // The kernel may give the lock to another process during the change from exclusive to shared.
@@ -163,7 +166,7 @@ pub(super) fn sweep(dir: &Path) {
 
 /// Whether this module creates, and removes, the file with that name.
 pub(super) fn owns(name: &[u8]) -> bool {
-    name == LOCK.as_bytes() || name == FILE.as_bytes()
+    [LOCK, FILE, PARAMETERS].iter().any(|own| own.as_bytes() == name)
 }
 
 /// The id of a running process of the instance, preferably `up`.
@@ -192,7 +195,27 @@ impl InForceFile {
     /// # Errors
     /// The operating system cannot read the file.
     pub fn read(&self) -> io::Result<Option<Vec<u8>>> {
-        let file = match File::open(self.dir.join(FILE)) {
+        self.read_file(FILE)
+    }
+
+    /// Reads the parameters that were set; `None` when none was.
+    ///
+    /// # Errors
+    /// The operating system cannot read the file.
+    pub fn read_parameters(&self) -> io::Result<Option<Vec<u8>>> {
+        self.read_file(PARAMETERS)
+    }
+
+    /// Replaces the parameters that were set, atomically. Only control calls this.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn write_parameters(&self, bytes: &[u8]) -> io::Result<()> {
+        write_privately(&self.dir.join(PARAMETERS), bytes)
+    }
+
+    fn read_file(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
+        let file = match File::open(self.dir.join(name)) {
             Ok(file) => file,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error),
@@ -212,7 +235,9 @@ impl InForceFile {
     }
 
     fn remove(&self) {
-        let _ = fs::remove_file(self.dir.join(FILE));
+        for name in [FILE, PARAMETERS] {
+            let _ = fs::remove_file(self.dir.join(name));
+        }
     }
 }
 

@@ -95,7 +95,7 @@ pub fn string_message(data: &str) -> Bytes {
 
 /// Serializes a message in plain little-endian CDR
 /// ([`Encapsulation::CDR_LE`](crate::model::Encapsulation::CDR_LE)).
-pub(super) fn cdr(message: &impl Serialize, expected_bytes: usize) -> Bytes {
+pub fn cdr(message: &impl Serialize, expected_bytes: usize) -> Bytes {
     // Writing to memory does not fail, and the messages contain only types that CDR supports.
     let bytes = cdr_encoding::to_vec_with_size_hint::<_, LittleEndian>(message, expected_bytes);
     Bytes::from(bytes.unwrap_or_default())

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::liveness::ProcessState;
 use crate::clock;
-use crate::config::Settings;
+use crate::config::{SetParameters, Settings};
 use crate::model::{
     AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
     LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
@@ -43,6 +43,8 @@ pub struct Snapshot {
     pub needs_control: bool,
     /// The control process's record for the whole bridge.
     pub control: ControlRecord,
+    /// The parameters that were set while the bridge runs.
+    pub set_parameters: SetParameters,
     /// The subscribers that control tracks.
     pub subscribers: Vec<SubscriberReading>,
     /// The intruders that control found.
@@ -189,6 +191,7 @@ impl Snapshot {
             at_wall: clock::wall(),
             processes,
             routes,
+            set_parameters: settings.set_parameters.clone(),
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
             intruders: records(

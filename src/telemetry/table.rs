@@ -6,8 +6,8 @@ use comfy_table::{CellAlignment, ColumnConstraint, Table, Width, presets};
 
 use super::liveness::ProcessState;
 use super::report::{
-    AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ProbesReport, ProcessReport, Report,
-    RouteReport, SafetyReport, SubscriberReport,
+    AbsenceReport, IntruderReport, LaneReport, Latency, OutputReport, ParametersReport, ProbesReport,
+    ProcessReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 use super::snapshot::ProcessReading;
 use super::text::{bytes_text, counted};
@@ -39,6 +39,7 @@ impl fmt::Display for Report {
             write!(f, "\n{}", process_line("control", control))?;
             f.write_str(&safety_text(&self.safety))?;
             f.write_str(&probes_text(&self.probes))?;
+            f.write_str(&parameters_text(&self.parameters))?;
             f.write_str(&subscribers_text(&self.subscribers))?;
             f.write_str(&absences_text(&self.absences))?;
             f.write_str(&intruders_text(&self.intruders, self.intruders_seen))?;
@@ -144,6 +145,15 @@ fn probes_text(probes: &ProbesReport) -> String {
         let _ = write!(text, ", {reason} {count}");
     }
     wrapped("  probes: ", "    ", text.split_inclusive(", "), "")
+}
+
+/// The parameters that were set; no line while the file has all values.
+fn parameters_text(parameters: &ParametersReport) -> String {
+    if parameters.set.is_empty() {
+        return String::new();
+    }
+    let text = format!("{}; in place of the file until the bridge ends", parameters.set.join(", "));
+    wrapped("  parameters set: ", "    ", text.split(' '), " ")
 }
 
 fn subscribers_text(subscribers: &[SubscriberReport]) -> String {

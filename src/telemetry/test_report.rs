@@ -4,8 +4,8 @@ use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
-    ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport, SafetyReport,
-    SubscriberReport, UnmatchedReport,
+    ParametersReport, ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport,
+    SafetyReport, SubscriberReport, UnmatchedReport,
 };
 use super::snapshot::ProcessReading;
 use crate::model::{
@@ -129,6 +129,10 @@ pub(super) fn wide_report() -> Report {
             dds_in: latency,
             lanes: vec![output],
         }],
+        parameters: ParametersReport {
+            set: vec!["safety.allow_noncritical_degrade: false".into(); 9],
+            ..ParametersReport::default()
+        },
         probes: ProbesReport {
             sent: u64::MAX,
             accepted: u64::MAX,

@@ -280,7 +280,7 @@ fn culprits() -> String {
 /// As the program has them; none comes here.
 fn reloads(settings: &Settings) -> ReloadRequests {
     let settings = settings.clone();
-    ReloadRequests::on_signal(move || Ok(settings.clone().into())).unwrap()
+    ReloadRequests::on_signal(move |_| Ok(settings.clone().into())).unwrap()
 }
 
 #[test]

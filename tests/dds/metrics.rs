@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use adaptive_bridge::config::MetricsListener;
+use adaptive_bridge::config::SetParameters;
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
     LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, RouteInfo,
@@ -120,6 +121,7 @@ fn report() -> Report {
             }],
         }],
         needs_control: true,
+        set_parameters: SetParameters::new(),
         control,
         subscribers: vec![SubscriberReading { lane: Some(0), record: subscriber }],
         named_endpoints: Vec::new(),

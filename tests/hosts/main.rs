@@ -19,6 +19,7 @@ mod latched;
 mod networks;
 mod noncritical_readers;
 mod original_probes;
+mod parameters;
 mod readers;
 mod responder;
 mod restarts;

@@ -1,4 +1,5 @@
-"""A ROS 2 node of the tests (rclpy): publishes or subscribes one topic, or lists endpoints of topics.
+"""A ROS 2 node of the tests (rclpy): publishes or subscribes one topic, lists endpoints of topics, or calls
+parameter services.
 
 It has the command line, the samples and the output of the peers in tests/peers (README.md there). Samples are
 published and taken in serialized form, so that Python keeps up with 1 kHz of 2.9 KB.
@@ -15,8 +16,11 @@ import time
 
 import numpy
 import rclpy
+from rcl_interfaces.msg import ParameterValue
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
@@ -36,6 +40,7 @@ MATCH_PERIOD_S = 0.02
 INFO_PERIOD_S = 0.2
 ACKNOWLEDGEMENT_S = 10
 MAX_MISSING_RANGES = 1000
+SERVICES_S = 30
 MASK = 2**64 - 1
 
 
@@ -47,7 +52,7 @@ def emit(event, **fields):
 def parse():
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     option = parser.add_argument
-    option("--role", choices=["pub", "sub", "info"], required=True)
+    option("--role", choices=["pub", "sub", "info", "parameters"], required=True)
     option("--node", default="", help="node name (default: peer_pub or peer_sub)")
     option("--domain", type=int, default=0)
     option("--topic", default="rt/scan", help="DDS name; of role info: DDS names, separated by commas")
@@ -423,6 +428,57 @@ class Info:
         emit("summary")
 
 
+class Parameters:
+    """Calls the parameter services of nodes: one call for each line of stdin, a JSON object such as
+    {"node": "/a/b", "call": "get", "names": ["c.d"]}."""
+
+    def __init__(self, node, options, signals):
+        self.node = node
+        self.clients = {}
+
+    def run(self):
+        for line in sys.stdin:
+            call = json.loads(line)
+            client = self.clients.get(call["node"])
+            if client is None:
+                client = self.clients[call["node"]] = AsyncParameterClient(self.node, call["node"])
+            # Of all six services, as `ros2 param` waits; its nodes give up after 5 s.
+            if not client.wait_for_services(timeout_sec=SERVICES_S):
+                emit("reply", reply="no services")
+                continue
+            # A call without an answer fails the test, which waits for the reply.
+            futures = [self.begin(client, call) for _ in range(call.get("times", 1))]
+            for future in futures if call.get("waits", True) else []:
+                rclpy.spin_until_future_complete(self.node, future, timeout_sec=SERVICES_S)
+            replies = [future.result() for future in futures if future.done()]
+            emit("reply", answered=len(replies), reply=self.fields(replies[0]) if replies else None)
+        emit("summary")
+
+    @staticmethod
+    def begin(client, call):
+        names = call.get("names", [])
+        given = [Parameter(name, value=value) for name, value in call.get("values", {}).items()]
+        return {
+            "list": lambda: client.list_parameters(names, call.get("depth", 0)),
+            "get": lambda: client.get_parameters(names),
+            "types": lambda: client.get_parameter_types(names),
+            "describe": lambda: client.describe_parameters(names),
+            "set": lambda: client.set_parameters(given),
+            "set_atomically": lambda: client.set_parameters_atomically(given),
+        }[call["call"]]()
+
+    @staticmethod
+    def fields(reply):
+        """The reply as JSON, with the value of a parameter in place of its message."""
+        if isinstance(reply, ParameterValue):
+            return parameter_value_to_python(reply)
+        if hasattr(reply, "get_fields_and_field_types"):
+            return {name: Parameters.fields(getattr(reply, name)) for name in reply.get_fields_and_field_types()}
+        if isinstance(reply, (str, bool, int, float)):
+            return reply
+        return [Parameters.fields(item) for item in reply]
+
+
 def main():
     options = parse()
     signals = Signals()
@@ -431,7 +487,7 @@ def main():
         args=["--ros-args", "--disable-external-lib-logs"], domain_id=options.domain,
         signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(options.node or f"peer_{options.role}")
-    peers = {"pub": Publisher, "sub": Subscriber, "info": Info}
+    peers = {"pub": Publisher, "sub": Subscriber, "info": Info, "parameters": Parameters}
     peer = peers[options.role](node, options, signals)
     emit("ready", library=f"rclpy, {rclpy.get_rmw_implementation_identifier()}")
     peer.run()

@@ -117,6 +117,11 @@ impl Peer {
         Peer { role: "info".to_owned(), ..Peer::rclpy("info") }.topic(&topics.join(","))
     }
 
+    /// Makes a ROS 2 node call parameter services, once for each [`RunningPeer::say`] of a call in JSON.
+    pub fn parameters(node: &str) -> Peer {
+        Peer { role: "parameters".to_owned(), reads_stdin: true, ..Peer::rclpy(node) }
+    }
+
     /// Makes the peer a publisher of `std_msgs/msg/String` with the generated type, one sample for each
     /// [`RunningPeer::say`]; Cyclone DDS only. It ends at [`RunningPeer::finish`], after sending all samples.
     pub fn say(mut self) -> Peer {

@@ -43,6 +43,20 @@ pub fn keys_at(path: &str) -> Vec<(String, &'static Row)> {
     found
 }
 
+/// The row of the key at this path, which may have items of lists and names that the user chose; `None` for
+/// an unknown path and for a section.
+pub(super) fn row_at(path: &str) -> Option<&'static Row> {
+    let mut key = Key::root();
+    for name in path.split('.') {
+        let (name, item) = name.split_once('[').map_or((name, None), |(name, item)| (name, Some(item)));
+        key = key.get(name)?;
+        if item.is_some() {
+            key = key.item()?;
+        }
+    }
+    key.row
+}
+
 /// The known path that is most similar to an unknown one.
 pub fn nearest_key(path: &str) -> Option<&'static str> {
     nearest(path, &KEYS)

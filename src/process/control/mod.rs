@@ -8,6 +8,7 @@ mod absences;
 mod diagnostics;
 mod intruders;
 mod link;
+mod parameters;
 mod safety;
 mod subscribers;
 
@@ -35,6 +36,7 @@ use crate::shm::{BoardWriter, ProcessRole};
 use diagnostics::Diagnostics;
 use intruders::EndpointMonitor;
 use link::{InvalidResponses, Link};
+use parameters::ParameterServices;
 use safety::Supervision;
 use subscribers::Subscribers;
 
@@ -77,6 +79,7 @@ struct Control {
     /// Declared before the participants: the DDS library requires readers and writers to be dropped first.
     links: Vec<Link>,
     diagnostics: Diagnostics,
+    parameters: ParameterServices,
     endpoints: EndpointMonitor,
     /// One for each network; the first is on the input network.
     participants: Vec<Participant>,
@@ -128,6 +131,12 @@ impl Control {
             supervision: Supervision::new(&role.boards, settings, now),
             endpoints: EndpointMonitor::open(&role.boards, settings, &mut participants)?,
             diagnostics: Diagnostics::open(&role.boards, settings, &mut participants[0])?,
+            parameters: ParameterServices::open(
+                settings,
+                role.parameter_store(),
+                &mut participants,
+                &link_of_lane,
+            )?,
             trust: load_trust(settings, secret),
             settings: settings.clone(),
             link_of_lane,
@@ -288,6 +297,7 @@ impl Control {
                 self.settings.classifier.enabled && self.settings.probes.enabled && self.trust.is_some(),
             ),
             without_secret: u8::from(self.trust.is_none()),
+            parameter_requests: self.parameters.counts(),
             ..*self.record.get()
         };
         self.record.set(record);
@@ -302,6 +312,7 @@ impl Control {
             // At once, together with the resulting modes, instead of at the next evaluation.
             self.subscribers.write_table(&self.settings);
             self.diagnostics.apply(&self.settings);
+            self.parameters.apply(&self.settings);
             self.decide(now);
         }
         self.endpoints.housekeeping(&mut self.participants, &self.settings, now);

@@ -260,6 +260,7 @@ fn matched_readers(reason: DropReason, output: &OutputReading) -> String {
 pub(super) mod tests {
     use super::super::snapshot::ProcessReading;
     use super::*;
+    use crate::config::SetParameters;
     use crate::model::{
         ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
         ModeReason, MonotonicNs, OutputReaders, ProcessHealth, RouteId, RouteInfo, TopicName, WallNs,
@@ -323,6 +324,7 @@ pub(super) mod tests {
                 outputs: vec![output(0, "/c/scan"), output(1, "/n/scan")],
             }],
             needs_control: false,
+            set_parameters: SetParameters::new(),
             control: ControlRecord::default(),
             subscribers: Vec::new(),
             intruders: Vec::new(),

@@ -2,8 +2,8 @@
 
 use super::{age_ms, some_text};
 use crate::model::{
-    AbsenceRecord, IntruderRecord, LaneMode, ModeReason, MonotonicNs, RefusalCounts, SubscriberState,
-    SubscriberWarning, TrafficClass,
+    AbsenceRecord, IntruderRecord, LaneMode, ModeReason, MonotonicNs, ParameterRequests, RefusalCounts,
+    SubscriberState, SubscriberWarning, TrafficClass,
 };
 use crate::telemetry::snapshot::{LaneReading, Snapshot, SubscriberReading};
 use crate::telemetry::text::printable;
@@ -27,6 +27,14 @@ pub struct ProbesReport {
     pub(crate) accepted: u64,
     pub(crate) refused: RefusalCounts,
     pub(crate) refused_in_window: RefusalCounts,
+}
+
+/// The parameters of the bridge's ROS 2 nodes.
+#[derive(Clone, Debug, Default, serde::Serialize)]
+pub struct ParametersReport {
+    /// Those that were set while the bridge runs, each as `key: value` in YAML.
+    pub(crate) set: Vec<String>,
+    pub(crate) requests: ParameterRequests,
 }
 
 /// The state and the link figures of one subscriber.
@@ -100,6 +108,11 @@ impl Snapshot {
             since_s: age_s(control.safety_since, self.at),
             transitions: control.safety_transitions,
         }
+    }
+
+    pub(super) fn parameters_report(&self) -> ParametersReport {
+        let set = self.set_parameters.iter().map(|(name, value)| printable(&format!("{name}: {value}")));
+        ParametersReport { set: set.collect(), requests: self.control.parameter_requests }
     }
 
     pub(super) fn probes_report(&self, earlier: &Self) -> ProbesReport {

@@ -5,7 +5,9 @@
 mod control;
 mod latency;
 
-pub use control::{AbsenceReport, IntruderReport, ProbesReport, SafetyReport, SubscriberReport};
+pub use control::{
+    AbsenceReport, IntruderReport, ParametersReport, ProbesReport, SafetyReport, SubscriberReport,
+};
 pub use latency::{Latency, LatencyTotal};
 
 use super::problem::Problem;
@@ -30,6 +32,7 @@ pub struct Report {
     pub(crate) lanes: Vec<LaneReport>,
     pub(crate) routes: Vec<RouteReport>,
     pub(crate) probes: ProbesReport,
+    pub(crate) parameters: ParametersReport,
     /// The subscribers that control tracks.
     pub subscribers: Vec<SubscriberReport>,
     pub(crate) intruders: Vec<IntruderReport>,
@@ -193,6 +196,7 @@ impl Snapshot {
                 .map(|route| self.route_report(route, earlier.route(route), window_ms))
                 .collect(),
             probes: self.probes_report(earlier),
+            parameters: self.parameters_report(),
             subscribers: self.subscribers.iter().map(|one| self.subscriber_report(one)).collect(),
             intruders: self.intruders.iter().map(|one| self.intruder_report(one)).collect(),
             intruders_seen: self.control.intruders_seen,

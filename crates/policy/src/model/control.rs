@@ -1,5 +1,7 @@
 //! Records that the control process writes to its board, of fixed size as in [`health`](super::health).
 
+use serde::Serialize;
+
 use super::health::FixedText;
 use super::modes::{SafetyMode, SubscriberState, numbered};
 use super::probe::RefusalCounts;
@@ -12,6 +14,22 @@ pub const MAX_SUBSCRIBERS: usize = 64;
 
 /// The most intruders on the board at once; further ones are only counted.
 pub const MAX_INTRUDERS: usize = 32;
+
+/// The requests to the parameter services.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[repr(C)]
+pub struct ParameterRequests {
+    /// Answered, also those that were refused with a reason.
+    pub answered: u64,
+    /// Dropped: it is no request of the service.
+    pub malformed: u64,
+    /// Dropped: request or reply is larger than the bridge allows.
+    pub too_large: u64,
+    /// Dropped: beyond the rate of one participant.
+    pub rate_limited: u64,
+    /// Dropped: the participant has no reader for the reply.
+    pub no_client: u64,
+}
 
 /// The state of the control process and its decisions for the whole bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -33,6 +51,8 @@ pub struct ControlRecord {
     pub responses_accepted: u64,
     /// Probe responses refused, by reason.
     pub refused: RefusalCounts,
+    /// Requests of ROS 2 nodes to the parameter services.
+    pub parameter_requests: ParameterRequests,
     /// The safety mode, as [`SafetyMode`]'s number.
     pub safety: u8,
     /// 1 while subscribers are classified.

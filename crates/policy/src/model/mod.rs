@@ -21,7 +21,8 @@ mod type_hash;
 
 pub use control::{
     AbsenceKind, AbsenceRecord, ControlRecord, IntruderRecord, MAX_ABSENCES, MAX_INTRUDERS,
-    MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint, SubscriberRecord, SubscriberWarning,
+    MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint, ParameterRequests, SubscriberRecord,
+    SubscriberWarning,
 };
 pub use counts::{Counts, Reason};
 pub use drops::{DropCounts, DropReason};

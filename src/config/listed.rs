@@ -1,0 +1,89 @@
+//! The settings as ROS 2 parameters: a name, a typed value and the declaration of the key for each.
+
+use super::keys::{Row, row_at};
+use super::settings::{Settings, TrustMode};
+use super::shown::Value;
+
+/// One setting as a ROS 2 parameter.
+#[derive(Clone, Debug)]
+pub struct Listed {
+    /// The key path. A route is named by its id: `topics.scan.max_sample_bytes`.
+    pub name: String,
+    /// The value in force.
+    pub value: Value,
+    /// The declaration of its key.
+    pub row: &'static Row,
+}
+
+/// The entries that a user may add to these sections; each is one setting.
+const OPEN_SECTIONS: [&str; 2] = ["overrides.", "subscribers."];
+
+/// What cannot be set as a parameter, because anyone on the network can set parameters: a change of `safety`
+/// or `policy_hold_s` could stop critical lanes, and one of `security` could admit forged messages.
+const FILE_ONLY: [&str; 3] = ["safety.", "security.", "policy_hold_s"];
+
+/// The place of the secret, or the secret itself, is not listed.
+const SECRET: &str = "security.hmac_secret";
+
+impl Listed {
+    /// Whether the parameter `name`, whose key is declared by `row`, can be set in a running bridge.
+    pub fn is_settable(name: &str, row: &Row) -> bool {
+        row.reloads && !Self::is_file_only(name)
+    }
+
+    /// Whether only the configuration file may change the parameter `name`.
+    pub fn is_file_only(name: &str) -> bool {
+        FILE_ONLY.iter().any(|start| name.starts_with(start))
+    }
+
+    /// The declaration of a parameter that is not set yet and can be: a forced state or the lane of a
+    /// subscriber.
+    pub fn unset(name: &str) -> Option<&'static Row> {
+        let is_open = OPEN_SECTIONS.iter().any(|section| name.starts_with(section));
+        let is_name = name.split('.').count() == 2 && !name.chars().any(char::is_control);
+        row_at(name).filter(|_| is_open && is_name)
+    }
+}
+
+impl Settings {
+    /// Every setting that has a key of its own, without secrets. Those that several keys determine, such as
+    /// `routing_policy`, are listed by the key of the lane.
+    pub fn listed(&self) -> Vec<Listed> {
+        let mut listed = Vec::new();
+        for (path, value) in self.values() {
+            let Some(row) = row_at(&path).filter(|_| path != SECRET) else { continue };
+            let name = named_by_id(&path);
+            // The history of an output whose durability its publishers decide: its depth is in `history`.
+            if name.ends_with(".depth") && matches!(value, Value::Text(_)) {
+                continue;
+            }
+            // HISTORY is two keys in the file.
+            if let (Some(policies), Value::Text(text)) = (name.strip_suffix(".history"), &value)
+                && let Some((kind, depth)) = text.split_once(' ')
+            {
+                let path = path.replace(".history", ".depth");
+                let depth = depth.parse().ok().map(Value::Whole).zip(row_at(&path));
+                listed.extend(depth.map(|(value, row)| Listed {
+                    name: format!("{policies}.depth"),
+                    value,
+                    row,
+                }));
+                listed.push(Listed { value: Value::Text(kind.to_owned()), name, row });
+                continue;
+            }
+            listed.push(Listed { name, value, row });
+        }
+        listed.sort_by(|one, other| one.name.cmp(&other.name));
+        listed
+    }
+
+    /// Whether control messages that are not authentic are refused, such as a request to set a parameter.
+    pub fn refuses_unsigned(&self) -> bool {
+        self.security.enable_probe_hmac && self.security.trust_mode == TrustMode::DefaultDeny
+    }
+}
+
+/// `topics.scan.id` of `topics[scan].id`.
+fn named_by_id(path: &str) -> String {
+    path.replacen('[', ".", 1).replacen(']', "", 1)
+}

@@ -1,0 +1,198 @@
+//! The parameter services of the bridge's nodes, called by a ROS 2 node (rclpy).
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+use support::bed::{Bed, SCAN};
+use support::peer::{Peer, RunningPeer};
+use support::process::signal;
+use support::ros;
+
+/// Beside SCAN: values that are not the defaults.
+const PROBES: &str = "probes: {rate_hz: 4}\nclassifier: {hysteresis_count: 7}\n";
+
+/// A node that calls services, and the replies that the test has read.
+struct Client {
+    peer: RunningPeer,
+    replies: usize,
+}
+
+impl Client {
+    fn start(bed: &Bed) -> Self {
+        Self { peer: Peer::parameters("rqt").start_on(bed.host("slow")), replies: 0 }
+    }
+
+    /// Calls a service of a node of the bridge; returns the whole event.
+    fn event(&mut self, bed: &Bed, node: &str, mut call: Value) -> Value {
+        call["node"] = format!("/adaptive_bridge/{}/{node}", bed.bridge.instance()).into();
+        self.peer.say(call.to_string());
+        self.replies += 1;
+        let mut seen = 0;
+        self.peer.wait_for(&format!("the reply to {call}"), |event| {
+            seen += usize::from(event["event"] == "reply");
+            event["event"] == "reply" && seen == self.replies
+        })
+    }
+
+    fn call(&mut self, bed: &Bed, node: &str, call: Value) -> Value {
+        let event = self.event(bed, node, call.clone());
+        assert_eq!(event["answered"], 1, "{call}: {event}");
+        event["reply"].clone()
+    }
+
+    fn values(&mut self, bed: &Bed, names: &[&str]) -> Value {
+        self.call(bed, "control", json!({ "call": "get", "names": names }))["values"].clone()
+    }
+
+    fn set(&mut self, bed: &Bed, values: Value) -> Value {
+        self.call(bed, "control", json!({ "call": "set", "values": values }))["results"].clone()
+    }
+}
+
+fn start(test: &str) -> Option<(Bed, Client)> {
+    if let Some(reason) = ros::missing() {
+        support::skip(test, &reason);
+        return None;
+    }
+    let bed = Bed::start(test, &format!("{SCAN}{PROBES}"))?;
+    let client = Client::start(&bed);
+    Some((bed, client))
+}
+
+fn refused(results: &Value, index: usize) -> &str {
+    assert_eq!(results[index]["successful"], false, "{results}");
+    results[index]["reason"].as_str().unwrap()
+}
+
+#[test]
+fn every_node_lists_gets_and_describes_the_configuration_in_force() {
+    let Some((bed, mut client)) = start("every_node_lists_gets_and_describes_the_configuration_in_force")
+    else {
+        return;
+    };
+    for node in ["ingress", "control", "egress_critical", "egress_noncritical"] {
+        let listed = client.call(&bed, node, json!({ "call": "list", "names": ["probes", "topics.scan"] }));
+        let names = listed["result"]["names"].as_array().unwrap();
+        for name in ["probes.rate_hz", "topics.scan.input_topic", "topics.scan.qos_overrides.critical.depth"]
+        {
+            assert!(names.contains(&json!(name)), "{node}: {names:?}");
+        }
+    }
+    let names = ["probes.rate_hz", "classifier.hysteresis_count", "topics.scan.input_topic", "no.key"];
+    assert_eq!(client.values(&bed, &names), json!([4.0, 7, "/scan", null]));
+    let types = client.call(&bed, "control", json!({ "call": "types", "names": names }));
+    assert_eq!(types["types"], json!([3, 2, 4, 0]));
+    let described = client.call(&bed, "control", json!({ "call": "describe", "names": names }));
+    let described = &described["descriptors"];
+    let range = json!([{ "from_value": 0.01, "to_value": 1000.0, "step": 0.0 }]);
+    assert_eq!(described[0]["floating_point_range"], range);
+    assert_eq!(described[1]["integer_range"], json!([{ "from_value": 1, "to_value": 1000, "step": 1 }]));
+    assert_eq!([&described[0]["read_only"], &described[2]["read_only"]], [false, true]);
+    // All at once, in several datagrams.
+    let all = client.call(&bed, "control", json!({ "call": "list" }))["result"]["names"].clone();
+    let count = all.as_array().unwrap().len();
+    assert!(count > 100, "{count} parameters");
+    let described = client.call(&bed, "control", json!({ "call": "describe", "names": all }));
+    assert_eq!(described["descriptors"].as_array().unwrap().len(), count);
+    bed.end();
+}
+
+#[test]
+fn a_parameter_that_is_set_reaches_all_processes_and_stays_until_the_bridge_ends() {
+    let test = "a_parameter_that_is_set_reaches_all_processes_and_stays_until_the_bridge_ends";
+    let Some((bed, mut client)) = start(test) else { return };
+    let set = |status: &Value| status["parameters"]["set"].clone();
+    let results = client.set(
+        &bed,
+        json!({ "lanes.noncritical.max_rate_hz": 7.0, "probes.rate_hz": 0.0, "topics.scan.input_topic": "/a" }),
+    );
+    assert_eq!(results[0], json!({ "successful": true, "reason": "" }), "{results}");
+    assert_eq!(refused(&results, 1), "probes.rate_hz = 0: must be a number from 0.01 to 1000");
+    assert!(refused(&results, 2).starts_with("read-only"), "{results}");
+    let status = bed.bridge.wait_status("the same settings in all processes", |status| {
+        let processes = status["processes"].as_array().unwrap();
+        processes.iter().all(|one| one["settings_fingerprint"] == processes[0]["settings_fingerprint"])
+    });
+    assert_eq!(set(&status), json!(["lanes.noncritical.max_rate_hz: 7"]));
+    bed.up.wait_for_log("reloaded: lanes.noncritical.max_rate_hz: 10 -> 7");
+    let names = ["lanes.noncritical.max_rate_hz", "probes.rate_hz"];
+    assert_eq!(client.values(&bed, &names), json!([7.0, 4.0]));
+
+    // A process that restarts keeps the parameter.
+    let lane = "egress-noncritical";
+    signal(bed.pid(lane), Signal::SIGKILL);
+    support::wait_until("a restart", || bed.pids(lane).len() == 2);
+    bed.bridge.wait_status("the parameter in the restarted process", |status| {
+        let processes = status["processes"].as_array().unwrap();
+        processes.iter().all(|one| one["settings_fingerprint"] == processes[0]["settings_fingerprint"])
+            && processes.iter().any(|one| one["name"] == lane && one["starts"] == 2)
+    });
+
+    // A reload of the file changes the rest of the settings and keeps the parameter.
+    let yaml = format!("instance: {{instance}}\n{SCAN}{}", PROBES.replace("rate_hz: 4", "rate_hz: 6"));
+    bed.bridge.write_config(&yaml);
+    let results = client.set(&bed, json!({ "classifier.hysteresis_count": 8 }));
+    assert!(refused(&results, 0).contains("run `adaptive-bridge reload` first"), "{results}");
+    let reload = bed.bridge.run("reload");
+    assert!(reload.status.success(), "{}", String::from_utf8_lossy(&reload.stderr));
+    support::wait_until("the reloaded file", || client.values(&bed, &names) == json!([7.0, 6.0]));
+
+    // All or none.
+    let both = json!({ "classifier.hysteresis_count": 8, "probes.rate_hz": 0.0 });
+    let result = client.call(&bed, "control", json!({ "call": "set_atomically", "values": both }));
+    assert_eq!(result["result"]["successful"], false, "{result}");
+    assert_eq!(client.values(&bed, &["classifier.hysteresis_count"]), json!([7]));
+    // Nothing that could stop critical lanes.
+    let values =
+        json!({ "safety.preserve_critical_path": false, "safety.silent_ms": 600, "policy_hold_s": 0.0 });
+    let results = client.set(&bed, values);
+    for index in 0..3 {
+        assert!(refused(&results, index).starts_with("read-only: edit the configuration file"), "{results}");
+    }
+    // With the value of the file the parameter is no longer in place of it.
+    client.set(&bed, json!({ "lanes.noncritical.max_rate_hz": 10.0 }));
+    assert_eq!(set(&bed.bridge.status()), json!([]));
+    bed.end();
+}
+
+#[test]
+fn a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed() {
+    let test = "a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed";
+    let Some((bed, mut client)) = start(test) else { return };
+    let nine: Value = (0..9).map(|index| (format!("overrides.laptop{index}"), json!("CRITICAL"))).collect();
+    let results = client.set(&bed, nine);
+    assert_eq!(refused(&results, 8), "at most 8 parameters can be set by one request");
+    let results = client.set(&bed, json!({ "probes.rate_hz": 15.0 }));
+    assert_eq!(results[0], json!({ "successful": true, "reason": "" }), "{results}");
+
+    let limit = "security: {max_probe_rate_hz: 10}\n";
+    bed.bridge.write_config(&format!("instance: {{instance}}\n{SCAN}{PROBES}{limit}"));
+    let reload = bed.bridge.run("reload");
+    let error = String::from_utf8_lossy(&reload.stderr).into_owned();
+    assert!(!reload.status.success(), "{error}");
+    assert!(error.contains("probes.rate_hz: 15") && error.contains("ros2 param delete"), "{error}");
+    let results = client.set(&bed, json!({ "policy_hold_s": 6.0, "probes.window_size": 60 }));
+    assert!(refused(&results, 1).contains("the configuration file is bad"), "{results}");
+    let results = client.set(&bed, json!({ "probes.rate_hz": null }));
+    assert_eq!(results[0], json!({ "successful": true, "reason": "" }), "{results}");
+    let names = ["probes.rate_hz", "security.max_probe_rate_hz"];
+    assert_eq!(client.values(&bed, &names), json!([4.0, 10]));
+    bed.end();
+}
+
+#[test]
+fn requests_beyond_the_rate_of_a_participant_are_counted_and_dropped() {
+    let test = "requests_beyond_the_rate_of_a_participant_are_counted_and_dropped";
+    let Some((bed, mut client)) = start(test) else { return };
+    let requests = |status: &Value, what: &str| status["parameters"]["requests"][what].as_u64().unwrap();
+    // 100 requests may arrive at once, and then 20 a second. The client waits for no reply.
+    support::wait_until("requests beyond the rate", || {
+        let call = json!({ "call": "get", "names": ["instance"], "times": 20, "waits": false });
+        client.event(&bed, "control", call);
+        requests(&bed.bridge.status(), "rate_limited") > 0
+    });
+    bed.bridge.wait_status("the answers within the rate", |status| requests(status, "answered") >= 100);
+    // A node of another participant is answered.
+    let mut other = Client::start(&bed);
+    assert_eq!(other.values(&bed, &["probes.rate_hz"]), json!([4.0]));
+    bed.end();
+}
