@@ -20,6 +20,7 @@ mod networks;
 mod noncritical_readers;
 mod original_probes;
 mod parameters;
+mod qos_table;
 mod readers;
 mod responder;
 mod restarts;

@@ -1,6 +1,7 @@
 //! What ROS 2 nodes (rclpy) see of the bridge, beyond the samples.
 
 use std::os::unix::fs::symlink;
+use std::path::Path;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -243,5 +244,29 @@ fn nodes_and_the_bridge_find_each_other_without_multicast() {
     for process in [&mut responder, &mut up] {
         process.signal(Signal::SIGINT);
         assert!(process.wait().success(), "{}", process.log());
+    }
+}
+
+#[test]
+fn every_worked_configuration_starts() {
+    let test = "every_worked_configuration_starts";
+    if let Some(reason) = support::testbed_missing() {
+        return support::skip(test, &reason);
+    }
+    let net = Net::new(&["bridge"]);
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/examples");
+    let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    assert!(files.len() >= 4, "{files:?}");
+    for file in files {
+        let text = std::fs::read_to_string(&file).unwrap();
+        let bridge = Bridge::new(&format!("{text}\ninstance: {{instance}}\n"));
+        let mut up = bridge.start_on(net.host("bridge"), "up");
+        bridge.wait_status(&file.display().to_string(), |status| {
+            let processes = status["processes"].as_array().unwrap();
+            !processes.is_empty() && processes.iter().all(|process| process["state"] == "running")
+        });
+        up.signal(Signal::SIGINT);
+        assert!(up.wait().success(), "{}: {}", file.display(), up.log());
     }
 }

@@ -21,7 +21,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 # Bytes of the encapsulation header, and of sequence number, time of sending and source timestamp after it.
@@ -60,6 +60,9 @@ def parse():
     option("--reliability", choices=["r", "be"], default="r")
     option("--durability", choices=["v", "tl"], default="v")
     option("--history", default="10", help="all, or the depth of KEEP_LAST")
+    option("--deadline-ms", type=int)
+    option("--lifespan-ms", type=int)
+    option("--liveliness-ms", type=int, help="MANUAL_BY_TOPIC with this lease duration")
     option("--rate", type=float, default=100.0, help="Hz; 0 is as fast as publish returns")
     option("--count", type=int, default=0)
     option("--duration", type=float, default=0.0, help="s")
@@ -94,7 +97,18 @@ def qos_of(options):
     keep_all = options.history == "all"
     reliable = options.reliability == "r"
     volatile = options.durability == "v"
+    durations = {
+        name: Duration(nanoseconds=ms * 10**6)
+        for name, ms in (
+            ("deadline", options.deadline_ms),
+            ("lifespan", options.lifespan_ms),
+            ("liveliness_lease_duration", options.liveliness_ms))
+        if ms is not None
+    }
+    manual = options.liveliness_ms is not None
     return QoSProfile(
+        **durations,
+        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC if manual else LivelinessPolicy.AUTOMATIC,
         history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
         depth=0 if keep_all else int(options.history),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
