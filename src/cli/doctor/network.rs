@@ -21,7 +21,7 @@ const SPDP: (Ipv4Addr, u16) = (Ipv4Addr::new(239, 255, 0, 1), 7400);
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let largest = settings.routes.iter().map(|route| route.max_sample_bytes).max().unwrap_or(0);
     let mut findings = Vec::new();
-    for name in ["rmem_max", "wmem_max"] {
+    for name in ["rmem_max", "wmem_max", "rmem_default"] {
         findings
             .extend(number(&format!("/proc/sys/net/core/{name}")).map(|bytes| buffer(name, bytes, largest)));
     }
@@ -43,8 +43,15 @@ fn buffer(name: &'static str, bytes: i64, largest_sample: usize) -> Finding {
         return Finding::ok(name, found);
     }
     let severity = if largest_sample <= SMALL_SAMPLE_BYTES { Severity::Note } else { Severity::Warning };
-    let means =
-        "The kernel drops fragments of large samples in a burst; their retransmission takes milliseconds.";
+    let means = match name {
+        "rmem_default" => {
+            "Nodes on Fast DDS have this receive buffer, and lose part of each large sample; its repair takes \
+             milliseconds. Nodes that run already keep theirs."
+        }
+        _ => {
+            "The kernel drops fragments of large samples in a burst; their retransmission takes milliseconds."
+        }
+    };
     Finding::new(name, severity, found).means(means).with_command(format!(
         "echo net.core.{name}={BUFFER_BYTES} | sudo tee -a /etc/sysctl.d/60-adaptive-bridge.conf \
          && sudo sysctl --system"
@@ -159,6 +166,7 @@ mod tests {
         assert_eq!(buffer("rmem_max", 4 << 20, 1 << 20).severity, Severity::Ok);
         assert_eq!(buffer("rmem_max", 212_992, 1 << 20).severity, Severity::Warning);
         assert_eq!(buffer("wmem_max", 212_992, 3_000).severity, Severity::Note);
+        assert_eq!(buffer("rmem_default", 212_992, 1 << 20).severity, Severity::Warning);
     }
 
     #[test]
