@@ -568,7 +568,20 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
         fs::copy(&new, root.join("new.deb")).unwrap();
     });
     let bed = Bed { machine, net };
+    // Limits of this machine's own, in place of the kernel's, which it shares with the host.
+    let limits = ["rmem_max", "wmem_max"].map(|name| format!("/proc/sys/net/core/{name}"));
+    // Older kernels (before 6.11) show them only outside of network namespaces.
+    let has_limits = bed.machine.try_run(&["test", "-e", &limits[0]]).status.success();
+    for (path, value) in limits.iter().zip(["212992", "8388608"]).filter(|_| has_limits) {
+        let file = format!("/run/{}", path.rsplit('/').next().unwrap());
+        let script = format!("echo {value} >{file}; mount --bind {file} {path}");
+        bed.machine.run(&["sh", "-c", &script]);
+    }
     bed.machine.run(&["dpkg", "-i", "/old.deb"]);
+    for (path, value) in limits.iter().zip(["4194304", "8388608"]).filter(|_| has_limits) {
+        let set = bed.machine.run(&["cat", path]);
+        assert_eq!(set.trim(), value, "{path}: a limit that is too low is raised, and none is lowered");
+    }
     assert_eq!(bed.machine.property(TARGET, "ActiveState"), "inactive");
     bed.machine.run(&["systemctl", "enable", "--now", TARGET]);
     bed.start();

@@ -246,7 +246,7 @@ pub fn install(root: &Path) {
     for entry in fs::read_dir(&source).unwrap().flatten() {
         let name = entry.file_name().into_string().unwrap();
         let to = match name.as_str() {
-            "sysusers.d" | "tmpfiles.d" => root.join("usr/lib").join(&name),
+            "sysctl.d" | "sysusers.d" | "tmpfiles.d" => root.join("usr/lib").join(&name),
             _ => units.join(&name),
         };
         fs::create_dir_all(to.parent().unwrap()).unwrap();

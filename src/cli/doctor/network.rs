@@ -170,6 +170,17 @@ mod tests {
     }
 
     #[test]
+    fn the_package_raises_the_limits_that_are_checked_and_no_default() {
+        let file = include_str!("../../../systemd/sysctl.d/00-adaptive-bridge.conf");
+        let set: Vec<&str> = file.lines().filter(|line| !line.starts_with('#') && !line.is_empty()).collect();
+        let expected = ["rmem_max", "wmem_max"].map(|name| format!("net.core.{name}={BUFFER_BYTES}"));
+        assert_eq!(set, expected);
+        // A file of that name in /etc/sysctl.d replaces the package's as a whole.
+        let command = buffer("rmem_default", 212_992, 0).command.unwrap();
+        assert!(!command.contains("00-adaptive-bridge.conf"), "{command}");
+    }
+
+    #[test]
     fn an_interface_must_be_there_up_addressed_and_carry_multicast() {
         let good = InterfaceFlags::IFF_UP | InterfaceFlags::IFF_MULTICAST;
         let all = [
