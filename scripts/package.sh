@@ -17,7 +17,8 @@ fi
 made=target/package
 rm -rf $made
 mkdir -p $made/man $made/completions $made/release target/debian
-cp "$PROGRAM" $made/release/adaptive-bridge
+# By itself cargo-deb keeps the line tables of the profile, most of the program.
+strip -o $made/release/adaptive-bridge "$PROGRAM"
 $made/release/adaptive-bridge man $made/man
 for shell in bash fish zsh; do
     $made/release/adaptive-bridge completions $shell >$made/completions/$shell
