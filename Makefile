@@ -40,9 +40,14 @@ lint:
 demo: build
 	target/release/adaptive-bridge demo
 
-# The Debian package: target/debian/adaptive-bridge_*.deb
+# The Debian package: target/debian/adaptive-bridge_*.deb. With ARCH=arm64, which needs Docker, for a robot's computer.
 package:
-	scripts/package.sh
+	ARCH=$(ARCH) scripts/package.sh
+
+# Builds for arm64, and runs the package's program and the tests without network under QEMU. Needs Docker.
+test-arm64:
+	cargo clippy --locked --test arm64 -- -D warnings
+	cargo test --locked --test arm64 -- --nocapture
 
 # Measures the latency and CPU time that the bridge adds. Takes an hour and saves the run in benches/runs. Shorter:
 # cargo bench -- --quick, or cargo bench -- --only isolation (benches/README.md).
@@ -66,4 +71,4 @@ clean:
 	cargo clean
 	$(MAKE) --no-print-directory -C tests/peers clean
 
-.PHONY: build setup peers test test-long quick lint demo package bench fuzz soak clean
+.PHONY: build setup peers test test-long test-arm64 quick lint demo package bench fuzz soak clean

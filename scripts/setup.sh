@@ -66,7 +66,8 @@ check_all() {
     if has docker; then
         need "docker compose version >/dev/null 2>&1 || has docker-compose" "docker-compose-v2|docker-compose" \
             "tests of the deployment in containers"
-        need "has debootstrap" debootstrap "tests of the deployment in containers, without access to a registry"
+        need "has debootstrap" debootstrap \
+            "tests of the deployment in containers and of the package for arm64, without access to a registry"
     fi
     need "has dpkg-shlibdeps" dpkg-dev "the Debian package, and its tests"
     need "has systemd-nspawn" systemd-container "tests of the services (in a container with systemd)"
