@@ -135,7 +135,7 @@ const SERVICES: [(Service, &str, &str); 7] = [
 pub(super) struct ParameterServices {
     reloaded: Option<Sender<Settings>>,
     counts: Arc<SharedCounts>,
-    thread: Option<JoinHandle<()>>,
+    thread: Option<JoinHandle<Vec<Server>>>,
 }
 
 /// The counts of the thread, for the board that control's main thread writes.
@@ -189,7 +189,7 @@ impl ParameterServices {
                 waiting: VecDeque::new(),
                 counts: shared,
             }
-            .run();
+            .run()
         })?;
         Ok(Self { reloaded: Some(sender), counts, thread: Some(thread) })
     }
@@ -226,10 +226,11 @@ impl Drop for ParameterServices {
     fn drop(&mut self) {
         self.reloaded = None;
         self.wake();
-        if let Some(thread) = self.thread.take()
-            && thread.join().is_err()
-        {
-            warn!("the thread of the parameter services panicked");
+        // The caller drops the endpoints: the thread gets little CPU time on a busy machine, and each endpoint
+        // waits for the event loop several times.
+        match self.thread.take().map(JoinHandle::join) {
+            Some(Err(_)) => warn!("the thread of the parameter services panicked"),
+            servers => drop(servers),
         }
     }
 }
@@ -282,14 +283,15 @@ struct Services {
 }
 
 impl Services {
-    fn run(mut self) {
+    /// Serves until control drops the sender of settings; returns the endpoints.
+    fn run(mut self) -> Vec<Server> {
         loop {
             match self.reloaded.try_recv() {
                 Ok(settings) => {
                     self.parameters = Parameters::new(settings);
                     continue;
                 }
-                Err(TryRecvError::Disconnected) => return,
+                Err(TryRecvError::Disconnected) => return self.servers,
                 Err(TryRecvError::Empty) => {}
             }
             let mut is_idle = true;
@@ -383,16 +385,20 @@ impl Services {
     fn wait_applied(&mut self, pending: &SetParameters) -> Vec<String> {
         let give_up_at = clock::monotonic().plus_ms(APPLY.as_millis() as u64);
         loop {
+            let is_last = give_up_at <= clock::monotonic();
+            // This thread may have had no CPU time since the last look.
+            while let Ok(settings) = self.reloaded.try_recv() {
+                self.parameters = Parameters::new(settings);
+            }
             let settings = &self.parameters.settings;
             let late = match settings.set_parameters == *pending {
                 true => others_than(settings),
                 false => vec!["control".to_owned()],
             };
-            let left = Duration::from_nanos(give_up_at.since(clock::monotonic()));
-            if late.is_empty() || left.is_zero() {
+            if late.is_empty() || is_last {
                 return late;
             }
-            match self.reloaded.recv_timeout(left.min(LOOK)) {
+            match self.reloaded.recv_timeout(LOOK) {
                 Ok(settings) => self.parameters = Parameters::new(settings),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return late,
