@@ -14,8 +14,8 @@ const LOSS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --s
 const LOSS_OF_ANSWERS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 25 --queue 1";
 const RATE_HZ: f64 = 100.0;
 const SAMPLES: u64 = 1_500;
-/// The samples that the lane forwards of those: 10 Hz for 15 s, and the first one.
-const FORWARDED: std::ops::RangeInclusive<u64> = 135..=155;
+/// The least that the lane forwards of those: 10 Hz for 15 s, less a tenth.
+const LEAST_FORWARDED: u64 = 135;
 
 fn bed(test: &str, yaml: &str) -> Option<Bed> {
     if let Some(reason) = ros::missing() {
@@ -39,6 +39,8 @@ fn subscribers(bed: &Bed, host: &str, node: &str, change: fn(Peer) -> Peer) -> V
 /// What the lane forwarded of a flow, and what its subscribers received.
 struct Outcome {
     forwarded: u64,
+    /// The time that the publisher took, in seconds.
+    elapsed_s: f64,
     reliable: Vec<Received>,
     best_effort: Vec<Received>,
     lossy: Vec<Received>,
@@ -55,7 +57,7 @@ fn flow(bed: &Bed, beside_bad: bool) -> Outcome {
     let output = noncritical(&bed.wait_accounted()).clone();
     let [received, before] = ["received", "forwarded"].map(|key| output[key].as_u64().unwrap());
     let reliable = subscribers(bed, "slow", "planner", |peer| peer.keep_last(100));
-    let best_effort = subscribers(bed, "slow", "viewer", Peer::best_effort);
+    let best_effort = subscribers(bed, "slow", "viewer", |peer| peer.best_effort().keep_last(100));
     let (mut lossy, mut stopped, mut links) = (Vec::new(), Vec::new(), Vec::new());
     if beside_bad {
         lossy = subscribers(bed, "lossy", "far", |peer| peer.keep_last(100));
@@ -66,14 +68,15 @@ fn flow(bed: &Bed, beside_bad: bool) -> Outcome {
         let [far, bridge] = ["lossy", "bridge"].map(|name| bed.host(name));
         links = vec![Impairment::start(far, bridge, LOSS), Impairment::start(bridge, far, LOSS_OF_ANSWERS)];
     }
-    let publisher = bed.publish(Peer::cyclone().rate_hz(RATE_HZ).count(SAMPLES), INPUT);
-    publisher.finish::<Sent>().assert_not_blocked();
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ).count(SAMPLES), INPUT);
+    let sent: Sent = publisher.finish();
+    sent.assert_not_blocked();
     let arrived = received + SAMPLES;
     let status = bed.bridge.wait_status("all samples accounted for", |status| {
         noncritical(status)["received"].as_u64() == Some(arrived) && is_accounted_and_idle(status)
     });
     let forwarded = noncritical(&status)["forwarded"].as_u64().unwrap() - before;
-    for subscriber in &reliable {
+    for subscriber in reliable.iter().chain(&best_effort) {
         subscriber.wait_received(forwarded);
     }
     for link in links {
@@ -84,7 +87,8 @@ fn flow(bed: &Bed, beside_bad: bool) -> Outcome {
     }
     let end = |subscribers: Vec<RunningPeer>| subscribers.into_iter().map(RunningPeer::end).collect();
     let _: Vec<Received> = end(stopped);
-    Outcome { forwarded, reliable: end(reliable), best_effort: end(best_effort), lossy: end(lossy) }
+    let (reliable, best_effort, lossy) = (end(reliable), end(best_effort), end(lossy));
+    Outcome { forwarded, elapsed_s: sent.elapsed_s, reliable, best_effort, lossy }
 }
 
 /// The age in milliseconds that 95 % of the samples did not exceed.
@@ -106,33 +110,53 @@ fn print(kind: &str, subscribers: &[Received]) {
 #[test]
 fn bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others() {
     let test = "bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others";
+    // It compares rates and ages.
+    let _alone = support::exclusive();
     let Some(bed) = bed(test, SCAN) else { return };
-    let [alone, beside] = [false, true].map(|beside_bad| flow(&bed, beside_bad));
-    for (name, flow) in [("alone", &alone), ("beside bad ones", &beside)] {
-        println!("{name}: {} forwarded", flow.forwarded);
-        print("RELIABLE", &flow.reliable);
-        print("BEST_EFFORT", &flow.best_effort);
-        print("RELIABLE, lossy", &flow.lossy);
-    }
-    for flow in [&alone, &beside] {
-        assert!(FORWARDED.contains(&flow.forwarded), "{} forwarded", flow.forwarded);
-        for received in flow.reliable.iter().chain(&flow.best_effort) {
-            received.assert_sound();
-            assert_eq!(received.received, flow.forwarded);
+    support::attempts(|| {
+        let [alone, beside] = [false, true].map(|beside_bad| flow(&bed, beside_bad));
+        for (name, flow) in [("alone", &alone), ("beside bad ones", &beside)] {
+            println!("{name}: {} forwarded", flow.forwarded);
+            print("RELIABLE", &flow.reliable);
+            print("BEST_EFFORT", &flow.best_effort);
+            print("RELIABLE, lossy", &flow.lossy);
+            for received in flow.reliable.iter().chain(&flow.best_effort) {
+                received.assert_sound();
+                assert_eq!(received.received, flow.forwarded);
+            }
+            flow.lossy.iter().for_each(Received::assert_sound);
+        }
+        are_unmoved(&alone, &beside)
+    });
+    bed.end();
+}
+
+/// Whether bad subscribers left the rate of the lane and the ages at the others as they were.
+fn are_unmoved(alone: &Outcome, beside: &Outcome) -> Result<(), String> {
+    for flow in [alone, beside] {
+        // Of the token bucket's 10 Hz, with the burst.
+        let most = 10.0f64.mul_add(flow.elapsed_s, 5.0);
+        if flow.forwarded < LEAST_FORWARDED || flow.forwarded as f64 > most {
+            return Err(format!("{} forwarded in {} s", flow.forwarded, flow.elapsed_s));
         }
     }
     let pairs = alone.reliable.iter().zip(&beside.reliable);
     for (alone, beside) in pairs.chain(alone.best_effort.iter().zip(&beside.best_effort)) {
-        let (alone, beside) = (p95_ms(alone), p95_ms(beside));
-        assert!(beside <= alone + 20.0, "the age of 95 % of the samples rose from {alone} to {beside} ms");
+        is_as_young(beside, alone)?;
     }
     // Without repair some 40 % arrive: a sample is three packets. The history is 0.2 s.
-    for received in &beside.lossy {
-        received.assert_sound();
-        assert!(received.received * 10 >= beside.forwarded * 6, "{received:?}");
-        assert!(p95_ms(received) <= 500.0, "{received:?}");
-    }
-    bed.end();
+    let is_repaired =
+        |lossy: &Received| lossy.received * 10 >= beside.forwarded * 6 && p95_ms(lossy) <= 500.0;
+    beside.lossy.iter().all(is_repaired).then_some(()).ok_or_else(|| format!("{:?}", beside.lossy))
+}
+
+/// Whether the age of 95 % of the samples is at most 20 ms above that of the others.
+fn is_as_young(received: &Received, than: &Received) -> Result<(), String> {
+    let (age, than) = (p95_ms(received), p95_ms(than));
+    let is_young = age <= than + 20.0;
+    is_young
+        .then_some(())
+        .ok_or_else(|| format!("the age of 95 % of the samples rose from {than} to {age} ms"))
 }
 
 #[test]
@@ -179,10 +203,19 @@ fn best_effort_subscribers_get_what_a_best_effort_lane_gives_them() {
         "{SCAN}lanes: {{plain: {{qos: {{reliability: BEST_EFFORT}}}}}}\n\
          routing_policy: {{noncritical_max_rate_hz: 50}}\n"
     );
+    // It compares rates and ages.
+    let _alone = support::exclusive();
     let Some(bed) = bed(test, &yaml) else { return };
     bed.up.wait_for_log("egress is up lane=\"plain\"");
+    support::attempts(|| compare_lanes(&bed));
+    bed.end();
+}
+
+/// Publishes for 15 s to subscribers of both lanes, which receive about the same.
+fn compare_lanes(bed: &Bed) -> Result<(), String> {
     let join = |host, topic| -> Vec<RunningPeer> {
-        LIBRARIES.map(|library| bed.subscribe(host, peer(library, "viewer").best_effort(), topic)).into()
+        let peer = |library| peer(library, "viewer").best_effort().keep_last(1_000);
+        LIBRARIES.map(|library| bed.subscribe(host, peer(library), topic)).into()
     };
     let [near, plain_near] = [NONCRITICAL, PLAIN].map(|topic| join("slow", topic));
     let [far, plain_far] = [NONCRITICAL, PLAIN].map(|topic| join("lossy", topic));
@@ -202,18 +235,18 @@ fn best_effort_subscribers_get_what_a_best_effort_lane_gives_them() {
     print("BEST_EFFORT lane", &plain_near);
     print("default lane, lossy", &far);
     print("BEST_EFFORT lane, lossy", &plain_far);
+    near.iter().chain(&far).for_each(Received::assert_sound);
     for (received, plain) in near.iter().zip(&plain_near) {
-        received.assert_sound();
-        assert!(received.received.abs_diff(plain.received) <= 3, "{received:?}\n{plain:?}");
+        if received.received.abs_diff(plain.received) > 3 {
+            return Err(format!("{received:?}\n{plain:?}"));
+        }
     }
     for (received, plain) in far.iter().zip(&plain_far) {
-        received.assert_sound();
         // Of 750 samples some 40 % arrive: a sample is three packets.
-        assert!(received.received * 4 >= plain.received * 3, "{received:?}\n{plain:?}");
+        if received.received * 4 < plain.received * 3 {
+            return Err(format!("{received:?}\n{plain:?}"));
+        }
     }
-    for (received, plain) in near.iter().chain(&far).zip(plain_near.iter().chain(&plain_far)) {
-        let (age, plain) = (p95_ms(received), p95_ms(plain));
-        assert!(age <= plain + 20.0, "the age of 95 % of the samples rose from {plain} to {age} ms");
-    }
-    bed.end();
+    let pairs = near.iter().chain(&far).zip(plain_near.iter().chain(&plain_far));
+    pairs.into_iter().try_for_each(|(received, plain)| is_as_young(received, plain))
 }

@@ -106,6 +106,18 @@ pub fn skip_into(list: &Path, ci: bool, test: &str, reason: &str) {
     writeln!(file, "{test}: {reason}").unwrap();
 }
 
+/// Repeats a check that compares rates or ages until it succeeds, three times at most. Another program on the machine
+/// can delay the samples of one flow; a fault of the bridge is there each time.
+pub fn attempts(mut check: impl FnMut() -> Result<(), String>) {
+    for number in 1.. {
+        match check() {
+            Ok(()) => return,
+            Err(error) if number < 3 => eprintln!("attempt {number}: {error}"),
+            Err(error) => panic!("attempt {number}: {error}"),
+        }
+    }
+}
+
 /// Returns why tests with several hosts cannot run on this machine: no permission to create network
 /// namespaces, or a peer that is not built.
 pub fn testbed_missing() -> Option<String> {
