@@ -68,6 +68,16 @@ fn wait_for_reader(writer: &RawWriter) {
     }
 }
 
+/// A writer matches a reader before the reader matches the writer, and DDS does not signal the end of that to a
+/// BEST_EFFORT writer.
+fn wait_for_writer(reader: &RawReader) {
+    let give_up = Instant::now() + Duration::from_secs(20);
+    while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
+        assert!(Instant::now() < give_up, "no writer was matched");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
 #[test]
 fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
     let mut here = participant("here", 70);
@@ -194,6 +204,7 @@ fn an_onlooker_sees_samples_come_and_takes_none() {
         .unwrap();
     let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
     wait_for_reader(&writer);
+    wait_for_writer(&reader);
     let arrivals = there.arrivals().unwrap();
     let closer = arrivals.closer();
     let (tell, seen) = std::sync::mpsc::channel();
@@ -413,12 +424,7 @@ fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
         assert!(Instant::now() < give_up);
         std::thread::sleep(Duration::from_millis(5));
     };
-    // The writer knows of the reader before the reader knows of the writer; nothing tells a BEST_EFFORT
-    // writer when that is over, so the reader's end is asked.
-    while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
-        assert!(Instant::now() < give_up);
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_for_writer(&reader);
     writer
         .write_to(joined, Bytes::from_static(b"map again..."), Encapsulation::CDR_LE, SourceTimestamp(1))
         .unwrap();

@@ -32,7 +32,8 @@ fn every_library_reaches_every_library_through_both_lanes() {
             assert_eq!(received.source_timestamps_kept, 300, "{from:?} to {to:?}: {received:?}");
             let slow: Received = noncritical.end();
             slow.assert_sound();
-            assert!(slow.received < 30, "10 Hz for 1.5 s, and two tokens to begin with: {slow:?}");
+            // 10 Hz for 1.5 s, and two tokens to begin with.
+            assert!((slow.received as f64) < 10.0 * sent.elapsed_s + 15.0, "{slow:?}, {sent:?}");
             assert_eq!(slow.headers.keys().collect::<Vec<_>>(), received.headers.keys().collect::<Vec<_>>());
             assert_eq!(slow.source_timestamps_changed, 0, "{from:?} to {to:?}");
         }
@@ -47,14 +48,15 @@ fn hosts_without_samples_send_few_packets() {
     for library in LIBRARIES {
         let subscriber = bed.subscribe("critical", Peer::on(library), CRITICAL);
         subscriber.wait_matched(1);
-        // Waits until discovery is finished.
-        std::thread::sleep(Duration::from_secs(3));
-        let before = packets(&bed);
-        std::thread::sleep(Duration::from_secs(4));
-        let sent = packets(&bed) - before;
-        // Expected are announcements of a few participants, seconds apart. A Fast DDS reader that receives no
-        // HEARTBEAT requests one seven times a second, from each of several writers of each process.
-        assert!(sent < 100, "{library:?}: {sent} packets in 4 s");
+        // Expected after discovery are announcements of a few participants, seconds apart. A Fast DDS reader that receives
+        // no HEARTBEAT requests one seven times a second, from each of several writers of each process, without end.
+        support::wait_until(format!("few packets of {library:?}"), || {
+            let before = packets(&bed);
+            std::thread::sleep(Duration::from_secs(4));
+            let sent = packets(&bed) - before;
+            println!("{library:?}: {sent} packets in 4 s");
+            sent < 100
+        });
         subscriber.end::<Received>();
     }
     bed.end();

@@ -51,7 +51,9 @@ fn a_late_joiner_of_either_lane_gets_the_last_sample_without_a_configured_durabi
     let Some(bed) = Bed::start(test, MAP) else { return };
     let publisher = publisher("map_server", 0, 3).start_on(bed.host("publisher"));
     publisher.wait_sent();
-    bed.wait_accounted();
+    bed.bridge.wait_status("all samples handled by both lanes", |status| {
+        outputs(status).all(|output| output["received"] == 3) && is_accounted_and_idle(status)
+    });
     for round in 0..2 {
         for subscriber in late_joiners(&bed) {
             subscriber.wait_received(1);
@@ -117,7 +119,11 @@ fn a_writer_with_subscribers_stays_volatile_until_they_leave() {
     };
     bed.bridge.wait_status("the subscribers that get nothing are named", are_named);
     // It publishes until the test ends it.
-    let publisher = publisher("map_server", 0, 1_000_000).wait_match(1).start_on(bed.host("publisher"));
+    let publisher =
+        publisher("map_server", 0, 1_000_000).wait_match(1).hold().start_on(bed.host("publisher"));
+    let is_matched = |status: &Value| status["routes"][0]["writers"] == 1;
+    bed.bridge.wait_status("the publisher matched by ingress", is_matched);
+    publisher.go();
     for subscriber in &present {
         subscriber.wait_received(20);
     }

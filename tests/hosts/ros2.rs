@@ -114,19 +114,26 @@ fn the_sample_of_a_node_that_publishes_once_and_ends_reaches_the_subscriber() {
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
     // Five at a time, because each takes half a second to start.
+    let mut late = 0;
     for first in (0..NODES).step_by(5) {
         let nodes = (first..first + 5).map(|number| {
-            // As `ros2 topic pub --once`, which ends 0.1 s after it has published.
+            // As `ros2 topic pub --once`, which ends 0.1 s after it has published. On a busy machine ingress may not
+            // have matched the node by then, so that a node whose sample is not acknowledged waits for that.
             let node = Peer::rclpy("once").option("--keep-alive", 0.1).first_seq(number).count(1);
             bed.publish(node, INPUT)
         });
         for mut node in nodes.collect::<Vec<_>>() {
+            let sent = node.wait_for("its sample acknowledged", |event| event["event"] == "sent");
+            late += u64::from(sent["in_time"] != true);
             node.wait();
         }
     }
     critical.wait_received(NODES);
     let received: Received = critical.end();
-    received.assert_sound();
+    // The nodes are not in step, so that their samples may arrive in another order.
+    assert_eq!((received.bad, received.duplicates, received.missing_count), (0, 0, 0), "{received:?}");
+    // One node in five was too late when ingress received no sample of a writer that it had not discovered.
+    assert!(late * 10 <= NODES, "{late} of {NODES} samples were acknowledged after 0.1 s");
     bed.wait_accounted();
     bed.end();
 }
@@ -226,7 +233,8 @@ fn nodes_and_the_bridge_find_each_other_without_multicast() {
         Peer::fast().subscriber().topic(NONCRITICAL).start_on(net.host("critical")),
         node(Peer::rclpy("rviz")).subscriber().topic(NONCRITICAL).start_on(net.host("slow")),
     ];
-    for library in [Peer::rclpy("lidar"), cyclone()] {
+    for (library, first) in [(Peer::rclpy("lidar"), 0), (cyclone(), 1_000_000)] {
+        let library = library.first_seq(first);
         let goals = subscribers.iter().map(|subscriber| subscriber.received() + 5).collect::<Vec<_>>();
         let publisher = library.publisher().topic(INPUT).rate_hz(30.0).start_on(net.host("publisher"));
         for (subscriber, goal) in subscribers.iter().zip(goals) {
