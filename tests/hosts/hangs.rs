@@ -55,12 +55,17 @@ fn up_restarts_a_process_that_hangs_before_its_first_turn() {
     let test = "up_restarts_a_process_that_hangs_before_its_first_turn";
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let role = "egress-noncritical";
-    kill(Pid::from_raw(bed.pid(role)), Signal::SIGKILL).unwrap();
-    support::wait_until("its restart", || bed.pids(role).len() == 2);
-    let process = bed.pid(role);
-    cause(Fault::Hang, process, thread(process, None));
-    support::wait_until("another restart", || bed.pids(role).len() == 3);
-    assert!(bed.up.log().contains("no first turn within 30000 ms"), "{}", bed.up.log());
+    let is_noticed = (0..5).any(|_| {
+        let starts = bed.pids(role).len();
+        kill(Pid::from_raw(bed.pid(role)), Signal::SIGKILL).unwrap();
+        support::wait_until("its restart", || bed.pids(role).len() == starts + 1);
+        let process = bed.pid(role);
+        cause(Fault::Hang, process, thread(process, None));
+        support::wait_until("another restart", || bed.pids(role).len() == starts + 2);
+        // On a busy machine the process may have had its first turn before this test stopped it.
+        bed.up.log().contains("no first turn within 30000 ms")
+    });
+    assert!(is_noticed, "{}", bed.up.log());
     bed.end();
 }
 
