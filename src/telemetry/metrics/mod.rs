@@ -14,7 +14,7 @@ use super::problem::Level;
 use super::report::{Latency, OutputReport, ProcessReport, Report, RouteReport, SubscriberReport};
 use crate::model::{LaneMode, SafetyMode, SubscriberState};
 use page::Kind::{Counter, Gauge, Histogram};
-use page::{Page, Value};
+use page::Page;
 
 /// The report as a page of [`CONTENT_TYPE`]. Its size grows with the number of routes and lanes: about 15 KiB
 /// for each route on two lanes.
@@ -45,27 +45,27 @@ fn bridge(page: &mut Page, report: &Report) {
 }
 
 fn processes(page: &mut Page, report: &Report) {
-    let mut each = |name, kind, help, value: fn(&ProcessReport) -> Option<Value>| {
+    let mut each = |name, kind, help, value: fn(&ProcessReport) -> Option<f64>| {
         page.family(name, kind, help);
         for process in &report.processes {
             page.sample(&[("process", &process.reading.name)], value(process));
         }
     };
     each("process_up", Gauge, "1 while the process runs and makes turns.", |process| {
-        Some(u64::from(process.reading.state == ProcessState::Running).into())
+        Some(f64::from(process.reading.state == ProcessState::Running))
     });
     each("process_starts_total", Counter, "Starts of the process.", |process| {
-        Some(process.reading.health.starts.into())
+        Some(process.reading.health.starts as f64)
     });
     each("process_turns_total", Counter, "Turns of its data path.", |process| {
-        Some(process.reading.health.turns.into())
+        Some(process.reading.health.turns as f64)
     });
     each("process_errors_total", Counter, "Errors, except dropped samples.", |process| {
-        Some(process.reading.health.errors.into())
+        Some(process.reading.health.errors as f64)
     });
     let help = "Reloads refused because of errors in the configuration file.";
     each("process_refused_reloads_total", Counter, help, |process| {
-        Some(process.reading.health.refused_reloads.into())
+        Some(process.reading.health.refused_reloads as f64)
     });
     each("process_last_turn_age_seconds", Gauge, "Time since its last turn.", |process| {
         seconds(process.last_turn_age_ms)
@@ -202,17 +202,17 @@ fn subscribers(page: &mut Page, report: &Report) {
     for subscriber in &report.subscribers {
         page.states(&labels(subscriber), "state", &states, subscriber.state);
     }
-    let mut each = |name, kind, help, value: fn(&SubscriberReport) -> Option<Value>| {
+    let mut each = |name, kind, help, value: fn(&SubscriberReport) -> Option<f64>| {
         page.family(name, kind, help);
         for subscriber in &report.subscribers {
             page.sample(&labels(subscriber), value(subscriber));
         }
     };
     each("subscriber_state_changes_total", Counter, "Changes of its state.", |one| {
-        Some(one.transitions.into())
+        Some(one.transitions as f64)
     });
     let help = "Share of its probes lost, 0 to 1.";
-    each("subscriber_loss_ratio", Gauge, help, |one| one.loss.map(Value::from));
+    each("subscriber_loss_ratio", Gauge, help, |one| one.loss);
     each("subscriber_rtt_mean_seconds", Gauge, "Mean round trip.", |one| seconds(one.rtt_mean_ms));
     let help = "95th percentile of the round trip.";
     each("subscriber_rtt_p95_seconds", Gauge, help, |one| seconds(one.rtt_p95_ms));
@@ -221,8 +221,8 @@ fn subscribers(page: &mut Page, report: &Report) {
     each("subscriber_last_response_age_seconds", Gauge, help, |one| seconds(one.last_response_age_ms));
 }
 
-fn seconds(ms: Option<f64>) -> Option<Value> {
-    ms.map(|ms| Value::from(ms / 1e3))
+fn seconds(ms: Option<f64>) -> Option<f64> {
+    ms.map(|ms| ms / 1e3)
 }
 
 #[cfg(test)]

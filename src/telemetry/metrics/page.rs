@@ -1,6 +1,6 @@
 //! Writes the text exposition format of Prometheus, version 0.0.4.
 
-use std::fmt::Write;
+use std::fmt::{Display, Write};
 
 use crate::model::{Counts, Reason};
 use crate::telemetry::report::LatencyTotal;
@@ -30,25 +30,6 @@ pub(super) enum Kind {
     Histogram,
 }
 
-/// The value of a sample: an integer count, or a floating-point number.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum Value {
-    Count(u64),
-    Float(f64),
-}
-
-impl From<u64> for Value {
-    fn from(count: u64) -> Self {
-        Self::Count(count)
-    }
-}
-
-impl From<f64> for Value {
-    fn from(float: f64) -> Self {
-        Self::Float(float)
-    }
-}
-
 impl Page {
     pub(super) fn with_prefix(prefix: &'static str) -> Self {
         Self { prefix, ..Self::default() }
@@ -67,23 +48,23 @@ impl Page {
     }
 
     /// Adds a sample to the family; `None` adds nothing.
-    pub(super) fn sample(&mut self, labels: Labels<'_>, value: Option<impl Into<Value>>) {
+    pub(super) fn sample(&mut self, labels: Labels<'_>, value: Option<impl Display>) {
         if let Some(value) = value {
-            self.put("", labels, None, value.into());
+            self.put("", labels, None, value);
         }
     }
 
     /// Adds one sample for each reason of the counts.
     pub(super) fn counts<R: Reason, const N: usize>(&mut self, labels: Labels<'_>, counts: &Counts<R, N>) {
         for &reason in R::ALL {
-            self.put("", labels, Some(("reason", &reason.to_string())), counts.get(reason).into());
+            self.put("", labels, Some(("reason", &reason.to_string())), counts.get(reason));
         }
     }
 
     /// Adds one sample for each possible state: 1 for the present state, 0 for the others.
     pub(super) fn states(&mut self, labels: Labels<'_>, name: &'static str, all: &[&str], present: &str) {
         for state in all {
-            self.put("", labels, Some((name, state)), u64::from(*state == present).into());
+            self.put("", labels, Some((name, state)), u64::from(*state == present));
         }
     }
 
@@ -91,11 +72,11 @@ impl Page {
     pub(super) fn histogram(&mut self, labels: Labels<'_>, total: &LatencyTotal) {
         for (edge_ns, below) in LatencyTotal::EDGES_NS.iter().zip(total.below) {
             let edge = (*edge_ns as f64 / 1e9).to_string();
-            self.put("_bucket", labels, Some(("le", &edge)), below.into());
+            self.put("_bucket", labels, Some(("le", &edge)), below);
         }
-        self.put("_bucket", labels, Some(("le", "+Inf")), total.count.into());
-        self.put("_sum", labels, None, (total.sum_ns as f64 / 1e9).into());
-        self.put("_count", labels, None, total.count.into());
+        self.put("_bucket", labels, Some(("le", "+Inf")), total.count);
+        self.put("_sum", labels, None, total.sum_ns as f64 / 1e9);
+        self.put("_count", labels, None, total.count);
     }
 
     pub(super) fn into_text(self) -> String {
@@ -103,19 +84,13 @@ impl Page {
     }
 
     /// Adds a line; `last` is the label after the others.
-    fn put(&mut self, suffix: &str, labels: Labels<'_>, last: Option<(&str, &str)>, value: Value) {
+    fn put(&mut self, suffix: &str, labels: Labels<'_>, last: Option<(&str, &str)>, value: impl Display) {
         self.text.push_str(&self.head.take().unwrap_or_default());
         let escaped = |value: &str| value.replace('\\', r"\\").replace('"', r#"\""#).replace('\n', r"\n");
         let labels = labels.iter().copied().chain(last);
         let labels: Vec<String> =
             labels.map(|(name, value)| format!("{name}=\"{}\"", escaped(value))).collect();
         let labels = if labels.is_empty() { String::new() } else { format!("{{{}}}", labels.join(",")) };
-        let value = match value {
-            Value::Count(count) => count.to_string(),
-            Value::Float(f64::INFINITY) => "+Inf".to_owned(),
-            Value::Float(f64::NEG_INFINITY) => "-Inf".to_owned(),
-            Value::Float(float) => float.to_string(),
-        };
         // Writing to a string does not fail.
         let _ = writeln!(self.text, "{}{}{suffix}{labels} {value}", self.prefix, self.name);
     }
