@@ -85,10 +85,7 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
             continue;
         };
         let grown = |now: u64, before: u64| now.checked_sub(before).filter(|&count| count > 0);
-        let about = match process.role {
-            ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), super::about_lane),
-            ProcessRole::Ingress | ProcessRole::Control => process.name.clone(),
-        };
+        let about = super::processes::about(process, now);
         if grown(process.health.refused_reloads, former.health.refused_reloads).is_some() {
             let text = format!(
                 "{} refused a reload in the last {window} and keeps its settings; run `adaptive-bridge check` to see \

@@ -19,10 +19,7 @@ pub(super) fn problem(process: &ProcessReading, now: &Snapshot, before: &Snapsho
             None => "its lane forwards nothing".to_owned(),
         },
     };
-    let about = match process.role {
-        ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), super::about_lane),
-        ProcessRole::Ingress | ProcessRole::Control => name.clone(),
-    };
+    let about = about(process, now);
     let start = start_command(name);
     let text = match process.state {
         // An operator ended it, so it is no error; the consequence is worth a warning.
@@ -60,6 +57,14 @@ pub(super) fn problem(process: &ProcessReading, now: &Snapshot, before: &Snapsho
         }
     };
     Some(Problem::new(about, Level::Error, text))
+}
+
+/// The part that a problem of this process is about.
+pub(super) fn about(process: &ProcessReading, now: &Snapshot) -> String {
+    match process.role {
+        ProcessRole::Egress(lane) => now.lanes.get(lane).map_or("bridge".to_owned(), super::about_lane),
+        ProcessRole::Ingress | ProcessRole::Control => process.name.clone(),
+    }
 }
 
 /// The command that starts the process of that name by hand.

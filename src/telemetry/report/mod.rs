@@ -15,7 +15,7 @@ use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, 
 use super::text::printable;
 use crate::model::{
     DropCounts, Guid, IngressCounters, LaneCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
-    TypeHash, UnmatchedPolicy,
+    TypeHash,
 };
 
 /// The state of a bridge. Keys that end in a unit are in that unit; an unknown value is null.
@@ -274,15 +274,21 @@ impl Snapshot {
     ) -> OutputReport {
         let (counters, former) = (&now.counters, before.map(|before| before.counters));
         let rate = |now, before: Option<u64>| per_s(now, before, window_ms);
+        let matched = now.readers.iter().map(|record| ReaderReport {
+            record: *record,
+            origin: self.origin(record.reader),
+            reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
+        });
+        let unmatched = now.readers.unmatched().map(|(reader, policy)| UnmatchedReport {
+            guid: reader.to_string(),
+            origin: self.origin(reader),
+            policy: policy.label(),
+        });
         OutputReport {
             lane: self.lanes[now.lane].name.to_string(),
             topic: now.topic.to_string(),
-            matched_readers: now.readers.iter().map(|record| self.reader_report(record)).collect(),
-            unmatched_readers: now
-                .readers
-                .unmatched()
-                .map(|unmatched| self.unmatched_report(unmatched))
-                .collect(),
+            matched_readers: matched.collect(),
+            unmatched_readers: unmatched.collect(),
             received: counters.received(),
             counters: *counters,
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),
@@ -295,18 +301,6 @@ impl Snapshot {
             dds_out: Latency::of(&now.dds_out, before.map(|before| &before.dds_out)),
             age: Latency::of(&now.age, before.map(|before| &before.age)),
         }
-    }
-
-    fn reader_report(&self, record: &ReaderRecord) -> ReaderReport {
-        ReaderReport {
-            record: *record,
-            origin: self.origin(record.reader),
-            reliability: if record.reliable == 1 { "RELIABLE" } else { "BEST_EFFORT" },
-        }
-    }
-
-    fn unmatched_report(&self, (reader, policy): (Guid, UnmatchedPolicy)) -> UnmatchedReport {
-        UnmatchedReport { guid: reader.to_string(), origin: self.origin(reader), policy: policy.label() }
     }
 
     fn origin(&self, endpoint: Guid) -> EndpointOrigin {
