@@ -165,11 +165,6 @@ impl IntruderWatch {
         }
     }
 
-    /// Whether this DDS topic is guarded.
-    pub fn guards(&self, dds_topic: &str) -> bool {
-        self.dds_names.iter().any(|name| name == dds_topic)
-    }
-
     /// Records a reader, new or changed, that discovery found on any DDS topic. `own` are the addresses of
     /// this host. A reader on this host or on an unknown one is no intruder.
     pub fn endpoint_discovered(
@@ -379,7 +374,6 @@ mod tests {
     #[test]
     fn readers_on_this_host_on_an_unknown_host_and_of_other_topics_are_no_intruders() {
         let mut watch = watch();
-        assert!(watch.guards("rt/scan") && !watch.guards("rt/adaptive_bridge/noncritical/scan"));
         watch.endpoint_discovered(guid(1, 1), "rt/scan", &at("10.0.0.5"), &own(), START);
         watch.endpoint_discovered(guid(1, 2), "rt/scan", &at("127.0.0.1"), &own(), START);
         watch.endpoint_discovered(guid(1, 3), "rt/scan", &Location::default(), &own(), START);

@@ -52,11 +52,6 @@ impl ReplayGuard {
         }
     }
 
-    /// Applies a new window. Messages already removed stay removed.
-    pub const fn set_window(&mut self, window_ms: u64) {
-        self.window_ns = window_ms.saturating_mul(1_000_000);
-    }
-
     /// Messages remembered.
     pub fn len(&self) -> usize {
         self.seen.len()
@@ -222,14 +217,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn another_window_applies_to_the_next_message() {
+    fn a_message_is_too_old_for_one_window_and_fresh_for_a_longer_one() {
         let mut guard = ReplayGuard::new(1_000, 8);
         assert!(guard.is_empty());
         let now = WallNs(100_000_000_000);
         let sent = WallNs(now.0 - 5_000_000_000);
         assert_eq!(guard.admit([1; 16], sent, now), Admission::TooOld);
         assert!(guard.is_empty());
-        guard.set_window(10_000);
+        let mut guard = ReplayGuard::new(10_000, 8);
         assert_eq!(guard.admit([2; 16], sent, now), Admission::Fresh);
         assert!(!guard.is_empty());
     }
