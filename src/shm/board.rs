@@ -298,12 +298,7 @@ impl Boards {
 
     /// Records latencies of a stage on a route. One writer at a time, as for the counters.
     pub fn histogram_writer(&self, stage: Stage, route: usize) -> HistogramWriter {
-        let upper_edges_ns = LatencyHistogram::default().buckets().map(|(edge_ns, _)| edge_ns).collect();
-        HistogramWriter {
-            segment: self.segment.clone(),
-            at: self.layout.histogram(stage, route),
-            upper_edges_ns,
-        }
+        HistogramWriter { segment: self.segment.clone(), at: self.layout.histogram(stage, route) }
     }
 
     /// The policy of a lane; epoch 0 if none has been set.
@@ -412,16 +407,12 @@ pub fn write_rows<T: Plain + PartialEq>(writers: &mut [BoardWriter<T>], rows: im
 pub struct HistogramWriter {
     segment: Arc<Segment>,
     at: usize,
-    /// The upper edge of each bucket, exclusive.
-    upper_edges_ns: Box<[u64]>,
 }
 
 impl HistogramWriter {
     /// Counts one latency, as [`LatencyHistogram::record`] does.
     pub fn record(&mut self, latency_ns: u64) {
-        let above = self.upper_edges_ns.partition_point(|&edge_ns| edge_ns <= latency_ns);
-        let bucket = above.min(HISTOGRAM_WORDS - 2);
-        let count = self.segment.word(self.at + bucket);
+        let count = self.segment.word(self.at + LatencyHistogram::bucket(latency_ns));
         count.store(count.load(Ordering::Relaxed).wrapping_add(1), Ordering::Relaxed);
         // The maximum is the word after the counts.
         let max_ns = self.segment.word(self.at + HISTOGRAM_WORDS - 1);

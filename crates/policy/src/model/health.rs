@@ -457,7 +457,9 @@ impl LatencyHistogram {
         self.counts.iter().enumerate().map(|(bucket, &count)| (Self::upper_edge_ns(bucket), count))
     }
 
-    fn bucket(latency_ns: u64) -> usize {
+    /// The index of the bucket in which a latency counts.
+    #[inline]
+    pub fn bucket(latency_ns: u64) -> usize {
         let clamped = latency_ns.clamp(1 << LOWEST_BIT, (1 << (LOWEST_BIT + OCTAVES as u32)) - 1);
         let octave = clamped.ilog2() - LOWEST_BIT;
         let within = (clamped >> (octave + LOWEST_BIT - SUB_BUCKETS.ilog2())) as usize - SUB_BUCKETS;
