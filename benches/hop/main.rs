@@ -32,7 +32,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use adaptive_bridge::telemetry::CpuTime;
+use adaptive_bridge_measure::cpu_time::CpuTime;
 use adaptive_bridge_measure::hop::{self, Summary};
 use clap::Parser;
 use options::Options;
@@ -61,7 +61,8 @@ fn main() -> ExitCode {
 fn measure(options: &Options) -> Result<(), String> {
     let _lock = system::lock_bench()?;
     let _awake = if options.awake { Some(system::keep_cpus_awake()?) } else { None };
-    let began = CpuTime::now();
+    let cpu_time = || CpuTime::parse(&fs::read_to_string("/proc/stat").unwrap_or_default());
+    let began = cpu_time();
     let mut options = options.clone();
     let mut summary = Summary {
         date: out::date(std::time::SystemTime::now()),
@@ -96,7 +97,7 @@ fn measure(options: &Options) -> Result<(), String> {
         scale::measure(&options, &mut output)?;
         isolation::measure(&options, &mut output)?;
     }
-    let stolen_percent = CpuTime::now().stolen_percent_since(began);
+    let stolen_percent = cpu_time().stolen_percent_since(began);
     let line =
         format!("steal: the hypervisor gave {stolen_percent:.0} % of the CPUs' time to other machines");
     output.summary.parameters.push(line);

@@ -1,6 +1,5 @@
 //! Observes a running bridge: snapshots of its boards, the report with its problems, its formats, and logs.
 
-mod cpu_time;
 mod diagnostics;
 mod intervals;
 mod journal;
@@ -17,8 +16,8 @@ mod table;
 #[cfg(test)]
 mod test_report;
 mod text;
+mod threads;
 
-pub use cpu_time::{CpuTime, Threads};
 pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
 pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, cdr, diagnostics_json, string_message};
@@ -30,6 +29,7 @@ pub use problem::{Level, Problem};
 pub use report::{Report, SubscriberReport};
 pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
 pub use text::bytes_text;
+pub use threads::Threads;
 
 impl Snapshot {
     /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in

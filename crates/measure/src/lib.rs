@@ -3,6 +3,7 @@
 //! Pure: values in, values and text out. Nothing here measures, reads a file or writes one.
 //!
 //! - [`statistics`]: quantiles, medians with their confidence interval, growth.
+//! - [`cpu_time`]: the CPU time that the hypervisor gave to other machines.
 //! - [`mod@format`]: text of values, and of text inside markup.
 //! - [`plot`]: axes, frames and elements of SVG, of which both make their charts.
 //! - [`table`]: Markdown tables.
@@ -10,6 +11,7 @@
 
 #![cfg_attr(not(test), warn(clippy::disallowed_methods, clippy::expect_used, clippy::unwrap_used))]
 
+pub mod cpu_time;
 pub mod format;
 pub mod hop;
 pub mod plot;

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use adaptive_bridge::telemetry::CpuTime;
+use adaptive_bridge_measure::cpu_time::CpuTime;
 use serde::Serialize;
 
 /// Properties and load of the machine.
@@ -36,13 +36,14 @@ impl Machine {
             memory_bytes: kib * 1_024,
             load_before: load.split_whitespace().next().and_then(|load| load.parse().ok()).unwrap_or(0.0),
             stolen_percent: 0.0,
-            read_at: CpuTime::now(),
+            read_at: CpuTime::parse(&text("/proc/stat")),
         }
     }
 
     /// Adds the CPU time that the hypervisor took since the first reading.
     pub fn read_again(self) -> Self {
-        Self { stolen_percent: CpuTime::now().stolen_percent_since(self.read_at), ..self }
+        let now = CpuTime::parse(&fs::read_to_string("/proc/stat").unwrap_or_default());
+        Self { stolen_percent: now.stolen_percent_since(self.read_at), ..self }
     }
 }
 
