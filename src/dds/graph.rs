@@ -5,6 +5,10 @@
 //! its readers and writers decode payloads; so this module encodes the entry of the raw endpoints. Each
 //! process of the bridge is one node.
 
+use byteorder::{BigEndian, ByteOrder, LittleEndian};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
 use crate::model::{DdsType, Encapsulation, Guid, TypeHash};
 
 /// The most nodes of one participant that are accepted; a component container has tens of them.
@@ -21,11 +25,14 @@ pub(super) const TYPE: DdsType = DdsType {
     hash: TypeHash::from_hex(b"91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"),
 };
 
+/// `rmw_dds_common/msg/ParticipantEntitiesInfo`: the identifiers of the participant and, of each node, its
+/// namespace, its name, its readers and its writers. An identifier is a GUID, then zeros.
+type Message<Gid> = (Gid, Vec<(String, String, Vec<Gid>, Vec<Gid>)>);
+
 /// Encodes the entry of a participant with one node in plain little-endian CDR (RTPS 2.5 clause 10), without
 /// the encapsulation header.
 ///
-/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron. The GUID is
-/// in the first 16 bytes; the others are zero.
+/// `gid_bytes` is the length of `rmw_dds_common/msg/Gid`: 24 up to ROS 2 Humble, 16 since Iron.
 pub fn encode_graph(
     participant: Guid,
     namespace: &str,
@@ -34,18 +41,26 @@ pub fn encode_graph(
     writers: &[Guid],
     gid_bytes: usize,
 ) -> Vec<u8> {
-    let mut cdr = Vec::with_capacity(128 + gid_bytes * (1 + readers.len() + writers.len()));
-    put_gid(&mut cdr, participant, gid_bytes);
-    put_u32(&mut cdr, 1);
-    put_string(&mut cdr, namespace);
-    put_string(&mut cdr, node);
-    for guids in [readers, writers] {
-        put_u32(&mut cdr, guids.len() as u32);
-        for guid in guids {
-            put_gid(&mut cdr, *guid, gid_bytes);
-        }
-    }
-    cdr
+    let encode = if gid_bytes == 24 { encode::<24> } else { encode::<16> };
+    encode(participant, namespace, node, readers, writers)
+}
+
+fn encode<const N: usize>(
+    participant: Guid,
+    namespace: &str,
+    node: &str,
+    readers: &[Guid],
+    writers: &[Guid],
+) -> Vec<u8>
+where
+    [u8; N]: Serialize,
+{
+    let gid = |guid: &Guid| -> [u8; N] { std::array::from_fn(|at| guid.0.get(at).copied().unwrap_or(0)) };
+    let gids = |guids: &[Guid]| guids.iter().map(gid).collect();
+    let node = (namespace.to_owned(), node.to_owned(), gids(readers), gids(writers));
+    let message: Message<[u8; N]> = (gid(&participant), vec![node]);
+    // Writing to memory does not fail.
+    cdr_encoding::to_vec::<_, LittleEndian>(&message).unwrap_or_default()
 }
 
 /// A decoded graph entry: the nodes of one participant.
@@ -76,73 +91,33 @@ pub struct GraphNode {
 /// bytes if its identifiers are short, and zeros there if they are long; an entry without a node is too short
 /// for long identifiers.
 pub fn decode_graph(cdr: &[u8], encapsulation: Encapsulation) -> Option<GraphEntry> {
-    let big_endian = match encapsulation.representation() {
-        [0, 0] => true,
-        [0, 1] => false,
-        _ => return None,
-    };
-    [16, 24].into_iter().find_map(|gid_bytes| CdrReader { cdr, at: 0, big_endian, gid_bytes }.entry())
+    match encapsulation.representation() {
+        [0, 0] => decode::<16, BigEndian>(cdr).or_else(|| decode::<24, BigEndian>(cdr)),
+        [0, 1] => decode::<16, LittleEndian>(cdr).or_else(|| decode::<24, LittleEndian>(cdr)),
+        _ => None,
+    }
 }
 
-struct CdrReader<'a> {
-    cdr: &'a [u8],
-    at: usize,
-    big_endian: bool,
-    gid_bytes: usize,
-}
-
-impl CdrReader<'_> {
-    fn entry(&mut self) -> Option<GraphEntry> {
-        let participant = self.gid()?;
-        let count = self.count(MAX_NODES)?;
-        let mut nodes = Vec::new();
-        let mut endpoints = 0;
-        for _ in 0..count {
-            let namespace = self.text()?;
-            let name = self.text()?;
-            let readers = self.gids(MAX_ENDPOINTS - endpoints)?;
-            endpoints += readers.len();
-            let writers = self.gids(MAX_ENDPOINTS - endpoints)?;
-            endpoints += writers.len();
-            nodes.push(GraphNode { name: full_name(namespace, name)?, readers, writers });
-        }
-        // RTPS pads a payload to a multiple of 4 bytes.
-        (self.cdr.len() - self.at < 4).then_some(GraphEntry { participant, nodes })
+fn decode<const N: usize, Order: ByteOrder>(cdr: &[u8]) -> Option<GraphEntry>
+where
+    [u8; N]: DeserializeOwned,
+{
+    let ((participant, nodes), used) = cdr_encoding::from_bytes::<Message<[u8; N]>, Order>(cdr).ok()?;
+    let endpoints: usize = nodes.iter().map(|(.., readers, writers)| readers.len() + writers.len()).sum();
+    // RTPS pads a payload to a multiple of 4 bytes.
+    if cdr.len() - used > 3 || nodes.len() > MAX_NODES || endpoints > MAX_ENDPOINTS {
+        return None;
     }
-
-    fn bytes(&mut self, count: usize) -> Option<&[u8]> {
-        let taken = self.cdr.get(self.at..)?.get(..count)?;
-        self.at += count;
-        Some(taken)
-    }
-
-    fn number(&mut self) -> Option<u32> {
-        self.at = self.at.next_multiple_of(4);
-        let big_endian = self.big_endian;
-        let bytes = self.bytes(4)?.try_into().ok()?;
-        Some(if big_endian { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) })
-    }
-
-    fn count(&mut self, max: usize) -> Option<usize> {
-        let count = usize::try_from(self.number()?).ok()?;
-        (count <= max).then_some(count)
-    }
-
-    fn gid(&mut self) -> Option<Guid> {
-        let (guid, rest) = self.bytes(self.gid_bytes)?.split_first_chunk::<16>()?;
+    let guid = |gid: &[u8; N]| {
+        let (guid, rest) = gid.split_first_chunk::<16>()?;
         rest.iter().all(|&byte| byte == 0).then_some(Guid(*guid))
-    }
-
-    fn gids(&mut self, max: usize) -> Option<Vec<Guid>> {
-        // Collects one by one, so that a false count cannot cause a large allocation.
-        (0..self.count(max)?).map(|_| self.gid()).collect()
-    }
-
-    fn text(&mut self) -> Option<String> {
-        let length = self.count(MAX_NAME_BYTES + 1)?;
-        let (last, text) = self.bytes(length)?.split_last()?;
-        (*last == 0).then(|| String::from_utf8(text.to_vec()).ok())?
-    }
+    };
+    let guids = |gids: Vec<[u8; N]>| gids.iter().map(guid).collect::<Option<Vec<_>>>();
+    let nodes = nodes.into_iter().map(|(namespace, name, readers, writers)| {
+        let name = full_name(namespace, name)?;
+        Some(GraphNode { name, readers: guids(readers)?, writers: guids(writers)? })
+    });
+    Some(GraphEntry { participant: guid(&participant)?, nodes: nodes.collect::<Option<_>>()? })
 }
 
 /// Joins namespace and name: `/robot` and `rviz` are `/robot/rviz`. Names are printed in logs and terminals,
@@ -152,28 +127,13 @@ fn full_name(namespace: String, name: String) -> Option<String> {
         !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
     };
     let tokens = namespace.strip_prefix('/')?;
-    if !is_token(&name) || !(tokens.is_empty() || tokens.split('/').all(is_token)) {
+    if namespace.len().max(name.len()) > MAX_NAME_BYTES
+        || !is_token(&name)
+        || !(tokens.is_empty() || tokens.split('/').all(is_token))
+    {
         return None;
     }
     Some(if tokens.is_empty() { format!("/{name}") } else { format!("{namespace}/{name}") })
-}
-
-fn put_gid(cdr: &mut Vec<u8>, guid: Guid, gid_bytes: usize) {
-    let end = cdr.len() + gid_bytes;
-    cdr.extend_from_slice(&guid.0);
-    cdr.resize(end, 0);
-}
-
-fn put_u32(cdr: &mut Vec<u8>, value: u32) {
-    cdr.resize(cdr.len().next_multiple_of(4), 0);
-    cdr.extend_from_slice(&value.to_le_bytes());
-}
-
-/// Writes a CDR string: its length with the terminating zero, its bytes, the zero.
-fn put_string(cdr: &mut Vec<u8>, text: &str) {
-    put_u32(cdr, text.len() as u32 + 1);
-    cdr.extend_from_slice(text.as_bytes());
-    cdr.push(0);
 }
 
 #[cfg(test)]
