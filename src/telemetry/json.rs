@@ -86,11 +86,7 @@ fn message(r#type: &'static str, body: &impl Serialize) -> Bytes {
 
 /// Serializes a `std_msgs/String` in plain little-endian CDR, without the encapsulation header.
 pub fn string_message(data: &str) -> Bytes {
-    #[derive(Serialize)]
-    struct StringMessage<'a> {
-        data: &'a str,
-    }
-    cdr(&StringMessage { data }, data.len() + 5)
+    cdr(&data, data.len() + 5)
 }
 
 /// Serializes a message in plain little-endian CDR
