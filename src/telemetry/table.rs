@@ -10,7 +10,7 @@ use super::report::{
     ProcessReport, Report, RouteReport, SafetyReport, SubscriberReport,
 };
 use super::snapshot::ProcessReading;
-use super::text::{bytes_text, counted};
+use super::text::{bytes_text, counted, wrapped};
 use crate::model::{DropCounts, PublisherAccount};
 
 /// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
@@ -32,7 +32,7 @@ impl fmt::Display for Report {
             count => writeln!(f, "{}:", counted(count, "problem"))?,
         }
         for problem in &self.problems {
-            f.write_str(&wrapped("  ! ", "    ", problem.text.split(' '), " "))?;
+            f.write_str(&wrapped(COLUMNS, "  ! ", "    ", problem.text.split(' '), " "))?;
         }
         let process = |name: &str| self.processes.iter().find(|process| process.reading.name == name);
         if let Some(control) = process("control") {
@@ -54,9 +54,9 @@ impl fmt::Display for Report {
             let title = format!("lane {}: {};", lane.name, mode_text(lane));
             let process = process.map(process_text).unwrap_or_default();
             let text = format!("{title} {process}");
-            write!(f, "\n{}", wrapped("", "  ", text.split(' '), " "))?;
+            write!(f, "\n{}", wrapped(COLUMNS, "", "  ", text.split(' '), " "))?;
             if matches!(lane.mode_reason, "control" | "safety" | "held") {
-                f.write_str(&wrapped("  why: ", "    ", lane.mode_detail.split(' '), " "))?;
+                f.write_str(&wrapped(COLUMNS, "  why: ", "    ", lane.mode_detail.split(' '), " "))?;
             }
             let heads = ["TOPIC", "SUBS", "IN HZ", "OUT HZ", "SHM", "DDS OUT", "AGE"];
             let outputs = self.routes.iter().flat_map(|route| &route.lanes);
@@ -113,7 +113,7 @@ fn route_row(route: &RouteReport) -> Row {
         let PublisherAccount { writer, received, lost_upstream, repeated, .. } = account;
         let counts = format!("{received} received, {lost_upstream} lost upstream, {repeated} repeated");
         let first = format!("    publisher {writer}: ");
-        notes.push_str(&wrapped(&first, "      ", counts.split_inclusive(", "), ""));
+        notes.push_str(&wrapped(COLUMNS, &first, "      ", counts.split_inclusive(", "), ""));
     }
     (cells, notes)
 }
@@ -136,7 +136,7 @@ fn safety_text(safety: &SafetyReport) -> String {
     let changes = counted(safety.transitions, "change");
     let reason = safety.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
     let text = format!("{}{since}, {changes}{reason}", safety.mode);
-    wrapped("  safety: ", "    ", text.split(' '), " ")
+    wrapped(COLUMNS, "  safety: ", "    ", text.split(' '), " ")
 }
 
 fn probes_text(probes: &ProbesReport) -> String {
@@ -144,7 +144,7 @@ fn probes_text(probes: &ProbesReport) -> String {
     for (reason, count) in probes.refused.iter() {
         let _ = write!(text, ", {reason} {count}");
     }
-    wrapped("  probes: ", "    ", text.split_inclusive(", "), "")
+    wrapped(COLUMNS, "  probes: ", "    ", text.split_inclusive(", "), "")
 }
 
 /// The parameters that were set; no line while the file has all values.
@@ -153,7 +153,7 @@ fn parameters_text(parameters: &ParametersReport) -> String {
         return String::new();
     }
     let text = format!("{}; in place of the file until the bridge ends", parameters.set.join(", "));
-    wrapped("  parameters set: ", "    ", text.split(' '), " ")
+    wrapped(COLUMNS, "  parameters set: ", "    ", text.split(' '), " ")
 }
 
 fn subscribers_text(subscribers: &[SubscriberReport]) -> String {
@@ -187,7 +187,7 @@ fn subscriber_row(subscriber: &SubscriberReport) -> Row {
     if !subscriber.listed {
         reason += "; not listed under subscribers";
     }
-    (cells, wrapped("    ", "      ", reason.split(' '), " "))
+    (cells, wrapped(COLUMNS, "    ", "      ", reason.split(' '), " "))
 }
 
 fn absences_text(absences: &[AbsenceReport]) -> String {
@@ -201,7 +201,7 @@ fn absences_text(absences: &[AbsenceReport]) -> String {
             Some(back_s) => format!("{name}{host} for {}, was away for {away}", duration_text(back_s)),
         };
         let first = if absence.back_s.is_none() { "  away: " } else { "  back: " };
-        text += &wrapped(first, "    ", line.split(' '), " ");
+        text += &wrapped(COLUMNS, first, "    ", line.split(' '), " ");
     }
     text
 }
@@ -219,7 +219,7 @@ fn intruders_text(intruders: &[IntruderReport], seen: u64) -> String {
         let node = intruder.node.as_deref().unwrap_or("a node of unknown name");
         let line =
             format!("{node} on {} subscribes to {}: {}", intruder.host, intruder.topic, intruder.remedy);
-        text += &wrapped("    ", "      ", line.split(' '), " ");
+        text += &wrapped(COLUMNS, "    ", "      ", line.split(' '), " ");
     }
     text
 }
@@ -233,29 +233,7 @@ fn drops_text(drops: &DropCounts, in_window: &DropCounts) -> String {
     if entries.is_empty() {
         return String::new();
     }
-    wrapped("    dropped: ", "      ", entries.iter().map(String::as_str), ", ")
-}
-
-/// Joins parts into lines of at most [`COLUMNS`]. A part that is longer gets a line of its own.
-fn wrapped<'a>(first: &str, next: &str, parts: impl Iterator<Item = &'a str>, between: &str) -> String {
-    let mut text = String::new();
-    let mut line = first.to_owned();
-    let mut empty = true;
-    for part in parts {
-        let length = line.chars().count() + between.len() + part.trim_end().chars().count();
-        if !empty && length > COLUMNS {
-            let _ = writeln!(text, "{}", line.trim_end());
-            line = format!("{next}{part}");
-        } else {
-            if !empty {
-                line.push_str(between);
-            }
-            line.push_str(part);
-        }
-        empty = false;
-    }
-    let _ = writeln!(text, "{}", line.trim_end());
-    text
+    wrapped(COLUMNS, "    dropped: ", "      ", entries.iter().map(String::as_str), ", ")
 }
 
 fn mode_text(lane: &LaneReport) -> String {
@@ -272,7 +250,7 @@ fn mode_text(lane: &LaneReport) -> String {
 
 fn process_line(name: &str, process: &ProcessReport) -> String {
     let text = process_text(process);
-    wrapped(&format!("{name}: "), "  ", text.split_inclusive(", "), "")
+    wrapped(COLUMNS, &format!("{name}: "), "  ", text.split_inclusive(", "), "")
 }
 
 fn process_text(process: &ProcessReport) -> String {

@@ -1,5 +1,7 @@
 //! Text helpers. Names come from the network, so they are made safe for terminals and logs.
 
+use std::fmt::Write;
+
 /// Replaces each control character, so that the text cannot control a terminal or end a line or a string.
 pub(super) fn printable(text: &str) -> String {
     text.chars().map(|char| if char.is_control() { char::REPLACEMENT_CHARACTER } else { char }).collect()
@@ -31,6 +33,32 @@ pub fn bytes_text(bytes: f64) -> String {
         ..1_048_576.0 => format!("{:.1} KiB", bytes / KIB),
         _ => format!("{:.1} MiB", bytes / KIB / KIB),
     }
+}
+
+/// Joins parts into lines of at most `columns`. A part that is longer gets a line of its own.
+pub fn wrapped<'a>(
+    columns: usize,
+    first: &str,
+    next: &str,
+    parts: impl Iterator<Item = &'a str>,
+    between: &str,
+) -> String {
+    let mut text = String::new();
+    let mut line = first.to_owned();
+    let mut empty = true;
+    for part in parts {
+        let length = line.chars().count() + between.len() + part.trim_end().chars().count();
+        if !empty && length > columns {
+            let _ = writeln!(text, "{}", line.trim_end());
+            line = next.to_owned();
+        } else if !empty {
+            line.push_str(between);
+        }
+        line.push_str(part);
+        empty = false;
+    }
+    let _ = writeln!(text, "{}", line.trim_end());
+    text
 }
 
 #[cfg(test)]

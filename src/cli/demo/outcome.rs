@@ -8,6 +8,7 @@ use super::scan::SCAN_BYTES;
 use super::tally::{Figures, Quantiles};
 use super::{HISTORY_SCANS, MAX_BLOCKING_MS, RATE_HZ, STALL_EVERY_MS, STALL_MS};
 use crate::model::DropReason;
+use crate::telemetry;
 
 /// The explanation of the drop reason `superseded`, which is intended on a rate-limited lane.
 const SUPERSEDED: &str = "Superseded: the remote lane forwards 10 scans a second, each time the latest one, \
@@ -151,19 +152,5 @@ fn quantile(figures: &Figures, which: impl Fn(&Quantiles) -> f64) -> String {
 
 /// Wraps the text into lines of at most 79 columns.
 pub(super) fn wrapped(text: &str) -> String {
-    let mut wrapped = String::new();
-    let mut columns = 0;
-    for word in text.split_whitespace() {
-        let width = word.chars().count();
-        if columns > 0 && columns + 1 + width > 79 {
-            wrapped.push('\n');
-            columns = 0;
-        } else if columns > 0 {
-            wrapped.push(' ');
-            columns += 1;
-        }
-        wrapped.push_str(word);
-        columns += width;
-    }
-    wrapped
+    telemetry::wrapped(79, "", "", text.split_whitespace(), " ").trim_end().to_owned()
 }
