@@ -233,14 +233,18 @@ fn status_accounts_for_every_sample() {
     let critical = lane(&status, "critical");
     assert_eq!(critical["received"], SAMPLES);
     assert_eq!(critical["forwarded_bytes"], bytes);
+    let handled = |lane: &Value| {
+        let drops: u64 = lane["drops"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
+        lane["forwarded"].as_u64().unwrap() + drops
+    };
+    // On a busy machine the noncritical lane receives fewer: its queue overflows, which counts as a drop.
     let settled = wait_status(&bridge, "every sample on the noncritical lane", |status| {
         let noncritical = lane(status, "noncritical");
-        noncritical["waiting"] == 0 && noncritical["received"] == SAMPLES
+        noncritical["waiting"] == 0 && handled(noncritical) == u64::from(SAMPLES)
     });
     for name in ["critical", "noncritical"] {
         let lane = lane(&settled, name);
-        let drops: u64 = lane["drops"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
-        assert_eq!(lane["forwarded"].as_u64().unwrap() + drops, u64::from(SAMPLES), "{name}");
+        assert_eq!(handled(lane), u64::from(SAMPLES), "{name}");
         assert_eq!(lane["whole"], true, "{name}");
     }
     let noncritical = lane(&settled, "noncritical");
