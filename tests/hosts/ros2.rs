@@ -2,6 +2,7 @@
 
 use std::os::unix::fs::symlink;
 use std::path::Path;
+use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -113,27 +114,37 @@ fn the_sample_of_a_node_that_publishes_once_and_ends_reaches_the_subscriber() {
     }
     let Some(bed) = Bed::start(test, SCAN) else { return };
     let critical = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
-    // Five at a time, because each takes half a second to start.
-    let mut late = 0;
-    for first in (0..NODES).step_by(5) {
-        let nodes = (first..first + 5).map(|number| {
-            // As `ros2 topic pub --once`, which ends 0.1 s after it has published. On a busy machine ingress may not
-            // have matched the node by then, so that a node whose sample is not acknowledged waits for that.
-            let node = Peer::rclpy("once").option("--keep-alive", 0.1).first_seq(number).count(1);
-            bed.publish(node, INPUT)
-        });
-        for mut node in nodes.collect::<Vec<_>>() {
-            let sent = node.wait_for("its sample acknowledged", |event| event["event"] == "sent");
-            late += u64::from(sent["in_time"] != true);
-            node.wait();
+    let received = || {
+        let status = bed.wait_accounted();
+        status["routes"][0]["received"].as_u64().unwrap()
+    };
+    let mut next = 0;
+    support::attempts(|| {
+        let before = received();
+        // Five at a time, because each takes half a second to start.
+        for _ in 0..NODES / 5 {
+            let nodes = (0..5).map(|_| {
+                // As `ros2 topic pub --once`, which ends 0.1 s after it has published. A machine that stalls for so
+                // long can keep ingress from discovering the node by then, as any subscriber.
+                let node = Peer::rclpy("once").option("--keep-alive", 0.1).first_seq(next).count(1);
+                next += 1;
+                bed.publish(node, INPUT)
+            });
+            for mut node in nodes.collect::<Vec<_>>() {
+                node.wait();
+            }
         }
-    }
+        // Ingress may still have to receive the last one.
+        let all = (0..20).any(|_| {
+            std::thread::sleep(Duration::from_millis(100));
+            received() - before == NODES
+        });
+        all.then_some(()).ok_or_else(|| format!("{} of {NODES} samples", received() - before))
+    });
     critical.wait_received(NODES);
     let received: Received = critical.end();
     // The nodes are not in step, so that their samples may arrive in another order.
-    assert_eq!((received.bad, received.duplicates, received.missing_count), (0, 0, 0), "{received:?}");
-    // One node in five was too late when ingress received no sample of a writer that it had not discovered.
-    assert!(late * 10 <= NODES, "{late} of {NODES} samples were acknowledged after 0.1 s");
+    assert_eq!((received.bad, received.duplicates), (0, 0), "{received:?}");
     bed.wait_accounted();
     bed.end();
 }

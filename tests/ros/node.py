@@ -72,7 +72,7 @@ def parse():
     option("--hold", action="store_true", help="publish from SIGUSR1 on")
     option("--prime", action="store_true")
     option("--linger", type=float, default=0.0, help="s")
-    option("--keep-alive", type=float, help="s; a publisher ends so long after the last sample, or when it is acknowledged if that is later")
+    option("--keep-alive", type=float, help="s; a publisher ends so long after the last sample, acknowledged or not")
     option("--stall-every", type=float, default=0.0, help="s")
     option("--stall-for", type=float, default=0.0, help="s")
     option("--summary", action="store_true")
@@ -218,14 +218,13 @@ class Publisher:
         elapsed = self.publish_all()
         if options.keep_alive is not None:
             time.sleep(options.keep_alive)
-        in_time = acknowledged = self.acknowledged(0)
+            return
+        acknowledged = self.acknowledged(0)
         # Also after SIGTERM: a publisher that ends at once takes the last samples with it.
         deadline = time.monotonic() + ACKNOWLEDGEMENT_S
         while not acknowledged and time.monotonic() < deadline:
             acknowledged = self.acknowledged(0.1)
-        emit("sent", acknowledged=acknowledged, in_time=in_time)
-        if options.keep_alive is not None:
-            return
+        emit("sent", acknowledged=acknowledged)
         end = time.monotonic() + options.linger
         while not signals.stop and (left := end - time.monotonic()) > 0:
             self.pause(min(left, MATCH_PERIOD_S))
