@@ -136,24 +136,25 @@ if ! has cc; then
 fi
 
 # Installs rclpy for the tests with ROS 2 nodes, in the exact versions of the list. Without it these tests do not run.
-ros=$(dirname "$0")/../target/ros/jazzy
-ros_list=$(dirname "$0")/../tests/ros/requirements.txt
-if ! cmp -s "$ros_list" "$ros/requirements.txt"; then
+for release in jazzy kilted; do
+    ros=$(dirname "$0")/../target/ros/$release
+    ros_list=$(dirname "$0")/../tests/ros/$release.txt
+    if cmp -s "$ros_list" "$ros/requirements.txt"; then continue; fi
     if ! python=$(python_of_ros); then
         say "******** no CPython 3.11 for x86-64 with venv: the tests with ROS 2 nodes (rclpy) will not run"
-    else
-        say "pip install -r tests/ros/requirements.txt (250 MB in target/ros/jazzy)"
-        rm -rf "$ros"
-        # The copy of the list marks a complete installation.
-        if "$python" -m venv "$ros" \
-            && "$ros/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: -r "$ros_list" \
-            && "$ros/bin/python" -c "import rclpy, sensor_msgs.msg, std_msgs.msg"; then
-            cp "$ros_list" "$ros/requirements.txt"
-        else
-            say "******** the installation of rclpy failed: the tests with ROS 2 nodes will not run"
-        fi
+        break
     fi
-fi
+    say "pip install -r tests/ros/$release.txt (250 MB in target/ros/$release)"
+    rm -rf "$ros"
+    # The copy of the list marks a complete installation.
+    if "$python" -m venv "$ros" \
+        && "$ros/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: -r "$ros_list" \
+        && "$ros/bin/python" -c "import rclpy, sensor_msgs.msg, std_msgs.msg"; then
+        cp "$ros_list" "$ros/requirements.txt"
+    else
+        say "******** the installation of rclpy failed: the tests with ROS 2 nodes of $release will not run"
+    fi
+done
 
 if ! has cargo; then
     say "error: the Rust toolchain is missing; install it, then run this again:"

@@ -12,7 +12,7 @@ fn original(test: &str, host: &Host, side: &str) -> Option<Process> {
         support::skip(test, &reason);
         return None;
     }
-    let mut command = host.command(ros::python());
+    let mut command = host.command(ros::Release::Jazzy.python());
     command.arg(ros::original_probes()).arg(side);
     Some(Process::spawn(&format!("original {side}"), command))
 }

@@ -11,8 +11,11 @@ use support::ros;
 /// The topics in the order of the table: without the bridge, and of both lanes.
 const TOPICS: [&str; 3] = [INPUT, CRITICAL, NONCRITICAL];
 
-fn offers() -> Vec<(&'static str, Peer)> {
-    let node = || Peer::rclpy("lidar").rate_hz(10.0);
+/// A node of one release of ROS 2.
+type Node = fn(&str) -> Peer;
+
+fn offers(node: Node) -> Vec<(&'static str, Peer)> {
+    let node = || node("lidar").rate_hz(10.0);
     vec![
         ("RELIABLE, VOLATILE", node()),
         ("BEST_EFFORT, VOLATILE", node().best_effort()),
@@ -23,8 +26,8 @@ fn offers() -> Vec<(&'static str, Peer)> {
     ]
 }
 
-fn requests(node: &str) -> Vec<(&'static str, Peer)> {
-    let node = |number: usize| Peer::rclpy(&format!("{node}_{number}")).subscriber();
+fn requests(node: Node, name: &str) -> Vec<(&'static str, Peer)> {
+    let node = |number: usize| node(&format!("{name}_{number}")).subscriber();
     vec![
         ("RELIABLE", node(0)),
         ("BEST_EFFORT, depth 1", node(1).best_effort().keep_last(1)),
@@ -46,7 +49,21 @@ const PAGE: &str = include_str!("../../docs/ros2.md");
 
 #[test]
 fn every_subscriber_that_receives_without_the_bridge_receives_or_is_named() {
-    let test = "every_subscriber_that_receives_without_the_bridge_receives_or_is_named";
+    fill_table("every_subscriber_that_receives_without_the_bridge_receives_or_is_named", Peer::rclpy);
+}
+
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
+
+    #[test]
+    fn the_table_is_the_same_with_nodes_of_kilted() {
+        fill_table("the_table_is_the_same_with_nodes_of_kilted", |name| Peer::rclpy(name).on_kilted());
+    }
+}
+
+/// Compares the table of the page with what nodes receive.
+fn fill_table(test: &str, node: Node) {
     if let Some(reason) = ros::missing() {
         return support::skip(test, &reason);
     }
@@ -55,20 +72,20 @@ fn every_subscriber_that_receives_without_the_bridge_receives_or_is_named() {
             .to_owned(),
         "|---|---|---|---|---|".to_owned(),
     ];
-    for (offered, publisher) in offers() {
+    for (offered, publisher) in offers(node) {
         let Some(bed) = Bed::start(test, SCAN) else { return };
         let publisher = publisher.publisher().topic(INPUT).start_on(bed.host("publisher"));
         // Both lanes know the publisher, so that their writers offer its durability, before a subscriber holds them.
         bed.bridge.wait_status("the first sample on both lanes", |status| {
             outputs(status).all(|output| output["drops"]["no_reader"].as_u64() > Some(0))
         });
-        let subscribers: Vec<(&str, [RunningPeer; 3])> = requests("x")
+        let subscribers: Vec<(&str, [RunningPeer; 3])> = requests(node, "x")
             .into_iter()
             .enumerate()
             .map(|(number, (requested, _))| {
                 let start = |place: usize| {
-                    let (_, peer) =
-                        requests(["direct", "critical", "noncritical"][place]).swap_remove(number);
+                    let name = ["direct", "critical", "noncritical"][place];
+                    let (_, peer) = requests(node, name).swap_remove(number);
                     peer.topic(TOPICS[place]).start_on(bed.host("critical"))
                 };
                 (requested, [0, 1, 2].map(start))

@@ -15,7 +15,7 @@ use serde_json::Value;
 
 use super::netns::Host;
 use super::process::Process;
-use super::ros;
+use super::ros::{self, Release};
 
 /// Returns which peer is not built; `None` if all are built.
 pub fn missing() -> Option<String> {
@@ -35,6 +35,8 @@ pub enum Library {
     Rust,
     /// A ROS 2 node (rclpy of Jazzy, Fast DDS 2.14). A test with such a node first calls [`ros::missing`].
     Rclpy,
+    /// A node of the next release (rclpy of Kilted, Fast DDS 3.2).
+    Kilted,
 }
 
 impl Library {
@@ -45,7 +47,8 @@ impl Library {
             Library::Fast => built_by_make.join("fast_peer"),
             // An example of the root package, in the same build profile as the bridge.
             Library::Rust => super::bridge::program().with_file_name("examples").join("rust_peer"),
-            Library::Rclpy => ros::python(),
+            Library::Rclpy => Release::Jazzy.python(),
+            Library::Kilted => Release::Kilted.python(),
         }
     }
 }
@@ -94,6 +97,12 @@ impl Peer {
     /// A ROS 2 node with a given name.
     pub fn rclpy(node: &str) -> Peer {
         Peer::on(Library::Rclpy).option("--node", node)
+    }
+
+    /// The same node on the release after that.
+    #[must_use]
+    pub fn on_kilted(self) -> Peer {
+        Peer { library: Library::Kilted, ..self }
     }
 
     /// Makes the peer a publisher.
@@ -320,7 +329,7 @@ impl Peer {
     }
 
     fn start_as(self, place: &str, mut command: Command) -> RunningPeer {
-        if self.library == Library::Rclpy {
+        if matches!(self.library, Library::Rclpy | Library::Kilted) {
             command.arg(ros::node_program());
         }
         command.args(["--role", &self.role]).args(&self.arguments).envs(self.environment);
