@@ -423,6 +423,14 @@ fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
                     })
             });
         }
+        // rmw_cyclonedds reads the enclave of a node in the USER_DATA of its participant.
+        let graph = viewer.graph();
+        let enclaves = graph.nodes.keys().map(|gid| graph.user_data[&gid[..32]].as_str());
+        assert!(
+            enclaves.clone().all(|enclave| enclave == "enclave=/;"),
+            "{:?}",
+            enclaves.collect::<Vec<_>>()
+        );
         let _: Sent = publisher.end();
         bed.end();
     }

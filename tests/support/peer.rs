@@ -121,7 +121,7 @@ impl Peer {
         Peer { role: "graph".to_owned(), ..self }.option("--gid-bytes", gid_bytes)
     }
 
-    /// Makes a ROS 2 node report the endpoints of these topics, which are DDS names.
+    /// Makes a ROS 2 node report the endpoints of these topics, which are DDS names, and all nodes.
     pub fn info(topics: &[&str]) -> Peer {
         Peer { role: "info".to_owned(), ..Peer::rclpy("info") }.topic(&topics.join(","))
     }
@@ -631,6 +631,8 @@ pub struct Graph {
     pub endpoints: BTreeMap<String, Endpoint>,
     /// The nodes of each participant that has published a graph entry, by its GID in hexadecimal.
     pub nodes: BTreeMap<String, Vec<Node>>,
+    /// The USER_DATA of each participant, by its GUID in hexadecimal.
+    pub user_data: BTreeMap<String, String>,
 }
 
 /// A reader or writer, as announced by discovery.
@@ -670,6 +672,12 @@ impl RunningPeer {
                 }
                 "endpoint_gone" => {
                     graph.endpoints.remove(&text("guid"));
+                }
+                "participant" => {
+                    graph.user_data.insert(text("guid"), text("user_data"));
+                }
+                "participant_gone" => {
+                    graph.user_data.remove(&text("guid"));
                 }
                 "participant_entities" => {
                     let nodes = serde_json::from_value(event["nodes"].clone()).unwrap();
