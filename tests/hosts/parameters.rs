@@ -182,6 +182,37 @@ fn a_parameter_that_is_set_reaches_all_processes_and_stays_until_the_bridge_ends
 }
 
 #[test]
+fn a_bridge_that_starts_with_the_dump_of_a_node_has_what_was_set() {
+    let test = "a_bridge_that_starts_with_the_dump_of_a_node_has_what_was_set";
+    let Some((mut bed, mut client)) = start(test) else { return };
+    let results = client.set(&bed, json!({ "lanes.noncritical.max_rate_hz": 7.0 }));
+    assert_eq!(results[0], json!({ "successful": true, "reason": "" }), "{results}");
+    // What `ros2 param dump` prints, in JSON, which is YAML.
+    let names = client.call(&bed, "ingress", json!({ "call": "list" }))["result"]["names"].clone();
+    let values = client.call(&bed, "ingress", json!({ "call": "get", "names": names }))["values"].clone();
+    let mut parameters = json!({});
+    for (name, value) in names.as_array().unwrap().iter().zip(values.as_array().unwrap()) {
+        let place = name.as_str().unwrap().split('.').fold(&mut parameters, |node, name| &mut node[name]);
+        *place = value.clone();
+    }
+    let node = format!("/adaptive_bridge/{}/ingress", bed.bridge.instance());
+    let dump = bed.bridge.folder().join("dump.yaml");
+    std::fs::write(&dump, format!("{:#}", json!({ node: { "ros__parameters": parameters } }))).unwrap();
+
+    bed.up.signal(Signal::SIGINT);
+    assert!(bed.up.wait().success(), "{}", bed.up.log());
+    let arguments = format!("up --ros-args --params-file {} --", dump.display());
+    bed.up = bed.bridge.start_on(bed.host("bridge"), &arguments);
+    bed.wait_up();
+    let mut client = Client::start(&bed);
+    let names = ["lanes.noncritical.max_rate_hz", "probes.rate_hz"];
+    assert_eq!(client.values(&bed, &names), json!([7.0, 4.0]));
+    let status = bed.bridge.status();
+    assert_eq!(status["parameters"]["set"], json!([]));
+    bed.end();
+}
+
+#[test]
 fn a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed() {
     let test = "a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed";
     let Some((bed, mut client)) = start(test) else { return };

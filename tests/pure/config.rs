@@ -864,7 +864,10 @@ fn a_wrong_parameter_is_reported_with_its_key_and_value() {
             &["probes:={rate_hz: 1, rate_hz: 2}"],
             "parameter: probes.rate_hz: must be given only once; a parameter",
         ),
-        (&["topics.id:=a"], "parameter: topics: must be set as a whole"),
+        (&["topics.id:=a"], "parameter: topics.id: must begin with `topics.` and the id of a topic"),
+        (&["topics.scan:=a"], "parameter: topics.scan: must begin with `topics.` and the id of a topic"),
+        (&["topics.scan.priority:=a"], "parameter: topics[0].priority = a: must be a whole number"),
+        (&["topics.scan:={priority: 100}"], "parameter: topics[0].priority = 100: must be a whole number"),
         (&["a.b.c.d.e.f.g.h.i.j:=4"], "parameter: a.b.c: must be a known key"),
         (&["/no/such/file.yaml"], "/no/such/file.yaml: cannot be read"),
     ] {
