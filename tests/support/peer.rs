@@ -131,6 +131,14 @@ impl Peer {
         Peer { role: "parameters".to_owned(), reads_stdin: true, ..Peer::rclpy(node) }
     }
 
+    /// Makes the peer call the service of this name as rmw_cyclonedds does, once for each
+    /// [`RunningPeer::say`] of a request in CDR, in hexadecimal; Cyclone DDS only. The name is without the
+    /// slash at its beginning, the type that of DDS without `_Request_`.
+    pub fn client(service: &str, type_name: &str) -> Peer {
+        let peer = Peer { role: "client".to_owned(), reads_stdin: true, ..Peer::cyclone() };
+        peer.topic(service).type_name(type_name)
+    }
+
     /// Makes the peer a publisher of `std_msgs/msg/String` with the generated type, one sample for each
     /// [`RunningPeer::say`]; Cyclone DDS only. It ends at [`RunningPeer::finish`], after sending all samples.
     pub fn say(mut self) -> Peer {
