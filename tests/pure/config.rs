@@ -897,6 +897,14 @@ fn a_file_of_parameters_applies_to_the_nodes_that_it_names() {
     let settings = load(file, &[]).unwrap();
     assert_eq!((settings.probes.rate_hz, settings.probes.timeout_ms), (3.0, 250));
 
+    // Of two sections the later one counts.
+    for (first, second) in [("/**", "/adaptive_bridge"), ("/adaptive_bridge", "/**")] {
+        let section =
+            |node, rate_hz| format!("{node}: {{ros__parameters: {{probes: {{rate_hz: {rate_hz}}}}}}}\n");
+        let file = section(first, 3) + &section(second, 5);
+        assert_eq!(load(&file, &[]).unwrap().probes.rate_hz, 5.0, "{file}");
+    }
+
     // The forms in which rcl takes the name of a node.
     for (node, applies) in [
         ("/*/front", true),
