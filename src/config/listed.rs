@@ -51,23 +51,22 @@ impl Settings {
     pub fn listed(&self) -> Vec<Listed> {
         let mut listed = Vec::new();
         for (path, value) in self.values() {
-            let Some(row) = row_at(&path).filter(|_| path != SECRET) else { continue };
+            // The id of a subscriber may have dots.
+            let section = OPEN_SECTIONS.iter().find(|section| path.starts_with(**section));
+            let row = section.map_or_else(|| row_at(&path), |section| row_at(&format!("{section}id")));
+            let Some(row) = row.filter(|_| path != SECRET) else { continue };
             let name = named_by_id(&path);
             // The history of an output whose durability its publishers decide: its depth is in `history`.
             if name.ends_with(".depth") && matches!(value, Value::Text(_)) {
                 continue;
             }
             // HISTORY is two keys in the file.
-            if let (Some(policies), Value::Text(text)) = (name.strip_suffix(".history"), &value)
+            if let (Some(policies), Value::Text(text)) = (path.strip_suffix(".history"), &value)
                 && let Some((kind, depth)) = text.split_once(' ')
             {
-                let path = path.replace(".history", ".depth");
+                let path = format!("{policies}.depth");
                 let depth = depth.parse().ok().map(Value::Whole).zip(row_at(&path));
-                listed.extend(depth.map(|(value, row)| Listed {
-                    name: format!("{policies}.depth"),
-                    value,
-                    row,
-                }));
+                listed.extend(depth.map(|(value, row)| Listed { name: named_by_id(&path), value, row }));
                 listed.push(Listed { value: Value::Text(kind.to_owned()), name, row });
                 continue;
             }

@@ -123,13 +123,45 @@ fn parse_configuration(
     let mut document = yaml::parse(text)
         .map_err(|error| failure(file_name, error.line.map_or(Place::File, Place::Line), error.message))?;
     let problems = Problems::default();
+    let checked = |document: Option<&Node>, problems: Problems| {
+        let settings = validate(document, file_name, env, &problems)?;
+        let problems = problems.into_inner();
+        if problems.is_empty() {
+            return Ok(settings);
+        }
+        Err(ConfigError::new(file_name, parameters::files(parameters), problems))
+    };
     if !parameters.is_empty() {
         let values = parameters::read(parameters).map_err(|problem| bad_parameter(parameters, problem))?;
         let root = Rc::make_mut(document.get_or_insert_with(|| Rc::new(Node::null())));
+        if values.have_sections() {
+            let (mut without, problems_without) = (root.clone(), Problems::default());
+            values.merge_into(&mut without, &problems_without);
+            let settings = checked(Some(&without), problems_without)?;
+            values.merge_dumps_into(root, &settings, &problems);
+        }
         values.merge_into(root, &problems);
     }
     let document = document.as_deref();
-    let root = Field::root(document, &problems);
+    let settings = checked(document, problems)?;
+    let no_problems = Problems::default();
+    let root = Field::root(document, &no_problems);
+    let inline_secret = match settings.security.secret {
+        Some(SecretSource::ConfigFile) => root.get("security").get("hmac_secret").text(),
+        _ => None,
+    };
+    let inline_secret = inline_secret.map(|secret| InlineSecret(secret.to_owned()));
+    Ok(Configuration { settings, inline_secret })
+}
+
+/// Reads the settings from the tree of a file. They are valid only if no problems are reported.
+fn validate(
+    document: Option<&Node>,
+    file_name: &str,
+    env: &dyn Fn(&str) -> Option<String>,
+    problems: &Problems,
+) -> Result<Settings, ConfigError> {
+    let root = Field::root(document, problems);
     if !root.is_given() {
         let what = "the file is empty: at least `topics` must be given, such as \
                     `topics: [{id: scan, input_topic: /scan}]`";
@@ -141,18 +173,9 @@ fn parse_configuration(
         return Err(failure(file_name, Place::Line(line), what.to_owned()));
     }
     if let Some(node) = document {
-        keys::check(node, &problems);
+        keys::check(node, problems);
     }
-    let settings = settings(&root, &Environment::read(env, &problems));
-    if !problems.is_empty() {
-        return Err(ConfigError::new(file_name, parameters::files(parameters), problems.into_inner()));
-    }
-    let inline_secret = match settings.security.secret {
-        Some(SecretSource::ConfigFile) => root.get("security").get("hmac_secret").text(),
-        _ => None,
-    };
-    let inline_secret = inline_secret.map(|secret| InlineSecret(secret.to_owned()));
-    Ok(Configuration { settings, inline_secret })
+    Ok(settings(&root, &Environment::read(env, problems)))
 }
 
 /// Builds the settings, which are valid only if no problems are reported.

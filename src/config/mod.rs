@@ -13,6 +13,7 @@ mod keys;
 mod lanes;
 mod listed;
 mod load;
+mod overlay;
 mod parameters;
 mod problem;
 mod qos;

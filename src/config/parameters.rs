@@ -1,14 +1,16 @@
-//! Values that the command line sets in place of those of the file: ROS 2 parameters. The name of a parameter
-//! is the key path of the configuration.
+//! Values that the command line sets in place of those of the file: ROS 2 parameters.
 
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::fmt;
 use std::path::PathBuf;
 use std::rc::Rc;
 use std::str::FromStr;
 
-use super::keys::{self, Key, joined};
+use super::keys::Key;
+use super::overlay::{is_equal, leaves, put};
 use super::problem::{Place, Problem, Problems};
+use super::settings::Settings;
 use super::yaml::{self, Content, Entry, Node};
 
 /// A source of ROS 2 parameters on the command line.
@@ -54,9 +56,6 @@ const CONFIG_PATH: &str = "config_path";
 /// source timestamps with the system's clock.
 const USE_SIM_TIME: &str = "use_sim_time";
 
-/// The most names in the name of a parameter. A longer one is no key.
-const MAX_NAMES: usize = 8;
-
 /// The name of the bridge's section in a file of parameters, unless the command line renames the node.
 const DEFAULT_NAME: &str = "adaptive_bridge";
 
@@ -65,17 +64,57 @@ const DEFAULT_NAME: &str = "adaptive_bridge";
 pub(super) struct Values {
     /// The value of `config_path`.
     pub config_path: Option<PathBuf>,
-    /// A tree for each parameter, with only its value.
-    trees: Vec<Node>,
+    /// The name and the value of each parameter.
+    given: Vec<(String, Node)>,
+    /// The sections for other nodes. Some of these may be nodes of the bridge.
+    sections: Vec<Section>,
 }
 
 impl Values {
     /// Puts the values into the tree of the configuration file. A later value replaces an earlier one.
-    pub fn merge_into(self, root: &mut Node, problems: &Problems) {
-        for tree in self.trees {
-            // Of a key that is given twice in one value, only the last one is left in the tree of the file.
-            keys::check(&tree, problems);
-            merge(root, tree, "", problems);
+    pub fn merge_into(&self, root: &mut Node, problems: &Problems) {
+        for (name, value) in &self.given {
+            put(root, name, value.clone(), problems);
+        }
+    }
+
+    /// Whether there are sections for single nodes, which may be nodes of the bridge.
+    pub fn have_sections(&self) -> bool {
+        !self.sections.is_empty()
+    }
+
+    /// Puts the values for single nodes of the bridge into the tree, as `ros2 param dump` writes them.
+    /// `settings` are those without these values.
+    ///
+    /// A dump has every setting, also those that follow from others or that no key sets alone. So values that
+    /// are in force without it are left out.
+    pub fn merge_dumps_into(&self, root: &mut Node, settings: &Settings, problems: &Problems) {
+        let processes = ["ingress".to_owned(), "control".to_owned()].into_iter();
+        let processes = processes.chain(settings.lanes.iter().map(|lane| format!("egress_{}", lane.name)));
+        let nodes: Vec<String> = processes
+            .map(|process| format!("{}/{}", settings.node_namespace, settings.node_name_of(&process)))
+            .collect();
+        let nodes: Vec<Vec<&str>> = nodes.iter().map(|node| tokens(node)).collect();
+        let mut values = BTreeMap::new();
+        for section in &self.sections {
+            if !nodes.iter().any(|node| matches(&tokens(&section.pattern), node)) {
+                continue;
+            }
+            let concerning = section.parameters.iter().filter(|entry| concerns(entry, section.is_shared));
+            for Entry { key, line, value } in concerning {
+                let value = Node { line: *line, ..Node::clone(value) };
+                leaves(key, &value, &mut |name, value| {
+                    values.insert(name.to_owned(), value);
+                });
+            }
+        }
+        let listed = settings.listed();
+        for (name, value) in values {
+            let own = listed.binary_search_by(|listed| listed.name.cmp(&name));
+            let is_in_force = own.is_ok_and(|index| is_equal(&listed[index].value, &value));
+            if !is_in_force && name != USE_SIM_TIME {
+                put(root, &name, value, problems);
+            }
         }
     }
 
@@ -85,7 +124,7 @@ impl Values {
                 self.config_path = Some(text.into()).filter(|_| !text.is_empty());
             }
             _ if key == USE_SIM_TIME => {}
-            _ => self.trees.push(nested(key, value)),
+            _ => self.given.push((key.to_owned(), value)),
         }
     }
 }
@@ -108,7 +147,7 @@ pub(super) fn read(parameters: &[Parameters]) -> Result<Values, Problem> {
         })
     };
     let namespace = renamed("ros.namespace").unwrap_or_default();
-    let mut node: Vec<&str> = namespace.split('/').filter(|token| !token.is_empty()).collect();
+    let mut node = tokens(namespace);
     node.push(renamed("ros.node_name").unwrap_or(DEFAULT_NAME));
     let mut values = Values::default();
     for (source, parameter) in parameters.iter().enumerate() {
@@ -132,17 +171,20 @@ pub(super) fn read(parameters: &[Parameters]) -> Result<Values, Problem> {
             }
             Parameters::File(path) => {
                 let bytes = yaml::read(path).map_err(|what| problem("", 0, what))?;
-                let sections = sections(parse("", &bytes)?, &node);
-                let sections = sections.map_err(|(line, what)| problem("", line, what))?;
-                for FileParameter { key, mut value, is_shared } in sections {
-                    let first = key.split('.').next().unwrap_or_default();
-                    let is_known =
-                        [CONFIG_PATH, USE_SIM_TIME].contains(&first) || Key::root().get(first).is_some();
-                    if is_shared && !is_known {
-                        continue;
+                let mut found = Vec::new();
+                sections("", parse("", &bytes)?, &mut found)
+                    .map_err(|(line, what)| problem("", line, what))?;
+                for mut section in found {
+                    section.parameters.iter_mut().for_each(|entry| relocate_entry(entry, source));
+                    if matches(&tokens(&section.pattern), &node) {
+                        let Section { parameters, is_shared, .. } = section;
+                        let concerning = parameters.into_iter().filter(|entry| concerns(entry, is_shared));
+                        for Entry { key, line, value } in concerning {
+                            values.add(&key, Node { line, ..Rc::unwrap_or_clone(value) });
+                        }
+                    } else {
+                        values.sections.push(section);
                     }
-                    relocate(&mut value, source);
-                    values.add(&key, value);
                 }
             }
         }
@@ -152,60 +194,63 @@ pub(super) fn read(parameters: &[Parameters]) -> Result<Values, Problem> {
 
 /// Marks a value and all below it as given by a parameter.
 fn relocate(node: &mut Node, source: usize) {
-    let marked = |line| Place::number_of_parameter(source, line);
-    node.line = marked(node.line);
+    node.line = Place::number_of_parameter(source, node.line);
     match &mut node.content {
         Content::Scalar { .. } => {}
         Content::List(items) => items.iter_mut().for_each(|item| relocate(Rc::make_mut(item), source)),
-        Content::Map(entries) => {
-            for entry in entries {
-                entry.line = marked(entry.line);
-                relocate(Rc::make_mut(&mut entry.value), source);
-            }
-        }
+        Content::Map(entries) => entries.iter_mut().for_each(|entry| relocate_entry(entry, source)),
     }
 }
 
-/// A parameter in a file.
-struct FileParameter {
-    key: String,
-    value: Node,
-    /// Whether it is in the section of all nodes, which may have parameters of other nodes.
+fn relocate_entry(entry: &mut Entry, source: usize) {
+    entry.line = Place::number_of_parameter(source, entry.line);
+    relocate(Rc::make_mut(&mut entry.value), source);
+}
+
+/// The parameters of a node in a file.
+struct Section {
+    /// The name of the node, or a pattern of names.
+    pattern: String,
+    parameters: Vec<Entry>,
+    /// Whether it is for several nodes, so that it may have parameters of others.
     is_shared: bool,
 }
 
-/// The parameters of a file in the sections of this node and in those of all nodes. Returns the line and the
-/// reason if the file has another form.
-fn sections(document: Node, node: &[&str]) -> Result<Vec<FileParameter>, (usize, String)> {
-    let mut found = Vec::new();
-    let mut waiting = vec![(String::new(), document)];
-    while let Some((name, section)) = waiting.pop() {
-        let Content::Map(entries) = section.content else {
-            let what = "must have the form `NODE: {ros__parameters: {KEY: VALUE}}`";
-            return Err((section.line, what.to_owned()));
-        };
-        for Entry { key, line, value } in entries {
-            let value = Node { line, ..Rc::unwrap_or_clone(value) };
-            // A section may also be written as `namespace: {node: {ros__parameters: …}}`.
-            if key != "ros__parameters" {
-                waiting.push((format!("{name}/{key}"), value));
-                continue;
-            }
-            let pattern: Vec<&str> = name.split('/').filter(|token| !token.is_empty()).collect();
-            if !matches(&pattern, node) {
-                continue;
-            }
-            let Content::Map(parameters) = value.content else {
-                return Err((line, "must be a mapping of parameters".to_owned()));
-            };
-            let is_shared = pattern.iter().any(|token| token.starts_with('*'));
-            found.extend(parameters.into_iter().map(|Entry { key, line, value }| {
-                let value = Node { line, ..Rc::unwrap_or_clone(value) };
-                FileParameter { key, value, is_shared }
-            }));
+/// Whether a parameter is one of the bridge, or may be one with a mistake.
+fn concerns(entry: &Entry, is_shared: bool) -> bool {
+    let first = entry.key.split('.').next().unwrap_or_default();
+    !is_shared || [CONFIG_PATH, USE_SIM_TIME].contains(&first) || Key::root().get(first).is_some()
+}
+
+/// Collects the sections of a file in their order. Returns the line and the reason if the file has another
+/// form.
+fn sections(name: &str, document: Node, found: &mut Vec<Section>) -> Result<(), (usize, String)> {
+    let Content::Map(entries) = document.content else {
+        let what = "must have the form `NODE: {ros__parameters: {KEY: VALUE}}`";
+        return Err((document.line, what.to_owned()));
+    };
+    for Entry { key, line, value } in entries {
+        let value = Node { line, ..Rc::unwrap_or_clone(value) };
+        // A section may also be written as `namespace: {node: {ros__parameters: …}}`.
+        if key != "ros__parameters" {
+            sections(&format!("{name}/{key}"), value, found)?;
+            continue;
         }
+        if value.is_null() {
+            continue;
+        }
+        let Content::Map(parameters) = value.content else {
+            return Err((line, "must be a mapping of parameters".to_owned()));
+        };
+        let is_shared = tokens(name).iter().any(|token| token.starts_with('*'));
+        found.push(Section { pattern: name.to_owned(), parameters, is_shared });
     }
-    Ok(found)
+    Ok(())
+}
+
+/// The parts of a node's name.
+fn tokens(name: &str) -> Vec<&str> {
+    name.split('/').filter(|token| !token.is_empty()).collect()
 }
 
 /// Whether a pattern of rcl is for this node: `*` is one token of its name, `**` any number of them.
@@ -217,46 +262,5 @@ fn matches(pattern: &[&str], node: &[&str]) -> bool {
         }
         (Some((token, rest)), Some((own, below))) => (*token == "*" || token == own) && matches(rest, below),
         _ => false,
-    }
-}
-
-/// The tree that has only this value, at this key path.
-fn nested(path: &str, value: Node) -> Node {
-    path.rsplitn(MAX_NAMES, '.').fold(value, |value, name| {
-        let line = value.line;
-        let entry = Entry { key: name.to_owned(), line, value: Rc::new(value) };
-        Node { line, content: Content::Map(vec![entry]) }
-    })
-}
-
-/// Merges mappings, and replaces other values. Reports a mapping in place of a value, such as the depth of a
-/// QoS profile that the file gives by its name.
-fn merge(into: &mut Node, from: Node, path: &str, problems: &Problems) {
-    let is_null = into.is_null();
-    match (&mut into.content, from.content) {
-        (Content::Map(own), Content::Map(new)) => {
-            for entry in new {
-                let Some(own) = own.iter_mut().find(|own| own.key == entry.key) else {
-                    own.push(entry);
-                    continue;
-                };
-                if !matches!(entry.value.content, Content::Map(_)) {
-                    own.line = entry.line;
-                }
-                let path = joined(path, &entry.key);
-                merge(Rc::make_mut(&mut own.value), Rc::unwrap_or_clone(entry.value), &path, problems);
-            }
-        }
-        (_, Content::Map(_)) if !is_null => problems.report(Problem {
-            place: Place::of(from.line),
-            key: path.to_owned(),
-            value: None,
-            allowed: "must be set as a whole: in the configuration file it is no mapping".to_owned(),
-            hint: None,
-        }),
-        (own, new) => {
-            *own = new;
-            into.line = from.line;
-        }
     }
 }

@@ -153,10 +153,6 @@ impl Problems {
         nearest(word, names).map(did_you_mean)
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.0.borrow().is_empty()
-    }
-
     pub fn into_inner(self) -> Vec<Problem> {
         self.0.into_inner()
     }

@@ -134,7 +134,7 @@ impl Participant {
             builder = builder.with_only_interfaces(network::selectors(interfaces));
         }
         builder = builder.with_discovery_peers(options.network.static_peers.iter().copied());
-        builder = builder.with_dscp(options.dscp);
+        builder = builder.with_dscp(options.dscp).with_user_data(qos::enclave());
         for absent in network::absent_interfaces(interfaces)? {
             tracing::warn!(node = options.node_name, domain_id = options.network.domain_id, "{absent}");
         }

@@ -83,6 +83,11 @@ pub(super) fn of_blocking_writer(
     .build()
 }
 
+/// The USER_DATA of a participant, as ROS 2 announces it: its enclave. Nodes without SROS 2 are in `/`.
+pub(super) fn enclave() -> policy::UserData {
+    policy::UserData { value: b"enclave=/;".to_vec() }
+}
+
 /// The USER_DATA with the hash of the endpoint's type, as ROS 2 announces it; empty if it is unknown.
 pub(super) fn user_data(type_hash: TypeHash) -> policy::UserData {
     let pair = type_hash.is_known().then(|| format!("typehash={type_hash};"));

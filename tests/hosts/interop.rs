@@ -201,9 +201,12 @@ fn every_size_from_0_bytes_to_4_mib_arrives_unchanged_on_both_lanes() {
         for to in LIBRARIES {
             let mut first = 0;
             // An empty sample; a LaserScan of 360 beams, a PointCloud2 of 2 MB, and the largest allowed
-            // sample, whose size includes the header.
-            for (sizes, count, rate_hz) in [(&[0][..], 10, 50.0), (&[2948, 2_000_000, (4 << 20) - 4], 9, 3.0)]
-            {
+            // sample, whose size includes the header; images, which end within a word.
+            for (sizes, count, rate_hz) in [
+                (&[0][..], 10, 50.0),
+                (&[2948, 2_000_000, (4 << 20) - 4], 9, 3.0),
+                (&[70_001, 70_002, 70_003], 9, 20.0),
+            ] {
                 let subscribe = |host, topic| bed.subscribe(host, cloud(to).sizes(sizes), topic);
                 let critical = subscribe("critical", critical_topic);
                 let noncritical = subscribe("slow", noncritical_topic);
@@ -224,9 +227,9 @@ fn every_size_from_0_bytes_to_4_mib_arrives_unchanged_on_both_lanes() {
         critical["by_reference"].as_u64() > Some(0),
         "no large sample was forwarded by reference: {critical}"
     );
-    // With every library, six of the nine samples of several sizes take several datagrams.
+    // With every library, six of the nine samples of several sizes take several datagrams, and all images.
     let in_place = status["routes"][0]["in_place"].as_u64();
-    let large = (LIBRARIES.len() * LIBRARIES.len() * 6) as u64;
+    let large = (LIBRARIES.len() * LIBRARIES.len() * (6 + 9)) as u64;
     assert!(in_place >= Some(large), "{in_place:?} of {large} large samples were assembled in the pool");
     bed.end();
 }
@@ -423,6 +426,14 @@ fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
                     })
             });
         }
+        // rmw_cyclonedds reads the enclave of a node in the USER_DATA of its participant.
+        let graph = viewer.graph();
+        let enclaves = graph.nodes.keys().map(|gid| graph.user_data[&gid[..32]].as_str());
+        assert!(
+            enclaves.clone().all(|enclave| enclave == "enclave=/;"),
+            "{:?}",
+            enclaves.collect::<Vec<_>>()
+        );
         let _: Sent = publisher.end();
         bed.end();
     }

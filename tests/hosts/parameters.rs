@@ -1,4 +1,5 @@
-//! The parameter services of the bridge's nodes, called by a ROS 2 node (rclpy).
+//! The parameter services of the bridge's nodes, called by a ROS 2 node (rclpy on Fast DDS), and by a peer on
+//! Cyclone DDS in the form of rmw_cyclonedds.
 
 use std::time::Duration;
 
@@ -182,6 +183,37 @@ fn a_parameter_that_is_set_reaches_all_processes_and_stays_until_the_bridge_ends
 }
 
 #[test]
+fn a_bridge_that_starts_with_the_dump_of_a_node_has_what_was_set() {
+    let test = "a_bridge_that_starts_with_the_dump_of_a_node_has_what_was_set";
+    let Some((mut bed, mut client)) = start(test) else { return };
+    let results = client.set(&bed, json!({ "lanes.noncritical.max_rate_hz": 7.0 }));
+    assert_eq!(results[0], json!({ "successful": true, "reason": "" }), "{results}");
+    // What `ros2 param dump` prints, in JSON, which is YAML.
+    let names = client.call(&bed, "ingress", json!({ "call": "list" }))["result"]["names"].clone();
+    let values = client.call(&bed, "ingress", json!({ "call": "get", "names": names }))["values"].clone();
+    let mut parameters = json!({});
+    for (name, value) in names.as_array().unwrap().iter().zip(values.as_array().unwrap()) {
+        let place = name.as_str().unwrap().split('.').fold(&mut parameters, |node, name| &mut node[name]);
+        *place = value.clone();
+    }
+    let node = format!("/adaptive_bridge/{}/ingress", bed.bridge.instance());
+    let dump = bed.bridge.folder().join("dump.yaml");
+    std::fs::write(&dump, format!("{:#}", json!({ node: { "ros__parameters": parameters } }))).unwrap();
+
+    bed.up.signal(Signal::SIGINT);
+    assert!(bed.up.wait().success(), "{}", bed.up.log());
+    let arguments = format!("up --ros-args --params-file {} --", dump.display());
+    bed.up = bed.bridge.start_on(bed.host("bridge"), &arguments);
+    bed.wait_up();
+    let mut client = Client::start(&bed);
+    let names = ["lanes.noncritical.max_rate_hz", "probes.rate_hz"];
+    assert_eq!(client.values(&bed, &names), json!([7.0, 4.0]));
+    let status = bed.bridge.status();
+    assert_eq!(status["parameters"]["set"], json!([]));
+    bed.end();
+}
+
+#[test]
 fn a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed() {
     let test = "a_parameter_that_makes_the_file_bad_is_named_by_reload_and_can_be_removed";
     let Some((bed, mut client)) = start(test) else { return };
@@ -223,5 +255,125 @@ fn requests_beyond_the_rate_of_a_participant_are_counted_and_dropped() {
     // A node of another participant is answered.
     let mut other = Client::start(&bed);
     assert_eq!(other.values(&bed, &["probes.rate_hz"]), json!([4.0]));
+    bed.end();
+}
+
+/// A client on Cyclone DDS of a service of a node.
+struct CycloneClient {
+    peer: RunningPeer,
+    calls: u64,
+}
+
+impl CycloneClient {
+    fn start(bed: &Bed, node: &str, service: &str, type_name: &str) -> Self {
+        let service = format!("adaptive_bridge/{}/{node}/{service}", bed.bridge.instance());
+        let type_name = format!("rcl_interfaces::srv::dds_::{type_name}");
+        Self { peer: Peer::client(&service, &type_name).start_on(bed.host("slow")), calls: 0 }
+    }
+
+    /// The CDR of the reply.
+    fn call(&mut self, request: &[u8]) -> Vec<u8> {
+        self.peer.say(request.iter().map(|byte| format!("{byte:02x}")).collect::<String>());
+        self.calls += 1;
+        let calls = self.calls;
+        let reply = self.peer.wait_for(&format!("reply {calls}"), |event| {
+            event["event"] == "reply" && event["number"] == calls
+        });
+        assert_eq!(reply["encapsulation"], "00010000");
+        let digits = reply["body"].as_str().unwrap().as_bytes().chunks(2);
+        digits.map(|two| u8::from_str_radix(std::str::from_utf8(two).unwrap(), 16).unwrap()).collect()
+    }
+
+    fn end(self) {
+        let others = self.peer.events().iter().filter(|event| event["event"] == "reply_of_another").count();
+        assert_eq!(others, 0);
+        let _: Value = self.peer.finish();
+    }
+}
+
+/// Lengthens plain CDR to a multiple of `bytes`.
+fn align(cdr: &mut Vec<u8>, bytes: usize) {
+    cdr.resize(cdr.len().next_multiple_of(bytes), 0);
+}
+
+fn put_string(cdr: &mut Vec<u8>, text: &str) {
+    align(cdr, 4);
+    cdr.extend((text.len() as u32 + 1).to_le_bytes());
+    cdr.extend([text.as_bytes(), b"\0"].concat());
+}
+
+/// `rcl_interfaces/msg/ParameterValue` with a number.
+fn put_value(cdr: &mut Vec<u8>, kind: u8, whole: i64, decimal: f64) {
+    cdr.extend([kind, 0]);
+    align(cdr, 8);
+    cdr.extend([whole.to_le_bytes(), decimal.to_le_bytes()].concat());
+    put_string(cdr, "");
+    align(cdr, 4);
+    // Five empty lists.
+    cdr.extend([0; 20]);
+}
+
+fn sequence(count: u32, put: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
+    let mut cdr = count.to_le_bytes().to_vec();
+    put(&mut cdr);
+    cdr
+}
+
+/// The texts of a sequence of strings at the beginning of `cdr`.
+fn strings(cdr: &[u8]) -> Vec<&str> {
+    let word = |at: usize| u32::from_le_bytes(cdr[at..at + 4].try_into().unwrap()) as usize;
+    let mut at = 4_usize;
+    let text = |_| {
+        at = at.next_multiple_of(4);
+        let (begin, length) = (at + 4, word(at));
+        at = begin + length;
+        std::str::from_utf8(&cdr[begin..at - 1]).unwrap()
+    };
+    (0..word(0)).map(text).collect()
+}
+
+#[test]
+fn clients_of_rmw_cyclonedds_list_get_and_set_parameters() {
+    let test = "clients_of_rmw_cyclonedds_list_get_and_set_parameters";
+    let Some(bed) = Bed::start(test, &format!("{SCAN}{PROBES}")) else { return };
+    let names = sequence(2, |cdr| {
+        put_string(cdr, "probes.rate_hz");
+        put_string(cdr, "classifier.hysteresis_count");
+    });
+    let values = |rate_hz: f64| {
+        sequence(2, |cdr| {
+            put_value(cdr, 3, 0, rate_hz);
+            put_value(cdr, 2, 7, 0.0);
+        })
+    };
+    // Two clients of the same service: each takes its own replies only.
+    let getting = || CycloneClient::start(&bed, "control", "get_parameters", "GetParameters");
+    let mut get = [getting(), getting()];
+    for call in 0..6 {
+        assert_eq!(get[call % 2].call(&names), values(4.0));
+    }
+    let mut list = CycloneClient::start(&bed, "ingress", "list_parameters", "ListParameters");
+    // No prefixes and any depth; the reply is larger than a datagram.
+    let listed = list.call(&[0; 16]);
+    assert!(listed.len() > 1_500, "{} bytes", listed.len());
+    let listed = strings(&listed);
+    assert!(listed.is_sorted() && listed.contains(&"topics.scan.input_topic"), "{listed:?}");
+
+    let mut set = CycloneClient::start(&bed, "control", "set_parameters", "SetParameters");
+    let request = sequence(1, |cdr| {
+        put_string(cdr, "probes.rate_hz");
+        put_value(cdr, 3, 0, 5.0);
+    });
+    let successful = sequence(1, |cdr| {
+        cdr.push(1);
+        put_string(cdr, "");
+        // RTPS sends whole words.
+        align(cdr, 4);
+    });
+    assert_eq!(set.call(&request), successful);
+    assert_eq!(get[0].call(&names), values(5.0));
+    for client in get.into_iter().chain([list, set]) {
+        client.end();
+    }
     bed.end();
 }

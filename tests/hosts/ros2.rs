@@ -78,6 +78,25 @@ fn nodes_see_the_type_hash_of_the_publisher_on_the_outputs() {
 }
 
 #[test]
+fn the_nodes_of_the_bridge_are_in_the_enclave_of_a_plain_node() {
+    let test = "the_nodes_of_the_bridge_are_in_the_enclave_of_a_plain_node";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let subscriber = bed.subscribe("slow", Peer::rclpy("plain"), NONCRITICAL);
+    let query = Peer::info(&[INPUT]).start_on(bed.host("critical"));
+    for name in ["plain", "ingress", "control", "egress_critical", "egress_noncritical"] {
+        query.wait_for(&format!("the enclave of {name}"), |event| {
+            let mut nodes = event["nodes"].as_array().into_iter().flatten();
+            nodes.any(|node| node["name"] == name && node["enclave"] == "/")
+        });
+    }
+    let _: Received = subscriber.end();
+    bed.end();
+}
+
+#[test]
 fn a_publisher_of_another_type_or_definition_is_a_problem_while_it_is_there() {
     let test = "a_publisher_of_another_type_or_definition_is_a_problem_while_it_is_there";
     let Some(bed) = Bed::start(test, SCAN) else { return };

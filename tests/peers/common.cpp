@@ -61,16 +61,10 @@ std::vector<uint32_t> size_list(const std::string& text) {
   return sizes;
 }
 
-Bytes hex_bytes(const std::string& text) {
+Bytes encapsulation(const std::string& text) {
   if (text == "none") return {};
-  if (text.size() != 2 * header_bytes || text.find_first_not_of("0123456789abcdefABCDEF") != std::string::npos) {
-    usage("--encap " + text + ": expected eight hexadecimal digits, or none");
-  }
-  Bytes bytes;
-  for (size_t at = 0; at < text.size(); at += 2) {
-    bytes.push_back(static_cast<uint8_t>(std::stoul(text.substr(at, 2), nullptr, 16)));
-  }
-  return bytes;
+  if (text.size() != 2 * header_bytes) usage("--encap " + text + ": expected eight hexadecimal digits, or none");
+  return hex_bytes(text);
 }
 
 uint64_t xorshift(uint64_t& state) {
@@ -205,7 +199,7 @@ Options parse_options(int argc, char** argv) {
     else if (name == "--first-seq") options.first_seq = whole(name, value);
     else if (name == "--size") options.sizes = size_list(value);
     else if (name == "--seed") options.seed = whole(name, value);
-    else if (name == "--encap") options.encapsulation = hex_bytes(value);
+    else if (name == "--encap") options.encapsulation = encapsulation(value);
     else if (name == "--payload-file") options.payload_file = value;
     else if (name == "--record") options.record_file = value;
     else if (name == "--source-age-ms") options.source_age_s = number(name, value, 1e9) / 1e3;
@@ -218,8 +212,8 @@ Options parse_options(int argc, char** argv) {
     else if (name == "--gid-bytes") options.gid_bytes = choose(name, value, "16", "24") ? 24 : 16;
     else usage(name + ": unknown option");
   }
-  if (options.role != "pub" && options.role != "sub" && options.role != "graph") {
-    usage("--role: expected pub, sub or graph");
+  if (options.role != "pub" && options.role != "sub" && options.role != "graph" && options.role != "client") {
+    usage("--role: expected pub, sub, graph or client");
   }
   if (options.say && options.role != "pub") usage("--say: only of role pub");
   if (!options.decode.empty() && options.role != "sub") usage("--decode: only of role sub");
@@ -309,6 +303,17 @@ std::string json_string(const std::string& text) {
     at += std::max<size_t>(length, 1);
   }
   return json + "\"";
+}
+
+Bytes hex_bytes(const std::string& text) {
+  if (text.size() % 2 != 0 || text.find_first_not_of("0123456789abcdefABCDEF") != std::string::npos) {
+    usage(text + ": expected hexadecimal digits");
+  }
+  Bytes bytes;
+  for (size_t at = 0; at < text.size(); at += 2) {
+    bytes.push_back(static_cast<uint8_t>(std::stoul(text.substr(at, 2), nullptr, 16)));
+  }
+  return bytes;
 }
 
 std::string hex(const uint8_t* bytes, size_t count) {

@@ -71,6 +71,8 @@ void emit_ready(const std::string& library);
 // Text in UTF-8 as a JSON string; bytes that are none become U+FFFD.
 std::string json_string(const std::string& text);
 std::string hex(const uint8_t* bytes, size_t count);
+// The bytes of text in hexadecimal; prints what is wrong with it and exits with code 2.
+std::vector<uint8_t> hex_bytes(const std::string& text);
 
 // The sequence number of a sample that only opens the way for others.
 constexpr uint64_t priming_seq = UINT64_MAX;

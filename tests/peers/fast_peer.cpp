@@ -187,8 +187,8 @@ int subscribe(const Options& options, fast::DomainParticipant* participant, fast
 int main(int argc, char** argv) {
   const Options options = parse_options(argc, argv);
   handle_signals();
-  if (options.role == "graph" || options.say || !options.decode.empty()) {
-    emit_error("fast_peer has no role graph, --say and --decode; cyclone_peer has");
+  if (options.role == "graph" || options.role == "client" || options.say || !options.decode.empty()) {
+    emit_error("fast_peer has no role graph or client, --say and --decode; cyclone_peer has");
     return 2;
   }
 

@@ -864,7 +864,10 @@ fn a_wrong_parameter_is_reported_with_its_key_and_value() {
             &["probes:={rate_hz: 1, rate_hz: 2}"],
             "parameter: probes.rate_hz: must be given only once; a parameter",
         ),
-        (&["topics.id:=a"], "parameter: topics: must be set as a whole"),
+        (&["topics.id:=a"], "parameter: topics.id: must begin with `topics.` and the id of a topic"),
+        (&["topics.scan:=a"], "parameter: topics.scan: must begin with `topics.` and the id of a topic"),
+        (&["topics.scan.priority:=a"], "parameter: topics[0].priority = a: must be a whole number"),
+        (&["topics.scan:={priority: 100}"], "parameter: topics[0].priority = 100: must be a whole number"),
         (&["a.b.c.d.e.f.g.h.i.j:=4"], "parameter: a.b.c: must be a known key"),
         (&["/no/such/file.yaml"], "/no/such/file.yaml: cannot be read"),
     ] {
@@ -893,6 +896,14 @@ fn a_file_of_parameters_applies_to_the_nodes_that_it_names() {
                 amcl:\n  ros__parameters: {alpha1: 0.2}\n";
     let settings = load(file, &[]).unwrap();
     assert_eq!((settings.probes.rate_hz, settings.probes.timeout_ms), (3.0, 250));
+
+    // Of two sections the later one counts.
+    for (first, second) in [("/**", "/adaptive_bridge"), ("/adaptive_bridge", "/**")] {
+        let section =
+            |node, rate_hz| format!("{node}: {{ros__parameters: {{probes: {{rate_hz: {rate_hz}}}}}}}\n");
+        let file = section(first, 3) + &section(second, 5);
+        assert_eq!(load(&file, &[]).unwrap().probes.rate_hz, 5.0, "{file}");
+    }
 
     // The forms in which rcl takes the name of a node.
     for (node, applies) in [

@@ -3,6 +3,7 @@
 
 mod config;
 mod control_policy;
+mod dumps;
 mod policy;
 mod regressions;
 mod tidy;

@@ -416,7 +416,7 @@ class Subscriber:
 
 
 class Info:
-    """Reports the endpoints of the topics as `ros2 topic info --verbose` shows them."""
+    """Reports the endpoints of the topics as `ros2 topic info --verbose` shows them, and all nodes."""
 
     def __init__(self, node, options, signals):
         self.node = node
@@ -436,7 +436,11 @@ class Info:
                     ("reader", self.node.get_subscriptions_info_by_topic))
                 for endpoint in list_endpoints(topic, no_mangle=True)
             ]
-            emit("endpoints", endpoints=endpoints)
+            nodes = [
+                {"name": name, "namespace": namespace, "enclave": enclave}
+                for name, namespace, enclave in self.node.get_node_names_and_namespaces_with_enclaves()
+            ]
+            emit("endpoints", endpoints=endpoints, nodes=nodes)
             time.sleep(INFO_PERIOD_S)
         emit("summary")
 

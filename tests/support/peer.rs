@@ -121,7 +121,7 @@ impl Peer {
         Peer { role: "graph".to_owned(), ..self }.option("--gid-bytes", gid_bytes)
     }
 
-    /// Makes a ROS 2 node report the endpoints of these topics, which are DDS names.
+    /// Makes a ROS 2 node report the endpoints of these topics, which are DDS names, and all nodes.
     pub fn info(topics: &[&str]) -> Peer {
         Peer { role: "info".to_owned(), ..Peer::rclpy("info") }.topic(&topics.join(","))
     }
@@ -129,6 +129,14 @@ impl Peer {
     /// Makes a ROS 2 node call parameter services, once for each [`RunningPeer::say`] of a call in JSON.
     pub fn parameters(node: &str) -> Peer {
         Peer { role: "parameters".to_owned(), reads_stdin: true, ..Peer::rclpy(node) }
+    }
+
+    /// Makes the peer call the service of this name as rmw_cyclonedds does, once for each
+    /// [`RunningPeer::say`] of a request in CDR, in hexadecimal; Cyclone DDS only. The name is without the
+    /// slash at its beginning, the type that of DDS without `_Request_`.
+    pub fn client(service: &str, type_name: &str) -> Peer {
+        let peer = Peer { role: "client".to_owned(), reads_stdin: true, ..Peer::cyclone() };
+        peer.topic(service).type_name(type_name)
     }
 
     /// Makes the peer a publisher of `std_msgs/msg/String` with the generated type, one sample for each
@@ -631,6 +639,8 @@ pub struct Graph {
     pub endpoints: BTreeMap<String, Endpoint>,
     /// The nodes of each participant that has published a graph entry, by its GID in hexadecimal.
     pub nodes: BTreeMap<String, Vec<Node>>,
+    /// The USER_DATA of each participant, by its GUID in hexadecimal.
+    pub user_data: BTreeMap<String, String>,
 }
 
 /// A reader or writer, as announced by discovery.
@@ -670,6 +680,12 @@ impl RunningPeer {
                 }
                 "endpoint_gone" => {
                     graph.endpoints.remove(&text("guid"));
+                }
+                "participant" => {
+                    graph.user_data.insert(text("guid"), text("user_data"));
+                }
+                "participant_gone" => {
+                    graph.user_data.remove(&text("guid"));
                 }
                 "participant_entities" => {
                     let nodes = serde_json::from_value(event["nodes"].clone()).unwrap();

@@ -47,12 +47,17 @@ pub fn keys_at(path: &str) -> Vec<(String, &'static Row)> {
 /// an unknown path and for a section.
 pub(super) fn row_at(path: &str) -> Option<&'static Row> {
     let mut key = Key::root();
-    for name in path.split('.') {
-        let (name, item) = name.split_once('[').map_or((name, None), |(name, item)| (name, Some(item)));
-        key = key.get(name)?;
-        if item.is_some() {
+    let mut rest = path;
+    while !rest.is_empty() {
+        let end = rest.find(['.', '[']).unwrap_or(rest.len());
+        key = key.get(&rest[..end])?;
+        rest = &rest[end..];
+        // The name of an item may have dots.
+        if let Some(item) = rest.strip_prefix('[') {
             key = key.item()?;
+            rest = item.split_once(']')?.1;
         }
+        rest = rest.strip_prefix('.').unwrap_or(rest);
     }
     key.row
 }

@@ -95,6 +95,8 @@ pub(crate) struct Hooks {
   pub dscp: u8,
   /// See `DomainParticipantBuilder::with_urgent_topics`.
   pub urgent_topics: BTreeSet<String>,
+  /// See `DomainParticipantBuilder::with_user_data`.
+  pub user_data: Vec<u8>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

@@ -120,7 +120,8 @@ mod tests {
     use crate::config;
 
     fn parameters() -> Parameters {
-        let yaml = "topics: [{id: scan, input_topic: /scan}]\noverrides: {laptop: CRITICAL}\n\
+        let yaml = "topics: [{id: scan, input_topic: /scan}, {id: scan.rear, input_topic: /rear}]\n\
+                    overrides: {laptop: CRITICAL, laptop.local: CRITICAL}\n\
                     security: {hmac_secret: a secret of the bridge}";
         Parameters::new(config::parse(yaml, "test.yaml", &|_| None).unwrap())
     }
@@ -134,7 +135,14 @@ mod tests {
     fn prefixes_and_depth_select_names() {
         let parameters = parameters();
         let all = names(&parameters, &[], 0);
-        for name in ["probes.rate_hz", "topics.scan.input_topic", "overrides.laptop", "policy_hold_s"] {
+        for name in [
+            "probes.rate_hz",
+            "topics.scan.input_topic",
+            "topics.scan.rear.qos_overrides.critical.depth",
+            "overrides.laptop",
+            "overrides.laptop.local",
+            "policy_hold_s",
+        ] {
             assert!(all.contains(&name.to_owned()), "{name}: {all:?}");
         }
         assert!(all.is_sorted() && !all.iter().any(|name| name.contains("secret")), "{all:?}");
@@ -142,7 +150,7 @@ mod tests {
         assert!(names(&parameters, &["probes"], 1).iter().all(|name| name.starts_with("probes.")));
         assert_eq!(names(&parameters, &["probes.rate_hz", "prob"], 0), ["probes.rate_hz"]);
         let reply = parameters.list(&ListRequest { prefixes: vec!["overrides".to_owned()], depth: 0 });
-        assert_eq!(reply.prefixes, ["overrides"]);
+        assert_eq!(reply.prefixes, ["overrides", "overrides.laptop"]);
     }
 
     #[test]

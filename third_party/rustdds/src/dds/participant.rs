@@ -21,10 +21,10 @@ use futures::stream::{FusedStream, Stream};
 use log::{debug, error, info, trace, warn};
 
 use crate::{
-  create_error_out_of_resources, create_error_poisoned,
+  create_error_bad_parameter, create_error_out_of_resources, create_error_poisoned,
   dds::{
     pubsub::*,
-    qos::*,
+    qos::{policy::UserData, *},
     result::*,
     statusevents::{
       sync_status_channel, DomainParticipantStatusEvent, StatusChannelReceiver, StatusChannelSender,
@@ -36,6 +36,7 @@ use crate::{
     discovery::{Discovery, DiscoveryCommand},
     discovery_db::{discovery_db_read, DiscoveryDB},
     sedp_messages::{DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData},
+    MAX_PARTICIPANT_USER_DATA,
   },
   network::{
     constant::*,
@@ -163,6 +164,15 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Sets the USER_DATA (DDS v1.4 Section 2.2.3.1) that discovery announces with the
+  /// participant: [`MAX_PARTICIPANT_USER_DATA`] bytes at most.
+  ///
+  /// [`MAX_PARTICIPANT_USER_DATA`]: crate::discovery::MAX_PARTICIPANT_USER_DATA
+  pub fn with_user_data(mut self, user_data: UserData) -> Self {
+    self.hooks.user_data = user_data.value;
+    self
+  }
+
   /// Enable/disable same-host communication over loopback (default: enabled).
   ///
   /// When enabled, the participant (a) additionally announces SPDP to the
@@ -268,6 +278,13 @@ impl DomainParticipantBuilder {
   }
 
   pub fn build(#[allow(unused_mut)] mut self) -> CreateResult<DomainParticipant> {
+    let user_data_bytes = self.hooks.user_data.len();
+    if user_data_bytes > MAX_PARTICIPANT_USER_DATA {
+      return create_error_bad_parameter!(
+        "USER_DATA of {user_data_bytes} bytes; a participant announces at most {MAX_PARTICIPANT_USER_DATA}"
+      );
+    }
+
     // QosPolicies with possible security properties, otherwise default
     let participant_qos = QosPolicies {
       #[cfg(feature = "security")]
@@ -818,6 +835,11 @@ impl DomainParticipant {
 
   pub(crate) fn urgent_topics(&self) -> Arc<BTreeSet<String>> {
     Arc::clone(&self.dpi.lock().unwrap().dpi.urgent_topics)
+  }
+
+  /// The USER_DATA that discovery announces.
+  pub(crate) fn user_data(&self) -> Vec<u8> {
+    self.dpi.lock().unwrap().dpi.user_data.clone()
   }
 
   /// Announces from now on the addresses that these interfaces have.
@@ -1373,6 +1395,8 @@ pub(crate) struct DomainParticipantInner {
   self_locators: HashMap<mio1::Token, Vec<Locator>>,
   // Topics whose readers announce the listener for urgent traffic.
   urgent_topics: Arc<BTreeSet<String>>,
+  // Of the participant, for discovery.
+  user_data: Vec<u8>,
   // Port of each listener, and whether it is one to multicast.
   listener_kinds: HashMap<mio1::Token, (u16, bool)>,
 
@@ -1524,6 +1548,7 @@ impl DomainParticipantInner {
 
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
 
+    let user_data = std::mem::take(&mut hooks.user_data);
     let mut urgent_topics = std::mem::take(&mut hooks.urgent_topics);
     if !urgent_topics.is_empty() {
       let size = socket_receive_buffer_size;
@@ -1694,6 +1719,7 @@ impl DomainParticipantInner {
       status_receiver,
       self_locators,
       urgent_topics: Arc::new(urgent_topics),
+      user_data,
       listener_kinds,
       security_plugins_handle,
       only_networks,

@@ -53,10 +53,10 @@ use crate::no_security::EndpointSecurityInfo;
 #[cfg(test)]
 use crate::structure::guid::EntityKind;
 
-// The USER_DATA of an endpoint: an octet sequence (RTPS v2.5 Section 9.4.2.11),
-// without its length and padding. It concerns only applications, so a malformed
-// one does not make the endpoint unknown.
-fn user_data_from(
+// The USER_DATA of an endpoint or a participant: an octet sequence (RTPS v2.5
+// Section 9.4.2.11), without its length and padding. It concerns only
+// applications, so a malformed one does not make its sender unknown.
+pub(super) fn user_data_from(
   pl_map: &BTreeMap<ParameterId, Vec<&Parameter>>,
   ctx: speedy::Endianness,
 ) -> Vec<u8> {

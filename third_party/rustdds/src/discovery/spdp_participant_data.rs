@@ -28,7 +28,10 @@ use crate::{
   },
   Key, Keyed, RepresentationIdentifier,
 };
-use super::builtin_endpoint::{BuiltinEndpointQos, BuiltinEndpointSet};
+use super::{
+  builtin_endpoint::{BuiltinEndpointQos, BuiltinEndpointSet},
+  sedp_messages::user_data_from,
+};
 #[cfg(feature = "security")]
 use crate::{
   dds::qos,
@@ -40,6 +43,11 @@ use crate::{
 use super::secure_discovery::SecureDiscovery;
 #[cfg(not(feature = "security"))]
 use crate::no_security::SecureDiscovery;
+
+/// The most bytes of USER_DATA that a participant announces, and that are kept of a
+/// remote one. Discovery keeps those of up to 1,024 participants, and a datagram has
+/// room for 64 KiB.
+pub const MAX_PARTICIPANT_USER_DATA: usize = 1024;
 
 // This type is used by Discovery to communicate the presence and properties
 // of DomainParticipants. It is sent over topic "DCPSParticipant".
@@ -65,6 +73,7 @@ pub struct SpdpDiscoveredParticipantData {
   pub manual_liveliness_count: i32,        // PartProxy
   pub builtin_endpoint_qos: Option<BuiltinEndpointQos>, // PartProxy
   pub entity_name: Option<String>,         // where does this come from??
+  pub user_data: Vec<u8>,                  // empty if not announced
 
   // security
   #[cfg(feature = "security")]
@@ -221,6 +230,7 @@ impl SpdpDiscoveredParticipantData {
       manual_liveliness_count: 0,
       builtin_endpoint_qos: None,
       entity_name: None,
+      user_data: participant.user_data(),
 
       // DDS Security
       #[cfg(feature = "security")]
@@ -312,6 +322,11 @@ impl PlCdrDeserialize for SpdpDiscoveredParticipantData {
       get_option_from_pl_map::< _ , StringWithNul>(&pl_map, ctx, ParameterId::PID_ENTITY_NAME, "entity name")?
       .map( String::from );
 
+    let mut user_data = user_data_from(&pl_map, ctx);
+    if user_data.len() > MAX_PARTICIPANT_USER_DATA {
+      user_data = Vec::new();
+    }
+
     // DDS security
     #[cfg(feature = "security")]
     let identity_token: Option<IdentityToken> = get_option_from_pl_map(
@@ -358,6 +373,7 @@ impl PlCdrDeserialize for SpdpDiscoveredParticipantData {
       manual_liveliness_count,
       builtin_endpoint_qos,
       entity_name,
+      user_data,
       #[cfg(feature = "security")]
       identity_token,
       #[cfg(feature = "security")]
@@ -404,6 +420,7 @@ impl ParameterListable for SpdpDiscoveredParticipantData {
       manual_liveliness_count,
       builtin_endpoint_qos,
       entity_name,
+      user_data,
 
       // DDS security
       #[cfg(feature = "security")]
@@ -488,6 +505,9 @@ impl ParameterListable for SpdpDiscoveredParticipantData {
     // and does not follow CDR encoding.
     let entity_name_n: Option<StringWithNul> = entity_name.clone().map(|e| e.into());
     emit_option!(PID_ENTITY_NAME, &entity_name_n, StringWithNul);
+    if !user_data.is_empty() {
+      emit!(PID_USER_DATA, user_data, Vec<u8>);
+    }
 
     #[cfg(feature = "security")] // DDS security
     {
@@ -626,6 +646,38 @@ mod tests {
         _ => continue,
       }
     }
+  }
+
+  #[test]
+  fn user_data_is_announced_and_kept_up_to_a_limit() {
+    let read_back = |user_data: Vec<u8>| {
+      let announced = SpdpDiscoveredParticipantData {
+        user_data,
+        ..spdp_participant_data().unwrap()
+      };
+      let bytes = announced
+        .to_pl_cdr_bytes(RepresentationIdentifier::PL_CDR_LE)
+        .unwrap();
+      let read = SpdpDiscoveredParticipantData::from_pl_cdr_bytes(
+        &bytes,
+        RepresentationIdentifier::PL_CDR_LE,
+      )
+      .unwrap();
+      assert_eq!(read.participant_guid, announced.participant_guid);
+      (bytes, read.user_data)
+    };
+    let enclave = b"enclave=/;".to_vec();
+    let (bytes, read) = read_back(enclave.clone());
+    assert_eq!(read, enclave);
+    // Parameter, its length with padding, length of the sequence, the sequence, padding.
+    let written = b"\x2c\0\x10\0\x0a\0\0\0enclave=/;\0\0";
+    assert!(bytes.windows(written.len()).any(|window| window == written));
+
+    let longest = vec![b'a'; MAX_PARTICIPANT_USER_DATA];
+    assert_eq!(read_back(longest.clone()).1, longest);
+    // What is longer is not kept, and does not make the participant unknown.
+    assert_eq!(read_back([longest, vec![b'a']].concat()).1, b"");
+    assert!(!read_back(Vec::new()).0.windows(4).any(|window| window == b"\x2c\0\x04\0"));
   }
 
   #[test]

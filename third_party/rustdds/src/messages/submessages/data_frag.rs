@@ -8,6 +8,7 @@ use bytes::Bytes;
 
 use crate::{
   messages::submessages::{elements::parameter_list::ParameterList, submessages::*},
+  serialization::{padding_needed_for_alignment_4, round_up_to_4},
   structure::{
     guid::EntityId,
     sequence_number::{FragmentNumber, SequenceNumber},
@@ -88,7 +89,7 @@ impl DataFrag {
     2 + // fragmentSize
     4 + // sampleSize
     self.inline_qos.as_ref().map(|q| q.len_serialized() ).unwrap_or(0) + // QoS ParameterList
-    self.serialized_payload.len()
+    round_up_to_4(self.serialized_payload.len())
   }
 
   /// Spec talks about (expected) total number of fragments.
@@ -306,6 +307,11 @@ impl<C: Context> Writable<C> for DataFrag {
       writer.write_value(inline_qos)?;
     }
     writer.write_bytes(&self.serialized_payload)?;
+    // Whole words (RTPS spec v2.5 Section 9.4.1): Cyclone DDS discards another
+    // length as malformed. The receiver knows the length of the last fragment.
+    for _ in 0..padding_needed_for_alignment_4(self.serialized_payload.len()) {
+      writer.write_u8(0)?;
+    }
     Ok(())
   }
 }
@@ -333,6 +339,26 @@ mod tests {
     df.write_to_stream_with_ctx(Endianness::LittleEndian, &mut buf)
       .expect("serialize DataFrag body");
     Bytes::from(buf)
+  }
+
+  #[test]
+  fn the_last_fragment_is_padded_to_whole_words() {
+    for size in 1..9 {
+      let df = DataFrag {
+        writer_sn: SequenceNumber::new(1),
+        fragment_starting_num: FragmentNumber::new(2),
+        fragments_in_submessage: 1,
+        fragment_size: 256,
+        data_size: 256 + size,
+        serialized_payload: Bytes::from(vec![1u8; size as usize]),
+        ..Default::default()
+      };
+      let bytes = serialize_body(&df);
+      assert_eq!((bytes.len() % 4, bytes.len()), (0, df.len_serialized()));
+      let read = DataFrag::deserialize(&bytes, DATAFRAG_Flags::Endianness.into()).unwrap();
+      assert_eq!(read.serialized_payload[..size as usize], df.serialized_payload);
+      assert!(read.serialized_payload[size as usize..].iter().all(|byte| *byte == 0));
+    }
   }
 
   #[test]
