@@ -26,6 +26,10 @@ const CRITICAL_SLICE_US: u32 = 100;
 /// lane's samples.
 const NONCRITICAL_SLICE_US: u32 = 10_000;
 
+/// The samples of a route that may wait for a noncritical lane in shared memory. Fourteen static publishers
+/// are discovered at once, while the lane sleeps or creates its writer.
+const NONCRITICAL_QUEUE: usize = 16;
+
 /// The default scheduling of a process: of a lane by its class, of others with `None`.
 pub(super) fn default_scheduling(class: Option<TrafficClass>) -> Scheduling {
     let (nice, slice_us) = match class {
@@ -95,7 +99,8 @@ impl LaneReader<'_> {
             rates::refuse_rates(field);
             (TrafficClass::Critical, 64, Some(DEFAULT_WINDOW_SAMPLES), Forwarding::Everything)
         } else {
-            (TrafficClass::Noncritical, 4, None, Forwarding::Limited(self.policy.lane_rates(field)))
+            let forwarding = Forwarding::Limited(self.policy.lane_rates(field));
+            (TrafficClass::Noncritical, NONCRITICAL_QUEUE, None, forwarding)
         };
         let qos = field.get("qos");
         let default_dscp = match class {

@@ -49,7 +49,7 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
     let settings = settings(TOPIC);
     let [critical, noncritical] = settings.lanes.as_slice() else { panic!("{:?}", settings.lanes) };
     assert_eq!((critical.name.as_str(), critical.queue_depth), ("critical", 64));
-    assert_eq!((noncritical.name.as_str(), noncritical.queue_depth), ("noncritical", 4));
+    assert_eq!((noncritical.name.as_str(), noncritical.queue_depth), ("noncritical", 16));
     assert_eq!(critical.outputs[0].topic.as_str(), "/adaptive_bridge/critical/scan");
     assert_eq!(critical.outputs[0].qos, QosProfile::CRITICAL);
     assert_eq!(noncritical.outputs[0].topic.as_str(), "/adaptive_bridge/noncritical/scan");

@@ -94,9 +94,40 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
     ) -> Result<Written, WriteError> {
+        self.write_from(None, payload, encapsulation, timestamp)
+    }
+
+    /// Like [`write`](Self::write), and with the publisher that the sample comes from: a RELIABLE,
+    /// TRANSIENT_LOCAL writer keeps the last samples of each publisher for late joiners, as many as its
+    /// HISTORY has, until [`forget_history_of`](Self::forget_history_of).
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn write_from(
+        &self,
+        publisher: Option<Guid>,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+    ) -> Result<Written, WriteError> {
         let payload = RawPayload { bytes: payload, encapsulation };
-        let (sample, readers) = self.inner.write_counting_readers(payload, stamped(timestamp).build())?;
+        let mut options = stamped(timestamp);
+        if let Some(publisher) = publisher {
+            options = options.history_source(GUID::from_bytes(publisher.0));
+        }
+        let (sample, readers) = self.inner.write_counting_readers(payload, options.build())?;
         Ok(Written { readers, sequence: i64::from(sample.sequence_number) })
+    }
+
+    /// Removes the samples of a publisher from the history for late joiners.
+    pub fn forget_history_of(&self, publisher: Guid) {
+        self.inner.forget_history_of(GUID::from_bytes(publisher.0));
+    }
+
+    /// How many samples of several publishers were evicted from the history for late joiners, because it had
+    /// more than 32 MiB or 8,192 of them.
+    pub fn history_evicted(&self) -> u64 {
+        self.inner.history_evicted()
     }
 
     /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, to

@@ -26,6 +26,31 @@ fn late_joiners(bed: &Bed) -> [RunningPeer; 2] {
     })
 }
 
+/// Fourteen publishers in one process, as of a robot's static transforms, which publish one sample each, all
+/// at once. The first of them publishes another one at [`RunningPeer::go`].
+fn static_publishers(bed: &Bed) -> RunningPeer {
+    let peer = publisher("static_transforms", 0, 15).rate_hz(0.0).option("--writers", 14);
+    peer.hold().option("--hold-after", 14).start_on(bed.host("publisher"))
+}
+
+/// Waits until both lanes have handled so many samples.
+fn wait_handled(bed: &Bed, samples: u64) {
+    let handled =
+        |status: &Value| status["routes"][0]["received"] == samples && is_accounted_and_idle(status);
+    bed.bridge.wait_status("the samples handled by both lanes", handled);
+}
+
+/// Checks that each subscriber gets these samples once, in whatever order ingress discovered the publishers.
+fn assert_history(late: [RunningPeer; 2], first: u64, last: u64) {
+    let samples = last - first + 1;
+    for subscriber in late {
+        subscriber.wait_received(samples);
+        let received: Received = subscriber.end();
+        let summary = (received.received, received.first, received.last, received.duplicates, received.bad);
+        assert_eq!(summary, (samples, Some(first), Some(last), 0, 0), "{received:?}");
+    }
+}
+
 /// Kills the processes of both lanes, and waits until they are back and have taken the retained samples.
 fn kill_lanes(bed: &Bed) {
     for child in ["egress-critical", "egress-noncritical"] {
@@ -75,6 +100,57 @@ fn a_late_joiner_of_either_lane_gets_the_last_sample_without_a_configured_durabi
 }
 
 #[test]
+fn a_late_joiner_of_either_lane_gets_the_last_sample_of_each_publisher() {
+    let test = "a_late_joiner_of_either_lane_gets_the_last_sample_of_each_publisher";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
+    let Some(bed) = Bed::start(test, MAP) else { return };
+    let publishers = static_publishers(&bed);
+    wait_handled(&bed, 14);
+    assert_history(late_joiners(&bed), 0, 13);
+    // It replaces the sample of its publisher, and no other.
+    publishers.go();
+    wait_handled(&bed, 15);
+    assert_history(late_joiners(&bed), 1, 14);
+    let _: Sent = publishers.end();
+    bed.bridge.wait_status("the publishers gone", |status| status["routes"][0]["writers"] == 0);
+    let cyclone = OUTPUTS.map(|topic| {
+        let peer = Peer::cyclone().subscriber().topic(topic).transient_local().keep_last(100);
+        peer.start_on(bed.host("critical"))
+    });
+    assert_history(cyclone, 1, 14);
+    bed.end();
+}
+
+#[test]
+fn a_restarted_lane_has_the_last_sample_of_each_publisher_among_the_retained_ones() {
+    let test = "a_restarted_lane_has_the_last_sample_of_each_publisher_among_the_retained_ones";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
+    let best_effort = "    qos_overrides: {noncritical: {reliability: BEST_EFFORT}}\n";
+    let Some(bed) = Bed::start(test, &format!("{MAP}    retained_samples: 16\n{best_effort}")) else {
+        return;
+    };
+    let publishers = static_publishers(&bed);
+    wait_handled(&bed, 14);
+    for round in 0..2 {
+        if round == 1 {
+            publishers.go();
+            wait_handled(&bed, 15);
+            kill_lanes(&bed);
+        }
+        let [reliable, noncritical] = OUTPUTS
+            .map(|topic| Peer::rclpy("late").subscriber().topic(topic).transient_local().keep_last(100));
+        let late = [reliable, noncritical.best_effort()].map(|peer| peer.start_on(bed.host("critical")));
+        assert_history(late, round, 13 + round);
+    }
+    let _: Sent = publishers.end();
+    bed.end();
+}
+
+#[test]
 fn a_latched_sample_from_before_the_bridge_reaches_late_joiners_of_both_lanes() {
     let test = "a_latched_sample_from_before_the_bridge_reaches_late_joiners_of_both_lanes";
     if let Some(reason) = ros::missing().or_else(support::testbed_missing) {
@@ -89,8 +165,7 @@ fn a_latched_sample_from_before_the_bridge_reaches_late_joiners_of_both_lanes() 
     let up = bridge.start_on(net.host("bridge"), "up");
     let bed = Bed { up, bridge, net };
     bed.wait_up();
-    let handled = |status: &Value| status["routes"][0]["received"] == 1 && is_accounted_and_idle(status);
-    bed.bridge.wait_status("the sample handled by both lanes", handled);
+    wait_handled(&bed, 1);
     for subscriber in late_joiners(&bed) {
         subscriber.wait_received(1);
         let received: Received = subscriber.end();

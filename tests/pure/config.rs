@@ -471,7 +471,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("lanes.rviz.dscp", "0", "34"),
     ("lanes.rviz.static_peers", "[]", r#"["10.0.0.7"]"#),
     ("lanes.rviz.networks", "[]", r#"["192.168.0.7"]"#),
-    ("lanes.rviz.queue_depth", "4", "5"),
+    ("lanes.rviz.queue_depth", "16", "17"),
     ("lanes.rviz.max_borrowed", "8", "9"),
     ("lanes.rviz.by_reference_min_bytes", "65536", "0"),
     ("lanes.rviz.window_samples", "null", "255"),

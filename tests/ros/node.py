@@ -70,6 +70,8 @@ def parse():
     option("--seed", type=int, default=1)
     option("--wait-match", type=int, default=0)
     option("--hold", action="store_true", help="publish from SIGUSR1 on")
+    option("--hold-after", type=int, default=0, help="with --hold: the samples that are published before SIGUSR1")
+    option("--writers", type=int, default=1, help="publishers, which publish the samples in turn")
     option("--prime", action="store_true")
     option("--linger", type=float, default=0.0, help="s")
     option("--keep-alive", type=float, help="s; a publisher ends so long after the last sample, acknowledged or not")
@@ -199,7 +201,10 @@ class Publisher:
         for size in self.sizes:
             xorshift_table((size - FRONT + 7) // 8)
         message = message_class(options.type)
-        self.publisher = node.create_publisher(message, options.ros_topic, qos_of(options))
+        qos = qos_of(options)
+        self.publishers = [
+            node.create_publisher(message, options.ros_topic, qos) for _ in range(options.writers)]
+        self.publisher = self.publishers[0]
         self.matches = Matches(self.publisher.get_subscription_count)
         self.attempted = self.ok = self.skipped_ticks = 0
         self.calls_ns = []
@@ -208,8 +213,8 @@ class Publisher:
         options, signals = self.options, self.signals
         while not signals.stop and self.matches.current < options.wait_match:
             self.pause(MATCH_PERIOD_S)
-        while not signals.stop and options.hold and not signals.go:
-            self.pause(MATCH_PERIOD_S)
+        if not options.hold_after:
+            self.wait_for_go()
         if options.prime:
             self.publisher.publish(b"\0\1\0\0" + struct.pack("<QQQ", PRIMING, 0, 0))
             while not signals.stop and not self.acknowledged(0.1):
@@ -236,6 +241,10 @@ class Publisher:
             acknowledged=acknowledged, hash="",
         )
 
+    def wait_for_go(self):
+        while not self.signals.stop and self.options.hold and not self.signals.go:
+            self.pause(MATCH_PERIOD_S)
+
     def publish_all(self):
         options, signals = self.options, self.signals
         period = 1 / options.rate if options.rate > 0 else 0.0
@@ -245,6 +254,9 @@ class Publisher:
                 break
             while not signals.stop and (left := due - time.monotonic()) > 0:
                 self.pause(min(left, MATCH_PERIOD_S))
+            if options.hold_after and self.attempted == options.hold_after:
+                self.wait_for_go()
+                due = time.monotonic()
             if signals.stop:
                 break
             self.write()
@@ -270,7 +282,8 @@ class Publisher:
         front = struct.pack("<QQQ", sequence, before_ns, time.time_ns())
         self.attempted += 1
         try:
-            self.publisher.publish(b"\0\1\0\0" + front + rest)
+            writer = self.publishers[(self.attempted - 1) % len(self.publishers)]
+            writer.publish(b"\0\1\0\0" + front + rest)
             self.ok += 1
             ok = True
         except Exception as error:  # An RCLError, which rclpy does not export.
@@ -283,7 +296,7 @@ class Publisher:
 
     def acknowledged(self, seconds):
         self.matches.look()
-        return self.publisher.wait_for_all_acked(Duration(seconds=seconds))
+        return all([one.wait_for_all_acked(Duration(seconds=seconds)) for one in self.publishers])
 
     def pause(self, seconds):
         self.matches.look()

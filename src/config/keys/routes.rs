@@ -108,7 +108,8 @@ pub(super) const ROWS: &[Row] = &[
     )
     .doc(
         "Samples retained in shared memory for a lane that restarts, which it then forwards, and which its \
-         TRANSIENT_LOCAL writer offers to late joiners.",
+         TRANSIENT_LOCAL writer offers to late joiners. A topic with several latched publishers, such as \
+         `/tf_static`, needs one for each.",
     ),
     restarts(qos!("reliability"), Choice(words::<Reliability>), "as above")
         .doc("RELIABILITY: whether lost samples are repaired."),
@@ -150,7 +151,7 @@ pub(super) const ROWS: &[Row] = &[
          such as Wi-Fi, send higher classes first.",
     ),
     // Each sample occupies `max_sample_bytes`.
-    restarts(&["lanes.<lane>.queue_depth"], Whole(1, 4_096, " samples"), "64 critical, 4 noncritical").doc(
+    restarts(&["lanes.<lane>.queue_depth"], Whole(1, 4_096, " samples"), "64 critical, 16 noncritical").doc(
         "Samples of each route that may wait for the lane in shared memory. The critical lane needs at \
          least the rate times the longest delay of its process: 64 is two seconds at 30 Hz, 13 ms at 5 \
          kHz.",

@@ -18,9 +18,13 @@ const SETTLING_MS: u64 = 1_000;
 /// The most late joiners that may wait at once, 24 bytes each. Further ones get no history and are counted.
 const MAX_WAITING: usize = 4_096;
 
+/// The most bytes of samples of several publishers. The last `depth` samples are kept whatever their size.
+const MAX_BYTES: usize = 32 << 20;
+
 /// A sample of the history, as it was written.
 #[derive(Clone, Debug)]
 pub(super) struct KeptSample {
+    pub publisher: Guid,
     pub payload: Bytes,
     pub encapsulation: Encapsulation,
     pub timestamp: SourceTimestamp,
@@ -29,6 +33,7 @@ pub(super) struct KeptSample {
 impl KeptSample {
     pub fn copy(payload: &[u8], header: &SampleHeader) -> Self {
         Self {
+            publisher: header.writer_guid,
             payload: Bytes::copy_from_slice(payload),
             encapsulation: header.encapsulation,
             timestamp: header.source_timestamp,
@@ -40,21 +45,54 @@ impl KeptSample {
 #[derive(Debug)]
 pub(super) struct LateJoiners {
     depth: usize,
+    /// The last `depth` samples of each publisher, in the order in which they were written.
     history: VecDeque<KeptSample>,
+    bytes: usize,
+    evicted: u64,
     waiting: VecDeque<(Guid, MonotonicNs)>,
 }
 
 impl LateJoiners {
     pub fn new(depth: usize) -> Self {
-        Self { depth: depth.max(1), history: VecDeque::with_capacity(depth.max(1)), waiting: VecDeque::new() }
+        Self {
+            depth: depth.max(1),
+            history: VecDeque::with_capacity(depth.max(1)),
+            bytes: 0,
+            evicted: 0,
+            waiting: VecDeque::new(),
+        }
     }
 
-    /// Adds a written sample, and removes the oldest one from a full history.
+    /// Adds a written sample, and removes the oldest one of its publisher if that has `depth` others.
     pub fn keep(&mut self, sample: KeptSample) {
-        if self.history.len() == self.depth {
-            self.history.pop_front();
+        let mut of_publisher =
+            self.history.iter().enumerate().filter(|(_, kept)| kept.publisher == sample.publisher);
+        if let Some((oldest, _)) = of_publisher.next()
+            && of_publisher.count() + 1 >= self.depth
+            && let Some(superseded) = self.history.remove(oldest)
+        {
+            self.bytes -= superseded.payload.len();
         }
+        self.bytes += sample.payload.len();
         self.history.push_back(sample);
+        while self.bytes > MAX_BYTES
+            && self.history.len() > self.depth
+            && let Some(oldest) = self.history.pop_front()
+        {
+            self.bytes -= oldest.payload.len();
+            self.evicted += 1;
+        }
+    }
+
+    /// Removes the samples of a publisher.
+    pub fn forget(&mut self, publisher: Guid) {
+        self.history.retain(|kept| kept.publisher != publisher);
+        self.bytes = self.history.iter().map(|kept| kept.payload.len()).sum();
+    }
+
+    /// Samples that were removed because there were too many bytes.
+    pub fn evicted(&self) -> u64 {
+        self.evicted
     }
 
     /// Adds a matched reader, which is due after the settling time. Returns whether there was room for it.
@@ -89,6 +127,7 @@ mod tests {
 
     fn kept(byte: u8) -> KeptSample {
         KeptSample {
+            publisher: Guid::default(),
             payload: Bytes::from(vec![byte]),
             encapsulation: Encapsulation::CDR_LE,
             timestamp: SourceTimestamp(1),
@@ -110,6 +149,39 @@ mod tests {
         let bytes: Vec<u8> = history.iter().map(|sample| sample.payload[0]).collect();
         assert_eq!((joiner, bytes), (reader, vec![3, 4]));
         assert!(late.next_due(later).is_none());
+    }
+
+    fn history(late: &LateJoiners) -> Vec<u8> {
+        late.history.iter().map(|sample| sample.payload[0]).collect()
+    }
+
+    #[test]
+    fn each_publisher_has_its_own_last_samples() {
+        let mut late = LateJoiners::new(2);
+        let of = |publisher: u8, byte: u8| KeptSample { publisher: Guid([publisher; 16]), ..kept(byte) };
+        for (publisher, byte) in [(1, 0), (2, 1), (2, 2), (2, 3), (1, 4), (3, 5), (2, 6)] {
+            late.keep(of(publisher, byte));
+        }
+        assert_eq!(history(&late), [0, 3, 4, 5, 6]);
+        late.forget(Guid([2; 16]));
+        assert_eq!(history(&late), [0, 4, 5]);
+        assert_eq!((late.bytes, late.evicted()), (3, 0));
+    }
+
+    #[test]
+    fn the_bytes_of_several_publishers_are_bounded_and_the_last_samples_are_kept() {
+        let large = |publisher: u8, bytes: usize| KeptSample {
+            publisher: Guid([publisher; 16]),
+            payload: Bytes::from(vec![publisher; bytes]),
+            ..kept(0)
+        };
+        let mut late = LateJoiners::new(1);
+        for publisher in 0..40 {
+            late.keep(large(publisher, 1 << 20));
+        }
+        assert_eq!((history(&late).len(), late.evicted()), (32, 8));
+        late.keep(large(50, MAX_BYTES + 1));
+        assert_eq!((history(&late), late.evicted()), (vec![50], 40));
     }
 
     #[test]

@@ -6,6 +6,7 @@
 //! to send and when; [`output`] writes samples and accounts for them.
 
 mod arena;
+mod history;
 mod late_joiners;
 mod noncritical;
 mod offer;
@@ -134,7 +135,9 @@ impl Egress {
         let now = clock::monotonic();
         let noncritical = match &lane.forwarding {
             Forwarding::Everything => None,
-            Forwarding::Limited(rates) => Some(Noncritical::new(lane, &more_urgent, *rates, now)),
+            Forwarding::Limited(rates) => {
+                Some(Noncritical::new(lane, &more_urgent, *rates, &settings.safety.rules, now))
+            }
         };
         let sleeper = role.boards.sleeper(index);
         let mut egress = Self {
@@ -296,7 +299,7 @@ impl Egress {
         self.policy.policy_hold_ms = settings.policy_hold_ms;
         let forwarding = &settings.lanes[self.index].forwarding;
         if let (Some(lane), Forwarding::Limited(rates)) = (&mut self.noncritical, forwarding) {
-            lane.set_rates(*rates, &mut self.outputs, now);
+            lane.set_rates(*rates, &settings.safety.rules, &mut self.outputs, now);
         }
         for output in &mut self.outputs {
             output.set_forwarding(forwarding);

@@ -6,14 +6,16 @@ use super::Turn;
 use super::arena::CopyArena;
 use super::output::Output;
 use crate::clock;
-use crate::config::{DropPolicy, Lane, LaneRates};
+use crate::config::{DropPolicy, Lane, LaneRates, SafetyRules};
 use crate::dds::Participant;
-use crate::model::{DropReason, Durability, LaneMode, MonotonicNs};
+use crate::model::{DropReason, Durability, LaneMode, MAX_PUBLISHERS, MonotonicNs};
 use crate::policy::{ByteBudget, Decision, PollOrder, RouteShaper, SampleStamps};
 use crate::shm::ShmSample;
 
 pub(super) struct Noncritical {
     rates: LaneRates,
+    /// The samples of a latched topic that may wait, unless `queue_samples` is more.
+    latched_queue: usize,
     mode: LaneMode,
     budget: ByteBudget,
     /// The outputs of each priority, the highest first; those of one take turns.
@@ -23,11 +25,18 @@ pub(super) struct Noncritical {
 
 impl Noncritical {
     /// `more_urgent` has for each output how many before it have a higher priority.
-    pub fn new(lane: &Lane, more_urgent: &[usize], rates: LaneRates, now: MonotonicNs) -> Self {
+    pub fn new(
+        lane: &Lane,
+        more_urgent: &[usize],
+        rates: LaneRates,
+        rules: &SafetyRules,
+        now: MonotonicNs,
+    ) -> Self {
+        let latched_queue = latched_queue(rules);
         let shapers = lane
             .outputs
             .iter()
-            .map(|output| RouteShaper::new(rates_of(rates, output.qos.durability), now))
+            .map(|output| RouteShaper::new(rates_of(rates, latched_queue, output.qos.durability), now))
             .collect();
         let turn_orders = more_urgent
             .chunk_by(|one, other| one == other)
@@ -39,6 +48,7 @@ impl Noncritical {
             .collect();
         Self {
             rates,
+            latched_queue,
             mode: LaneMode::Normal,
             budget: ByteBudget::new(rates.normal.max_bytes_per_s, now),
             turn_orders,
@@ -47,19 +57,26 @@ impl Noncritical {
     }
 
     /// Applies other rates. Queued samples stay queued, except those beyond a new, shorter queue.
-    pub fn set_rates(&mut self, rates: LaneRates, outputs: &mut [Output], now: MonotonicNs) {
+    pub fn set_rates(
+        &mut self,
+        rates: LaneRates,
+        rules: &SafetyRules,
+        outputs: &mut [Output],
+        now: MonotonicNs,
+    ) {
         self.rates = rates;
+        self.latched_queue = latched_queue(rules);
         self.budget.set_mode(&rates, self.mode, now);
-        for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            let rates = rates_of(rates, output.durability.get());
-            shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
-            output.set_queued(shaper.waiting());
-        }
+        self.follow_durability(outputs, now);
     }
 
     /// Applies the rates again after the durability of an output has changed.
     pub fn follow_durability(&mut self, outputs: &mut [Output], now: MonotonicNs) {
-        self.set_rates(self.rates, outputs, now);
+        for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
+            let rates = rates_of(self.rates, self.latched_queue, output.durability.get());
+            shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
+            output.set_queued(shaper.waiting());
+        }
     }
 
     /// Queues the samples that wait in shared memory and forwards as many as the tokens allow.
@@ -79,7 +96,7 @@ impl Noncritical {
             }
         }
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output, self.rates, now);
+            fill_queue(shaper, output, self.rates, self.latched_queue, now);
         }
         let now = clock::monotonic();
         let now_wall = clock::wall();
@@ -102,6 +119,8 @@ impl Noncritical {
                         }
                         Decision::SleepUntil(at) => {
                             token_at = MonotonicNs(token_at.0.min(at.0));
+                            // The channel has room for fewer samples than several publishers may have.
+                            waits_for_sample |= output.durability.get() == Durability::TransientLocal;
                             break;
                         }
                         Decision::WaitForSample => {
@@ -127,7 +146,7 @@ impl Noncritical {
     pub fn shut_down(&mut self, outputs: &mut [Output]) {
         let now = clock::monotonic();
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output, self.rates, now);
+            fill_queue(shaper, output, self.rates, self.latched_queue, now);
             shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(0);
         }
@@ -136,10 +155,16 @@ impl Noncritical {
 
 /// Moves the route's samples from the channel in shared memory to the lane's own queue. The first sample of a
 /// publisher may change the durability, and with it the rates that apply to this sample.
-fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output, rates: LaneRates, now: MonotonicNs) {
+fn fill_queue(
+    shaper: &mut RouteShaper<ShmSample>,
+    output: &mut Output,
+    rates: LaneRates,
+    latched_queue: usize,
+    now: MonotonicNs,
+) {
     while let Some(sample) = output.take() {
         if output.durability.take_change() {
-            let rates = rates_of(rates, output.durability.get());
+            let rates = rates_of(rates, latched_queue, output.durability.get());
             shaper.set_rates(rates, now, |dropped, _, reason| output.drop_sample(&dropped, reason));
         }
         let stamps = SampleStamps::new(sample.header(), sample.payload().len() as u64);
@@ -147,14 +172,22 @@ fn fill_queue(shaper: &mut RouteShaper<ShmSample>, output: &mut Output, rates: L
     }
 }
 
+/// The queue for a latched topic: room for a sample of each publisher, because all may be discovered at once,
+/// but not so much that the queue counts as overflowing. What it holds in shared memory is bounded by
+/// `max_borrowed`; more waits in the channel.
+fn latched_queue(rules: &SafetyRules) -> usize {
+    rules.max_noncritical_queue.min(MAX_PUBLISHERS)
+}
+
 /// The rates of an output. TRANSIENT_LOCAL publishers publish state (a map, static transforms): their samples
 /// do not become stale and do not supersede each other, so they are sent in order, at the lane's rate.
-fn rates_of(lane: LaneRates, durability: Durability) -> LaneRates {
+fn rates_of(lane: LaneRates, latched_queue: usize, durability: Durability) -> LaneRates {
     let mut rates = lane;
     if durability == Durability::TransientLocal {
         for rate in [&mut rates.normal, &mut rates.degraded] {
             rate.stale_threshold_ms = 0;
             rate.drop_policy = DropPolicy::DropStale;
+            rate.queue_samples = rate.queue_samples.max(latched_queue);
         }
     }
     rates

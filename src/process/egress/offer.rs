@@ -1,5 +1,6 @@
 //! What the DDS writer of an output offers to its readers.
 
+use super::history::History;
 use super::late_joiners::LateJoiners;
 use crate::config::Lane;
 use crate::model::{Durability, QosProfile, Reliability};
@@ -22,11 +23,15 @@ impl Offer {
         self.window_samples.max(self.qos.depth().unwrap_or(1) as usize)
     }
 
-    /// The history for late joiners that request nothing.
-    pub fn late_joiners(&self) -> Option<LateJoiners> {
-        let is_latched_best_effort = self.qos.durability == Durability::TransientLocal
-            && self.qos.reliability == Reliability::BestEffort;
-        is_latched_best_effort.then(|| LateJoiners::new(self.qos.depth().unwrap_or(1) as usize))
+    /// The history for late joiners, if the output has one.
+    pub fn history(&self) -> Option<History> {
+        if self.qos.durability != Durability::TransientLocal {
+            return None;
+        }
+        // Late joiners of a BEST_EFFORT writer request nothing.
+        let depth = self.qos.depth().unwrap_or(1) as usize;
+        let is_best_effort = self.qos.reliability == Reliability::BestEffort;
+        Some(History::new(is_best_effort.then(|| LateJoiners::new(depth))))
     }
 }
 

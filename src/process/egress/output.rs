@@ -6,15 +6,16 @@ use tracing::{error, info, warn};
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
-use super::late_joiners::{KeptSample, LateJoiners};
+use super::history::History;
 use super::offer::{Offer, RouteDurability};
 use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
 use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
-    OutputReaders, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
+    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_PUBLISHERS, MAX_UNMATCHED_READERS,
+    MonotonicNs, OutputReaders, PublisherAccount, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
+    UnmatchedReader,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::{
@@ -53,7 +54,8 @@ pub(super) struct Output {
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
-    late_joiners: Option<LateJoiners>,
+    /// `None` of a VOLATILE output.
+    history: Option<History>,
     tracker: SequenceTracker,
     pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
@@ -114,7 +116,7 @@ impl Output {
             class: lane.class(),
             route: output.route,
             dds_topic: output.topic.to_dds(),
-            late_joiners: offer.late_joiners(),
+            history: offer.history(),
             unsent: UnsentSamples::new(offer.most_unsent()),
             durability: RouteDurability::new(&offer, latched_offer.is_some()),
             offer,
@@ -213,8 +215,9 @@ impl Output {
         let by_reference = bytes >= self.by_reference_min_bytes
             && self.subscriber.borrowed() < self.subscriber.max_borrowed();
         let payload = if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) };
-        let kept = self.late_joiners.as_ref().map(|_| KeptSample::copy(&payload, &header));
-        let outcome = writer.write(payload, header.encapsulation, header.source_timestamp);
+        let kept = self.history.as_ref().and_then(|history| history.copy(&payload, &header));
+        let publisher = self.history.as_ref().map(|_| header.writer_guid);
+        let outcome = writer.write_from(publisher, payload, header.encapsulation, header.source_timestamp);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
@@ -247,8 +250,9 @@ impl Output {
             counters.waiting = queued + unsent.len() as u64;
         });
         if outcome.is_ok() {
-            if let (Some(late_joiners), Some(kept)) = (&mut self.late_joiners, kept) {
-                late_joiners.keep(kept);
+            if let Some(history) = &mut self.history {
+                let present = || present_publishers(&self.boards, self.route);
+                history.add(header.writer_guid, kept, Some(writer), present);
             }
             self.shm.record(began_at.since(header.published_at));
             self.dds_out.record(done_at.since(began_at));
@@ -337,7 +341,9 @@ impl Output {
         }
         self.follow_matching(now);
         self.record_readers(now);
-        self.serve_late_joiners(now);
+        if let (Some(history), Some(writer)) = (&mut self.history, &self.writer) {
+            history.serve(writer, &self.id, &self.lane, now);
+        }
         let class = self.class;
         let is_expected = |reason: DropReason| reason.is_expected(class);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
@@ -361,7 +367,8 @@ impl Output {
                         self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
-                    if let Some(late_joiners) = &mut self.late_joiners {
+                    let history = self.history.as_mut();
+                    if let Some(late_joiners) = history.and_then(|it| it.late_joiners.as_mut()) {
                         if !joined {
                             late_joiners.left(reader);
                         } else if !late_joiners.joined(reader, now) {
@@ -421,27 +428,6 @@ impl Output {
         }
     }
 
-    fn serve_late_joiners(&mut self, now: MonotonicNs) {
-        let (Some(late_joiners), Some(writer)) = (&mut self.late_joiners, &self.writer) else {
-            return;
-        };
-        while let Some((reader, history)) = late_joiners.next_due(now) {
-            for kept in history {
-                let written =
-                    writer.write_to(reader, kept.payload.clone(), kept.encapsulation, kept.timestamp);
-                if let Err(failure) = written {
-                    warn!(
-                        route = self.id,
-                        lane = self.lane,
-                        ?reader,
-                        %failure,
-                        "cannot send the history to a late joiner"
-                    );
-                }
-            }
-        }
-    }
-
     /// Reads the durability with the first sample of each publisher: ingress publishes type and durability
     /// before it takes that sample, and the next housekeeping would be too late for it.
     fn follow_publisher(&mut self, publisher: Guid) {
@@ -480,7 +466,7 @@ impl Output {
             drop(volatile);
             participant.remove_endpoint(guid);
         }
-        self.late_joiners = latched.late_joiners();
+        self.history = latched.history();
         self.unsent = UnsentSamples::new(latched.most_unsent());
         self.offer = latched;
     }
@@ -552,15 +538,29 @@ impl Output {
 
     /// Writes a sample that was forwarded before a restart again, for late joiners.
     fn restore(&mut self, sample: &ShmSample) {
-        let kept = KeptSample::copy(sample.payload(), sample.header());
-        if let Some(late_joiners) = &mut self.late_joiners {
-            late_joiners.keep(kept);
-        } else if let Some(writer) = &self.writer
-            && let Err(failure) = writer.write(kept.payload, kept.encapsulation, kept.timestamp)
+        let Some(history) = &mut self.history else { return };
+        let (header, publisher) = (sample.header(), sample.header().writer_guid);
+        let kept = history.copy(sample.payload(), header);
+        if kept.is_none()
+            && let Some(writer) = &self.writer
         {
-            warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
+            let payload = Bytes::copy_from_slice(sample.payload());
+            let written =
+                writer.write_from(Some(publisher), payload, header.encapsulation, header.source_timestamp);
+            if let Err(failure) = written {
+                warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
+            }
         }
+        history.add(publisher, kept, self.writer.as_ref(), || present_publishers(&self.boards, self.route));
     }
+}
+
+/// The publishers of a route that ingress knows to be there.
+fn present_publishers(boards: &Boards, route: usize) -> Vec<Guid> {
+    let accounts = (0..MAX_PUBLISHERS).filter_map(|place| boards.publisher(route, place));
+    let is_present =
+        |account: &PublisherAccount| account.offered_reliability != PublisherAccount::OFFER_UNKNOWN;
+    accounts.filter(is_present).map(|account| account.writer).collect()
 }
 
 /// Records the sequence numbers that are accounted for, up to the last sample taken.

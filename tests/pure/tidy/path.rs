@@ -63,7 +63,7 @@ fn a_small_critical_sample_passes_at_most_15_files_and_30_functions() {
     let read = |file: &str| std::fs::read_to_string(root.join(file)).unwrap_or_default();
     let page = read(PAGE);
     let path = path(&page);
-    for end in [("src/process/ingress/receiving.rs", "turn"), ("src/dds/writer.rs", "write")] {
+    for end in [("src/process/ingress/receiving.rs", "turn"), ("src/dds/writer.rs", "write_from")] {
         assert!(path.contains(&end), "{PAGE} does not list {end:?}: {path:?}");
     }
     let wrong = violations(&path, &read);

@@ -17,6 +17,7 @@ pub(crate) mod rtps_writer_proxy;
 pub(crate) mod timed_event;
 pub(crate) mod transmit;
 pub(crate) mod writer;
+pub(crate) mod source_history;
 pub(crate) mod writer_send_buffer;
 
 pub(crate) mod message;

@@ -1,8 +1,11 @@
 //! What a Writer knows of the progress of each matched reader.
 
-use std::sync::{
-  atomic::{AtomicI64, AtomicU64, Ordering},
-  Arc,
+use std::{
+  collections::BTreeSet,
+  sync::{
+    atomic::{AtomicI64, AtomicU64, Ordering},
+    Arc,
+  },
 };
 
 use crate::structure::{guid::GUID, sequence_number::SequenceNumber};
@@ -33,8 +36,18 @@ pub(crate) struct ReaderProgress {
   reader: GUID,
   reliable: bool,
   first_offered: SequenceNumber,
+  history: Option<OfferedHistory>,
   acked_before: AtomicI64,
   overrun: AtomicU64,
+}
+
+/// A history with holes, such as the last samples of several sources: of what was written
+/// before the reader was matched, it is offered these only.
+#[derive(Debug)]
+pub(crate) struct OfferedHistory {
+  pub listed: BTreeSet<SequenceNumber>,
+  /// The first number that was written, or is to be sent to all, after the match.
+  pub before: SequenceNumber,
 }
 
 impl ReaderProgress {
@@ -43,9 +56,49 @@ impl ReaderProgress {
       reader,
       reliable,
       first_offered,
+      history: None,
       acked_before: AtomicI64::new(first_offered.into()),
       overrun: AtomicU64::new(0),
     }
+  }
+
+  #[must_use]
+  pub fn with_history(mut self, history: Option<OfferedHistory>) -> Self {
+    self.history = history;
+    self
+  }
+
+  /// If the reader is not offered this sample, the next one that it is offered.
+  pub fn offered_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
+    let history = self.history.as_ref()?;
+    if sequence_number >= history.before || history.listed.contains(&sequence_number) {
+      return None;
+    }
+    let later = history.listed.range(sequence_number..history.before).next();
+    Some(later.copied().unwrap_or(history.before))
+  }
+
+  /// Whether the reader is offered this sample of the history.
+  pub fn offers_of_history(&self, sequence_number: SequenceNumber) -> bool {
+    let history = self.history.as_ref();
+    history.is_some_and(|history| history.listed.contains(&sequence_number))
+  }
+
+  /// How many samples of this range the reader is offered.
+  pub fn offered_between(&self, first: SequenceNumber, before: SequenceNumber) -> u64 {
+    let (listed, first) = match &self.history {
+      Some(history) if first < history.before => {
+        let end = history.before.min(before);
+        let listed = if first < end {
+          history.listed.range(first..end).count()
+        } else {
+          0
+        };
+        (listed as u64, history.before)
+      }
+      _ => (0, first),
+    };
+    listed + u64::try_from(i64::from(before) - i64::from(first)).unwrap_or(0)
   }
 
   pub fn first_offered(&self) -> SequenceNumber {
@@ -63,13 +116,13 @@ impl ReaderProgress {
   }
 
   pub fn snapshot(&self, last: SequenceNumber) -> MatchedReader {
-    let through_last = |first: i64| u64::try_from(i64::from(last) + 1 - first).unwrap_or(0);
+    let through_last = |first| self.offered_between(first, last.plus_1());
     MatchedReader {
       guid: self.reader,
       reliable: self.reliable,
-      offered: through_last(self.first_offered.into()),
+      offered: through_last(self.first_offered),
       unacknowledged: if self.reliable {
-        through_last(self.acked_before.load(Ordering::Relaxed))
+        through_last(SequenceNumber::new(self.acked_before.load(Ordering::Relaxed)))
       } else {
         0
       },

@@ -299,6 +299,35 @@ impl RtpsReaderProxy {
       .map_or_else(SequenceNumber::zero, |progress| progress.first_offered())
   }
 
+  // If the reader is not offered this sample of the history, the next one that it is.
+  fn offered_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
+    let progress = self.progress.as_ref()?;
+    progress.offered_after(sequence_number)
+  }
+
+  // How many samples of this range the reader is offered.
+  fn offered_between(&self, first: SequenceNumber, before: SequenceNumber) -> u64 {
+    match &self.progress {
+      Some(progress) => progress.offered_between(first, before),
+      None => u64::try_from(i64::from(before) - i64::from(first)).unwrap_or(0),
+    }
+  }
+
+  /// If the first sample requested is one that the reader is not offered, takes the
+  /// requests up to the next one that it is, and returns these two numbers: one GAP tells
+  /// it of any number of samples. The reader will request the next one, too.
+  pub fn take_unoffered_requests(&mut self) -> Option<(SequenceNumber, SequenceNumber)> {
+    let first = self.first_unsent_change()?;
+    let before = self.offered_after(first)?;
+    self.unsent_changes = self.unsent_changes.split_off(&before);
+    let progress = self.progress.as_ref();
+    let is_offered = progress.is_some_and(|progress| progress.offers_of_history(before));
+    if is_offered && !self.repairs_under_way.is_under_way(before, Instant::now()) {
+      self.unsent_changes.insert(before);
+    }
+    Some((first, before))
+  }
+
   // Counts `missed` samples, all of them before `before`, once.
   fn add_overrun(&mut self, missed: u64, before: SequenceNumber) {
     self.overrun_counted_before = max(self.overrun_counted_before, before);
@@ -333,18 +362,18 @@ impl RtpsReaderProxy {
     let mut further = evicted.split_off(&(first + SequenceNumber::from(GAP_MAX_SPAN)));
     let last = evicted.last().copied().unwrap_or(first);
 
-    let uncounted =
-      |sn: &&SequenceNumber| **sn >= self.overrun_counted_before && **sn >= self.first_offered();
+    let uncounted = |sn: &&SequenceNumber| {
+      **sn >= self.overrun_counted_before
+        && **sn >= self.first_offered()
+        && self.offered_after(**sn).is_none()
+    };
     let missed = evicted.iter().filter(uncounted).count() as u64;
     let counted_before = last.plus_1();
     let span = i64::from(counted_before) - i64::from(first);
     if evicted.len() >= BULK_GAP_MIN_SAMPLES && span <= 2 * evicted.len() as i64 {
       let unknown_from = max(counted_before, self.overrun_counted_before);
-      let unknown = i64::from(first_available) - i64::from(unknown_from);
-      self.add_overrun(
-        missed + u64::try_from(unknown).unwrap_or(0),
-        first_available,
-      );
+      let unknown = self.offered_between(unknown_from, first_available);
+      self.add_overrun(missed + unknown, first_available);
       return EvictedRequests::AllFrom {
         first,
         before: first_available,
@@ -763,8 +792,8 @@ impl RtpsReaderProxy {
         let skipped_from = max(self.all_acked_before, self.overrun_counted_before);
         let skipped_before = new_all_acked_before.min(advertised_first);
         if skipped_before > skipped_from {
-          let skipped = i64::from(skipped_before) - i64::from(skipped_from);
-          self.add_overrun(skipped.unsigned_abs(), skipped_before);
+          let skipped = self.offered_between(skipped_from, skipped_before);
+          self.add_overrun(skipped, skipped_before);
         }
         self.remove_from_unsent_set_all_before(new_all_acked_before);
         self.all_acked_before = new_all_acked_before;

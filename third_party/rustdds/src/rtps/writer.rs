@@ -529,13 +529,15 @@ impl Writer {
       TimedEvent::SendRepairData {
         to_reader: reader_guid,
       } => {
-        let history = self.send_buffer.history_first()..self.last_sent().plus_1();
+        let history = self.send_buffer.history_before(self.last_sent().plus_1());
         match self.lookup_reader_proxy_mut(reader_guid) {
           Some(rp) => {
             rp.repair_data_scheduled = false;
             if !rp.qos().is_reliable() && !rp.repair_mode {
               // The history for a late joiner, see `update_reader_proxy`.
-              rp.request_changes(history);
+              for number in history {
+                rp.request_change(number);
+              }
               rp.repair_mode = true;
             }
           }
@@ -1759,12 +1761,16 @@ impl Writer {
       let Some(unsent_sn) = reader_proxy.first_unsent_change() else {
         break;
       };
-      let first_available = self.send_buffer.first_change_sequence_number();
+      let gone_before = self.send_buffer.available_after(unsent_sn);
       let pending_gaps = reader_proxy.get_pending_gap().clone();
 
       let mut gap = MessageBuilder::new();
       let mut cache_change = None;
-      if unsent_sn < first_available {
+      if let Some((first, before)) = reader_proxy.take_unoffered_requests() {
+        // No HEARTBEAT that begins after them, as in `withdraw_msg`: the reader has no
+        // fragment of these, and may still lack earlier samples of the history.
+        gap = gap.gap_msg_range(first, before, self.entity_id(), self.endianness, reader_guid);
+      } else if let Some(first_available) = gone_before {
         // The reader requests samples that are gone.
         let evicted = reader_proxy.take_evicted_requests(first_available);
         debug!(
@@ -1777,7 +1783,7 @@ impl Writer {
         match self.send_buffer.get_by_sn(unsent_sn) {
           Some(cc) => cache_change = Some(cc),
           None => {
-            // A write has evicted it since `first_available` was read, or the send
+            // A write has evicted it since `gone_before` was read, or the send
             // buffer has a hole there.
             let evicted = reader_proxy.take_evicted_requests(unsent_sn.plus_1());
             gap = self.withdraw_msg(gap, &evicted, reader_guid);
@@ -2671,7 +2677,7 @@ impl Writer {
     let Some(new_reader) = self.readers.get(&new_reader_guid) else {
       return;
     };
-    let first_retained = self.send_buffer.first_change_sequence_number();
+    let first_available = self.send_buffer.first_available();
     let has_sibling = self
       .readers
       .range(new_reader_guid.prefix.range())
@@ -2679,7 +2685,7 @@ impl Writer {
     let first = if has_sibling {
       self.send_buffer.advertised_first()
     } else {
-      max(first_retained, new_reader.first_offered())
+      max(first_available, new_reader.first_offered())
     };
     let before_first = first - SequenceNumber::from(1);
     let last = if new_reader.is_joining() {
@@ -3412,7 +3418,7 @@ mod tests {
         ddsdata::DDSData,
         qos::{policy::Durability, QosPolicyBuilder},
         statusevents::{sync_status_channel, StatusChannelReceiver},
-        with_key::datawriter::WriteOptions,
+        with_key::datawriter::{WriteOptions, WriteOptionsBuilder},
       },
       discovery::discovery::Discovery,
       messages::submessages::{
@@ -3894,6 +3900,10 @@ mod tests {
     }
 
     fn write(f: &Fixture, samples: usize, payload_len: usize) {
+      write_with(f, WriteOptions::default(), samples, payload_len);
+    }
+
+    fn write_with(f: &Fixture, options: WriteOptions, samples: usize, payload_len: usize) {
       for _ in 0..samples {
         let data = DDSData::new(SerializedPayload::new(
           RepresentationIdentifier::CDR_LE,
@@ -3903,7 +3913,7 @@ mod tests {
         let admission = f
           .writer
           .send_buffer
-          .admit_blocking(WriteOptions::default(), data, none);
+          .admit_blocking(options.clone(), data, none);
         assert!(
           matches!(admission, Admission::Admitted { .. }),
           "a write failed"
@@ -4145,6 +4155,78 @@ mod tests {
         let joined = readers.iter().find(|reader| reader.guid == late).unwrap();
         assert_eq!(joined.offered, offered, "{durability:?}");
       }
+    }
+
+    // Each source has a history of its own. One GAP withdraws any number of other samples,
+    // which do not count as missed.
+    #[test]
+    fn a_late_joiner_gets_the_last_sample_of_each_source() {
+      let mut f = Fixture::user(0, 8, None);
+      f.writer.send_buffer = WriterSendBuffer::new(
+        f.writer.my_guid,
+        "t".to_string(),
+        true,
+        false,
+        false,
+        8,
+        8,
+        1,
+      )
+      .keep_last(1);
+      let of = |source: u8| {
+        let source = GUID::new(GuidPrefix::new(&[source; 12]), EntityId::UNKNOWN);
+        WriteOptionsBuilder::new().history_source(source).build()
+      };
+      let few = 3;
+      (1..=few).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 100_000, 8);
+      let last = 100_003;
+      let former = f.writer.readers.remove(&f.reader_guid);
+      assert!(former.is_some());
+
+      let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+      let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
+      let qos = f.writer.qos_policies.clone();
+      f.writer
+        .update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+      let reader = f.writer.readers.get_mut(&late).unwrap();
+      reader.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+      f.reader_guid = late;
+      f.writer.nack_response_delay = StdDuration::ZERO;
+      f.writer.offer_to_new_reader(late);
+      assert_eq!(received_messages(&socket), (0, vec![(1, last)]));
+      let reader = only_reader(&f);
+      assert_eq!((reader.offered, reader.unacknowledged), (4, 4));
+
+      // What it requests, and the sample after the hole.
+      let requested: Vec<i64> = (1..=256).collect();
+      acknowledge(&mut f, 1, &requested, 1);
+      assert_eq!(f.repair_round(), 256);
+      assert_eq!(received_messages(&socket).0, 4);
+      acknowledge(&mut f, 4, &requested[3..], 2); // the GAP was lost
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(4, last)]);
+      write_with(&f, of(2), 1, 8);
+      acknowledge(&mut f, last + 1, &[], 3);
+      let reader = only_reader(&f);
+      assert_eq!(
+        (reader.offered, reader.unacknowledged, reader.overrun),
+        (5, 1, 0)
+      );
+
+      // A later sample of one source replaces only its own.
+      acknowledge(&mut f, last + 2, &[], 4);
+      write_with(&f, of(100), 20, 8);
+      let later = GUID::new(GuidPrefix::new(&[4; 12]), f.reader_guid.entity_id);
+      f.writer
+        .update_reader_proxy(&RtpsReaderProxy::new(later, qos.clone(), false), &qos);
+      let before = SequenceNumber::new(last + 1_000);
+      assert_eq!(
+        f.writer.send_buffer.history_before(before),
+        [1, 3, last + 1, last + 21].map(SequenceNumber::new).into()
+      );
+      f.reader_guid = later;
+      assert_eq!(only_reader(&f).offered, 4);
     }
 
     // An ACKNACK that lies moves neither another reader's frontier nor, beyond what was

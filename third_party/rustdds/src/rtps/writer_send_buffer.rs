@@ -1,6 +1,6 @@
 use std::{
   cmp::max,
-  collections::BTreeMap,
+  collections::{BTreeMap, BTreeSet},
   sync::{Arc, Condvar, Mutex, MutexGuard},
   time::{Duration as StdDuration, Instant},
 };
@@ -12,9 +12,12 @@ use log::{debug, error, trace, warn};
 use crate::{
   dds::{ddsdata::DDSData, with_key::datawriter::WriteOptions},
   rtps::{
-    constant::{KEEP_LAST_MAX_RETAINED_BYTES, MAX_ADVERTISED_EVICTED_SAMPLES},
+    constant::{
+      DEFAULT_WRITER_MAX_SAMPLES, KEEP_LAST_MAX_RETAINED_BYTES, MAX_ADVERTISED_EVICTED_SAMPLES,
+    },
     direct_send::DirectSend,
-    reader_progress::{MatchedReader, ReaderProgress},
+    reader_progress::{MatchedReader, OfferedHistory, ReaderProgress},
+    source_history::SourceHistory,
   },
   structure::{cache_change::CacheChange, guid::GUID, sequence_number::SequenceNumber},
 };
@@ -47,6 +50,9 @@ struct Inner {
   written_bytes: u64,        // payload bytes of all samples ever written
   first_seq: SequenceNumber, // oldest still retained (default 1)
   last_seq: SequenceNumber,  // latest allocated (default 0 == nothing yet)
+
+  // What late joiners get beside `changes`, if the samples come from several sources.
+  history: SourceHistory,
 
   // What each matched reader was offered and has acknowledged.
   readers: BTreeMap<GUID, Arc<ReaderProgress>>,
@@ -98,16 +104,32 @@ struct Inner {
 impl Inner {
   fn evict_oldest(&mut self) {
     if let Some((oldest, evicted)) = self.changes.pop_first() {
-      self.retained_bytes -= evicted.data_value.payload_size();
       self.first_seq = oldest.plus_1();
+      self.release(evicted);
     }
+  }
+
+  // Of a sample that was removed from `changes`.
+  fn release(&mut self, released: CacheChange) {
+    self.retained_bytes -= released.data_value.payload_size();
+    self.history.keep(released);
+  }
+
+  // The first sample that is available, in `changes` or in the history.
+  fn first_available(&self) -> SequenceNumber {
+    let kept = self.history.kept_range();
+    kept.map_or(self.first_seq, |(first, _)| first.min(self.first_seq))
   }
 
   fn advertised_first(&self) -> SequenceNumber {
     if !self.reliable_readers_present {
       return self.first_seq;
     }
-    let furthest_back = self.first_seq - SequenceNumber::from(self.max_advertised_evicted);
+    let furthest_back = match self.history.kept_range() {
+      // A late joiner may still lack what is kept for it.
+      Some((_, last)) if self.acked_before <= last => self.acked_before,
+      _ => self.first_seq - SequenceNumber::from(self.max_advertised_evicted),
+    };
     let unacknowledged = max(self.acked_before, furthest_back);
     max(unacknowledged, SequenceNumber::new(1)).min(self.first_seq)
   }
@@ -169,6 +191,7 @@ impl WriterSendBuffer {
           retained_bytes: 0,
           written_bytes: 0,
           readers: BTreeMap::new(),
+          history: SourceHistory::default(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
           window_limit: window_limit.max(1),
@@ -365,6 +388,13 @@ impl WriterSendBuffer {
     may_block: bool,
   ) -> SequenceNumber {
     let seq = inner.last_seq.plus_1();
+    if let (false, Some(depth), Some(source)) = (
+      shared.volatile,
+      shared.keep_last,
+      write_options.history_source(),
+    ) {
+      inner.history.record(source, seq, depth);
+    }
     let cc = CacheChange::new(shared.writer_guid, seq, write_options, data);
     inner.retained_bytes += cc.data_value.payload_size();
     inner.written_bytes += cc.data_value.payload_size() as u64;
@@ -391,7 +421,7 @@ impl WriterSendBuffer {
       && (!may_block
         || (shared.reliable_writer && shared.volatile && !inner.reliable_readers_present));
     if trim_keep_last {
-      while inner.changes.len() > inner.max_retain {
+      while inner.changes.len() > inner.max_retain && !Self::waits_for_one_reader(shared, inner) {
         inner.evict_oldest();
       }
     } else if shared.keep_last.is_some() {
@@ -405,6 +435,17 @@ impl WriterSendBuffer {
       }
     }
     seq
+  }
+
+  // Whether the oldest sample is one for a late joiner that the event loop has not sent
+  // yet. The history may be longer than `max_retain`, which later samples bound.
+  fn waits_for_one_reader(shared: &Shared, inner: &Inner) -> bool {
+    if shared.volatile || inner.changes.len() > inner.max_retain + DEFAULT_WRITER_MAX_SAMPLES {
+      return false;
+    }
+    inner.changes.first_key_value().is_some_and(|(oldest, change)| {
+      change.write_options.to_single_reader().is_some() && *oldest > shared.direct_send.last_sent()
+    })
   }
 
   /// Sends a freshly admitted sample on the calling thread, if that is possible.
@@ -513,19 +554,46 @@ impl WriterSendBuffer {
   ) -> Arc<ReaderProgress> {
     let mut inner = self.shared.inner.lock().unwrap();
     let next = inner.last_seq.plus_1();
+    let first_unsent = self.shared.direct_send.last_sent().plus_1().min(next);
+    let mut history = None;
     let first_offered = if !wants_history {
-      self.shared.direct_send.last_sent().plus_1().min(next)
+      first_unsent
+    } else if let Some(mut listed) = inner.history.numbers() {
+      listed.split_off(&first_unsent);
+      let first = listed.first().copied().unwrap_or(first_unsent);
+      history = Some(OfferedHistory {
+        listed,
+        before: first_unsent,
+      });
+      first
     } else {
       Self::history_first_locked(&self.shared, &inner)
     };
-    let progress = Arc::new(ReaderProgress::new(reader, reliable, first_offered));
+    let progress = ReaderProgress::new(reader, reliable, first_offered).with_history(history);
+    let progress = Arc::new(progress);
     inner.readers.insert(reader, progress.clone());
     progress
   }
 
-  /// The first sample of the history that a late joiner is offered.
-  pub fn history_first(&self) -> SequenceNumber {
-    Self::history_first_locked(&self.shared, &self.shared.inner.lock().unwrap())
+  /// The samples of the history before this one, for a late joiner.
+  pub fn history_before(&self, before: SequenceNumber) -> BTreeSet<SequenceNumber> {
+    let inner = self.shared.inner.lock().unwrap();
+    let mut numbers = inner.history.numbers().unwrap_or_else(|| {
+      let first = Self::history_first_locked(&self.shared, &inner);
+      inner.changes.range(first..).map(|(number, _)| *number).collect()
+    });
+    numbers.split_off(&before);
+    numbers
+  }
+
+  /// Forgets the history of a source.
+  pub fn forget_history_of(&self, source: GUID) {
+    self.shared.inner.lock().unwrap().history.forget(source);
+  }
+
+  /// Samples of several sources that left the history because of its bounds.
+  pub fn history_evicted(&self) -> u64 {
+    self.shared.inner.lock().unwrap().history.evicted()
   }
 
   fn history_first_locked(shared: &Shared, inner: &Inner) -> SequenceNumber {
@@ -560,7 +628,25 @@ impl WriterSendBuffer {
   /// Returns an owned `CacheChange` (a cheap `Bytes`-backed clone) so the
   /// caller can serialize and transmit without holding the lock.
   pub fn get_by_sn(&self, sn: SequenceNumber) -> Option<CacheChange> {
-    self.shared.inner.lock().unwrap().changes.get(&sn).cloned()
+    let inner = self.shared.inner.lock().unwrap();
+    let change = inner.changes.get(&sn).or_else(|| inner.history.get(sn));
+    change.cloned()
+  }
+
+  /// The first sample that is available, also if only the history has it.
+  pub fn first_available(&self) -> SequenceNumber {
+    self.shared.inner.lock().unwrap().first_available()
+  }
+
+  /// If this sample is gone, because it is before the first one retained and the history
+  /// does not have it: the next one that is available.
+  pub fn available_after(&self, missing: SequenceNumber) -> Option<SequenceNumber> {
+    let inner = self.shared.inner.lock().unwrap();
+    if missing >= inner.first_seq || inner.history.get(missing).is_some() {
+      return None;
+    }
+    let kept = inner.history.kept_after(missing);
+    Some(kept.map_or(inner.first_seq, |kept| kept.min(inner.first_seq)))
   }
 
   /// Evict all samples with sequence number strictly less than `remove_before`.
@@ -569,8 +655,8 @@ impl WriterSendBuffer {
     let mut inner = shared.inner.lock().unwrap();
     let count_before = inner.changes.len();
     let kept = inner.changes.split_off(&remove_before);
-    for evicted in std::mem::replace(&mut inner.changes, kept).values() {
-      inner.retained_bytes -= evicted.data_value.payload_size();
+    for evicted in std::mem::replace(&mut inner.changes, kept).into_values() {
+      inner.release(evicted);
     }
     if remove_before > inner.first_seq {
       inner.first_seq = remove_before;
@@ -603,7 +689,7 @@ impl WriterSendBuffer {
         break;
       }
       let released = entry.remove();
-      inner.retained_bytes -= released.data_value.payload_size();
+      inner.release(released);
     }
     // Not past what has been written: a reader may acknowledge ahead of us.
     let written_before = inner.last_seq.plus_1();
@@ -860,6 +946,48 @@ mod tests {
     assert!(buf.get_by_sn(SequenceNumber::new(1)).is_none());
   }
 
+  // The history of a BEST_EFFORT writer is written again to a late joiner: more samples
+  // than the writer retains, which stay until they were sent.
+  #[test]
+  fn what_is_for_one_reader_is_retained_until_it_was_sent() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      /* reliable_writer */ false,
+      /* is_builtin */ false,
+      /* volatile */ false,
+      /* window_limit */ 1000,
+      /* backlog_limit */ 1000,
+      /* max_retain */ 2,
+    );
+    let to_one = || {
+      WriteOptionsBuilder::new()
+        .to_single_reader(GUID::GUID_UNKNOWN)
+        .build()
+    };
+    for _ in 0..4 {
+      assert!(admit_now(&buf, WriteOptions::default()));
+    }
+    for _ in 0..14 {
+      assert!(admit_now(&buf, to_one()));
+    }
+    assert!(admit_now(&buf, WriteOptions::default()));
+    assert_eq!(buf.retained_len(), 15);
+    assert_eq!(
+      buf.first_change_sequence_number(),
+      SequenceNumber::new(5)
+    );
+    buf.direct_send().set_last_sent(SequenceNumber::new(10));
+    assert!(admit_now(&buf, WriteOptions::default()));
+    assert_eq!(
+      buf.first_change_sequence_number(),
+      SequenceNumber::new(11)
+    );
+    buf.direct_send().set_last_sent(SequenceNumber::new(20));
+    assert!(admit_now(&buf, WriteOptions::default()));
+    assert_eq!(buf.retained_len(), 2);
+  }
+
   // A durable (non-VOLATILE) reliable writer must NOT drop on insert even before
   // a reader matches: it retains samples for late-joining readers. The
   // `max_retain` bound does not apply to it.
@@ -940,7 +1068,10 @@ mod tests {
       assert!(admit_now(&buf, WriteOptions::default()));
     }
     assert_eq!(buf.retained_len(), 5);
-    assert_eq!(buf.history_first(), SequenceNumber::new(9));
+    assert_eq!(
+      buf.history_before(SequenceNumber::new(11)),
+      [9, 10].map(SequenceNumber::new).into()
+    );
     assert_eq!(buf.advertised_first(), SequenceNumber::new(1));
     buf.offer_only_retained();
     assert_eq!(buf.advertised_first(), SequenceNumber::new(6));

@@ -133,6 +133,16 @@ where
     self.keyed_datawriter.offer_only_retained();
   }
 
+  /// Forgets the history of a source, see `WriteOptionsBuilder::history_source`.
+  pub fn forget_history_of(&self, source: GUID) {
+    self.keyed_datawriter.forget_history_of(source);
+  }
+
+  /// Samples of several sources that left the history because of its bounds.
+  pub fn history_evicted(&self) -> u64 {
+    self.keyed_datawriter.history_evicted()
+  }
+
   /// Every matched reader, with what it was offered, acknowledged and missed.
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     self.keyed_datawriter.matched_readers()

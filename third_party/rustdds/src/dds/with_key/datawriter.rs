@@ -44,6 +44,7 @@ pub struct WriteOptionsBuilder {
   related_sample_identity: Option<SampleIdentity>,
   source_timestamp: Option<Timestamp>,
   to_single_reader: Option<GUID>,
+  history_source: Option<GUID>,
   best_effort_may_block: bool,
 }
 
@@ -57,6 +58,7 @@ impl WriteOptionsBuilder {
       related_sample_identity: self.related_sample_identity,
       source_timestamp: self.source_timestamp,
       to_single_reader: self.to_single_reader,
+      history_source: self.history_source,
       best_effort_may_block: self.best_effort_may_block,
     }
   }
@@ -85,6 +87,15 @@ impl WriteOptionsBuilder {
   #[must_use]
   pub fn to_single_reader(mut self, reader: GUID) -> Self {
     self.to_single_reader = Some(reader);
+    self
+  }
+
+  /// The writer that the sample comes from, where samples of several writers are
+  /// forwarded: a KEEP_LAST writer that is not VOLATILE keeps the last `depth` samples of
+  /// each for late joiners.
+  #[must_use]
+  pub fn history_source(mut self, source: GUID) -> Self {
+    self.history_source = Some(source);
     self
   }
 
@@ -118,6 +129,7 @@ pub struct WriteOptions {
   source_timestamp: Option<Timestamp>,             // from DDS spec
   to_single_reader: Option<GUID>,                  /* try to send to one Reader only
                                                     * future extension room fo other fields. */
+  history_source: Option<GUID>,
   // nonblocking-transmit: opt-in blocking back-pressure for best-effort writers.
   // Defaults to `false` (DDS v1.4 section 2.2.2.4.2.11: `write` must not block
   // for best-effort reliability). See `WriteOptionsBuilder::best_effort_may_block`.
@@ -135,6 +147,11 @@ impl WriteOptions {
 
   pub fn to_single_reader(&self) -> Option<GUID> {
     self.to_single_reader
+  }
+
+  /// The writer that the sample comes from, if each has a history of its own.
+  pub fn history_source(&self) -> Option<GUID> {
+    self.history_source
   }
 
   /// Whether a best-effort `write` call is allowed to block under send-socket
@@ -155,6 +172,7 @@ impl From<Option<Timestamp>> for WriteOptions {
       related_sample_identity: None,
       source_timestamp,
       to_single_reader: None,
+      history_source: None,
       best_effort_may_block: false,
     }
   }
@@ -448,6 +466,16 @@ where
   /// instead of requesting them. Those that it has not acknowledged count as missed.
   pub fn offer_only_retained(&self) {
     self.send_buffer.offer_only_retained();
+  }
+
+  /// Forgets the history of a source, see `WriteOptionsBuilder::history_source`.
+  pub fn forget_history_of(&self, source: GUID) {
+    self.send_buffer.forget_history_of(source);
+  }
+
+  /// Samples of several sources that left the history because of its bounds.
+  pub fn history_evicted(&self) -> u64 {
+    self.send_buffer.history_evicted()
   }
 
   /// Every matched reader, with what it was offered, acknowledged and missed.
