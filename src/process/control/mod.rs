@@ -8,6 +8,7 @@ mod absences;
 mod diagnostics;
 mod intruders;
 mod link;
+pub(super) mod memory;
 mod parameters;
 mod safety;
 mod subscribers;
@@ -354,7 +355,7 @@ fn next_due(due: MonotonicNs, rate_hz: f64, now: MonotonicNs) -> MonotonicNs {
 }
 
 /// The networks that control joins, the input network first, and the index of each lane's network.
-fn networks(settings: &Settings) -> (Vec<DdsNetwork>, Vec<usize>) {
+pub(super) fn networks(settings: &Settings) -> (Vec<DdsNetwork>, Vec<usize>) {
     let mut networks = vec![settings.input.clone()];
     let mut of_lane = Vec::with_capacity(settings.lanes.len());
     for lane in &settings.lanes {

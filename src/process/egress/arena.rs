@@ -12,6 +12,9 @@ const CHUNK_BYTES: usize = 256 * 1024;
 /// acknowledges nothing of a slow route keeps one chunk for each sample of it.
 const MAX_CHUNKS: usize = 128;
 
+/// The memory of all chunks.
+pub(super) const MAX_BYTES: usize = MAX_CHUNKS * CHUNK_BYTES;
+
 /// Copies payloads into chunks, and reuses a chunk when the DDS writer has dropped all payloads in it.
 #[derive(Debug)]
 pub(super) struct CopyArena {

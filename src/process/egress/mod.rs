@@ -8,6 +8,7 @@
 mod arena;
 mod history;
 mod late_joiners;
+pub(super) mod memory;
 mod noncritical;
 mod offer;
 mod output;

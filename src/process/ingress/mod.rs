@@ -6,6 +6,7 @@
 
 mod early_waker;
 mod input;
+pub(super) mod memory;
 mod pool;
 mod publishers;
 mod receiving;
