@@ -12,6 +12,7 @@ mod in_force;
 mod ingress;
 mod lane_override;
 mod memory;
+mod memory_limit;
 mod notify;
 mod parameter_store;
 pub mod probes;

@@ -20,6 +20,7 @@ use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
+use super::memory_limit;
 use super::notify::write_list;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
@@ -109,6 +110,7 @@ impl Control {
     ) -> Result<Self, RoleError> {
         let scheduling = &settings.control_scheduling;
         let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", scheduling)?;
+        memory_limit::check(settings, ProcessRole::Control);
         let (networks, link_of_lane) = networks(settings);
         let mut participants = Vec::with_capacity(networks.len());
         for network in &networks {
