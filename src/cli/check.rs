@@ -13,7 +13,7 @@ use serde_json::json;
 use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed, print};
 use crate::config::{self, ConfigError, Place, Problem, Route, Row, Settings};
 use crate::model::{InstanceName, LaneName, RouteId, TopicName, TypeName};
-use crate::process::InForce;
+use crate::process::{InForce, MemoryNeed, MemoryNeeds};
 use crate::shm::RouteChannel;
 use crate::telemetry::bytes_text;
 
@@ -121,6 +121,28 @@ struct Summary<'a> {
     lanes: Vec<&'a LaneName>,
     routes: Vec<RouteSummary<'a>>,
     shared_memory_bytes: u64,
+    memory: Vec<ProcessMemory>,
+}
+
+/// The most memory that a process may need.
+#[derive(Serialize)]
+struct ProcessMemory {
+    process: String,
+    limit_bytes: u64,
+    #[serde(flatten)]
+    parts: MemoryNeed,
+}
+
+impl ProcessMemory {
+    fn all(settings: &Settings) -> Vec<Self> {
+        let needs = MemoryNeeds::of(settings);
+        let lanes = settings.lanes.iter().zip(needs.lanes).filter(|(lane, _)| lane.is_used());
+        let lanes = lanes.map(|(lane, need)| (format!("egress-{}", lane.name), need));
+        let all = [("ingress".to_owned(), needs.ingress)].into_iter().chain(lanes);
+        all.chain([("control".to_owned(), needs.control)])
+            .map(|(process, parts)| Self { process, limit_bytes: parts.limit_bytes(), parts })
+            .collect()
+    }
 }
 
 #[derive(Serialize)]
@@ -164,6 +186,7 @@ impl<'a> Summary<'a> {
             lanes: settings.lanes.iter().map(|lane| &lane.name).collect(),
             shared_memory_bytes: routes.iter().map(|route| route.shared_memory_bytes).sum(),
             routes,
+            memory: ProcessMemory::all(settings),
         }
     }
 }
@@ -186,7 +209,17 @@ impl fmt::Display for Summary<'_> {
                 bytes_text(route.shared_memory_bytes as f64)
             )?;
         }
-        writeln!(f, "\ntotal shared memory: {}", bytes_text(self.shared_memory_bytes as f64))
+        writeln!(f, "\ntotal shared memory: {}", bytes_text(self.shared_memory_bytes as f64))?;
+        writeln!(f, "\nmost memory of each process, the limit that `adaptive-bridge units` sets:")?;
+        for memory in &self.memory {
+            let parts = memory.parts.parts();
+            let parts = parts.iter().filter(|(_, bytes)| *bytes > 0);
+            let parts: Vec<_> =
+                parts.map(|(name, bytes)| format!("{name} {}", bytes_text(*bytes as f64))).collect();
+            let limit = bytes_text(memory.limit_bytes as f64);
+            writeln!(f, "  {:<20} {limit}: {}", memory.process, parts.join(", "))?;
+        }
+        Ok(())
     }
 }
 

@@ -12,9 +12,13 @@ use clap::Args;
 use super::{ConfigArguments, EXIT_USAGE, failed, print};
 use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
 use crate::model::TrafficClass;
+use crate::process::MemoryNeeds;
 
 /// The folder of the administrator's units (systemd.unit(5)).
 pub(super) const FOLDER: &str = "/etc/systemd/system";
+
+const INGRESS: &str = "adaptive-bridge-ingress.service";
+const CONTROL: &str = "adaptive-bridge-control.service";
 
 /// The first line of each written drop-in, by which a later run recognises it.
 const HEADER: &str =
@@ -23,6 +27,8 @@ const HEADER: &str =
 /// The file name of each drop-in. It sorts after those of the package (10 and 50), so that it overrides them.
 const FILE: &str = "60-configuration.conf";
 
+const MIB: u64 = 1 << 20;
+
 /// The highest real-time priority that the installed units of the critical path allow.
 const MAX_PRIORITY: u8 = 50;
 
@@ -30,7 +36,7 @@ const MAX_PRIORITY: u8 = 50;
 ///
 /// The installed units run ingress, the lanes critical and noncritical, and control, with
 /// /etc/adaptive-bridge/config.yaml. Drop-ins add what a configuration needs beside them: further lanes, and
-/// settings for scheduling, paths and another configuration file.
+/// settings for scheduling, paths and another configuration file, and the limit of memory of each process.
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Write the drop-ins, and remove obsolete ones of an earlier configuration
@@ -59,6 +65,29 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// The slice of all noncritical lanes.
+const NONCRITICAL_SLICE: &str = "adaptive-bridge-noncritical.slice";
+
+/// The memory of that slice in which the kernel lets its processes grow unhindered, in quarters of the limit.
+/// Beyond it they are slowed down, as in the installed unit.
+const UNHINDERED_QUARTERS: u64 = 3;
+
+/// The limit of memory (`MemoryMax`) of each unit, in bytes: what the configuration may need.
+pub(super) fn memory_limits(settings: &Settings) -> BTreeMap<String, u64> {
+    let needs = MemoryNeeds::of(settings);
+    let lanes = || settings.lanes.iter().zip(&needs.lanes).filter(|(lane, _)| lane.is_used());
+    let of_lanes = lanes().map(|(lane, need)| (egress(lane.name.as_str()), need.limit_bytes()));
+    let noncritical = lanes().filter(|(lane, _)| lane.class() == TrafficClass::Noncritical);
+    let noncritical: Vec<u64> = noncritical.map(|(_, need)| need.limit_bytes()).collect();
+    let mut limits = BTreeMap::from_iter(of_lanes);
+    limits.insert(INGRESS.to_owned(), needs.ingress.limit_bytes());
+    limits.insert(CONTROL.to_owned(), needs.control.limit_bytes());
+    if !noncritical.is_empty() {
+        limits.insert(NONCRITICAL_SLICE.to_owned(), noncritical.into_iter().fold(0, u64::saturating_add));
+    }
+    limits
+}
+
 /// The drop-ins that a configuration needs, by unit.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct DropIns(BTreeMap<String, String>);
@@ -77,12 +106,19 @@ impl DropIns {
         let wants = lanes.map(|lane| format!("Wants={}", egress(lane.name.as_str())));
         add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
 
+        let limits = memory_limits(settings);
+        if let Some(bytes) = limits.get(NONCRITICAL_SLICE) {
+            let high = bytes / 4 * UNHINDERED_QUARTERS;
+            let lines = vec![format!("MemoryHigh={}M", high / MIB), memory_max(*bytes)];
+            add(NONCRITICAL_SLICE.to_owned(), "Slice", lines);
+        }
         let common = common(settings, config);
         let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Option<String>| {
-            let own = Vec::from_iter(own);
+            let limit = limits.get(&unit).map(|bytes| memory_max(*bytes));
+            let own = own.into_iter().chain(limit).collect();
             add(unit, "Service", [common.clone(), scheduling(configured, critical), own].concat());
         };
-        service("adaptive-bridge-ingress.service".to_owned(), &settings.ingress_scheduling, true, None);
+        service(INGRESS.to_owned(), &settings.ingress_scheduling, true, None);
         for lane in &settings.lanes {
             let critical = lane.class() == TrafficClass::Critical;
             service(egress(lane.name.as_str()), &lane.scheduling, critical, None);
@@ -91,14 +127,17 @@ impl DropIns {
             Some(MetricsListener::Unix(socket)) => socket.parent().map(read_write),
             _ => None,
         };
-        service("adaptive-bridge-control.service".to_owned(), &settings.control_scheduling, false, own);
+        service(CONTROL.to_owned(), &settings.control_scheduling, false, own);
         Self(drop_ins)
     }
 
-    /// Whether `folder` has exactly these drop-ins.
+    /// Whether `folder` has exactly these drop-ins, whatever their limits of memory.
     pub fn match_folder(&self, folder: &Path) -> bool {
-        self.0.iter().all(|(unit, text)| is_written(&path(folder, unit), text))
-            && self.obsolete(folder).is_ok_and(|obsolete| obsolete.is_empty())
+        let is_there = |(unit, text): (&String, &String)| {
+            let present = fs::read_to_string(path(folder, unit)).unwrap_or_default();
+            without_memory(&present) == without_memory(text)
+        };
+        self.0.iter().all(is_there) && self.obsolete(folder).is_ok_and(|obsolete| obsolete.is_empty())
     }
 
     fn print(&self, folder: &Path) -> String {
@@ -106,9 +145,6 @@ impl DropIns {
         for (unit, drop_in) in &self.0 {
             // Writing to a String cannot fail.
             let _ = writeln!(text, "# {}\n{drop_in}", path(folder, unit).display());
-        }
-        if self.0.is_empty() {
-            text.push_str("# This configuration needs no drop-ins: the installed units suffice.\n");
         }
         text
     }
@@ -163,6 +199,17 @@ impl DropIns {
         obsolete.sort();
         Ok(obsolete)
     }
+}
+
+/// The settings of a drop-in other than limits of memory.
+fn without_memory(drop_in: &str) -> Vec<&str> {
+    let is_setting =
+        |line: &&str| line.contains('=') && !line.starts_with('#') && !line.starts_with("Memory");
+    drop_in.lines().filter(is_setting).collect()
+}
+
+fn memory_max(bytes: u64) -> String {
+    format!("MemoryMax={}M", bytes / MIB)
 }
 
 fn path(folder: &Path, unit: &str) -> PathBuf {
@@ -240,16 +287,55 @@ mod tests {
         diagnostics: {metrics: 'unix:/run/metrics/bridge.sock'}\n";
 
     #[test]
-    fn the_installed_units_are_enough_for_a_plain_configuration() {
+    fn a_plain_configuration_gets_limits_of_memory_and_nothing_else() {
         let drop_ins = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
-        assert_eq!(drop_ins, DropIns(BTreeMap::new()));
-        assert!(drop_ins.print(Path::new("/x")).contains("needs no drop-ins"));
+        let units: Vec<&str> = drop_ins.0.keys().map(String::as_str).collect();
+        let [critical, noncritical] = ["critical", "noncritical"].map(egress);
+        assert_eq!(units, [CONTROL, &critical, &noncritical, INGRESS, NONCRITICAL_SLICE]);
+        for (unit, text) in &drop_ins.0 {
+            assert!(without_memory(text).is_empty() && text.contains("\nMemoryMax="), "{unit}: {text}");
+        }
+        assert!(drop_ins.match_folder(Path::new("/nonexistent")));
+    }
+
+    #[test]
+    fn the_installed_limits_are_enough_for_a_plain_configuration() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd");
+        let installed_mib = |unit: &str| {
+            let text = fs::read_to_string(folder.join(unit)).unwrap();
+            let limit = text.lines().find_map(|line| line.strip_prefix("MemoryMax="));
+            limit.map(|limit| limit.strip_suffix('M').unwrap().parse::<u64>().unwrap())
+        };
+        let limits = memory_limits(&settings(PLAIN));
+        for unit in [CONTROL, NONCRITICAL_SLICE] {
+            assert!(
+                installed_mib(unit) >= Some(limits[unit] / MIB),
+                "{unit} needs {} MiB",
+                limits[unit] / MIB
+            );
+        }
+        let responder = MemoryNeeds::of_responder().limit_bytes() / MIB;
+        assert!(installed_mib("adaptive-bridge-responder@.service") >= Some(responder), "{responder} MiB");
+        // A limit that is not made for the configuration could end the critical lane.
+        let without = [INGRESS, "adaptive-bridge-egress@critical.service.d/50-critical.conf"];
+        assert!(without.iter().all(|unit| installed_mib(unit).is_none()));
+    }
+
+    #[test]
+    fn the_slice_of_noncritical_lanes_has_room_for_all_of_them() {
+        let limits = memory_limits(&settings(LANES));
+        assert_eq!(limits[NONCRITICAL_SLICE], limits[&egress("noncritical")] + limits[&egress("rviz")]);
+        let unused = "topics: [{id: scan, input_topic: /scan, lanes: [critical]}]\n";
+        assert!(!memory_limits(&settings(unused)).contains_key(NONCRITICAL_SLICE));
     }
 
     #[test]
     fn drop_ins_add_the_lanes_rights_and_paths_of_a_configuration() {
         let drop_ins = DropIns::of(&settings(LANES), Path::new("/home/robot/100% \"bridge\".yaml"));
-        let lines = |unit: &str| drop_ins.0[unit].lines().skip(1).map(str::to_owned).collect::<Vec<_>>();
+        let lines = |unit: &str| {
+            let lines = drop_ins.0[unit].lines().skip(1).filter(|line| !line.starts_with("MemoryMax="));
+            lines.map(str::to_owned).collect::<Vec<_>>()
+        };
         assert_eq!(lines("adaptive-bridge.target"), ["[Unit]", "Wants=adaptive-bridge-egress@rviz.service"]);
         let common = [
             "[Service]",
@@ -279,6 +365,11 @@ mod tests {
         fs::write(&own, "").unwrap();
         plain.write(folder.path()).unwrap();
         assert!(plain.match_folder(folder.path()) && own.exists());
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+        assert!(!path(folder.path(), &egress("rviz")).exists());
+        // Only what doctor reports as a limit of memory differs.
+        let limit = path(folder.path(), INGRESS);
+        fs::write(&limit, format!("{HEADER}[Service]\nMemoryMax=1M\n")).unwrap();
+        assert!(plain.match_folder(folder.path()));
+        assert!(plain.write(folder.path()).unwrap().contains("written"));
     }
 }

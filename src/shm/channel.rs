@@ -35,6 +35,9 @@ const PUBLISHERS: usize = 2;
 const OPEN_ATTEMPTS: usize = 20;
 const OPEN_PAUSE: Duration = Duration::from_millis(25);
 
+/// Shared memory beside the pools: boards, and iceoryx2's data of services and connections.
+pub const OTHER_SHARED_BYTES: u64 = 4 << 20;
+
 /// The most samples of a route that a lane may hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct QueueLimits {

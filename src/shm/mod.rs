@@ -31,7 +31,7 @@ mod wake;
 pub use board::{
     BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
 };
-pub use channel::{PoolSize, QueueLimits, RouteChannel};
+pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::{HEADER_BYTES, HeaderError, decode_header};
 pub use in_force::{BridgeAddress, InForceFile, InForceShare};

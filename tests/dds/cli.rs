@@ -633,6 +633,15 @@ fn check_prints_json_of_good_and_of_bad_configurations() {
     assert_eq!(good["routes"][0]["outputs"][1]["topic"], "/adaptive_bridge/noncritical/scan");
     let total = good["shared_memory_bytes"].as_u64().unwrap();
     assert!(total > 8_192 && good["routes"][0]["shared_memory_bytes"] == total, "{good}");
+    let memory = good["memory"].as_array().unwrap();
+    let processes: Vec<_> = memory.iter().map(|memory| memory["process"].as_str().unwrap()).collect();
+    assert_eq!(processes, ["ingress", "egress-critical", "egress-noncritical", "control"]);
+    assert!(memory[0]["shared_memory_bytes"].as_u64().unwrap() > 2 * total, "{good}");
+    for memory in memory {
+        let parts = memory.as_object().unwrap().iter().filter(|(part, _)| !part.starts_with("limit"));
+        let sum: u64 = parts.filter_map(|(_, bytes)| bytes.as_u64()).sum();
+        assert!(memory["limit_bytes"].as_u64().unwrap() > sum, "{memory}");
+    }
     bridge.write_config("topics:\n  - {id: scan, input_topic: /scan, max_sample_bytes: 0}\n");
     let output = bridge.run("check --json");
     assert_eq!(output.status.code(), Some(78));

@@ -6,6 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use adaptive_bridge::config;
+use adaptive_bridge::process::MemoryNeeds;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
 use support::peer::{Peer, Received, Sent};
@@ -89,12 +91,16 @@ mod long {
         let after = pids.map(resident_kib);
         let [many, malformed, evicted] = [too_many, "malformed_datagram", "evicted_participant"]
             .map(|cause| ROLES.map(|role| refused(&status, role, cause)));
-        println!("resident memory {before:?} KiB, then {after:?} KiB");
+        let needs = MemoryNeeds::of(&config::parse(SCAN, "the test", &|_| None).unwrap());
+        let needs = [needs.ingress, needs.control, needs.lanes[0], needs.lanes[1]];
+        let limits_kib = needs.map(|need| need.limit_bytes() as i64 / 1024);
+        println!("resident memory {before:?} KiB, then {after:?} KiB, limits {limits_kib:?} KiB");
         println!("refused {many:?}, malformed {malformed:?}, evicted {evicted:?}");
         for (index, role) in ROLES.into_iter().enumerate() {
             assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
             let growth = after[index] - before[index];
             assert!(growth < MAX_GROWTH_KIB, "{role} grew by {growth} KiB");
+            assert!(after[index] < limits_kib[index], "{role} takes more than its limit");
             // A full socket buffer discards the others.
             assert!(many[index] > 10_000, "{role} refused {}", many[index]);
             assert!(malformed[index] > 1_000, "{role} took {} of another sender", malformed[index]);

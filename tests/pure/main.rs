@@ -4,6 +4,7 @@
 mod config;
 mod control_policy;
 mod dumps;
+mod memory;
 mod policy;
 mod regressions;
 mod tidy;

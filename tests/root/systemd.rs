@@ -309,6 +309,52 @@ fn what_noncritical_lanes_may_take_is_limited_and_the_critical_one_flows() {
 }
 
 #[test]
+fn the_limits_of_memory_of_a_configuration_are_in_force_and_samples_flow() {
+    let test = "the_limits_of_memory_of_a_configuration_are_in_force_and_samples_flow";
+    let Some(bed) = Bed::boot_by(Machine::boot_with_limits, test, SCAN) else { return };
+    let doctor = || -> (Value, Value) {
+        let output = bed.machine.try_run(&["adaptive-bridge", "doctor", "--json"]);
+        let diagnosis: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let findings = diagnosis["findings"].as_array().unwrap();
+        let found = findings.iter().find(|finding| finding["check"] == "memory limits");
+        let found = found.unwrap_or_else(|| panic!("{diagnosis}"));
+        (found["severity"].clone(), found["found"].clone())
+    };
+    let (severity, found) = doctor();
+    assert!(severity == "note" && found.as_str().unwrap().contains(INGRESS), "{severity}: {found}");
+    bed.machine.run(&["adaptive-bridge", "units", "--write"]);
+    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.start();
+    assert_eq!(doctor().0, "ok");
+    let checked: Value =
+        serde_json::from_str(&bed.machine.run(&["adaptive-bridge", "check", "--json"])).unwrap();
+    let number = |unit: &str, property: &str| -> u64 {
+        let value = bed.machine.property(unit, property);
+        value.parse().unwrap_or_else(|_| panic!("{property} of {unit} is {value}"))
+    };
+    let flow = bed.flow();
+    flow.wait_critical(600);
+    let processes = ["ingress", "egress-critical", "egress-noncritical", "control"];
+    for (unit, process) in UNITS.into_iter().zip(processes) {
+        let memory = checked["memory"].as_array().unwrap();
+        let expected = memory.iter().find(|memory| memory["process"] == process).unwrap();
+        let limit = number(unit, "MemoryMax");
+        assert_eq!(Some(limit), expected["limit_bytes"].as_u64(), "{unit}");
+        // What the kernel counts, with sockets and shared memory.
+        let used = number(unit, "MemoryCurrent");
+        println!("{unit}: {} of {} MiB", used >> 20, limit >> 20);
+        assert!((1 << 20..limit).contains(&used), "{unit} uses {used} of {limit}");
+        assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+    }
+    flow.end();
+    bed.stop();
+    // A file that needs more than the limits allow.
+    bed.machine.write(CONFIG, &SCAN.replace("65536", "67108864"));
+    let (severity, found) = doctor();
+    assert!(severity == "warning" && found.as_str().unwrap().contains(INGRESS), "{severity}: {found}");
+}
+
+#[test]
 fn a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on() {
     let test = "a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on";
     let Some(bed) = Bed::boot(test, SCAN) else { return };

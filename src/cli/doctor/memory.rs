@@ -8,19 +8,16 @@ use nix::unistd::geteuid;
 
 use super::Finding;
 use crate::config::Settings;
-use crate::shm::{RoleHolder, RouteChannel, instance_files, root_of};
+use crate::shm::{OTHER_SHARED_BYTES, RoleHolder, RouteChannel, instance_files, root_of};
 
 const SHM: &str = "/dev/shm";
-
-/// Shared memory beside the pools: boards, and iceoryx2's data of services and connections.
-const OTHER_BYTES: u64 = 4 << 20;
 
 /// The highest user id of system users, whose shared memory logind does not remove.
 const SYSTEM_UID_MAX: u32 = 999;
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
     let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
-    let needed = pools.sum::<u64>() + OTHER_BYTES;
+    let needed = pools.sum::<u64>() + OTHER_SHARED_BYTES;
     let root = root_of(settings);
     let holders = RoleHolder::all(&root, &settings.instance).unwrap_or_default();
     let space = match statvfs(SHM) {

@@ -1,5 +1,6 @@
 //! Checks of versions and of the systemd services.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
@@ -44,6 +45,9 @@ pub(super) fn check(settings: &Settings, file: &Path) -> Vec<Finding> {
     if !["", "not-found"].contains(&enabled.as_str()) {
         let match_configuration = DropIns::of(settings, file).match_folder(Path::new(units::FOLDER));
         findings.push(drop_ins(match_configuration, file));
+        findings.push(memory_limits(&units::memory_limits(settings), file, |unit| {
+            output("systemctl", &["show", "--property=MemoryMax", "--value", unit])
+        }));
         let list = ["list-units", "--plain", "--no-legend", "--state=failed", "adaptive-bridge-*"];
         findings.push(failed(&output("systemctl", &list).unwrap_or_default()));
     }
@@ -87,6 +91,38 @@ fn drop_ins(match_configuration: bool, file: &Path) -> Finding {
         .with_command(format!("sudo adaptive-bridge units --write --config {}", file.display()))
 }
 
+/// Checks the limits of memory in force, which `systemctl show` prints in bytes or as `infinity`.
+fn memory_limits(
+    needed: &BTreeMap<String, u64>,
+    file: &Path,
+    in_force: impl Fn(&str) -> Option<String>,
+) -> Finding {
+    let check = "memory limits";
+    let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+    let (mut too_low, mut unlimited) = (Vec::new(), Vec::new());
+    for (unit, needed) in needed {
+        match in_force(unit).and_then(|limit| limit.parse::<u64>().ok()) {
+            Some(limit) if limit < *needed => {
+                too_low.push(format!("{unit} has {} MiB and may need {}", mib(limit), mib(*needed)));
+            }
+            Some(_) => {}
+            None => unlimited.push(unit),
+        }
+    }
+    let command = format!("sudo adaptive-bridge units --write --config {}", file.display());
+    if !too_low.is_empty() {
+        Finding::warning(check, list(&too_low))
+            .means("The kernel ends a process that needs more than its limit.")
+            .with_command(command)
+    } else if !unlimited.is_empty() {
+        Finding::note(check, format!("{} have none", list(&unlimited)))
+            .means("If a process takes too much memory, the kernel ends other programs first.")
+            .with_command(command)
+    } else {
+        Finding::ok(check, "are what the configuration may need, or more")
+    }
+}
+
 /// Checks the services that `systemctl list-units --state=failed` lists.
 fn failed(units: &str) -> Finding {
     let names: Vec<&str> = units.lines().filter_map(|line| line.split_whitespace().next()).collect();
@@ -116,6 +152,21 @@ mod tests {
         assert_eq!(failed("").severity, Severity::Ok);
         let found = failed("adaptive-bridge-control.service loaded failed failed Adaptive Bridge: control\n");
         assert_eq!(found.command.unwrap(), "journalctl -u adaptive-bridge-control.service -n 50");
+    }
+
+    #[test]
+    fn a_limit_of_memory_is_enough_or_missing_or_too_low() {
+        let needed = BTreeMap::from([("a.service".to_owned(), 32 << 20), ("b.service".to_owned(), 64 << 20)]);
+        let found = |a: &'static str, b: &'static str| {
+            let in_force = move |unit: &str| Some(if unit == "a.service" { a } else { b }.to_owned());
+            memory_limits(&needed, Path::new("/x"), in_force)
+        };
+        assert_eq!(found("33554432", "infinity").severity, Severity::Note);
+        assert_eq!(found("33554432", "67108864").severity, Severity::Ok);
+        let too_low = found("infinity", "67108863");
+        assert_eq!(too_low.severity, Severity::Warning);
+        assert_eq!(too_low.found, "b.service has 64 MiB and may need 64");
+        assert!(too_low.command.unwrap().contains("units --write"));
     }
 
     #[test]

@@ -8,6 +8,7 @@ mod absences;
 mod diagnostics;
 mod intruders;
 mod link;
+pub(super) mod memory;
 mod parameters;
 mod safety;
 mod subscribers;
@@ -19,6 +20,7 @@ use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
+use super::memory_limit;
 use super::notify::write_list;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
@@ -108,6 +110,7 @@ impl Control {
     ) -> Result<Self, RoleError> {
         let scheduling = &settings.control_scheduling;
         let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", scheduling)?;
+        memory_limit::check(settings, ProcessRole::Control);
         let (networks, link_of_lane) = networks(settings);
         let mut participants = Vec::with_capacity(networks.len());
         for network in &networks {
@@ -354,7 +357,7 @@ fn next_due(due: MonotonicNs, rate_hz: f64, now: MonotonicNs) -> MonotonicNs {
 }
 
 /// The networks that control joins, the input network first, and the index of each lane's network.
-fn networks(settings: &Settings) -> (Vec<DdsNetwork>, Vec<usize>) {
+pub(super) fn networks(settings: &Settings) -> (Vec<DdsNetwork>, Vec<usize>) {
     let mut networks = vec![settings.input.clone()];
     let mut of_lane = Vec::with_capacity(settings.lanes.len());
     for lane in &settings.lanes {

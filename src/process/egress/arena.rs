@@ -8,6 +8,13 @@ use bytes::{Bytes, BytesMut};
 /// that size without a system call for each allocation.
 const CHUNK_BYTES: usize = 256 * 1024;
 
+/// The most chunks. A single payload that a writer retains keeps a chunk from being reused: a reader that
+/// acknowledges nothing of a slow route keeps one chunk for each sample of it.
+const MAX_CHUNKS: usize = 128;
+
+/// The memory of all chunks.
+pub(super) const MAX_BYTES: usize = MAX_CHUNKS * CHUNK_BYTES;
+
 /// Copies payloads into chunks, and reuses a chunk when the DDS writer has dropped all payloads in it.
 #[derive(Debug)]
 pub(super) struct CopyArena {
@@ -18,28 +25,32 @@ pub(super) struct CopyArena {
 
 impl CopyArena {
     pub fn new() -> Self {
-        Self { current: BytesMut::with_capacity(CHUNK_BYTES), filled: VecDeque::with_capacity(64) }
+        Self { current: BytesMut::with_capacity(CHUNK_BYTES), filled: VecDeque::with_capacity(MAX_CHUNKS) }
     }
 
-    /// Copies `payload`; one that is larger than a chunk gets an allocation of its own.
+    /// Copies `payload`. It gets an allocation of its own if it is larger than a chunk, or if every chunk is
+    /// full and has a payload that is held.
     pub fn copy(&mut self, payload: &[u8]) -> Bytes {
-        if payload.len() > CHUNK_BYTES {
+        let is_full = |chunk: &BytesMut| chunk.capacity() - chunk.len() < payload.len();
+        if payload.len() > CHUNK_BYTES || (is_full(&self.current) && !self.next_chunk()) {
             return Bytes::copy_from_slice(payload);
-        }
-        if self.current.capacity() - self.current.len() < payload.len() {
-            self.next_chunk();
         }
         self.current.extend_from_slice(payload);
         self.current.split().freeze()
     }
 
-    /// Continues with the oldest full chunk if no payload in it is held, else with a new one.
-    fn next_chunk(&mut self) {
-        let is_free = self.filled.front_mut().is_some_and(|oldest| oldest.try_reclaim(CHUNK_BYTES));
-        let reused = if is_free { self.filled.pop_front() } else { None };
-        let next = reused.unwrap_or_else(|| BytesMut::with_capacity(CHUNK_BYTES));
+    /// Continues with a full chunk in which no payload is held, else with a new one. Returns false if there
+    /// is neither.
+    fn next_chunk(&mut self) -> bool {
+        let free = self.filled.iter_mut().position(|chunk| chunk.try_reclaim(CHUNK_BYTES));
+        let reused = free.and_then(|place| self.filled.remove(place));
+        let may_grow = self.filled.len() + 1 < MAX_CHUNKS;
+        let Some(next) = reused.or_else(|| may_grow.then(|| BytesMut::with_capacity(CHUNK_BYTES))) else {
+            return false;
+        };
         let full = std::mem::replace(&mut self.current, next);
         self.filled.push_back(full);
+        true
     }
 }
 
@@ -71,5 +82,31 @@ mod tests {
         }
         assert!(arena.filled.len() <= 4, "{} chunks for 600 kB in use", arena.filled.len());
         assert!(held.iter().all(|copy| copy[..] == payload));
+    }
+
+    #[test]
+    fn a_payload_that_is_held_for_ever_costs_one_chunk() {
+        let mut arena = CopyArena::new();
+        let latched = arena.copy(b"latched");
+        for _ in 0..100_000 {
+            arena.copy(&[9; 3_000]);
+        }
+        assert!(arena.filled.len() <= 4, "{} chunks", arena.filled.len());
+        assert_eq!(&latched[..], b"latched");
+    }
+
+    #[test]
+    fn chunks_are_bounded_however_many_payloads_are_held() {
+        let mut arena = CopyArena::new();
+        let mut held = Vec::new();
+        for _ in 0..2 * MAX_CHUNKS {
+            held.push(arena.copy(b"held"));
+            arena.copy(&[9; CHUNK_BYTES - 8]);
+        }
+        assert_eq!(arena.filled.len() + 1, MAX_CHUNKS);
+        assert!(held.iter().all(|copy| copy[..] == b"held"[..]));
+        held.clear();
+        arena.copy(&[9; CHUNK_BYTES]);
+        assert_eq!(arena.filled.len() + 1, MAX_CHUNKS, "a chunk is reused");
     }
 }

@@ -8,6 +8,7 @@
 mod arena;
 mod history;
 mod late_joiners;
+pub(super) mod memory;
 mod noncritical;
 mod offer;
 mod output;
@@ -19,6 +20,7 @@ use std::time::Duration;
 use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
+use super::memory_limit;
 use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, participant_options};
@@ -121,6 +123,7 @@ impl Egress {
         let role_name = format!("egress-{}", lane.name);
         let process = ProcessRole::Egress(index);
         let mut role = Role::open(settings, reloads, process, &role_name, &lane.scheduling)?;
+        memory_limit::check(settings, process);
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };

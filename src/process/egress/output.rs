@@ -214,7 +214,14 @@ impl Output {
         // One borrow stays free, so that the next sample can be taken while DDS holds all others.
         let by_reference = bytes >= self.by_reference_min_bytes
             && self.subscriber.borrowed() < self.subscriber.max_borrowed();
-        let payload = if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) };
+        let payload = if by_reference {
+            Bytes::from_owner(sample)
+        } else if self.offer.qos.durability == Durability::TransientLocal {
+            // The writer keeps it for late joiners, and with it a chunk of the arena.
+            Bytes::copy_from_slice(sample.payload())
+        } else {
+            arena.copy(sample.payload())
+        };
         let kept = self.history.as_ref().and_then(|history| history.copy(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
         let outcome = writer.write_from(publisher, payload, header.encapsulation, header.source_timestamp);

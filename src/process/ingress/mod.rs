@@ -6,6 +6,7 @@
 
 mod early_waker;
 mod input;
+pub(super) mod memory;
 mod pool;
 mod publishers;
 mod receiving;
@@ -18,6 +19,7 @@ use std::time::Duration;
 use tracing::{debug, info};
 
 use super::HOUSEKEEPING_MS;
+use super::memory_limit;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, participant_options};
@@ -94,6 +96,7 @@ impl Ingress {
     fn open(settings: &Settings, reloads: ReloadRequests) -> Result<Self, RoleError> {
         let scheduling = &settings.ingress_scheduling;
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
+        memory_limit::check(settings, ProcessRole::Ingress);
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for route in 0..settings.routes.len() {
             let flag = ArrivalFlag::passive();

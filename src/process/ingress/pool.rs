@@ -102,12 +102,17 @@ impl SampleMemory for Pool {
     }
 
     fn limits(&self) -> AssemblyLimits {
-        // With the encapsulation header.
-        let max_sample_bytes = self.publisher.max_sample_bytes() + 4;
-        let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
-        // Three, because the library counts some KiB more for each: two always have room.
-        AssemblyLimits { max_sample_bytes, max_total_bytes: max_total_bytes.max(3 * max_sample_bytes) }
+        assembly_limits(self.publisher.max_sample_bytes())
     }
+}
+
+/// The memory of the DDS library for unfinished samples at a reader of a route.
+pub(super) fn assembly_limits(max_sample_bytes: usize) -> AssemblyLimits {
+    // With the encapsulation header.
+    let max_sample_bytes = max_sample_bytes + 4;
+    let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
+    // Three, because the library counts some KiB more for each: two always have room.
+    AssemblyLimits { max_sample_bytes, max_total_bytes: max_total_bytes.max(3 * max_sample_bytes) }
 }
 
 /// A sample that the route does not allow: its bytes are discarded as they arrive. It becomes complete like

@@ -129,10 +129,23 @@ impl Source {
     }
 }
 
-/// The history depth of a reader. At most 1,024 samples: 0.2 s at 5 kHz, far longer than ingress ever takes
-/// to come back to a route. At least 16.
+/// The most bytes that may wait in the DDS library for ingress on a route.
+pub(super) fn most_waiting_bytes(input: &InputQos, max_sample_bytes: usize) -> usize {
+    let of_samples = |samples: usize| samples.saturating_mul(max_sample_bytes);
+    match input.history {
+        Some(History::KeepLast { depth }) => of_samples(depth as usize),
+        _ => WAITING_BYTES.clamp(of_samples(MIN_DEPTH), of_samples(MAX_DEPTH)),
+    }
+}
+
+/// The least history depth of a reader.
+const MIN_DEPTH: usize = 16;
+/// The most: 0.2 s at 5 kHz, far longer than ingress ever takes to come back to a route.
+const MAX_DEPTH: usize = 1024;
+
+/// The history depth of a reader.
 fn history_depth(max_sample_bytes: usize) -> u32 {
-    let depth = (WAITING_BYTES / max_sample_bytes.max(1)).clamp(16, 1024);
+    let depth = (WAITING_BYTES / max_sample_bytes.max(1)).clamp(MIN_DEPTH, MAX_DEPTH);
     depth as u32
 }
 
@@ -293,5 +306,11 @@ mod tests {
         assert_eq!(history_depth(1), 1024);
         assert_eq!(history_depth(1 << 20), 32);
         assert_eq!(history_depth(64 << 20), 16);
+        for bytes in [1, 30_000, 1_000_000, 3_000_000, 64 << 20] {
+            let most = most_waiting_bytes(&InputQos::default(), bytes);
+            assert!(history_depth(bytes) as usize * bytes <= most, "{bytes}");
+        }
+        let input = InputQos { history: Some(History::KeepLast { depth: 3 }), ..InputQos::default() };
+        assert_eq!(most_waiting_bytes(&input, 1_000), 3_000);
     }
 }

@@ -22,6 +22,11 @@ pub(crate) const MAX_ENDPOINTS_PER_PARTICIPANT: usize = 4_096;
 /// a topic of ours are accepted up to twice this number.
 pub(crate) const MAX_ENDPOINTS: usize = 16_384;
 
+/// Bytes of an endpoint's announcement without its addresses, of which 16 are kept. A
+/// larger announcement is refused: 16,384 of 64 KB would take a gigabyte. That of a ROS 2
+/// endpoint has 800 bytes at most: two names of 255, the hash of its type, and its QoS.
+pub(crate) const MAX_ENDPOINT_BYTES: usize = 2_048;
+
 /// Topic names that discovery keeps.
 pub(crate) const MAX_TOPICS: usize = 16_384;
 

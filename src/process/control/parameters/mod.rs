@@ -57,6 +57,9 @@ const MAX_CLIENTS: usize = 64;
 /// Requests of one service that wait for the thread; the oldest is overwritten.
 const WAITING_REQUESTS: u32 = 16;
 
+/// Unfinished requests of one service for which there is memory (`RawReader::expect_samples_up_to`).
+const UNFINISHED_REQUESTS: usize = 4;
+
 /// Replies of one service that are kept for clients that have not acknowledged them. With 34 nodes, those of
 /// 32 lanes, ingress and control, all replies in histories stay below 60 MiB.
 const WINDOW_SAMPLES: usize = 4;
@@ -130,6 +133,13 @@ const SERVICES: [(Service, &str, &str); 7] = [
     (Service::SetAtomically, "set_parameters_atomically", "SetParametersAtomically"),
     (Service::GetLoggerLevels, "get_logger_levels", "GetLoggerLevels"),
 ];
+
+/// The bytes that requests and replies of one node take at most: of each service, requests that wait and
+/// unfinished ones, and replies for clients that have not acknowledged them.
+pub(super) fn bytes_of_node() -> usize {
+    let requests = (WAITING_REQUESTS as usize + UNFINISHED_REQUESTS) * MAX_REQUEST_BYTES;
+    SERVICES.iter().map(|(service, ..)| requests + WINDOW_SAMPLES * service.max_reply_bytes()).sum()
+}
 
 /// The running services. Dropping it ends the thread.
 pub(super) struct ParameterServices {

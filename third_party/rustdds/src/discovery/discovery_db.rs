@@ -16,18 +16,21 @@ use crate::{
     topic::{Topic, TopicDescription},
   },
   network_counts::{
-    NetworkCounters, MAX_ENDPOINTS, MAX_ENDPOINTS_PER_PARTICIPANT, MAX_LEASE, MAX_PARTICIPANTS,
-    MAX_TOPICS,
+    NetworkCounters, MAX_ENDPOINTS, MAX_ENDPOINTS_PER_PARTICIPANT, MAX_ENDPOINT_BYTES, MAX_LEASE,
+    MAX_PARTICIPANTS, MAX_TOPICS,
   },
   rtps::{
-    reader::ReaderIngredients, rtps_reader_proxy::RtpsReaderProxy,
+    constant::MAX_LOCATORS_PER_READER, reader::ReaderIngredients, rtps_reader_proxy::RtpsReaderProxy,
     rtps_writer_proxy::RtpsWriterProxy,
   },
+  serialization::pl_cdr_adapters::PlCdrSerialize,
   structure::{
     duration::Duration,
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
+    locator::Locator,
   },
+  RepresentationIdentifier,
 };
 use super::{
   sedp_messages::{
@@ -125,6 +128,17 @@ fn move_by_guid_prefix<D>(
   for guid in to_move {
     from.remove(&guid).map(|d| to.insert(guid, d));
   }
+}
+
+// Bytes of the announcement of an endpoint without its locators, each of which takes 28.
+fn announced_bytes(endpoint: &impl PlCdrSerialize, locators: usize) -> usize {
+  let serialized = endpoint.to_pl_cdr_bytes(RepresentationIdentifier::PL_CDR_LE);
+  serialized.map_or(usize::MAX, |bytes| bytes.len().saturating_sub(28 * locators))
+}
+
+fn keep_first_locators(locators: &mut Vec<Locator>) {
+  locators.truncate(MAX_LOCATORS_PER_READER);
+  locators.shrink_to_fit();
 }
 
 pub(crate) fn discovery_db_read(
@@ -247,7 +261,17 @@ impl DiscoveryDB {
 
     // In any case:
     // Update SpdpDiscoveredParticipantData to DB
-    self.participant_proxies.insert(guid.prefix, data.clone());
+    let mut data = data.clone();
+    for locators in [
+      &mut data.metatraffic_unicast_locators,
+      &mut data.metatraffic_multicast_locators,
+      &mut data.default_unicast_locators,
+      &mut data.default_multicast_locators,
+    ] {
+      keep_first_locators(locators);
+    }
+    data.entity_name = data.entity_name.filter(|name| name.len() <= MAX_ENDPOINT_BYTES);
+    self.participant_proxies.insert(guid.prefix, data);
     // Timestamp last life sign fro participant
     self
       .participant_last_life_signs
@@ -280,12 +304,21 @@ impl DiscoveryDB {
   }
 
   // Whether there is room for one more endpoint, given the endpoints of its kind.
-  fn has_room_for_endpoint<D>(&self, of_kind: &BTreeMap<GUID, D>, guid: GUID, topic: &str) -> bool {
+  fn has_room_for_endpoint<D>(
+    &self,
+    of_kind: &BTreeMap<GUID, D>,
+    guid: GUID,
+    topic: &str,
+    announced_bytes: usize,
+  ) -> bool {
     let of_participant = || of_kind.range(guid.prefix.range()).count();
-    let has_room = of_kind.contains_key(&guid)
-      || of_participant() < MAX_ENDPOINTS_PER_PARTICIPANT
-        && (of_kind.len() < MAX_ENDPOINTS
-          || of_kind.len() < 2 * MAX_ENDPOINTS && self.is_local_topic(topic));
+    let is_known_or_admitted = || {
+      of_kind.contains_key(&guid)
+        || of_participant() < MAX_ENDPOINTS_PER_PARTICIPANT
+          && (of_kind.len() < MAX_ENDPOINTS
+            || of_kind.len() < 2 * MAX_ENDPOINTS && self.is_local_topic(topic))
+    };
+    let has_room = announced_bytes <= MAX_ENDPOINT_BYTES && is_known_or_admitted();
     if !has_room {
       self.counters.endpoints_refused.increment();
     }
@@ -361,7 +394,19 @@ impl DiscoveryDB {
       &mut self.external_topic_writers,
       &mut self.external_topic_writers_attic,
     );
+    self.limit_attic();
     true
+  }
+
+  // No more endpoints than of participants that are there. Those that have been gone for
+  // longest are forgotten.
+  fn limit_attic(&mut self) {
+    while self.external_topic_readers_attic.len() > MAX_ENDPOINTS
+      || self.external_topic_writers_attic.len() > MAX_ENDPOINTS
+    {
+      let Some(forgotten) = self.attic_order.pop_front() else { return };
+      self.remove_from_attic(forgotten);
+    }
   }
 
   // What the participant and its endpoints announced of topics. A topic with another
@@ -634,7 +679,10 @@ impl DiscoveryDB {
   ) -> Option<DiscoveredReaderData> {
     let guid = data.reader_proxy.remote_reader_guid;
     let topic = data.subscription_topic_data.topic_name();
-    if !self.has_room_for_endpoint(&self.external_topic_readers, guid, topic) {
+    let proxy = &data.reader_proxy;
+    let locators = proxy.unicast_locator_list.len() + proxy.multicast_locator_list.len();
+    let bytes = announced_bytes(data, locators);
+    if !self.has_room_for_endpoint(&self.external_topic_readers, guid, topic, bytes) {
       return None;
     }
 
@@ -700,7 +748,10 @@ impl DiscoveryDB {
   ) -> Option<DiscoveredWriterData> {
     let guid = data.writer_proxy.remote_writer_guid;
     let topic = &data.publication_topic_data.topic_name;
-    if !self.has_room_for_endpoint(&self.external_topic_writers, guid, topic) {
+    let proxy = &data.writer_proxy;
+    let locators = proxy.unicast_locator_list.len() + proxy.multicast_locator_list.len();
+    let bytes = announced_bytes(data, locators);
+    if !self.has_room_for_endpoint(&self.external_topic_writers, guid, topic, bytes) {
       return None;
     }
 
@@ -730,12 +781,15 @@ impl DiscoveryDB {
 
     // Build enriched data with participant's default locators filled in, so that
     // later lookups via writers_on_topic() return usable locator information.
+    let mut writer_proxy = WriterProxy::from(RtpsWriterProxy::from_discovered_writer_data(
+      data,
+      &default_locator_lists.0,
+      &default_locator_lists.1,
+    ));
+    keep_first_locators(&mut writer_proxy.unicast_locator_list);
+    keep_first_locators(&mut writer_proxy.multicast_locator_list);
     let enriched = DiscoveredWriterData {
-      writer_proxy: WriterProxy::from(RtpsWriterProxy::from_discovered_writer_data(
-        data,
-        &default_locator_lists.0,
-        &default_locator_lists.1,
-      )),
+      writer_proxy,
       ..data.clone()
     };
 
@@ -831,10 +885,17 @@ impl DiscoveryDB {
         }
         // We have to topic, but not from this participant
         // TODO: Check that there is agreement about topic type name (at least)
+        if discovered_via == DiscoveredVia::Topic && !t.is_empty() {
+          // Each participant may announce each topic, which would be millions of entries.
+          return;
+        }
         t.insert(updater, (discovered_via, dtd.clone())); // this should return None
         notify = true;
       }
-    } else if self.topics.len() >= MAX_TOPICS && discovered_via != DiscoveredVia::SelfDefined {
+    } else if discovered_via != DiscoveredVia::SelfDefined
+      && (self.topics.len() >= MAX_TOPICS
+        || topic_name.len() + dtd.topic_data.type_name.len() > MAX_ENDPOINT_BYTES)
+    {
       self.counters.endpoints_refused.increment();
     } else {
       // new topic to us
@@ -1230,6 +1291,128 @@ mod tests {
     assert!(!accepts(&mut db, late, 1, "theirs"));
     assert!(accepts(&mut db, late, 2, "ours"), "a reader of our topic is accepted");
     assert!(db.counters().counts().endpoints_refused > 5_000 - MAX_ENDPOINTS_PER_PARTICIPANT as u64);
+  }
+
+  #[test]
+  fn what_an_endpoint_announces_is_limited_in_bytes() {
+    let mut db = database();
+    let participant = new_participant().participant_guid;
+    let named = |number, bytes| new_reader(participant, number, &"t".repeat(bytes));
+    assert!(db.update_subscription(&named(1, 256)).is_some());
+    assert!(db.update_subscription(&named(2, MAX_ENDPOINT_BYTES)).is_none());
+    let large = DiscoveredReaderData {
+      user_data: vec![0; MAX_ENDPOINT_BYTES],
+      ..named(1, 256)
+    };
+    assert!(db.update_subscription(&large).is_none());
+    assert_eq!(db.counters().counts().endpoints_refused, 2);
+    // A host with many interfaces is not refused; the first addresses count.
+    let mut many = named(3, 256);
+    let locator = Locator::UdpV4("192.0.2.1:7411".parse().unwrap());
+    many.reader_proxy.unicast_locator_list = vec![locator; 2_000];
+    let known = db.update_subscription(&many).unwrap();
+    assert_eq!(known.reader_proxy.unicast_locator_list.len(), MAX_LOCATORS_PER_READER);
+    let mut participant = new_participant();
+    participant.default_unicast_locators = vec![locator; 2_000];
+    db.update_participant(&participant);
+    let known = db.find_participant_proxy(participant.participant_guid.prefix);
+    assert_eq!(known.unwrap().default_unicast_locators.len(), MAX_LOCATORS_PER_READER);
+  }
+
+  #[test]
+  fn the_endpoints_of_participants_that_are_gone_are_limited() {
+    let mut db = database();
+    let mut gone = Vec::new();
+    for _ in 0..6 {
+      let participant = new_participant();
+      db.update_participant(&participant);
+      for number in 0..MAX_ENDPOINTS_PER_PARTICIPANT {
+        db.update_subscription(&new_reader(participant.participant_guid, number as u32, "theirs"));
+      }
+      db.remove_participant(participant.participant_guid.prefix, true);
+      gone.push(participant);
+    }
+    assert_eq!(db.external_topic_readers_attic.len(), MAX_ENDPOINTS);
+    let restored = |db: &mut DiscoveryDB, participant: &SpdpDiscoveredParticipantData| {
+      db.update_participant(participant);
+      db.endpoints_of(participant.participant_guid.prefix).0.len()
+    };
+    assert_eq!(restored(&mut db, &gone[0]), 0, "the one that has been gone for longest");
+    assert_eq!(restored(&mut db, &gone[5]), MAX_ENDPOINTS_PER_PARTICIPANT);
+  }
+
+  #[test]
+  fn a_topic_of_others_is_remembered_once_however_many_announce_it() {
+    let mut db = database();
+    let data = TopicBuiltinTopicData::new(
+      None,
+      "theirs".to_string(),
+      "RandomData".to_string(),
+      &QosPolicies::qos_none(),
+    );
+    for _ in 0..10 {
+      let topic = DiscoveredTopicData::new(Utc::now(), data.clone());
+      db.update_topic_data(&topic, GUID::new_participant_guid(), DiscoveredVia::Topic);
+    }
+    assert_eq!(db.topics["theirs"].len(), 1);
+  }
+
+  // Prints what the kernel counts for a database at all its limits, with the largest
+  // announcements that it accepts.
+  #[cfg(target_os = "linux")]
+  #[test]
+  fn a_full_database_takes_a_bounded_amount_of_memory() {
+    let resident_kib = || -> usize {
+      let status = std::fs::read_to_string("/proc/self/status").unwrap();
+      let line = status.lines().find(|line| line.starts_with("RssAnon")).unwrap();
+      line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    };
+    let before = resident_kib();
+    let mut db = database();
+    fill_with_large_announcements(&mut db, 16);
+    for prefix in db.participant_prefixes(|_| true) {
+      db.remove_participant(prefix, true);
+    }
+    assert_eq!(db.external_topic_writers_attic.len(), MAX_ENDPOINTS);
+    db.topic_cleanup();
+    fill_with_large_announcements(&mut db, MAX_PARTICIPANTS);
+    assert_eq!(db.external_topic_writers.len(), MAX_ENDPOINTS);
+    let mib = (resident_kib() - before) / 1024;
+    println!("a full database takes {mib} MiB");
+    assert!(mib < 400, "{mib} MiB");
+  }
+
+  // Adds as many readers and writers as there is room for, of so many participants.
+  fn fill_with_large_announcements(db: &mut DiscoveryDB, participants: usize) {
+    let locators = vec![Locator::UdpV4("192.0.2.1:7411".parse().unwrap()); MAX_LOCATORS_PER_READER];
+    for place in 0..participants {
+      let mut participant = new_participant();
+      participant.default_unicast_locators = locators.clone();
+      participant.metatraffic_unicast_locators = locators.clone();
+      db.update_participant(&participant);
+      for number in 0..MAX_ENDPOINTS / participants {
+        let topic = format!("{place}_{number:0>800}");
+        let mut reader = new_reader(participant.participant_guid, number as u32, &topic);
+        reader.reader_proxy.unicast_locator_list = locators.clone();
+        reader.reader_proxy.multicast_locator_list = locators.clone();
+        reader.user_data = vec![0; 900];
+        assert!(db.update_subscription(&reader).is_some());
+        let guid = reader.reader_proxy.remote_reader_guid;
+        let writer = DiscoveredWriterData {
+          last_updated: Instant::now(),
+          writer_proxy: WriterProxy::new(guid, locators.clone(), locators.clone()),
+          publication_topic_data: crate::discovery::PublicationBuiltinTopicData::new(
+            guid,
+            None,
+            topic,
+            "t".repeat(900),
+            None,
+          ),
+          user_data: Vec::new(),
+        };
+        assert!(db.update_publication(&writer).is_some());
+      }
+    }
   }
 
   #[test]
