@@ -18,8 +18,9 @@ const SETTLING_MS: u64 = 1_000;
 /// The most late joiners that may wait at once, 24 bytes each. Further ones get no history and are counted.
 const MAX_WAITING: usize = 4_096;
 
-/// The most bytes of samples of several publishers. The last `depth` samples are kept whatever their size.
-const MAX_BYTES: usize = 32 << 20;
+/// The most bytes of samples of several publishers, here and in the history of a RELIABLE writer. The last
+/// `depth` samples are kept whatever their size.
+pub(super) const MAX_BYTES: usize = 32 << 20;
 
 /// A sample of the history, as it was written.
 #[derive(Clone, Debug)]
