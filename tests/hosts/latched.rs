@@ -35,9 +35,9 @@ fn static_publishers(bed: &Bed) -> RunningPeer {
 
 /// Waits until both lanes have handled so many samples.
 fn wait_handled(bed: &Bed, samples: u64) {
-    let handled =
-        |status: &Value| status["routes"][0]["received"] == samples && is_accounted_and_idle(status);
-    bed.bridge.wait_status("the samples handled by both lanes", handled);
+    bed.bridge.wait_status("all samples handled by both lanes", |status| {
+        outputs(status).all(|output| output["received"] == samples) && is_accounted_and_idle(status)
+    });
 }
 
 /// Checks that each subscriber gets these samples once, in whatever order ingress discovered the publishers.
