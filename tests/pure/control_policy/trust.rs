@@ -126,8 +126,10 @@ fn a_flood_from_many_names_costs_as_much_as_a_few_senders() {
 #[test]
 fn a_sender_without_a_burst_starts_with_one_message() {
     let mut limits = SenderLimits::new(20.0, 8, at_ms(0));
+    assert!(limits.is_empty());
     let allowed = [0, 0, 49, 50, 50].map(|ms| limits.allow("laptop", at_ms(ms)));
     assert_eq!(allowed, [true, false, false, true, false]);
+    assert!(!limits.is_empty());
 }
 
 #[test]
