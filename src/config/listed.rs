@@ -98,6 +98,36 @@ mod tests {
     }
 
     #[test]
+    fn each_setting_is_listed_once_by_its_key_and_a_secret_is_not() {
+        let listed = settings(
+            "lanes: {noncritical: {qos: {history: KEEP_ALL}}}\noverrides: {laptop: critical}\n\
+             security: {hmac_secret: swordfish}\n",
+        )
+        .listed();
+        let text = |text: &str| Some(Value::Text(text.to_owned()));
+        let critical = "topics.scan.qos_overrides.critical";
+        for (name, expected) in [
+            ("probes.rate_hz", Some(Value::Decimal(5.0))),
+            ("topics.scan.input_topic", text("/scan")),
+            ("overrides.laptop", text("CRITICAL")),
+            (&format!("{critical}.history"), text("KEEP_LAST")),
+            (&format!("{critical}.depth"), Some(Value::Whole(10))),
+            ("topics.scan.qos_overrides.noncritical.history", text("KEEP_ALL")),
+            ("topics.scan.qos_overrides.noncritical.depth", None),
+            ("security.hmac_secret", None),
+        ] {
+            let found: Vec<_> = listed.iter().filter(|listed| listed.name == name).collect();
+            assert_eq!(
+                found.iter().map(|listed| &listed.value).collect::<Vec<_>>(),
+                Vec::from_iter(&expected)
+            );
+            let row = row_at(&name.replace("topics.scan", "topics[scan]")).unwrap();
+            assert!(found.iter().all(|listed| std::ptr::eq(listed.row, row)), "{name}");
+        }
+        assert!(listed.is_sorted_by(|one, other| one.name < other.name), "each once, in order");
+    }
+
+    #[test]
     fn what_can_stop_lanes_or_admit_messages_can_be_set_in_the_file_only() {
         for (name, is_settable, is_file_only) in [
             ("probes.rate_hz", true, false),

@@ -352,6 +352,18 @@ mod tests {
     }
 
     #[test]
+    fn as_many_aliases_as_the_size_of_the_file_allows_are_read_and_not_more() {
+        // Of a value, and of one that contains an alias: 110 + 1 + 2 × 201.
+        let mut text = format!("- &a x\n{}- &b [*a]\n{}", "- *a\n".repeat(110), "- *b\n".repeat(201));
+        let comment = MAX_ALIASED_BYTES / 513 - 100 - text.len();
+        text = format!("# {}\n{text}", "x".repeat(comment));
+        assert_eq!(max_aliases(&text), 513);
+        assert_eq!(error(&text), None);
+        let many = "must use at most 513 aliases in a file of this size".to_owned();
+        assert_eq!(error(&format!("{text}- *a\n")), Some((315, many)));
+    }
+
+    #[test]
     fn as_much_text_as_the_limit_is_read_and_not_more() {
         // Half of the kibibytes by a text and its aliases, the other half by aliases of a list that has it.
         let kibibytes = MAX_TEXT_BYTES / 1_024 / 2;
