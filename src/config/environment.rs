@@ -165,4 +165,15 @@ mod tests {
             assert!(with(accepted).is_ok());
         }
     }
+
+    #[test]
+    fn as_many_static_peers_as_allowed_are_accepted_and_more_are_not() {
+        let with = |peers: usize| {
+            let value = vec!["10.0.0.1"; peers].join(";");
+            parse(TOPIC, "f.yaml", &|asked: &str| (asked == "ROS_STATIC_PEERS").then(|| value.clone()))
+        };
+        assert_eq!(with(16).unwrap().input.static_peers.len(), 16);
+        let message = with(17).unwrap_err().to_string();
+        assert!(message.contains("must be at most 16 IPv4 addresses"), "{message}");
+    }
 }

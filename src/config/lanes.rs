@@ -181,3 +181,28 @@ pub(super) fn scheduling(section: &Field<'_>, default: Scheduling) -> Scheduling
         lock_memory: section.get("lock_memory").flag_or_default(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::MAX_LANES;
+    use crate::config::{DdsNetwork, parse};
+
+    #[test]
+    fn as_many_lanes_and_addresses_as_allowed_are_accepted_and_more_are_not() {
+        let problems = |lanes: usize, addresses: usize| {
+            let lanes: String = (2..lanes).map(|number| format!("  l{number}: {{}}\n")).collect();
+            let addresses = vec!["10.0.0.1"; addresses].join(", ");
+            let text = format!(
+                "topics: [{{id: scan, input_topic: /scan}}]\nros: {{static_peers: [{addresses}]}}\nlanes:\n{lanes}"
+            );
+            parse(&text, "f.yaml", &|_| None).map_or_else(|error| error.to_string(), |_| String::new())
+        };
+        let peers = DdsNetwork::MAX_STATIC_PEERS;
+        assert_eq!(problems(MAX_LANES, peers), "");
+        assert!(problems(MAX_LANES + 1, peers).starts_with("f.yaml:3: lanes: must be at most 32 lanes"));
+        for more in [1, 2] {
+            let problems = problems(MAX_LANES, peers + more);
+            assert_eq!(problems, "f.yaml:2: ros.static_peers: must be at most 16 addresses");
+        }
+    }
+}

@@ -86,3 +86,83 @@ impl Settings {
 fn named_by_id(path: &str) -> String {
     path.replacen('[', ".", 1).replacen(']', "", 1)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::parse;
+
+    fn settings(text: &str) -> Settings {
+        let text = format!("topics: [{{id: scan, input_topic: /scan}}]\n{text}");
+        parse(&text, "f.yaml", &|_| None).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    #[test]
+    fn each_setting_is_listed_once_by_its_key_and_a_secret_is_not() {
+        let listed = settings(
+            "lanes: {noncritical: {qos: {history: KEEP_ALL}}}\noverrides: {laptop: critical}\n\
+             security: {hmac_secret: swordfish}\n",
+        )
+        .listed();
+        let text = |text: &str| Some(Value::Text(text.to_owned()));
+        let critical = "topics.scan.qos_overrides.critical";
+        for (name, expected) in [
+            ("probes.rate_hz", Some(Value::Decimal(5.0))),
+            ("topics.scan.input_topic", text("/scan")),
+            ("overrides.laptop", text("CRITICAL")),
+            (&format!("{critical}.history"), text("KEEP_LAST")),
+            (&format!("{critical}.depth"), Some(Value::Whole(10))),
+            ("topics.scan.qos_overrides.noncritical.history", text("KEEP_ALL")),
+            ("topics.scan.qos_overrides.noncritical.depth", None),
+            ("security.hmac_secret", None),
+        ] {
+            let found: Vec<_> = listed.iter().filter(|listed| listed.name == name).collect();
+            assert_eq!(
+                found.iter().map(|listed| &listed.value).collect::<Vec<_>>(),
+                Vec::from_iter(&expected)
+            );
+            let row = row_at(&name.replace("topics.scan", "topics[scan]")).unwrap();
+            assert!(found.iter().all(|listed| std::ptr::eq(listed.row, row)), "{name}");
+        }
+        assert!(listed.is_sorted_by(|one, other| one.name < other.name), "each once, in order");
+    }
+
+    #[test]
+    fn what_can_stop_lanes_or_admit_messages_can_be_set_in_the_file_only() {
+        for (name, is_settable, is_file_only) in [
+            ("probes.rate_hz", true, false),
+            ("probes.request_topic", false, false),
+            ("policy_hold_s", false, true),
+            ("safety.silent_ms", false, true),
+            ("security.trust_mode", false, true),
+        ] {
+            let row = row_at(name).unwrap();
+            assert_eq!(Listed::is_settable(name, row), is_settable, "{name}");
+            assert_eq!(Listed::is_file_only(name), is_file_only, "{name}");
+        }
+    }
+
+    #[test]
+    fn only_the_state_or_lane_of_a_subscriber_can_be_set_without_being_listed() {
+        for name in ["overrides.laptop", "subscribers.laptop"] {
+            assert_eq!(Listed::unset(name).unwrap().paths, row_at(name).unwrap().paths, "{name}");
+        }
+        for name in
+            ["overrides", "overrides.a.b", "overrides.a\nb", "subscribers.laptop.lane", "probes.rate_hz"]
+        {
+            assert!(Listed::unset(name).is_none(), "{name}");
+        }
+    }
+
+    #[test]
+    fn unsigned_messages_are_refused_if_messages_are_signed_and_unknown_senders_denied() {
+        for (signed, trust_mode, refuses) in
+            [(true, "default_deny", true), (true, "permissive", false), (false, "default_deny", false)]
+        {
+            let settings = settings(&format!(
+                "security: {{enable_probe_hmac: {signed}, hmac_secret: swordfish, trust_mode: {trust_mode}}}\n"
+            ));
+            assert_eq!(settings.refuses_unsigned(), refuses, "{signed} {trust_mode}");
+        }
+    }
+}

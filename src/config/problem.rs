@@ -240,6 +240,13 @@ mod tests {
         assert_eq!(nearest("reliabilty", &["reliability", "durability"]), Some("reliability"));
         assert_eq!(nearest("RELIABEL", &["RELIABLE", "BEST_EFFORT"]), Some("RELIABLE"));
         assert_eq!(nearest("colour", &["depth", "history"]), None);
+        // One letter of a short word may differ, and a third of those of a longer one.
+        assert_eq!(nearest("dpt", &["depth"]), None);
+        assert_eq!(nearest("dept", &["depth"]), Some("depth"));
+        assert_eq!(nearest("xxrability", &["durability"]), Some("durability"));
+        assert_eq!(nearest("xxxxbility", &["durability"]), None);
+        let longest = "a".repeat(MAX_COMPARED_BYTES);
+        assert_eq!(nearest(&longest, &["a", &longest]), Some(longest.as_str()));
         assert_eq!(nearest(&"a".repeat(100_000), &["a"]), None);
     }
 

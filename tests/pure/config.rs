@@ -444,6 +444,7 @@ fn anything_but_a_regular_file_is_refused_without_blocking() {
 
 /// Keys with two values each; both are allowed whatever the others are. As JSON, which is YAML.
 const CHOICES: &[(&str, &str, &str)] = &[
+    ("instance", r#""robot""#, r#""robot_2""#),
     ("policy_hold_s", "5", "4.5"),
     ("ros.domain_id", "0", "7"),
     ("ros.networks", "[]", r#"["lo"]"#),
@@ -613,6 +614,7 @@ fn each_change_is_reported_with_key_and_values_of_the_file() {
         "topics[scan].qos_overrides.input.history: none -> KEEP_ALL",
         "topics[scan].qos_overrides.critical.history: KEEP_LAST 10 -> KEEP_LAST 11",
         "lanes.rviz.domain_id: 0 -> 9",
+        "lanes.rviz.scheduling.slice_ms: 10 -> 5",
         "diagnostics.metrics: none -> 127.0.0.1:9464",
     ] {
         assert!(
@@ -666,6 +668,89 @@ fn a_longer_queue_is_reloaded_only_if_shared_memory_has_room_for_it() {
         let expected = format!("lanes.noncritical.queue_samples: {old} -> {new}");
         assert_eq!(left[0], expected);
     }
+}
+
+#[test]
+fn a_noncritical_lane_holds_its_queue_and_two_samples_more_in_shared_memory() {
+    let held = |lane: usize, queue_samples: usize| {
+        let lanes = format!("lanes: {{noncritical: {{queue_samples: {queue_samples}}}}}");
+        settings(&format!("topics: [{{id: scan, input_topic: /scan}}]\n{lanes}")).lanes[lane]
+            .max_borrowed_in_all()
+    };
+    // At least `max_borrowed`, which is 8; of a critical lane only that.
+    assert_eq!([5, 7, 50].map(|queue_samples| held(1, queue_samples)), [8, 9, 52]);
+    assert_eq!(held(0, 50), 8);
+}
+
+#[test]
+fn the_parameter_config_path_names_the_file_unless_it_is_empty() {
+    let folder = tempfile::tempdir().unwrap();
+    let [of_environment, of_parameter] = ["environment", "parameter"].map(|id| {
+        let path = folder.path().join(id).display().to_string();
+        fs::write(&path, format!("topics: [{{id: {id}, input_topic: /scan}}]\n")).unwrap();
+        path
+    });
+    let env = |name: &str| (name == config::PATH_VARIABLE).then(|| of_environment.clone());
+    for (config_path, expected) in [(of_parameter.as_str(), "parameter"), ("''", "environment")] {
+        let parameters = [format!("config_path:={config_path}").parse().unwrap()];
+        let loaded = config::load_configuration(None, &parameters, &env).unwrap();
+        assert_eq!(loaded.settings.routes[0].id.as_str(), expected);
+    }
+}
+
+#[test]
+fn aliases_of_aliases_within_the_limit_of_keys_and_values_are_read() {
+    // 11,110 aliases if written out; without a limit of its own, the YAML library refuses 100 for each value.
+    let mut text = String::from("a0: &a0 x\n");
+    for level in 1..=4 {
+        let aliases = vec![format!("*a{}", level - 1); 10].join(", ");
+        text.push_str(&format!("a{level}: &a{level} [{aliases}]\n"));
+    }
+    let error = parse(&text).unwrap_err().to_string();
+    assert!(error.contains("f.yaml:5: a4: must be a known key"), "{error}");
+    // It also refuses more than 100 aliases of one value.
+    let error = parse(&format!("a: &a x\nb: [{}]\n", ["*a"; 200].join(", "))).unwrap_err().to_string();
+    assert!(error.contains("f.yaml:2: b: must be a known key"), "{error}");
+}
+
+#[test]
+fn a_file_may_be_nested_as_deep_as_the_limit_and_not_deeper() {
+    // The file itself is a mapping.
+    let error =
+        |lists: usize| parse(&format!("a: {}{}\n", "[".repeat(lists), "]".repeat(lists))).unwrap_err();
+    assert!(error(31).to_string().contains("f.yaml:1: a: must be a known key"), "{}", error(31));
+    assert_eq!(error(32).to_string(), "f.yaml:1: must be nested at most 32 deep");
+}
+
+#[test]
+fn a_depth_that_differs_only_for_latched_topics_is_reported_as_the_depth() {
+    let with = |depth: &str| {
+        settings(&format!(
+            "topics: [{{id: scan, input_topic: /scan, qos_overrides: {{critical: {{depth: {depth}}}}}}}]"
+        ))
+    };
+    // Without a depth it is 10, and 1 for an output that follows TRANSIENT_LOCAL publishers.
+    for (depth, expected) in
+        [("10", "depth: KEEP_LAST 1 -> KEEP_LAST 10"), ("11", "history: KEEP_LAST 10 -> KEEP_LAST 11")]
+    {
+        let (_, reload) = with("null").reloaded(with(depth));
+        let changes = reload.waits.iter().map(ToString::to_string);
+        let of_qos: Vec<_> = changes.filter(|change| change.contains(".qos_overrides.")).collect();
+        assert_eq!(of_qos, [format!("topics[scan].qos_overrides.critical.{expected}")]);
+    }
+}
+
+#[test]
+fn a_lane_without_a_route_is_not_used() {
+    let settings = settings("topics: [{id: scan, input_topic: /scan, lanes: [critical]}]");
+    assert_eq!(settings.lanes.iter().map(config::Lane::is_used).collect::<Vec<_>>(), [true, false]);
+}
+
+#[test]
+fn as_many_topics_as_allowed_are_accepted() {
+    let topics: String =
+        (0..1_024).map(|number| format!("- {{id: t{number}, input_topic: /t{number}}}\n")).collect();
+    assert_eq!(settings(&format!("topics:\n{topics}")).routes.len(), 1_024);
 }
 
 /// Pieces that YAML is made of, and pieces of configurations, with `;` between them.
@@ -844,6 +929,14 @@ fn parameters_replace_values_of_the_file() {
     assert_eq!(named.node_namespace, "/adaptive_bridge");
     assert_eq!(named.node_name_of("egress_rviz"), "front_egress_rviz");
     assert_eq!(load_with(file, &["use_sim_time:=true"]), load_with(file, &[]));
+    // A section of the file that has no value is one without keys.
+    assert_eq!(
+        load_with("topics: [{id: scan, input_topic: /scan}]\nprobes:\n", &["probes.rate_hz:=4"])
+            .unwrap()
+            .probes
+            .rate_hz,
+        4.0
+    );
     let deep = format!("{}a:=1", "a.".repeat(400_000));
     assert!(load_with(file, &[&deep]).is_err());
     let replaced = load_with(file, &["topics:=[{id: b, input_topic: /b}]"]).unwrap();

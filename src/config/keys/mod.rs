@@ -205,3 +205,41 @@ fn shown_key(path: &str, key: &str) -> String {
 pub(super) fn joined(path: &str, name: &str) -> String {
     if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_keys_at_a_path_are_those_at_and_below_it_as_they_are_declared() {
+        let paths_at =
+            |path: &str| -> Vec<String> { keys_at(path).into_iter().map(|(key, _)| key).collect() };
+        for (path, key) in [
+            ("policy_hold_s", "policy_hold_s"),
+            ("lanes.rviz.queue_depth", "lanes.<lane>.queue_depth"),
+            ("topics[0].id", "topics[].id"),
+            ("topics.id", "topics[].id"),
+        ] {
+            assert_eq!(paths_at(path), [key]);
+        }
+        let subscriber = "subscribers.<subscriber>";
+        assert_eq!(paths_at("subscribers"), [format!("{subscriber}.lane"), subscriber.to_owned()]);
+        for (section, start) in [("probes", "probes."), ("topics", "topics[].")] {
+            let expected: Vec<_> = KEYS.iter().filter(|key| key.starts_with(start)).collect();
+            let mut found = paths_at(section);
+            assert_eq!(found.len(), expected.len(), "{found:?}");
+            found.retain(|key| !expected.contains(&&key.as_str()));
+            assert_eq!(found, [""; 0]);
+        }
+        for unknown in ["", "prob", "probes.", "probes.rate", "probes..rate_hz", "policy_hold_s.x"] {
+            assert_eq!(paths_at(unknown), [""; 0], "{unknown}");
+        }
+        assert!(keys_at("probes").iter().all(|(path, row)| row.paths.contains(&path.as_str())));
+    }
+
+    #[test]
+    fn the_nearest_key_is_one_with_a_similar_path() {
+        assert_eq!(nearest_key("probes.rate_hs"), Some("probes.rate_hz"));
+        assert_eq!(nearest_key("something.else.entirely"), None);
+    }
+}

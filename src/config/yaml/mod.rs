@@ -267,3 +267,110 @@ fn merged(entries: Vec<Entry>) -> Vec<Entry> {
     }
     entries
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The line and the message of the error of a text; `None` for a text that is accepted.
+    fn error(text: &str) -> Option<(usize, String)> {
+        parse(text.as_bytes()).err().map(|error| (error.line.unwrap(), error.message))
+    }
+
+    /// The keys of a mapping, each with its text or the number of its items.
+    fn entries(node: &Node) -> Vec<String> {
+        let Content::Map(entries) = &node.content else { panic!("{node:?}") };
+        let shown = |entry: &Entry| match &entry.value.content {
+            Content::Scalar { text, .. } => format!("{}: {text}", entry.key),
+            Content::List(items) => format!("{}: {} items", entry.key, items.len()),
+            Content::Map(_) => format!("{}: a mapping", entry.key),
+        };
+        entries.iter().map(shown).collect()
+    }
+
+    #[test]
+    fn lines_end_with_either_or_both_of_cr_and_lf() {
+        for (text, line) in
+            [("", 1), ("a", 1), ("a\nb", 2), ("a\rb", 2), ("a\r\nb", 2), ("a\r\n\r\nb\n\nc", 5)]
+        {
+            assert_eq!(line_after(text, usize::MAX), line, "{text:?}");
+        }
+        assert_eq!(line_after("a\nb\nc", 3), 2);
+    }
+
+    #[test]
+    fn a_list_of_merged_mappings_gives_each_key_the_first_value() {
+        let text = "one: &one {a: 1, b: 1}\ntwo: &two {b: 2, c: 2}\nthree: {<<: [*one, *two], a: 3}\n\
+                    four: {<<: [*one, 5]}\n";
+        let root = parse(text.as_bytes()).unwrap().unwrap();
+        let Content::Map(sections) = &root.content else { panic!("{root:?}") };
+        assert_eq!(entries(&sections[2].value), ["a: 3", "b: 1", "c: 2"]);
+        assert_eq!(entries(&sections[3].value), ["<<: 2 items"]);
+    }
+
+    #[test]
+    fn a_value_may_have_the_core_tag_of_its_kind_and_no_other() {
+        for text in
+            ["!!bool true", "!!bool FALSE", "!!int -7", "!!float 2.5", "!!str 7", "!!map {b: c}", "!!seq [b]"]
+        {
+            assert_eq!(error(&format!("a: {text}\n")), None, "{text}");
+        }
+        for text in ["!!bool yes", "!!int 2.5", "!!float x", "!!null x", "!!seq {b: c}", "!!map [b]", "!b c"]
+        {
+            let refused = Some((1, "must not use YAML tags (`!name`)".to_owned()));
+            assert_eq!(error(&format!("a: {text}\n")), refused, "{text}");
+        }
+    }
+
+    #[test]
+    fn an_error_of_the_parser_is_repeated_in_words() {
+        let (line, message) = error("a: {").unwrap();
+        assert!(line == 1 && message.len() > "not YAML: ".len() + 5, "{message}");
+    }
+
+    #[test]
+    fn as_many_keys_and_values_as_the_limit_are_read_and_not_more() {
+        // The list is a value, too.
+        assert_eq!(error(&"- a\n".repeat(MAX_NODES - 1)), None);
+        let many = "must have at most 65536 keys and values, including those of aliases".to_owned();
+        assert_eq!(error(&"- a\n".repeat(MAX_NODES)), Some((MAX_NODES, many)));
+    }
+
+    #[test]
+    fn values_may_be_nested_as_deep_as_the_limit_and_not_deeper() {
+        let lists = |depth: usize| format!("{}x\n", "- ".repeat(depth));
+        assert_eq!(error(&lists(MAX_DEPTH)), None);
+        let deep = "must be nested at most 32 deep".to_owned();
+        assert_eq!(error(&lists(MAX_DEPTH + 1)), Some((1, deep.clone())));
+        // Three lists, written out inside of 29, one of which is the file.
+        let aliased = |depth: usize| {
+            let (open, close) = ("[".repeat(depth - 1), "]".repeat(depth - 1));
+            format!("- &a [[[x]]]\n- {open}*a{close}\n")
+        };
+        assert_eq!(error(&aliased(29)), None);
+        assert_eq!(error(&aliased(30)), Some((2, deep)));
+    }
+
+    #[test]
+    fn as_many_aliases_as_the_size_of_the_file_allows_are_read_and_not_more() {
+        // Of a value, and of one that contains an alias: 110 + 1 + 2 × 201.
+        let mut text = format!("- &a x\n{}- &b [*a]\n{}", "- *a\n".repeat(110), "- *b\n".repeat(201));
+        let comment = MAX_ALIASED_BYTES / 513 - 100 - text.len();
+        text = format!("# {}\n{text}", "x".repeat(comment));
+        assert_eq!(max_aliases(&text), 513);
+        assert_eq!(error(&text), None);
+        let many = "must use at most 513 aliases in a file of this size".to_owned();
+        assert_eq!(error(&format!("{text}- *a\n")), Some((315, many)));
+    }
+
+    #[test]
+    fn as_much_text_as_the_limit_is_read_and_not_more() {
+        // Half of the kibibytes by a text and its aliases, the other half by aliases of a list that has it.
+        let kibibytes = MAX_TEXT_BYTES / 1_024 / 2;
+        let (own, listed) = ("- *a\n".repeat(kibibytes - 1), "- *b\n".repeat(kibibytes - 1));
+        let text = format!("- &a {}\n{own}- &b [*a]\n{listed}", "x".repeat(1_024));
+        assert_eq!(error(&text), None);
+        let much = "must have at most 2097152 bytes of text, including that of aliases".to_owned();
+        assert_eq!(error(&format!("{text}- y\n")), Some((2 * kibibytes + 1, much)));
+    }
+}

@@ -218,6 +218,71 @@ fn a_constant_difference_between_clocks_is_no_lag_and_growth_is() {
     assert_eq!(SourceLag::default().excess_ms(800.0, at_ms(500)), Some(0.0));
 }
 
+#[test]
+fn the_minimum_lag_is_that_of_at_most_the_last_two_minutes() {
+    // With a gap between two readings in which no sample arrived.
+    for (gap_s, excess_ms) in [(60, 1_437.5), (90, 1_437.5), (120, 1_437.5), (121, 0.0)] {
+        let mut lag = SourceLag::default();
+        assert_eq!(lag.excess_ms(7_000.0, at_ms(0)), Some(0.0));
+        // The histogram may have rounded up by 562.5 ms, a sixteenth.
+        assert_eq!(lag.excess_ms(9_000.0, at_ms(gap_s * 1_000)), Some(excess_ms), "{gap_s} s");
+    }
+}
+
+#[test]
+fn the_worst_trouble_is_named_then_that_of_the_critical_path_then_the_first() {
+    let second = ProcessLoad { name: "second", ..NEAR };
+    let extreme = ProcessLoad { name: "extreme", ..EXTREME };
+    let waiting = ProcessLoad { waiting: 51, ..NONCRITICAL };
+    let slow = ProcessLoad { name: "slow", writer_lag_ms: Some(1e9), ..NONCRITICAL };
+    for (processes, worst) in [
+        ([waiting, NEAR], "critical"),
+        ([NEAR, waiting], "critical"),
+        ([NEAR, second], "critical"),
+        ([NEAR, extreme], "extreme"),
+        ([extreme, NEAR], "extreme"),
+        ([waiting, slow], "noncritical"),
+    ] {
+        let cause = bench().next(&processes).cause.unwrap();
+        assert_eq!(cause.process.as_str(), worst, "{processes:?}");
+    }
+}
+
+#[test]
+fn each_trouble_has_its_label() {
+    let errors = ErrorCounts { write_failed: 100, ..ErrorCounts::default() };
+    for (process, label) in [
+        (ProcessLoad { queued: 64, ..CRITICAL }, "queue"),
+        (ProcessLoad { waiting: 51, ..NONCRITICAL }, "waiting"),
+        (ProcessLoad { source_lag_ms: Some(900.0), ..INGRESS }, "source_lag"),
+        (NEAR, "writer_lag"),
+        (ProcessLoad { errors, ..CRITICAL }, "errors"),
+        (ProcessLoad { silent_ms: 2_000, ..CRITICAL }, "silent"),
+    ] {
+        assert_eq!(bench().next(&[process]).cause.unwrap().trouble.label(), label);
+    }
+}
+
+#[test]
+fn a_silent_noncritical_lane_counts_as_one_error_per_second() {
+    let silent = ProcessLoad { silent_ms: 2_000, ..NONCRITICAL };
+    for (degraded_errors_per_s, mode) in [(1.0, Degraded), (1.1, Normal)] {
+        let rules = SafetyRules { degraded_errors_per_s, ..SafetyRules::default() };
+        assert_eq!(Bench::new(rules).last(silent, 10), mode, "{degraded_errors_per_s}");
+    }
+}
+
+#[test]
+fn errors_between_two_evaluations_at_one_instant_have_no_rate() {
+    let errors = ErrorCounts { write_failed: 1, ..ErrorCounts::default() };
+    let mut supervisor = SafetySupervisor::default();
+    for _ in 0..10 {
+        let decision =
+            supervisor.evaluate(&[ProcessLoad { errors, ..CRITICAL }], &SafetyRules::default(), at_ms(500));
+        assert!(decision.clean, "{decision:?}");
+    }
+}
+
 fn load(class: TrafficClass) -> impl Strategy<Value = ProcessLoad<'static>> {
     let count = prop_oneof![Just(0), 0..100_u64, any::<u64>()];
     let errors = prop::collection::vec(count.clone(), 4).prop_map(|n| ErrorCounts {

@@ -122,3 +122,38 @@ fn a_flood_from_many_names_costs_as_much_as_a_few_senders() {
     let places = 8 * (100_000 / IDLE_SENDER_MS as u32 + 1);
     assert!(flood <= 2_000 + 4 + places, "{flood}");
 }
+
+#[test]
+fn a_sender_without_a_burst_starts_with_one_message() {
+    let mut limits = SenderLimits::new(20.0, 8, at_ms(0));
+    assert!(limits.is_empty());
+    let allowed = [0, 0, 49, 50, 50].map(|ms| limits.allow("laptop", at_ms(ms)));
+    assert_eq!(allowed, [true, false, false, true, false]);
+    assert!(!limits.is_empty());
+}
+
+#[test]
+fn a_sender_keeps_its_place_until_it_was_silent_for_longer_than_the_limit() {
+    // A new place has one message, and what the senders without a place share has gathered two by then.
+    let messages_of_a_second_sender = |after_ms: u64| {
+        let mut limits = SenderLimits::new(1.0, 1, at_ms(0));
+        assert!(limits.allow("first", at_ms(0)));
+        (0..10).filter(|_| limits.allow("second", at_ms(after_ms))).count()
+    };
+    assert_eq!(messages_of_a_second_sender(IDLE_SENDER_MS), 2, "without a place");
+    assert_eq!(messages_of_a_second_sender(IDLE_SENDER_MS + 1), 1, "in the place of the first");
+}
+
+#[test]
+fn another_rate_applies_to_senders_with_and_without_a_place() {
+    let mut limits = SenderLimits::new(20.0, 1, at_ms(0));
+    assert!(limits.allow("known", at_ms(0)) && limits.allow("other", at_ms(0)));
+    limits.set_rate(2.0, at_ms(0));
+    for sender in ["known", "other", "known"] {
+        assert!(!limits.allow(sender, at_ms(499)), "{sender}");
+    }
+    assert!(limits.allow("known", at_ms(500)) && limits.allow("other", at_ms(500)));
+    let replaced_ms = 501 + IDLE_SENDER_MS;
+    let of_a_new_one = [0, 499, 500].map(|ms| limits.allow("new", at_ms(replaced_ms + ms)));
+    assert_eq!(of_a_new_one, [true, false, true]);
+}

@@ -126,9 +126,31 @@ fn pending_probes_beyond_the_window_are_lost_oldest_first() {
     for seq in 1..20_000 {
         window.sent(seq, at_ms(1));
     }
-    assert!(window.outstanding() <= MAX_OUTSTANDING + 64);
+    assert_eq!(window.outstanding(), MAX_OUTSTANDING + 64);
+    assert_eq!(window.totals().lost, 19_999 - (MAX_OUTSTANDING + 64) as u64);
     assert_eq!(window.reading(at_ms(1)).loss, 1.0);
     assert!(is_accounted_for(&window));
+}
+
+#[test]
+fn responses_to_the_newest_64_settled_probes_are_recognized() {
+    let mut window = open_window(50);
+    let send = |window: &mut ProbeWindow, seqs: std::ops::Range<u64>| {
+        for seq in seqs {
+            window.sent(seq, at_ms(20));
+            window.answered(seq, at_ms(30));
+        }
+    };
+    send(&mut window, 1..100);
+    assert_eq!(window.answered(36, at_ms(40)), ResponseOutcome::Repeated);
+    assert_eq!(window.answered(35, at_ms(40)), ResponseOutcome::Unknown);
+    // One that waits for its response keeps those behind it.
+    window.sent(100, at_ms(40));
+    send(&mut window, 101..300);
+    assert_eq!(window.answered(101, at_ms(50)), ResponseOutcome::Repeated);
+    assert_eq!(window.answered(100, at_ms(50)), ResponseOutcome::Counted { rtt_ns: 10 * MS });
+    assert_eq!(window.answered(236, at_ms(50)), ResponseOutcome::Repeated);
+    assert_eq!(window.answered(235, at_ms(50)), ResponseOutcome::Unknown);
 }
 
 #[test]

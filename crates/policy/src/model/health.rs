@@ -476,7 +476,7 @@ impl LatencyHistogram {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::DropReason;
+    use crate::model::{DropReason, UnmatchedPolicy};
 
     #[test]
     fn quantiles_are_within_one_bucket_of_the_exact_value() {
@@ -531,6 +531,31 @@ mod tests {
         assert_eq!((account.last_sequence, account.last_at), (10, MonotonicNs(10)));
         account.take(i64::MAX, MonotonicNs(11));
         assert_eq!(account.lost_upstream, 3 + i64::MAX.unsigned_abs() - 11);
+    }
+
+    #[test]
+    fn the_readers_of_an_output_are_those_whose_records_are_in_use() {
+        let mut readers = OutputReaders::default();
+        assert_eq!((readers.iter().count(), readers.unmatched().count()), (0, 0));
+        let [matched, strict, foreign] = [1, 2, 3].map(|number| Guid([number; 16]));
+        readers.records[0].reader = matched;
+        let policy = UnmatchedPolicy::Durability as u64;
+        readers.unmatched[0] = UnmatchedReader { reader: strict, policy };
+        // A number that only a foreign program writes.
+        readers.unmatched[1] = UnmatchedReader { reader: foreign, policy: 1 << 40 };
+        assert_eq!(readers.iter().map(|record| record.reader).collect::<Vec<_>>(), [matched]);
+        let unmatched: Vec<_> = readers.unmatched().collect();
+        assert_eq!(unmatched, [(strict, UnmatchedPolicy::Durability), (foreign, UnmatchedPolicy::default())]);
+    }
+
+    #[test]
+    fn a_route_announces_the_type_and_the_durability_of_its_publishers() {
+        let mut info = RouteInfo::default();
+        assert_eq!((info.announced_type(), info.durability()), (None, Durability::Volatile));
+        let (name, hash) = ("std_msgs::msg::dds_::String_", TypeHash([7; 32]));
+        (info.dds_type, info.type_hash, info.transient_local) = (FixedText::new(name), hash, 1);
+        assert_eq!(info.announced_type(), Some(DdsType { name, hash }));
+        assert_eq!(info.durability(), Durability::TransientLocal);
     }
 
     #[test]

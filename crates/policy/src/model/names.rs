@@ -206,6 +206,16 @@ mod tests {
     }
 
     #[test]
+    fn node_names_are_one_token_of_at_most_200_characters() {
+        for right in ["ingress", "_Front2", &"n".repeat(200)] {
+            assert_eq!(NodeName::try_from(right).map(|name| name.to_string()), Ok(right.to_owned()));
+        }
+        for wrong in ["", "2d", "a/b", "a b", &"n".repeat(201)] {
+            assert!(NodeName::try_from(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
     fn route_ids_have_1_to_64_letters_digits_and_three_signs() {
         for right in ["a", "2", "scan_2-b.c", "A", &"x".repeat(64)] {
             assert_eq!(RouteId::try_from(right).map(|id| id.to_string()), Ok(right.to_owned()));

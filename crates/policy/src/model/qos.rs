@@ -91,6 +91,8 @@ mod tests {
             (critical.durability, noncritical.durability),
             (Durability::Volatile, Durability::Volatile)
         );
+        let repaired = QosProfile::NONCRITICAL_RELIABLE;
+        assert_eq!((repaired.reliability, repaired.depth()), (Reliability::Reliable, Some(2)));
         assert_eq!(QosProfile { history: History::KeepAll, ..critical }.depth(), None);
     }
 }

@@ -102,4 +102,12 @@ mod tests {
         let other_key = alloc::format!("mytypehash={LASER_SCAN};");
         assert_eq!(TypeHash::find_in(other_key.as_bytes()), TypeHash::UNKNOWN);
     }
+
+    #[test]
+    fn hashes_contradict_each_other_only_if_both_are_known_and_differ() {
+        let [one, other] = [TypeHash([1; 32]), TypeHash([2; 32])];
+        assert!(one.is_known() && !TypeHash::UNKNOWN.is_known());
+        assert!(one.contradicts(&other) && !one.contradicts(&one));
+        assert!(!one.contradicts(&TypeHash::UNKNOWN) && !TypeHash::UNKNOWN.contradicts(&one));
+    }
 }

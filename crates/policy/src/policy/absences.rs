@@ -415,6 +415,14 @@ mod tests {
     }
 
     #[test]
+    fn an_interface_without_a_link_is_reported_so_although_it_has_entries_without_an_address() {
+        let mut watch = AbsenceWatch::new(["wlan0".to_owned()]);
+        let no_link = interface("wlan0", Some([10, 0, 1, 2]), false);
+        watch.update_interfaces(&[no_link, interface("wlan0", None, true)], at(0));
+        assert_eq!(absences(&watch), ["away wlan0 has no link"]);
+    }
+
+    #[test]
     fn without_configured_interfaces_those_that_reach_peers_are_watched() {
         let mut watch = AbsenceWatch::new([]);
         let eth = |has_link| interface("eth0", Some([10, 0, 0, 1]), has_link);

@@ -307,15 +307,39 @@ mod tests {
     }
 
     #[test]
-    fn the_offset_follows_clocks_that_drift_apart() {
-        // 100 ppm for an hour: 360 ms behind, without a step between two samples.
+    fn a_late_sample_is_late_also_after_the_clock_of_this_host_was_set_or_slewed() {
         let mut simulation = Simulation::default();
-        for at_ms in (0..3_600_000).step_by(100) {
-            simulation.publisher_ms = -at_ms / 10_000;
-            let age_ms = simulation.sample(at_ms, 2);
-            assert!(age_ms <= 110, "{at_ms}: {age_ms}");
+        simulation.run(0, 10_000, |_| 2);
+        simulation.host_ms = -5_000;
+        assert_eq!(simulation.sample(10_000, 702), 700);
+        // By less than a step in each drift window, and by more than one in total.
+        let mut simulation = Simulation::default();
+        for (from_ms, to_ms, host_ms) in [(0, 5_000, 0), (5_000, 15_000, -30), (15_000, 16_000, -60)] {
+            simulation.host_ms = host_ms;
+            simulation.run(from_ms, to_ms, |_| 2);
         }
-        assert!(simulation.clock.offset_ns().is_some());
+        assert_eq!(simulation.sample(16_000, 152), 150);
+    }
+
+    #[test]
+    fn delays_that_vary_widely_show_no_offset() {
+        let mut simulation = Simulation::of(5_000);
+        simulation.run(0, 10_000, |at_ms| if at_ms / 20 % 2 == 0 { 2 } else { 150 });
+        assert_eq!(simulation.clock.offset_ns(), None);
+    }
+
+    #[test]
+    fn the_offset_follows_clocks_that_drift_apart() {
+        // For an hour, up to 1.44 s behind, without a step between two samples.
+        for ppm in [100, 400] {
+            let mut simulation = Simulation::default();
+            for at_ms in (0..3_600_000).step_by(100) {
+                simulation.publisher_ms = -at_ms * ppm / 1_000_000;
+                let age_ms = simulation.sample(at_ms, 2);
+                assert!(age_ms <= 110, "{ppm} ppm, {at_ms}: {age_ms}");
+            }
+            assert!(simulation.clock.offset_ns().is_some());
+        }
     }
 
     #[test]

@@ -531,6 +531,20 @@ mod tests {
     }
 
     #[test]
+    fn the_safety_floor_is_the_reason_only_of_a_mode_that_it_changes() {
+        let of = |mode: LaneMode, floor: LaneMode| {
+            let written_at = at_ms(1_000);
+            let (mode, safety_floor) = (mode as u8, floor as u8);
+            let policy = LanePolicy { epoch: 1, written_at, mode, safety_floor, ..LanePolicy::default() };
+            mode_and_source(&policy, TrafficClass::Noncritical, at_ms(2_000), 2_000)
+        };
+        use LaneMode::{Degraded, Normal, Suspended};
+        assert_eq!(of(Normal, Suspended), (Suspended, ModeReason::Safety));
+        assert_eq!(of(Suspended, Suspended), (Suspended, ModeReason::Control));
+        assert_eq!(of(Suspended, Degraded), (Suspended, ModeReason::Control));
+    }
+
+    #[test]
     fn without_a_policy_every_lane_is_normal() {
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
             assert_eq!(effective_mode(&LanePolicy::default(), class, at_ms(9), 1), LaneMode::Normal);

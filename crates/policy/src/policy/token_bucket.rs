@@ -337,6 +337,15 @@ mod tests {
     }
 
     #[test]
+    fn the_balance_has_the_bytes_of_the_time_passed_up_to_the_burst_and_none_in_debt() {
+        let start = MonotonicNs(0);
+        let mut budget = ByteBudget::new(Some(1_000), start);
+        assert_eq!([0, 10, 50, 5_000].map(|ms| budget.balance_bytes(start.plus_ms(ms))), [0, 10, 50, 50]);
+        assert!(budget.try_take(100, start.plus_ms(50)));
+        assert_eq!([50, 99, 120].map(|ms| budget.balance_bytes(start.plus_ms(ms))), [0, 0, 20]);
+    }
+
+    #[test]
     fn an_unlimited_budget_is_always_ready_and_cancels_debt() {
         let start = MonotonicNs(0);
         let mut budget = ByteBudget::new(Some(1), start);

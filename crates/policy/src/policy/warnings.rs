@@ -100,6 +100,15 @@ mod tests {
     }
 
     #[test]
+    fn without_a_number_of_readings_one_is_enough() {
+        let mut warnings = SubscriberWarnings::default();
+        let at_once = WarningThresholds { readings: 0, ..THRESHOLDS };
+        let shown = [101.0, 101.0, 99.0, 99.0]
+            .map(|rtt_ms| warnings.read(&at_once, &link(Some(rtt_ms), Some(0.0), Some(0.0))));
+        assert_eq!(shown, [1, 1, 0, 0]);
+    }
+
+    #[test]
     fn each_figure_has_its_own_warning() {
         let mut warnings = SubscriberWarnings::default();
         let once = WarningThresholds { readings: 1, ..THRESHOLDS };
