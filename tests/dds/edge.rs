@@ -68,8 +68,8 @@ fn wait_for_reader(writer: &RawWriter) {
     }
 }
 
-/// A writer matches a reader before the reader matches the writer, and DDS does not signal the end of that to a
-/// BEST_EFFORT writer.
+/// A writer matches a reader before the reader matches the writer, and DDS does not signal the end of that
+/// to a BEST_EFFORT writer.
 fn wait_for_writer(reader: &RawReader) {
     let give_up = Instant::now() + Duration::from_secs(20);
     while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {

@@ -48,8 +48,9 @@ fn hosts_without_samples_send_few_packets() {
     for library in LIBRARIES {
         let subscriber = bed.subscribe("critical", Peer::on(library), CRITICAL);
         subscriber.wait_matched(1);
-        // Expected after discovery are announcements of a few participants, seconds apart. A Fast DDS reader that receives
-        // no HEARTBEAT requests one seven times a second, from each of several writers of each process, without end.
+        // Expected after discovery are announcements of a few participants, seconds apart. A Fast DDS
+        // reader that receives no HEARTBEAT requests one seven times a second, from each of several writers
+        // of each process, without end.
         support::wait_until(format!("few packets of {library:?}"), || {
             let before = packets(&bed);
             std::thread::sleep(Duration::from_secs(4));

@@ -75,7 +75,8 @@ fn fill_table(test: &str, node: Node) {
     for (offered, publisher) in offers(node) {
         let Some(bed) = Bed::start(test, SCAN) else { return };
         let publisher = publisher.publisher().topic(INPUT).start_on(bed.host("publisher"));
-        // Both lanes know the publisher, so that their writers offer its durability, before a subscriber holds them.
+        // Both lanes know the publisher, so that their writers offer its durability, before a subscriber
+        // holds them.
         bed.bridge.wait_status("the first sample on both lanes", |status| {
             outputs(status).all(|output| output["drops"]["no_reader"].as_u64() > Some(0))
         });
@@ -102,8 +103,8 @@ fn fill_table(test: &str, node: Node) {
                 });
             }
         }
-        // Those subscribers without the bridge that the page has as served are waited for. The others have had 2 s since
-        // all that use the bridge were served or named.
+        // Those subscribers without the bridge that the page has as served are waited for. The others have
+        // had 2 s since all that use the bridge were served or named.
         for (requested, [direct, ..]) in &subscribers {
             if PAGE.contains(&format!("| {offered} | {requested} | yes |")) {
                 direct.wait_received(1);

@@ -143,8 +143,8 @@ fn the_sample_of_a_node_that_publishes_once_and_ends_reaches_the_subscriber() {
         // Five at a time, because each takes half a second to start.
         for _ in 0..NODES / 5 {
             let nodes = (0..5).map(|_| {
-                // As `ros2 topic pub --once`, which ends 0.1 s after it has published. A machine that stalls for so
-                // long can keep ingress from discovering the node by then, as any subscriber.
+                // As `ros2 topic pub --once`, which ends 0.1 s after it has published. A machine that
+                // stalls for so long can keep ingress from discovering the node by then, as any subscriber.
                 let node = Peer::rclpy("once").option("--keep-alive", 0.1).first_seq(next).count(1);
                 next += 1;
                 bed.publish(node, INPUT)

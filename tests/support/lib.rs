@@ -106,8 +106,8 @@ pub fn skip_into(list: &Path, ci: bool, test: &str, reason: &str) {
     writeln!(file, "{test}: {reason}").unwrap();
 }
 
-/// Repeats a check that compares rates or ages until it succeeds, three times at most. Another program on the machine
-/// can delay the samples of one flow; a fault of the bridge is there each time.
+/// Repeats a check that compares rates or ages until it succeeds, three times at most. Another program on
+/// the machine can delay the samples of one flow; a fault of the bridge is there each time.
 pub fn attempts(mut check: impl FnMut() -> Result<(), String>) {
     for number in 1.. {
         match check() {

@@ -236,8 +236,8 @@ impl Drop for ParameterServices {
     fn drop(&mut self) {
         self.reloaded = None;
         self.wake();
-        // The caller drops the endpoints: the thread gets little CPU time on a busy machine, and each endpoint
-        // waits for the event loop several times.
+        // The caller drops the endpoints: the thread gets little CPU time on a busy machine, and each
+        // endpoint waits for the event loop several times.
         match self.thread.take().map(JoinHandle::join) {
             Some(Err(_)) => warn!("the thread of the parameter services panicked"),
             servers => drop(servers),
