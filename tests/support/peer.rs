@@ -100,7 +100,6 @@ impl Peer {
     }
 
     /// The same node on the release after that.
-    #[must_use]
     pub fn on_kilted(self) -> Peer {
         Peer { library: Library::Kilted, ..self }
     }
