@@ -19,8 +19,9 @@ const SOCKET_BYTES: u64 = 8 * MIB;
 const DISCOVERED_BYTES: u64 = 320 * MIB;
 /// Topics of discovery, of which a participant has a RELIABLE reader.
 const DISCOVERY_TOPICS: u64 = 4;
-/// Announcements of one of them that wait for an earlier one (16 MiB), and unfinished ones (4 MiB).
-const DISCOVERY_TOPIC_BYTES: u64 = 20 * MIB;
+/// Announcements of one of them that were read (16 MiB), that wait for an earlier one (16 MiB), and
+/// unfinished ones (4 MiB).
+const DISCOVERY_TOPIC_BYTES: u64 = 36 * MIB;
 
 /// The payload bytes that a RELIABLE writer retains for readers that have not acknowledged them
 /// (`KEEP_LAST_MAX_RETAINED_BYTES` of the library), and the samples that it retains whatever their size.
@@ -67,6 +68,7 @@ mod tests {
         for (path, limit) in [
             ("rtps/constant.rs", "KEEP_LAST_MAX_RETAINED_BYTES: usize = 32 << 20;"),
             ("rtps/constant.rs", "MAX_WITHHELD_BYTES_PER_TOPIC: usize = 16 * 1024 * 1024;"),
+            ("rtps/constant.rs", "MAX_KEPT_BYTES_PER_BUILTIN_TOPIC: usize = 16 * 1024 * 1024;"),
             ("dds/lent.rs", "max_total_bytes: 4 * 1024 * 1024,"),
             ("network_counts.rs", "MAX_PARTICIPANTS: usize = 1_024;"),
             ("network_counts.rs", "MAX_ENDPOINTS: usize = 16_384;"),

@@ -213,11 +213,12 @@ impl Output {
         let began_at = clock::monotonic();
         // One borrow stays free, so that the next sample can be taken while DDS holds all others.
         let by_reference = bytes >= self.by_reference_min_bytes
+            && self.history.is_none()
             && self.subscriber.borrowed() < self.subscriber.max_borrowed();
         let payload = if by_reference {
             Bytes::from_owner(sample)
-        } else if self.offer.qos.durability == Durability::TransientLocal {
-            // The writer keeps it for late joiners, and with it a chunk of the arena.
+        } else if self.history.is_some() {
+            // Late joiners need it while the lane runs, and with it a borrow or a chunk of the arena.
             Bytes::copy_from_slice(sample.payload())
         } else {
             arena.copy(sample.payload())

@@ -677,6 +677,11 @@ impl DiscoveryDB {
     &mut self,
     data: &DiscoveredReaderData,
   ) -> Option<DiscoveredReaderData> {
+    // Not used here, and as long as the application of the Reader likes.
+    let data = &DiscoveredReaderData {
+      content_filter: None,
+      ..data.clone()
+    };
     let guid = data.reader_proxy.remote_reader_guid;
     let topic = data.subscription_topic_data.topic_name();
     let proxy = &data.reader_proxy;

@@ -184,6 +184,11 @@ pub const MAX_UNSENT_CHANGES_PER_READER: usize = DEFAULT_WRITER_MAX_SAMPLES;
 // bounded.
 pub const MAX_TRACKED_CHANGES_PER_WRITER: usize = DEFAULT_WRITER_MAX_SAMPLES;
 
+// Most payload bytes a TopicCache keeps of a topic of discovery: room for 4096
+// announcements of 4 KiB. Their Readers take them at once, so older ones are of no use,
+// and any participant can send 4096 of 64 KB to each of three topics.
+pub const MAX_KEPT_BYTES_PER_BUILTIN_TOPIC: usize = 16 * 1024 * 1024;
+
 // Most payload bytes a TopicCache retains for samples withheld from Reliable
 // DataReaders while an earlier sample from the same Writer is missing. Beyond
 // this, the oldest missing sample is given up as lost, and the samples after it

@@ -529,19 +529,22 @@ impl Writer {
       TimedEvent::SendRepairData {
         to_reader: reader_guid,
       } => {
-        let history = self.send_buffer.history_before(self.last_sent().plus_1());
-        match self.lookup_reader_proxy_mut(reader_guid) {
+        let is_late_joiner = match self.lookup_reader_proxy_mut(reader_guid) {
           Some(rp) => {
             rp.repair_data_scheduled = false;
-            if !rp.qos().is_reliable() && !rp.repair_mode {
-              // The history for a late joiner, see `update_reader_proxy`.
-              for number in history {
-                rp.request_change(number);
-              }
-              rp.repair_mode = true;
-            }
+            !rp.qos().is_reliable() && !rp.repair_mode
           }
           None => return, // reader is gone
+        };
+        if is_late_joiner {
+          // The history, see `update_reader_proxy`.
+          let history = self.send_buffer.history_before(self.last_sent().plus_1());
+          if let Some(rp) = self.lookup_reader_proxy_mut(reader_guid) {
+            for number in history {
+              rp.request_change(number);
+            }
+            rp.repair_mode = true;
+          }
         }
         // Do not add to a send socket that already holds queued control
         // datagrams: back off and try again in the next round.

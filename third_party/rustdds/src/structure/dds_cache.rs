@@ -20,7 +20,7 @@ use crate::{
     typedesc::TypeDesc,
     CreateError, CreateResult,
   },
-  rtps::constant::MAX_WITHHELD_BYTES_PER_TOPIC,
+  rtps::constant::{MAX_KEPT_BYTES_PER_BUILTIN_TOPIC, MAX_WITHHELD_BYTES_PER_TOPIC},
   structure::{sequence_number::SequenceNumber, time::Timestamp},
   GUID,
 };
@@ -123,6 +123,9 @@ pub(crate) struct TopicCache {
   min_keep_samples: History,
   max_keep_samples: i32, // from QoS, for quick, repeated access
   // TODO: Change this to Option<u32>, where None means "no limit".
+  // The most payload bytes that it keeps beyond what is withheld; no limit for topics
+  // of the application, whose readers limit the number and the size of samples.
+  max_keep_bytes: Option<usize>,
 
   // The main content of the cache is in this map.
   // Timestamp is assumed to be unique id over all the CacheChanges. Uniqueness is
@@ -170,8 +173,10 @@ pub(crate) struct TopicCache {
 
 impl TopicCache {
   pub fn new(topic_name: String, topic_data_type: TypeDesc, topic_qos: &QosPolicies) -> Self {
+    let is_built_in = topic_name.starts_with("DCPS");
     let mut new_self = Self {
       topic_name,
+      max_keep_bytes: is_built_in.then_some(MAX_KEPT_BYTES_PER_BUILTIN_TOPIC),
       topic_data_type,
       topic_qos: topic_qos.clone(),
       min_keep_samples: History::KeepLast { depth: 1 }, /* dummy value, next call will overwrite
@@ -302,6 +307,21 @@ impl TopicCache {
       .min()
   }
 
+  // The oldest samples that exceed the limits.
+  fn excess_samples(&self) -> usize {
+    let count = self.changes.len();
+    let by_count = count.saturating_sub(self.max_keep_samples as usize);
+    let Some(max_keep_bytes) = self.max_keep_bytes else {
+      return by_count;
+    };
+    let mut bytes = 0;
+    let kept = self.changes.values().rev().take_while(|change| {
+      bytes += change.data_value.payload_size();
+      bytes <= max_keep_bytes
+    });
+    max(by_count, count - kept.count())
+  }
+
   // Payload bytes retained from the oldest withheld change onwards.
   fn withheld_bytes(&self, from: Timestamp) -> usize {
     self
@@ -314,8 +334,8 @@ impl TopicCache {
   // Over MAX_WITHHELD_BYTES_PER_TOPIC, give up on missing samples, oldest first,
   // and hand over the samples after them. Returns true if anything was given up.
   fn give_up_withheld_over_limit(&mut self) -> bool {
-    // Under the sample count limit nothing is retained just for being withheld.
-    if self.changes.len() <= self.max_keep_samples as usize {
+    // Under the limits nothing is retained just for being withheld.
+    if self.excess_samples() == 0 {
       return false;
     }
     let mut gave_up = false;
@@ -372,7 +392,10 @@ impl TopicCache {
     } else {
       1
     };
-    let gc_triggered = modulus <= 1 || semi_random_number.is_multiple_of(modulus);
+    // The sender chooses the numbers: it must not choose when its large samples go.
+    let is_large_built_in = self.max_keep_bytes.is_some() && payload_size > 1024;
+    let gc_triggered =
+      modulus <= 1 || semi_random_number.is_multiple_of(modulus) || is_large_built_in;
     if gc_triggered {
       debug!("Garbage collecting topic {}", self.topic_name);
       self.remove_changes_before(Timestamp::ZERO);
@@ -551,9 +574,7 @@ impl TopicCache {
     let sample_count = self.changes.len();
 
     // We must remove at least enough to stay within max limit,
-    // must_remove_count = sample_count - max_keep_samples
-    let must_remove_count = sample_count.saturating_sub(self.max_keep_samples as usize);
-    // Saturating sub takes care that this does not underflow below zero.
+    let must_remove_count = self.excess_samples();
 
     let may_remove_count = match self.min_keep_samples {
       // We are erquested to KeepAll, so do not remove more than absolutely required.
@@ -891,6 +912,42 @@ mod tests {
       SequenceNumber::new(201)
     );
     assert!(topic_cache.changes.len() <= topic_cache.max_keep_samples as usize + 1);
+  }
+
+  #[test]
+  fn large_announcements_are_kept_up_to_a_number_of_bytes() {
+    let cache_of = |name: &str| {
+      let qos = QosPolicyBuilder::new()
+        .history(History::KeepAll)
+        .resource_limits(super::ResourceLimits {
+          max_samples: 4096,
+          max_instances: 4096,
+          max_samples_per_instance: 4096,
+        })
+        .build();
+      TopicCache::new(name.to_owned(), TypeDesc::new("type".to_owned()), &qos)
+    };
+    let fill = |mut cache: TopicCache| {
+      // Numbers that are no multiple of eight.
+      for number in (1..8 * 1_000).step_by(8) {
+        let payload =
+          SerializedPayload::new(RepresentationIdentifier::PL_CDR_LE, vec![0; 60_000]);
+        let change = CacheChange::new(
+          user_writer(),
+          SequenceNumber::new(number),
+          WriteOptions::default(),
+          DDSData::new(payload),
+        );
+        cache.add_change(&Timestamp::now(), change);
+      }
+      cache.changes.len()
+    };
+    let kept = fill(cache_of("DCPSPublication"));
+    assert!(
+      kept * 60_000 <= super::MAX_KEPT_BYTES_PER_BUILTIN_TOPIC + 2 * 60_000,
+      "{kept} samples"
+    );
+    assert_eq!(fill(cache_of("rt/scan")), 1_000);
   }
 
   #[test]
