@@ -3,9 +3,10 @@
 //! A publisher's samples stay in the history when it ends, because `ros2 topic pub --once` ends at once. They
 //! leave it first when there are more publishers than it has room for.
 
+use bytes::Bytes;
 use tracing::warn;
 
-use super::late_joiners::{KeptSample, LateJoiners};
+use super::late_joiners::{self, KeptSample, LateJoiners};
 use crate::dds::RawWriter;
 use crate::model::{Guid, MAX_PUBLISHERS, MonotonicNs, SampleHeader};
 
@@ -35,9 +36,9 @@ impl History {
         }
     }
 
-    /// A copy of the sample if this history keeps it, not the DDS library.
-    pub fn copy(&self, payload: &[u8], header: &SampleHeader) -> Option<KeptSample> {
-        self.late_joiners.as_ref().map(|_| KeptSample::copy(payload, header))
+    /// The sample, if this history keeps it and not the DDS library.
+    pub fn kept(&self, payload: &Bytes, header: &SampleHeader) -> Option<KeptSample> {
+        self.late_joiners.as_ref().map(|_| KeptSample::of(payload.clone(), header))
     }
 
     /// Adds a sample that was written. If it is of one publisher too many, the history loses the samples of
@@ -85,7 +86,9 @@ impl History {
                 lane,
                 evicted_publishers = evicted.0,
                 evicted_samples = evicted.1,
-                "the history for late joiners is full: it has the samples of 64 publishers, 32 MiB in all"
+                most_publishers = MAX_PUBLISHERS,
+                most_bytes = late_joiners::MAX_BYTES,
+                "the history for late joiners is full"
             );
             self.logged = evicted;
             self.log_at = now.plus_ms(LOG_MS);

@@ -32,10 +32,10 @@ pub(super) struct KeptSample {
 }
 
 impl KeptSample {
-    pub fn copy(payload: &[u8], header: &SampleHeader) -> Self {
+    pub const fn of(payload: Bytes, header: &SampleHeader) -> Self {
         Self {
             publisher: header.writer_guid,
-            payload: Bytes::copy_from_slice(payload),
+            payload,
             encapsulation: header.encapsulation,
             timestamp: header.source_timestamp,
         }

@@ -223,7 +223,7 @@ impl Output {
         } else {
             arena.copy(sample.payload())
         };
-        let kept = self.history.as_ref().and_then(|history| history.copy(&payload, &header));
+        let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
         let outcome = writer.write_from(publisher, payload, header.encapsulation, header.source_timestamp);
         let complete = self.former_readers.is_empty();
@@ -548,11 +548,11 @@ impl Output {
     fn restore(&mut self, sample: &ShmSample) {
         let Some(history) = &mut self.history else { return };
         let (header, publisher) = (sample.header(), sample.header().writer_guid);
-        let kept = history.copy(sample.payload(), header);
+        let payload = Bytes::copy_from_slice(sample.payload());
+        let kept = history.kept(&payload, header);
         if kept.is_none()
             && let Some(writer) = &self.writer
         {
-            let payload = Bytes::copy_from_slice(sample.payload());
             let written =
                 writer.write_from(Some(publisher), payload, header.encapsulation, header.source_timestamp);
             if let Err(failure) = written {
