@@ -61,23 +61,25 @@ impl Setter {
         client: Guid,
         is_atomic: bool,
     ) -> Outcome {
-        let attempt = self.attempt(given, current, is_atomic);
-        let (results, pending) = attempt.unwrap_or_else(|reason| (vec![Err(reason); given.len()], None));
-        let set = given.iter().zip(&results).filter(|(_, result)| pending.is_some() && result.is_ok());
-        for (Parameter { name, value }, _) in set {
+        let outcome = self.attempt(given, current, is_atomic);
+        let outcome = outcome
+            .unwrap_or_else(|reason| Outcome { results: vec![Err(reason); given.len()], pending: None });
+        let is_set = |result: &Result<(), String>| outcome.pending.is_some() && result.is_ok();
+        for (Parameter { name, value }, _) in
+            given.iter().zip(&outcome.results).filter(|(_, result)| is_set(result))
+        {
             info!(%client, name, value = value.yaml(), "a ROS 2 node sets a parameter");
         }
-        Outcome { results, pending }
+        outcome
     }
 
-    /// Returns a result for each parameter, or why all are refused.
-    #[allow(clippy::type_complexity, reason = "the parts of an outcome")]
+    /// Returns the outcome, or why all parameters are refused.
     fn attempt(
         &mut self,
         given: &[Parameter],
         current: &Parameters,
         is_atomic: bool,
-    ) -> Result<(Vec<Result<(), String>>, Option<SetParameters>), String> {
+    ) -> Result<Outcome, String> {
         let Some(store) = &self.store else {
             return Err("the bridge reads no configuration file".to_owned());
         };
@@ -119,7 +121,7 @@ impl Setter {
         }
         drop_equal_to_file(store, &mut accepted, &candidates);
         if accepted == before {
-            return Ok((results, None));
+            return Ok(Outcome { results, pending: None });
         }
         let (root, instance): (PathBuf, _) = (root_of(&current.settings), &current.settings.instance);
         let holders = RoleHolder::all(&root, instance)
@@ -137,7 +139,7 @@ impl Setter {
         }
         store.write(&accepted).map_err(|error| format!("cannot store the parameters: {error}"))?;
         match request_reload(&root, instance) {
-            Ok(_) => Ok((results, Some(accepted))),
+            Ok(_) => Ok(Outcome { results, pending: Some(accepted) }),
             Err(error) => {
                 error!(%error, "cannot request a reload");
                 // Else a process that restarts would apply what was refused.
