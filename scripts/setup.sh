@@ -69,6 +69,7 @@ check_all() {
         need "has debootstrap" debootstrap \
             "tests of the deployment in containers and of the package for arm64, without access to a registry"
     fi
+    need "has xz" xz-utils "recorded results in the tests of adaptive-bridge-eval report, cargo bench -- --save"
     need "has dpkg-shlibdeps" dpkg-dev "the Debian package, and its tests"
     need "has systemd-nspawn" systemd-container "tests of the services (in a container with systemd)"
     need "has systemd-analyze" systemd "tests of the service units"

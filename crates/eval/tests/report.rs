@@ -13,8 +13,13 @@ use tempfile::TempDir;
 const PLOT_WIDTH: f64 = 480.0;
 const TEXT_PX: f64 = 13.0;
 
-fn recorded() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data")
+/// Unpacks the recorded results into a new folder, which the caller may change.
+fn recorded() -> TempDir {
+    let archive = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/runs.tar.xz");
+    let folder = tempfile::tempdir().unwrap();
+    let status = Command::new("tar").arg("-xJf").arg(&archive).arg("-C").arg(folder.path()).status();
+    assert!(status.expect("tar").success(), "{}: tar or xz failed", archive.display());
+    folder
 }
 
 fn report(results: &Path, out: &Path) -> Output {
@@ -34,25 +39,6 @@ fn report_of(results: &Path) -> (TempDir, String) {
 fn parse(page: &str) -> Document<'_> {
     Document::parse_with_options(page, ParsingOptions { allow_dtd: true, ..ParsingOptions::default() })
         .unwrap()
-}
-
-/// A copy of the recorded results, to be changed.
-fn copy() -> TempDir {
-    fn copy(from: &Path, to: &Path) {
-        fs::create_dir_all(to).unwrap();
-        for entry in fs::read_dir(from).unwrap() {
-            let path = entry.unwrap().path();
-            let to = to.join(path.file_name().unwrap());
-            if path.is_dir() {
-                copy(&path, &to);
-            } else {
-                fs::copy(&path, to).unwrap();
-            }
-        }
-    }
-    let folder = tempfile::tempdir().unwrap();
-    copy(&recorded(), folder.path());
-    folder
 }
 
 fn runs(results: &Path) -> Vec<PathBuf> {
@@ -78,7 +64,7 @@ fn texts<'a>(document: &'a Document, tag: &str) -> Vec<String> {
 
 #[test]
 fn the_page_is_well_formed_and_needs_nothing_from_elsewhere() {
-    let (_out, page) = report_of(&recorded());
+    let (_out, page) = report_of(recorded().path());
     let document = parse(&page);
     let ids: BTreeSet<&str> = document.descendants().filter_map(|node| node.attribute("id")).collect();
     for node in document.descendants().filter(Node::is_element) {
@@ -107,7 +93,7 @@ fn the_page_is_well_formed_and_needs_nothing_from_elsewhere() {
 
 #[test]
 fn text_in_plots_can_be_read_on_a_phone_and_stays_within() {
-    let (_out, page) = report_of(&recorded());
+    let (_out, page) = report_of(recorded().path());
     let document = parse(&page);
     let style = texts(&document, "style").concat();
     assert!(style.contains(&format!("svg .t {{ font: {TEXT_PX}px")), "the size of text in plots");
@@ -161,7 +147,7 @@ fn text_in_plots_can_be_read_on_a_phone_and_stays_within() {
 
 #[test]
 fn it_shows_what_was_run_and_what_was_not() {
-    let (out, page) = report_of(&recorded());
+    let (out, page) = report_of(recorded().path());
     let document = parse(&page);
     let headings = texts(&document, "h3").concat();
     for title in
@@ -189,7 +175,7 @@ fn it_shows_what_was_run_and_what_was_not() {
     assert_eq!(badges.len(), 5);
     assert!(badges.iter().all(|badge| badge.text() == Some("not tested")));
     assert!(page.contains("Smoke runs"));
-    let manifest = fs::read_to_string(runs(&recorded())[0].join("manifest.json")).unwrap();
+    let manifest = fs::read_to_string(runs(recorded().path())[0].join("manifest.json")).unwrap();
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
     for (group, key) in
         [("machine", "kernel"), ("machine", "cpu"), ("software", "version"), ("software", "peer")]
@@ -205,14 +191,14 @@ fn it_shows_what_was_run_and_what_was_not() {
 
 #[test]
 fn csv_files_have_a_line_for_each_run_and_figure() {
-    let (out, _page) = report_of(&recorded());
+    let (out, _page) = report_of(recorded().path());
     let lines = |name: &str| -> Vec<Vec<String>> {
         let mut reader =
             csv::ReaderBuilder::new().has_headers(false).from_path(out.path().join(name)).unwrap();
         reader.deserialize().map(|line| line.unwrap()).collect()
     };
     let by_run = lines("runs.csv");
-    assert_eq!(by_run.len(), runs(&recorded()).len() + 1);
+    assert_eq!(by_run.len(), runs(recorded().path()).len() + 1);
     assert!(by_run.iter().all(|line| line.len() == by_run[0].len()));
     let column = |name: &str| by_run[0].iter().position(|column| column == name).unwrap();
     for line in &by_run[1..] {
@@ -234,7 +220,7 @@ fn csv_files_have_a_line_for_each_run_and_figure() {
 
 #[test]
 fn every_figure_is_documented() {
-    let (out, _page) = report_of(&recorded());
+    let (out, _page) = report_of(recorded().path());
     let mut runs = csv::Reader::from_path(out.path().join("runs.csv")).unwrap();
     let page = fs::read_to_string(support::root().join("docs/eval-report.md")).unwrap();
     // Those from p50 to max are named by their ends.
@@ -246,14 +232,14 @@ fn every_figure_is_documented() {
 
 #[test]
 fn two_reports_of_the_same_results_are_the_same() {
-    let (_one, first) = report_of(&recorded());
-    let (_other, second) = report_of(&recorded());
+    let (_one, first) = report_of(recorded().path());
+    let (_other, second) = report_of(recorded().path());
     assert!(first == second, "the page depends on more than the results");
 }
 
 #[test]
 fn a_run_that_cannot_be_read_is_told_and_the_others_are_shown() {
-    let results = copy();
+    let results = recorded();
     let broken = runs(results.path());
     replace(&broken[0].join("publisher.csv"), "seq,time_ns", "seq,when");
     replace(&broken[1].join("manifest.json"), "\"format\": 1", "\"format\": 2");
@@ -270,7 +256,7 @@ fn a_run_that_cannot_be_read_is_told_and_the_others_are_shown() {
 
 #[test]
 fn names_from_the_results_are_no_markup() {
-    let results = copy();
+    let results = recorded();
     for run in runs(results.path()) {
         replace(
             &run.join("manifest.json"),
