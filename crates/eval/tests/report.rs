@@ -232,8 +232,9 @@ fn every_figure_is_documented() {
 
 #[test]
 fn two_reports_of_the_same_results_are_the_same() {
-    let (_one, first) = report_of(recorded().path());
-    let (_other, second) = report_of(recorded().path());
+    let results = recorded();
+    let (_one, first) = report_of(results.path());
+    let (_other, second) = report_of(results.path());
     assert!(first == second, "the page depends on more than the results");
 }
 
