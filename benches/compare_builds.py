@@ -7,7 +7,8 @@
 Both builds run during the whole comparison, each in a DDS domain of its own. They and a direct flow without a bridge
 take turns: only one receives samples at a time, and each round begins with another one. The hop of a build in a round
 is its median latency minus that of the direct flow. The output has the medians over the rounds, and their ratio
-with its 95 % confidence interval (bootstrap over the rounds). No CPU affinity is set, and scheduling is normal.
+with its 95 % confidence interval (bootstrap over the rounds). Scheduling is normal. Without --cpus no CPU affinity is
+set.
 """
 
 import argparse
@@ -29,10 +30,14 @@ CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20)}
 DIRECT_DOMAIN = 63
 
 
+def scheduling(cpu):
+    return f"scheduling: {{cpus: [{'' if cpu is None else cpu}]}}"
+
+
 class Build:
     """A running bridge of one build."""
 
-    def __init__(self, name, program, domain, folder):
+    def __init__(self, name, program, domain, folder, cpus):
         self.name, self.domain = name, domain
         config = folder / f"{name}.yaml"
         config.write_text(
@@ -40,7 +45,8 @@ class Build:
             "topics: [{id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, "
             "max_sample_bytes: 2097152}]\n"
             f"shared_memory: {{root_path: {folder}/{name}}}\n"
-            "lanes: {critical: {queue_depth: 512}}\nclassifier: {enabled: false}\n")
+            f"lanes: {{critical: {{queue_depth: 512, {scheduling(cpus[1])}}}}}\n"
+            f"processes: {{ingress: {{{scheduling(cpus[0])}}}}}\nclassifier: {{enabled: false}}\n")
         environment = {**os.environ, "RUST_LOG": "info", "NO_COLOR": "1"}
         self.log = folder / f"{name}.log"
         with open(self.log, "w") as log:
@@ -126,6 +132,8 @@ def main():
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=4.0, help="duration of each flow in each round")
     parser.add_argument("--case", choices=CASES, action="append", help="repeatable; default: all cases")
+    parser.add_argument("--cpus", type=int, nargs=2, default=(None, None), metavar=("INGRESS", "LANE"),
+                        help="give ingress and the critical lane a CPU each")
     parser.add_argument("--json", help="also write every round to this file")
     options = parser.parse_args()
     if not PEER.exists():
@@ -133,7 +141,7 @@ def main():
     rounds = {}
     with tempfile.TemporaryDirectory() as folder:
         builds = [
-            Build(name, program, domain, Path(folder))
+            Build(name, program, domain, Path(folder), options.cpus)
             for name, program, domain in (("old", options.old, 61), ("new", options.new, 62))]
         try:
             for case in options.case or CASES:
