@@ -120,71 +120,76 @@ impl Chaos<'_> {
     }
 }
 
-#[test]
-fn in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason() {
-    let test = "in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason";
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(4_000), CRITICAL);
-    let publisher = bed.publish(Peer::cyclone().keep_last(1_000).rate_hz(RATE_HZ), INPUT);
-    subscriber.wait_received(200);
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-    let seconds = std::env::var(SECONDS_VARIABLE).map_or(SECONDS, |text| text.parse().unwrap());
-    let seed = u64::from(std::process::id()) | 1;
-    println!("seed {seed}");
-    let ports = udp_ports(bed.pid("ingress"));
-    let ended = AtomicBool::new(false);
-    let (address, attacker) = (bed.host("bridge").address(), bed.host("slow"));
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            let go_on = || !ended.load(Ordering::Relaxed);
-            attacker.within(|| hostile::send(address, &ports, seed, &[], go_on))
+    #[test]
+    fn in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason() {
+        let test = "in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, SCAN) else { return };
+        let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(4_000), CRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_last(1_000).rate_hz(RATE_HZ), INPUT);
+        subscriber.wait_received(200);
+
+        let seconds = std::env::var(SECONDS_VARIABLE).map_or(SECONDS, |text| text.parse().unwrap());
+        let seed = u64::from(std::process::id()) | 1;
+        println!("seed {seed}");
+        let ports = udp_ports(bed.pid("ingress"));
+        let ended = AtomicBool::new(false);
+        let (address, attacker) = (bed.host("bridge").address(), bed.host("slow"));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let go_on = || !ended.load(Ordering::Relaxed);
+                attacker.within(|| hostile::send(address, &ports, seed, &[], go_on))
+            });
+            let random = Random(seed);
+            let mut chaos = Chaos { bed: &bed, random, visitor: None, visitors: 0, events: BTreeMap::new() };
+            let until = Instant::now() + Duration::from_secs(seconds);
+            while Instant::now() < until {
+                chaos.event();
+                chaos.pause(200, 1_500);
+            }
+            ended.store(true, Ordering::Relaxed);
+            chaos.end();
         });
-        let random = Random(seed);
-        let mut chaos = Chaos { bed: &bed, random, visitor: None, visitors: 0, events: BTreeMap::new() };
-        let until = Instant::now() + Duration::from_secs(seconds);
-        while Instant::now() < until {
-            chaos.event();
-            chaos.pause(200, 1_500);
-        }
-        ended.store(true, Ordering::Relaxed);
-        chaos.end();
-    });
-    subscriber.wait_received(subscriber.received() + 400);
+        subscriber.wait_received(subscriber.received() + 400);
 
-    let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
-    let account_of = |status: &Value| {
-        let accounts = status["routes"][0]["publishers"].as_array().unwrap();
-        accounts.iter().max_by_key(|account| number(&account["received"])).unwrap().clone()
-    };
-    bed.bridge.wait_status("the last sample received by ingress", |status| {
-        account_of(status)["last_sequence"].as_u64() == Some(sent.ok)
-    });
-    let status = bed.wait_accounted();
-    let account = account_of(&status);
-    let before_first = number(&account["first_sequence"]) - 1;
-    let taken = number(&account["received"]) + number(&account["lost_upstream"]);
-    assert_eq!(before_first + taken, sent.ok, "{sent:?} {account}");
-    let route = &status["routes"][0];
-    let published = number(&route["received"]) - sum(&route["drops"]);
-    assert_eq!(number(&route["published"]), published, "{route}");
-    for lane in outputs(&status) {
-        assert_eq!(number(&lane["received"]), published, "{lane}");
-        assert_eq!(number(&lane["forwarded"]) + sum(&lane["drops"]), published, "{lane}");
+        let sent: Sent = publisher.end();
+        assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+        let account_of = |status: &Value| {
+            let accounts = status["routes"][0]["publishers"].as_array().unwrap();
+            accounts.iter().max_by_key(|account| number(&account["received"])).unwrap().clone()
+        };
+        bed.bridge.wait_status("the last sample received by ingress", |status| {
+            account_of(status)["last_sequence"].as_u64() == Some(sent.ok)
+        });
+        let status = bed.wait_accounted();
+        let account = account_of(&status);
+        let before_first = number(&account["first_sequence"]) - 1;
+        let taken = number(&account["received"]) + number(&account["lost_upstream"]);
+        assert_eq!(before_first + taken, sent.ok, "{sent:?} {account}");
+        let route = &status["routes"][0];
+        let published = number(&route["received"]) - sum(&route["drops"]);
+        assert_eq!(number(&route["published"]), published, "{route}");
+        for lane in outputs(&status) {
+            assert_eq!(number(&lane["received"]), published, "{lane}");
+            assert_eq!(number(&lane["forwarded"]) + sum(&lane["drops"]), published, "{lane}");
+        }
+        let critical = outputs(&status).find(|output| output["lane"] == "critical").unwrap();
+        let forwarded = number(&critical["forwarded"]);
+        subscriber.wait_received(forwarded);
+        let received: Received = subscriber.end();
+        assert_eq!((received.bad, received.duplicates), (0, 0), "{received:?}");
+        // What a restarted lane writes before it has matched its subscribers counts as `no_reader`; this one may
+        // have received it.
+        let possible = forwarded..=forwarded + number(&critical["drops"]["no_reader"]);
+        assert!(possible.contains(&received.received), "{received:?} of {critical}");
+        println!(
+            "{} sent, lost_upstream {}, repeated {}; critical lane: {forwarded} forwarded, {}",
+            sent.ok, account["lost_upstream"], route["repeated"], critical["drops"]
+        );
+        bed.end();
     }
-    let critical = outputs(&status).find(|output| output["lane"] == "critical").unwrap();
-    let forwarded = number(&critical["forwarded"]);
-    subscriber.wait_received(forwarded);
-    let received: Received = subscriber.end();
-    assert_eq!((received.bad, received.duplicates), (0, 0), "{received:?}");
-    // What a restarted lane writes before it has matched its subscribers counts as `no_reader`; this one may
-    // have received it.
-    let possible = forwarded..=forwarded + number(&critical["drops"]["no_reader"]);
-    assert!(possible.contains(&received.received), "{received:?} of {critical}");
-    println!(
-        "{} sent, lost_upstream {}, repeated {}; critical lane: {forwarded} forwarded, {}",
-        sent.ok, account["lost_upstream"], route["repeated"], critical["drops"]
-    );
-    bed.end();
 }

@@ -73,31 +73,36 @@ fn anonymous_kib(bed: &Bed) -> [i64; PROCESSES.len()] {
     PROCESSES.map(|process| memory_kib(bed.pid(process), "RssAnon"))
 }
 
-#[test]
-fn memory_does_not_grow_with_the_participants_that_are_gone() {
-    let test = "memory_does_not_grow_with_the_participants_that_are_gone";
-    // A process that is restarted, on a machine that is busy otherwise, would begin with less memory.
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start_without_watchdog(test, SCAN) else {
-        return;
-    };
-    bed.up.wait_for_log("control is up");
-    let mut visitors = Visitors::new(bed.host("slow"), endpoints(), PROCESSES.len());
-    churn(&bed, &mut visitors, FIRST);
-    let before = anonymous_kib(&bed);
-    let more = std::env::var(MORE_VARIABLE).map_or(MORE, |count| count.parse().unwrap());
-    for number in 1..=more.div_ceil(FIRST) {
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
+
+    #[test]
+    fn memory_does_not_grow_with_the_participants_that_are_gone() {
+        let test = "memory_does_not_grow_with_the_participants_that_are_gone";
+        // A process that is restarted, on a machine that is busy otherwise, would begin with less memory.
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start_without_watchdog(test, SCAN) else {
+            return;
+        };
+        bed.up.wait_for_log("control is up");
+        let mut visitors = Visitors::new(bed.host("slow"), endpoints(), PROCESSES.len());
         churn(&bed, &mut visitors, FIRST);
-        let after = anonymous_kib(&bed);
-        println!("after {FIRST}: {before:?} KiB; after {} more: {after:?} KiB", number * FIRST);
-        for ((process, before), after) in PROCESSES.iter().zip(before).zip(after) {
-            assert!(
-                after - before < MAX_GROWTH_KIB,
-                "{process} has grown from {before} to {after} KiB with {} participants",
-                number * FIRST
-            );
-            assert_eq!(bed.pids(process).len(), 1, "{process} was restarted\n{}", bed.up.log());
+        let before = anonymous_kib(&bed);
+        let more = std::env::var(MORE_VARIABLE).map_or(MORE, |count| count.parse().unwrap());
+        for number in 1..=more.div_ceil(FIRST) {
+            churn(&bed, &mut visitors, FIRST);
+            let after = anonymous_kib(&bed);
+            println!("after {FIRST}: {before:?} KiB; after {} more: {after:?} KiB", number * FIRST);
+            for ((process, before), after) in PROCESSES.iter().zip(before).zip(after) {
+                assert!(
+                    after - before < MAX_GROWTH_KIB,
+                    "{process} has grown from {before} to {after} KiB with {} participants",
+                    number * FIRST
+                );
+                assert_eq!(bed.pids(process).len(), 1, "{process} was restarted\n{}", bed.up.log());
+            }
         }
+        bed.end();
     }
-    bed.end();
 }

@@ -150,37 +150,37 @@ pub(super) fn send(
     sent
 }
 
-#[test]
-fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process() {
-    let test = "a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process";
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    // Two subscribers in whose names datagrams come. They may miss samples; the others may not.
-    let named = [
-        bed.subscribe("slow", Peer::cyclone(), CRITICAL),
-        bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL),
-    ];
-    let known = prefixes(readers(&bed.bridge.status()));
-    assert_eq!(known.len(), named.len(), "{known:?}");
-    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
-    let slow = bed.subscribe("critical", Peer::fast().best_effort(), NONCRITICAL);
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
-    critical.wait_received(50);
-    attack(&bed, 60, &known);
-
-    let before = slow.received();
-    slow.wait_received(before + 5);
-    let sent: Sent = publisher.end();
-    critical.wait_received(sent.ok);
-    critical.end::<Received>().assert_all_of(&sent);
-    slow.end::<Received>().assert_sound();
-    bed.wait_accounted();
-    bed.end();
-}
-
 /// Tests of a minute or more: `make test-long`.
 mod long {
     use super::*;
+
+    #[test]
+    fn a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process() {
+        let test = "a_minute_of_malformed_datagrams_at_every_port_loses_no_sample_and_restarts_no_process";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, SCAN) else { return };
+        // Two subscribers in whose names datagrams come. They may miss samples; the others may not.
+        let named = [
+            bed.subscribe("slow", Peer::cyclone(), CRITICAL),
+            bed.subscribe("slow", Peer::fast().best_effort(), NONCRITICAL),
+        ];
+        let known = prefixes(readers(&bed.bridge.status()));
+        assert_eq!(known.len(), named.len(), "{known:?}");
+        let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+        let slow = bed.subscribe("critical", Peer::fast().best_effort(), NONCRITICAL);
+        let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+        critical.wait_received(50);
+        attack(&bed, 60, &known);
+
+        let before = slow.received();
+        slow.wait_received(before + 5);
+        let sent: Sent = publisher.end();
+        critical.wait_received(sent.ok);
+        critical.end::<Received>().assert_all_of(&sent);
+        slow.end::<Received>().assert_sound();
+        bed.wait_accounted();
+        bed.end();
+    }
 
     #[test]
     fn malformed_datagrams_in_the_names_of_all_participants_restart_no_process() {

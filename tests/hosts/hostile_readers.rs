@@ -206,130 +206,136 @@ fn received_bytes(bed: &Bed, host: &str) -> u64 {
     line.split_whitespace().next().unwrap().parse().unwrap()
 }
 
-#[test]
-fn twenty_hostile_readers_cost_the_others_no_sample() {
-    let test = "twenty_hostile_readers_cost_the_others_no_sample";
-    if let Some(reason) = ros::missing() {
-        return support::skip(test, &reason);
-    }
-    let _alone = support::exclusive();
-    let Some(bed) = Bed::start_with(test, YAML, &["victim"]) else { return };
-    let subscribe = |host: &str| -> Vec<RunningPeer> {
-        LIBRARIES
-            .map(|library| match library {
-                Library::Rclpy => Peer::rclpy("planner"),
-                other => Peer::on(other),
-            })
-            .map(|peer| bed.subscribe(host, peer.keep_last(1000).sizes(&SIZES), CRITICAL))
-            .into()
-    };
-    let healthy = subscribe("critical");
-    // The GUIDs of these subscribers are forged.
-    let victims = subscribe("victim");
-    let victims_address = bed.host("victim").address().to_string();
-    let publisher = Peer::cyclone().keep_last(1000).sizes(&SIZES).rate_hz(200.0);
-    let publisher = bed.publish(publisher, INPUT);
-    healthy[0].wait_received(400);
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use super::*;
 
-    let mut readers: Vec<ForgedReader> =
-        (0..READERS).map(|identity| ForgedReader::new(bed.host("slow"), identity)).collect();
-    support::wait_until("a match with each hostile reader", || {
-        for reader in &mut readers {
-            reader.receive();
-            if reader.writer().is_none() {
-                reader.announce_endpoint(CRITICAL, SCAN_TYPE);
-            }
+    #[test]
+    fn twenty_hostile_readers_cost_the_others_no_sample() {
+        let test = "twenty_hostile_readers_cost_the_others_no_sample";
+        if let Some(reason) = ros::missing() {
+            return support::skip(test, &reason);
         }
-        std::thread::sleep(Duration::from_millis(50));
-        readers.iter().all(|reader| reader.writer().is_some())
-    });
-    let status = bed.bridge.wait_status("hosts of the victims", |status| {
-        matched_readers(status).iter().filter(|reader| reader["host"] == *victims_address).count()
-            == LIBRARIES.len()
-    });
-    let others: Vec<(Prefix, EntityId)> = matched_readers(&status)
-        .iter()
-        .filter(|reader| reader["host"] == *victims_address)
-        .map(|reader| guid(reader["guid"].as_str().unwrap()))
-        .collect();
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start_with(test, YAML, &["victim"]) else { return };
+        let subscribe = |host: &str| -> Vec<RunningPeer> {
+            LIBRARIES
+                .map(|library| match library {
+                    Library::Rclpy => Peer::rclpy("planner"),
+                    other => Peer::on(other),
+                })
+                .map(|peer| bed.subscribe(host, peer.keep_last(1000).sizes(&SIZES), CRITICAL))
+                .into()
+        };
+        let healthy = subscribe("critical");
+        // The GUIDs of these subscribers are forged.
+        let victims = subscribe("victim");
+        let victims_address = bed.host("victim").address().to_string();
+        let publisher = Peer::cyclone().keep_last(1000).sizes(&SIZES).rate_hz(200.0);
+        let publisher = bed.publish(publisher, INPUT);
+        healthy[0].wait_received(400);
 
-    let egress = bed.pid("egress-critical");
-    let measure = |what: &str, work: &mut dyn FnMut()| {
-        // Subscribes only during `work`, so that its latency is that of this time.
-        let probe_subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(1000), CRITICAL);
-        let read = || (Instant::now(), usage(egress), received_bytes(&bed, "slow"), healthy[0].received());
-        let (began, before, bytes_before, samples_before) = read();
-        work();
-        let (ended, after, bytes_after, samples_after) = read();
-        let latency = probe_subscriber.end::<Received>().latency_us;
-        let latency =
-            latency.map(|latency| format!("{:.0} µs median, {:.0} µs p99", latency.p50, latency.p99));
-        let per_s = |amount: f64| amount / ended.duration_since(began).as_secs_f64();
-        println!(
-            "{what}: critical egress {} to {} KiB resident, CPU {:.0} %; the hostile host received {:.1} MB/s; \
-             rclpy received {:.0} samples/s; latency {}",
-            before.0 >> 10,
-            after.0 >> 10,
-            per_s(after.1 - before.1) * 100.0,
-            per_s((bytes_after - bytes_before) as f64) / 1e6,
-            per_s((samples_after - samples_before) as f64),
-            latency.unwrap_or_default(),
-        );
-        (before.0, after.0)
-    };
-    measure("silent readers", &mut || std::thread::sleep(Duration::from_secs(5)));
-    let mut sent = 0;
-    let (before, after) = paced(&publisher, &healthy, 100, || {
-        let memory = measure("attacking readers", &mut || sent = run_attacks(&mut readers, &others));
-        // After the attack all subscribers still receive samples.
-        for subscriber in healthy.iter().chain(&victims) {
-            subscriber.wait_received(subscriber.received() + 50);
-        }
-        memory
-    });
-    println!("{sent} hostile datagrams");
-
-    let hostile_address = bed.host("slow").address().to_string();
-    let status = bed.bridge.wait_status("the hostile readers in the status", |status| {
-        readers.iter().zip(ATTACKS).all(|(reader, attack)| {
-            let is_reader = |matched: &&Value| matched["guid"] == reader.guid();
-            let Some(matched) = matched_readers(status).iter().find(is_reader) else { return false };
-            let is_counted = |key: &str| matched[key].as_u64() > Some(0);
-            matched["host"] == *hostile_address
-                && match attack {
-                    Attack::Silence => is_counted("unacknowledged"),
-                    Attack::Evicted => is_counted("overrun"),
-                    _ => true,
+        let mut readers: Vec<ForgedReader> =
+            (0..READERS).map(|identity| ForgedReader::new(bed.host("slow"), identity)).collect();
+        support::wait_until("a match with each hostile reader", || {
+            for reader in &mut readers {
+                reader.receive();
+                if reader.writer().is_none() {
+                    reader.announce_endpoint(CRITICAL, SCAN_TYPE);
                 }
-        })
-    });
-    for (reader, attack) in readers.iter().zip(ATTACKS) {
-        let matched = matched_readers(&status).iter().find(|matched| matched["guid"] == reader.guid());
-        println!("{attack:?}: {}", matched.unwrap_or(&Value::Null));
-    }
+            }
+            std::thread::sleep(Duration::from_millis(50));
+            readers.iter().all(|reader| reader.writer().is_some())
+        });
+        let status = bed.bridge.wait_status("hosts of the victims", |status| {
+            matched_readers(status).iter().filter(|reader| reader["host"] == *victims_address).count()
+                == LIBRARIES.len()
+        });
+        let others: Vec<(Prefix, EntityId)> = matched_readers(&status)
+            .iter()
+            .filter(|reader| reader["host"] == *victims_address)
+            .map(|reader| guid(reader["guid"].as_str().unwrap()))
+            .collect();
 
-    let sent: Sent = publisher.end();
-    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
-    for subscriber in healthy {
-        subscriber.wait_received(sent.ok);
-        let received: Received = subscriber.end();
-        received.assert_all_of(&sent);
+        let egress = bed.pid("egress-critical");
+        let measure = |what: &str, work: &mut dyn FnMut()| {
+            // Subscribes only during `work`, so that its latency is that of this time.
+            let probe_subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(1000), CRITICAL);
+            let read =
+                || (Instant::now(), usage(egress), received_bytes(&bed, "slow"), healthy[0].received());
+            let (began, before, bytes_before, samples_before) = read();
+            work();
+            let (ended, after, bytes_after, samples_after) = read();
+            let latency = probe_subscriber.end::<Received>().latency_us;
+            let latency =
+                latency.map(|latency| format!("{:.0} µs median, {:.0} µs p99", latency.p50, latency.p99));
+            let per_s = |amount: f64| amount / ended.duration_since(began).as_secs_f64();
+            println!(
+                "{what}: critical egress {} to {} KiB resident, CPU {:.0} %; the hostile host received {:.1} MB/s; \
+                 rclpy received {:.0} samples/s; latency {}",
+                before.0 >> 10,
+                after.0 >> 10,
+                per_s(after.1 - before.1) * 100.0,
+                per_s((bytes_after - bytes_before) as f64) / 1e6,
+                per_s((samples_after - samples_before) as f64),
+                latency.unwrap_or_default(),
+            );
+            (before.0, after.0)
+        };
+        measure("silent readers", &mut || std::thread::sleep(Duration::from_secs(5)));
+        let mut sent = 0;
+        let (before, after) = paced(&publisher, &healthy, 100, || {
+            let memory = measure("attacking readers", &mut || sent = run_attacks(&mut readers, &others));
+            // After the attack all subscribers still receive samples.
+            for subscriber in healthy.iter().chain(&victims) {
+                subscriber.wait_received(subscriber.received() + 50);
+            }
+            memory
+        });
+        println!("{sent} hostile datagrams");
+
+        let hostile_address = bed.host("slow").address().to_string();
+        let status = bed.bridge.wait_status("the hostile readers in the status", |status| {
+            readers.iter().zip(ATTACKS).all(|(reader, attack)| {
+                let is_reader = |matched: &&Value| matched["guid"] == reader.guid();
+                let Some(matched) = matched_readers(status).iter().find(is_reader) else { return false };
+                let is_counted = |key: &str| matched[key].as_u64() > Some(0);
+                matched["host"] == *hostile_address
+                    && match attack {
+                        Attack::Silence => is_counted("unacknowledged"),
+                        Attack::Evicted => is_counted("overrun"),
+                        _ => true,
+                    }
+            })
+        });
+        for (reader, attack) in readers.iter().zip(ATTACKS) {
+            let matched = matched_readers(&status).iter().find(|matched| matched["guid"] == reader.guid());
+            println!("{attack:?}: {}", matched.unwrap_or(&Value::Null));
+        }
+
+        let sent: Sent = publisher.end();
+        assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+        for subscriber in healthy {
+            subscriber.wait_received(sent.ok);
+            let received: Received = subscriber.end();
+            received.assert_all_of(&sent);
+        }
+        for victim in victims {
+            victim.wait_for("the last sample", |event| event["last"] == sent.last);
+            let received: Received = victim.end();
+            received.assert_sound();
+            println!(
+                "{} of {} samples received by a subscriber whose GUID was forged",
+                received.received, sent.ok
+            );
+        }
+        let status = bed.wait_accounted();
+        assert_eq!(critical(&status)["forwarded"], sent.ok, "{status}");
+        for role in ["ingress", "egress-critical", "egress-noncritical"] {
+            assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+        }
+        // The samples that the lane retains, 32 MiB at most, and as much again for samples that are being sent.
+        assert!(after < before + (64 << 20), "{before} to {after} bytes resident");
+        bed.end();
     }
-    for victim in victims {
-        victim.wait_for("the last sample", |event| event["last"] == sent.last);
-        let received: Received = victim.end();
-        received.assert_sound();
-        println!(
-            "{} of {} samples received by a subscriber whose GUID was forged",
-            received.received, sent.ok
-        );
-    }
-    let status = bed.wait_accounted();
-    assert_eq!(critical(&status)["forwarded"], sent.ok, "{status}");
-    for role in ["ingress", "egress-critical", "egress-noncritical"] {
-        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
-    }
-    // The samples that the lane retains, 32 MiB at most, and as much again for samples that are being sent.
-    assert!(after < before + (64 << 20), "{before} to {after} bytes resident");
-    bed.end();
 }

@@ -47,14 +47,14 @@ fn named(status: &Value, node: &str) -> Option<String> {
 
 const PAGE: &str = include_str!("../../docs/ros2.md");
 
-#[test]
-fn every_subscriber_that_receives_without_the_bridge_receives_or_is_named() {
-    fill_table("every_subscriber_that_receives_without_the_bridge_receives_or_is_named", Peer::rclpy);
-}
-
 /// Tests of a minute or more: `make test-long`.
 mod long {
     use super::*;
+
+    #[test]
+    fn every_subscriber_that_receives_without_the_bridge_receives_or_is_named() {
+        fill_table("every_subscriber_that_receives_without_the_bridge_receives_or_is_named", Peer::rclpy);
+    }
 
     #[test]
     fn the_table_is_the_same_with_nodes_of_kilted() {
