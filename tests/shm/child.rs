@@ -1,4 +1,4 @@
-//! What the children of the tests do.
+//! The functions of the tests' child processes.
 
 use std::io::Read;
 use std::path::PathBuf;
