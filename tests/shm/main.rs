@@ -1,4 +1,5 @@
-//! The shared-memory edge on real shared memory, with real processes that are killed, stopped and restarted.
+//! The shared-memory module on real shared memory, with real processes that are killed, stopped and
+//! restarted.
 
 mod child;
 mod support;
