@@ -63,10 +63,10 @@ pub enum SupervisorError {
         error: io::Error,
     },
     /// Every child has failed in a way that a restart does not cure.
-    #[error("every process of the bridge has given up; see the log above")]
+    #[error("no process of the bridge can be restarted; see the log above for the reason of each")]
     AllGaveUp,
     /// Children did not end in time after SIGTERM and were killed.
-    #[error("killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))]
+    #[error("these processes did not end within {GRACE_MS} ms of SIGTERM and were killed: {}", names.join(", "))]
     Killed {
         /// Their names.
         names: Vec<String>,
