@@ -15,13 +15,13 @@ fail() { echo "arm64: $*" >&2; exit 1; }
 has_image() { docker image inspect "$1" >/dev/null 2>&1; }
 
 docker info >/dev/null 2>&1 \
-    || fail "no Docker Engine is in reach: apt-get install docker.io, and run this as root or in group docker"
+    || fail "the Docker Engine does not answer: apt-get install docker.io, and run this as root or in group docker"
 if has_image $bootstrapped; then
     base=$bootstrapped
 elif ! has_image $base && ! docker pull --quiet $base >/dev/null 2>&1; then
     # Without a registry Debian's own tool makes the like.
     if ! command -v debootstrap >/dev/null || [ "$(id -u)" -ne 0 ]; then
-        fail "the image $base is not to be had: apt-get install debootstrap, and run this as root"
+        fail "the image $base is not available: apt-get install debootstrap, and run this as root"
     fi
     root=$(mktemp -d)
     trap 'rm -rf --one-file-system "$root"' EXIT

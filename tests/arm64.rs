@@ -17,7 +17,7 @@ const AARCH64: u16 = 183;
 /// supported.
 const GLIBC: (u32, u32) = (2, 35);
 
-/// What a command prints to stdout; `Err` with the rest if it fails.
+/// Runs a command and returns its stdout; `Err` with all its output if it fails.
 fn output(command: &mut Command) -> Result<String, String> {
     let output = command.output().map_err(|error| format!("{command:?}: {error}"))?;
     let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -28,7 +28,7 @@ fn output(command: &mut Command) -> Result<String, String> {
     }
 }
 
-/// A command where programs for arm64 run.
+/// A command in the container, where programs for arm64 run.
 fn on_arm64(words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Command {
     let mut command = Command::new(support::root().join("scripts/arm64.sh"));
     command.args(words);
@@ -92,7 +92,7 @@ fn the_package_has_what_that_of_this_machine_has_and_its_program_runs() {
     assert!(glibc(&depends) <= GLIBC, "{depends}");
     assert_eq!(files(&package), files(&native));
 
-    // In the folder that the container has too.
+    // In a folder that the container also has.
     let folder = TempDir::new_in(support::root().join("target")).unwrap();
     dpkg_deb("--extract", &package, &[folder.path().as_ref()]);
     let program = folder.path().join("usr/bin/adaptive-bridge");
@@ -128,7 +128,7 @@ fn the_package_has_what_that_of_this_machine_has_and_its_program_runs() {
 
 /// Runs a test program, and returns how many of its tests passed.
 ///
-/// With the optimisations of the package's program, which are what may differ between architectures.
+/// It is built with the optimisations of the package's program, which may differ between architectures.
 fn passed(program: &str, options: &[&str]) -> u32 {
     let mut command = on_arm64(["cargo", "test", "--locked", "--release", "--test", program, "--"]);
     let printed = output(command.args(options)).unwrap();
@@ -144,7 +144,7 @@ fn the_pure_tests_and_those_of_shared_memory_pass() {
     }
     let _exclusive = support::exclusive();
     assert!(passed("pure", &[]) > 100);
-    // Gives a folder to another user, and the user namespace of the container has only one.
+    // This test gives a folder to another user, and the user namespace of the container has only one user.
     let needs_users = ["--skip", "a_folder_that_others_could_tamper_with_is_refused"];
     assert!(passed("shm", &needs_users) > 30);
 }

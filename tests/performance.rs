@@ -1,4 +1,4 @@
-//! What the bench makes of its figures, with invented ones: quantiles, growth, targets, tables and plots; and
+//! The computations of the bench, with invented figures: quantiles, growth, targets, tables and plots; and
 //! the pages docs/performance-runs.md and docs/performance.md. Pure: reads files of the project, measures
 //! nothing.
 
@@ -157,7 +157,7 @@ fn made_up() -> Summary {
 fn series(name: &str, kib_per_second: f64, seconds: f64) -> SoakSeries {
     let points = (0..=100).map(|point| {
         let at_s = seconds * f64::from(point) / 100.0;
-        // Now and then an outlier, as a reader of the memory causes.
+        // An outlier in every 17th point, as a program that reads the memory causes.
         let outlier = if point % 17 == 0 { 3_000.0 } else { 0.0 };
         (at_s, 20_000.0 + at_s * kib_per_second + outlier)
     });
@@ -214,7 +214,7 @@ fn growth_is_not_moved_by_outliers() {
     assert!((slope(0.5) - 0.5).abs() < 0.01, "{}", slope(0.5));
     assert!((slope(-2.0) + 2.0).abs() < 0.02);
     assert_eq!(growth(&[(0.0, 1.0), (1.0, 2.0)]), None);
-    // More points than are looked at.
+    // More points than the estimate uses.
     let many: Vec<(f64, f64)> = (0..5_000).map(|at| (f64::from(at), 3.0 * f64::from(at))).collect();
     assert_eq!(growth(&many), Some(3.0));
 }
@@ -269,7 +269,7 @@ fn targets_are_met_or_missed() {
     assert!(!readme.contains("noncritical lane repeat / undisturbed"), "what is no target is one");
     assert_eq!(row("growth of the memory of ingress"), met("0.00 KiB/h"));
     assert_eq!(row("growth of the memory of critical").1, "**missed**");
-    // What was not measured is no target.
+    // A case that was not measured has no target.
     assert!(!readme.contains("100 Hz of 2,948 B, other"));
 }
 
@@ -397,11 +397,11 @@ fn filling_the_page_keeps_its_text_and_replaces_its_figures() {
     assert!(!filled.contains("old"));
     assert!(filled.contains("(../benches/runs/2026-01-02T03-04-05Z/throughput.svg)"), "{filled}");
     assert_eq!(runs_named(&filled), ["2026-01-02T03-04-05Z"]);
-    // Again, with the same or another run: nothing is left of before.
+    // Filled again, with the same run or another one, the page has none of the former figures.
     assert_eq!(fill(&filled, std::slice::from_ref(&run)).unwrap(), filled);
     let empty = fill(&filled, &[]).unwrap();
     assert!(empty.contains("Not measured yet.") && runs_named(&empty).is_empty(), "{empty}");
-    // Of two runs the first that has the section.
+    // Of two runs, the first one with the section is used.
     let second = ("b".to_owned(), made_up());
     let first = ("a".to_owned(), Summary { throughput: Vec::new(), ..made_up() });
     let filled = fill(PAGE, &[first, second]).unwrap();

@@ -1,4 +1,4 @@
-//! The test bed tested by itself, without the bridge: real hosts (network namespaces), real DDS peers.
+//! Tests of the test bed itself, without the bridge: real hosts (network namespaces), real DDS peers.
 
 use std::fs;
 use std::path::Path;
@@ -18,7 +18,8 @@ const STRANGERS: [(Library, Library); 4] = [
     (Library::Fast, Library::Rust),
 ];
 
-/// A publisher and a subscriber host; `None` where they can't be made, which has then been recorded.
+/// Creates a publisher and a subscriber host; `None` if the machine cannot, which records the test as
+/// skipped.
 fn two_hosts(test: &str) -> Option<(Net, Host, Host)> {
     if let Some(reason) = support::testbed_missing() {
         support::skip(test, &reason);
@@ -29,7 +30,7 @@ fn two_hosts(test: &str) -> Option<(Net, Host, Host)> {
     Some((net, publisher, critical))
 }
 
-/// Lets a publisher begin when it and the subscriber know each other.
+/// Starts a waiting publisher when it and the subscriber have matched each other.
 fn go_when_matched(publisher: &RunningPeer, subscriber: &RunningPeer) {
     publisher.wait_matched(1);
     subscriber.wait_matched(1);
@@ -123,9 +124,8 @@ fn every_size_from_nothing_to_4_mib_passes_between_all_libraries() {
 }
 
 #[test]
-fn a_subscriber_says_when_a_sample_has_the_wrong_bytes_or_the_wrong_size() {
-    let Some((_net, here, there)) =
-        two_hosts("a_subscriber_says_when_a_sample_has_the_wrong_bytes_or_the_wrong_size")
+fn a_subscriber_reports_samples_of_wrong_bytes_or_wrong_size() {
+    let Some((_net, here, there)) = two_hosts("a_subscriber_reports_samples_of_wrong_bytes_or_wrong_size")
     else {
         return;
     };
@@ -160,7 +160,7 @@ fn encapsulation_kind_and_options_pass_unchanged() {
             transfer((peer(from).encapsulation(header).count(20), &here), (peer(to), &there), 20);
         received.assert_all_of(&sent);
         assert_eq!(received.headers, [(header.to_owned(), 20)].into(), "{from:?} to {to:?}");
-        // RTPS fills up a DATA submessage to whole words, and the reader sees it.
+        // RTPS pads a DATA submessage to whole words, and the reader gets the padding.
         assert_eq!((received.size_max, received.padded), (104, 20));
     }
 }
@@ -173,8 +173,8 @@ fn a_transient_local_late_joiner_gets_what_the_writer_keeps() {
     };
     for from in LIBRARIES {
         let peer = |library| Peer::on(library).transient_local().keep_last(5).size(100);
-        // A publisher for each: Debian's Fast DDS 2.9 fails an assertion of its own (OutputTrafficManager)
-        // when a reader of RustDDS comes while it takes one of Cyclone DDS for present.
+        // A publisher for each subscriber: Debian's Fast DDS 2.9 fails an assertion of its own
+        // (OutputTrafficManager) when a reader on RustDDS joins before one on Cyclone DDS counts as gone.
         for to in LIBRARIES {
             let publisher = peer(from).publisher().count(20).linger_s(600.0).start_on(&here);
             publisher.wait_sent();
@@ -184,7 +184,8 @@ fn a_transient_local_late_joiner_gets_what_the_writer_keeps() {
             received.assert_sound();
             let whole = received.first <= Some(15) && received.missing.iter().all(|(_, last)| *last < 15);
             assert!(whole && received.last == Some(19), "{from:?} to {to:?}: {received:?}");
-            // RustDDS lets go of what is beyond the depth at its cache cleaning only: some of it may come.
+            // RustDDS discards samples beyond the depth only at its cache cleaning, so some of them may
+            // arrive.
             assert!(received.received == 5 || from == Library::Rust, "{from:?} to {to:?}: {received:?}");
             assert_eq!(publisher.end::<Sent>().ok, 20);
         }
@@ -353,8 +354,8 @@ fn the_ros_graph_and_its_endpoints_are_shown() {
 }
 
 #[test]
-fn what_one_peer_says_another_decodes_by_the_definition_alone() {
-    let test = "what_one_peer_says_another_decodes_by_the_definition_alone";
+fn a_published_string_is_decoded_by_a_peer_with_the_message_definition() {
+    let test = "a_published_string_is_decoded_by_a_peer_with_the_message_definition";
     let Some((_net, here, there)) = two_hosts(test) else { return };
     let peer = || Peer::cyclone().keep_all().topic("rt/adaptive_bridge/test");
     let listener = peer().decode_string().start_on(&there);
@@ -432,8 +433,8 @@ fn diagnostics_are_decoded_by_their_definition_and_cut_off_ones_are_not() {
 }
 
 #[test]
-fn a_host_whose_cable_is_pulled_hears_nothing() {
-    let Some((_net, here, there)) = two_hosts("a_host_whose_cable_is_pulled_hears_nothing") else { return };
+fn a_host_without_a_link_receives_nothing() {
+    let Some((_net, here, there)) = two_hosts("a_host_without_a_link_receives_nothing") else { return };
     let subscriber = Peer::fast().best_effort().subscriber().start_on(&there);
     let publisher = Peer::fast().best_effort().rate_hz(100.0).wait_match(1).publisher().start_on(&here);
     subscriber.wait_received(10);
@@ -453,8 +454,8 @@ fn a_host_whose_cable_is_pulled_hears_nothing() {
 }
 
 #[test]
-fn hosts_and_what_runs_there_go_with_their_net() {
-    let test = "hosts_and_what_runs_there_go_with_their_net";
+fn dropping_a_net_removes_its_hosts_and_their_processes() {
+    let test = "dropping_a_net_removes_its_hosts_and_their_processes";
     if let Some(reason) = support::netns::requires_root() {
         return support::skip(test, &reason);
     }
@@ -463,7 +464,7 @@ fn hosts_and_what_runs_there_go_with_their_net() {
     let file = format!("/run/netns/{}", host.namespace());
     assert!(Path::new(&file).exists());
     assert!(host.run("ip", &["-o", "addr"]).contains(&format!("{}/24", host.address())));
-    // A child of a child, in a session of its own: out of reach of the process group.
+    // A grandchild in a session of its own, which a signal to the process group does not reach.
     let mut command = host.command("setsid");
     command.args(["--fork", "sh", "-c", "echo $$; exec sleep 600"]);
     let process = Process::spawn("sleeper", command);
@@ -476,8 +477,8 @@ fn hosts_and_what_runs_there_go_with_their_net() {
 }
 
 #[test]
-fn what_a_killed_test_program_left_is_removed_by_the_next() {
-    let test = "what_a_killed_test_program_left_is_removed_by_the_next";
+fn the_hosts_of_a_killed_test_program_are_removed_by_the_next() {
+    let test = "the_hosts_of_a_killed_test_program_are_removed_by_the_next";
     if let Some(reason) = support::netns::requires_root() {
         return support::skip(test, &reason);
     }
@@ -543,6 +544,6 @@ fn a_bridge_has_a_configuration_file_and_a_name_of_its_own() {
     let written = fs::read_to_string(one.config()).unwrap();
     let expected = format!("instance: {}\nroot: {}/shm\n", one.instance(), one.folder().display());
     assert_eq!(written, expected);
-    // Whatever the program says to such a file, it is the program that was run, and it ended by itself.
+    // The exit code shows that the program was run and ended by itself; this file is not valid for it.
     assert!(one.run("check").status.code().is_some());
 }

@@ -1,6 +1,6 @@
-//! Everything that reads bytes which somebody else wrote, as functions of those bytes. A function panics when
-//! the bridge breaks a promise, or the bridge does. `tests/pure/regressions.rs` runs the same ones on kept
-//! inputs.
+//! The fuzz targets: one function for each part of the bridge that reads bytes of another process or host. A
+//! target panics if the bridge panics or breaks a promise. `tests/pure/regressions.rs` runs the targets on
+//! kept inputs.
 
 use std::collections::HashMap;
 use std::fs::DirEntry;
@@ -48,7 +48,7 @@ pub fn config(bytes: &[u8]) {
     assert_eq!(outcome, config::parse(file, "f.yaml", &env), "read differently the second time");
     match outcome {
         Ok(settings) => {
-            // What the other layers take for granted.
+            // The properties that other layers rely on.
             assert!(!settings.routes.is_empty() && settings.lanes.len() >= 2);
             let outputs = settings.lanes.iter().flat_map(|lane| &lane.outputs);
             assert!(outputs.clone().all(|output| output.route < settings.routes.len()));
@@ -125,31 +125,31 @@ impl Foreign {
     }
 
     fn check(&self, bytes: &[u8]) {
-        // The two words in front are those by which boards are known; a foreign file is refused for them. The
-        // bytes are repeated, so that few of them reach every value.
+        // The first two words stay: by these the bridge recognises boards, and refuses another file. The
+        // bytes are repeated, so that few of them fill every value.
         let wanted = self.file_bytes as usize - 16;
         let source = if bytes.is_empty() { &[0] } else { bytes };
         let content: Vec<u8> = source.iter().copied().cycle().take(wanted).collect();
         self.file.write_all_at(&content, 16).expect("room in shared memory");
 
         for role in [ProcessRole::Ingress, ProcessRole::Control, ProcessRole::Egress(0)] {
-            let health = self.boards.health(role).expect("nobody writes");
+            let health = self.boards.health(role).expect("no writer");
             assert_eq!(*self.boards.health_writer(role).get(), health);
         }
-        let ingress = self.boards.ingress(0).expect("nobody writes");
+        let ingress = self.boards.ingress(0).expect("no writer");
         let drops: Vec<u64> = ingress.drops.iter().map(|(_, count)| count).collect();
         assert!(drops.len() <= DropReason::COUNT && !drops.contains(&0));
         let _ = ingress.drops.total();
-        let lane = self.boards.lane(0, 0).expect("nobody writes");
+        let lane = self.boards.lane(0, 0).expect("no writer");
         let _ = (lane.received(), lane.is_accounted_for());
         self.boards.lane_writer(0, 0).update(|counters| {
             counters.drops.add(DropReason::Stale, 1);
         });
-        let info = self.boards.route_info(0).expect("nobody writes");
+        let info = self.boards.route_info(0).expect("no writer");
         assert!(info.dds_type.as_str().len() <= 127);
         let _ = TypeName::from_dds(info.dds_type.as_str());
 
-        let policy = self.boards.policy(0).expect("nobody writes");
+        let policy = self.boards.policy(0).expect("no writer");
         let _ = mode_and_source(&policy, TrafficClass::Critical, MonotonicNs(1), 1);
         let policies = self.boards.policies().expect("the lock of a folder of our own");
         let set = policies.set(0, MonotonicNs(1), |mut policy| {
@@ -160,12 +160,12 @@ impl Foreign {
         assert!(set.epoch != 0 && set.epoch != policy.epoch, "{policy:?} {set:?}");
         assert_eq!(self.boards.policy(0), Some(set));
 
-        let control = self.boards.control().expect("nobody writes");
+        let control = self.boards.control().expect("no writer");
         let _ = (control.safety(), control.safety_reason.as_str());
-        let subscriber = self.boards.subscriber(MAX_SUBSCRIBERS - 1).expect("nobody writes");
+        let subscriber = self.boards.subscriber(MAX_SUBSCRIBERS - 1).expect("no writer");
         let _ = (subscriber.state(), subscriber.id.as_str());
         assert!(subscriber.loss().is_none_or(|loss| (0.0..=1.0).contains(&loss)));
-        let intruder = self.boards.intruder(MAX_INTRUDERS - 1).expect("nobody writes");
+        let intruder = self.boards.intruder(MAX_INTRUDERS - 1).expect("no writer");
         assert!(intruder.host.as_str().len() <= 127);
 
         for stage in [Stage::DdsIn, Stage::Shm(0), Stage::DdsOut(0), Stage::Age(0)] {
@@ -224,7 +224,7 @@ pub fn graph(bytes: &[u8]) {
         let Some(entry) = decode_graph(bytes, encapsulation) else { continue };
         assert!(entry.nodes.len() <= 256);
         let endpoints = entry.nodes.iter().map(|node| node.readers.len() + node.writers.len()).sum::<usize>();
-        // Nothing is kept that did not come.
+        // No more endpoints than the bytes have room for.
         assert!(endpoints <= 8_192 && endpoints * 16 <= bytes.len());
         for node in &entry.nodes {
             assert!(node.name.starts_with('/') && node.name.len() <= 2 * 255);
@@ -319,7 +319,7 @@ pub fn rtps_message(bytes: &[u8]) {
     fuzzing::read_message(bytes);
 }
 
-/// A datagram that is looked at before it is received, of which the bridge reads 256 bytes.
+/// A datagram that the bridge peeks at before it is received, 256 bytes of it.
 pub fn rtps_arriving(bytes: &[u8]) {
     let whole = sample_arriving(bytes);
     if let Some((writer, _, left_bytes)) = whole {
@@ -328,7 +328,7 @@ pub fn rtps_arriving(bytes: &[u8]) {
         assert_eq!(writer[15] & 0xc0, 0, "{writer:?}");
         assert!(u32::try_from(left_bytes).is_ok());
     }
-    // A part of a datagram tells the same as the whole, or nothing.
+    // The beginning of a datagram gives the same result as the whole one, or none.
     for length in [256, bytes.len() / 2, bytes.len().saturating_sub(1)] {
         let part = sample_arriving(&bytes[..length.min(bytes.len())]);
         assert!(part.is_none() || part == whole, "{length} bytes: {part:?}, all: {whole:?}");
@@ -349,7 +349,7 @@ pub fn rtps_receive(bytes: &[u8]) {
     fuzzing::receive(first % 2 == 1, datagrams.iter().map(Vec::as_slice));
 }
 
-/// What another participant announces of itself and its endpoints; big-endian if the first byte is odd.
+/// Announcements of another participant and its endpoints; big-endian if the first byte is odd.
 pub fn rtps_discovery(bytes: &[u8]) {
     let Some((&first, parameters)) = bytes.split_first() else { return };
     let is_big_endian = first % 2 == 1;

@@ -123,7 +123,7 @@ pub(super) fn safety(root: &Field<'_>) -> Safety {
     }
 }
 
-/// Reads `security`; of the secret only whether there is one.
+/// Reads `security`. The settings contain the source of the secret, not the secret.
 pub(super) fn security(root: &Field<'_>) -> Security {
     let section = root.section("security");
     let inline = section.get("hmac_secret");

@@ -27,9 +27,9 @@ const DDS_IMPLEMENTATIONS: [&str; 5] = [
 
 type NotSupported = (&'static str, fn(&str) -> bool, &'static str);
 
-/// Variables that make the nodes of the robot communicate in a way that the bridge does not: it would find no
-/// node, or receive nothing, without an error. Each with whether nodes with this value and the bridge do not
-/// find each other, and with what is allowed, why, and what to do.
+/// Variables with which nodes communicate in a way that the bridge does not support: it would find no node,
+/// or receive nothing, without an error. For each: its name; whether a value has this effect; the message
+/// with the allowed values, the reason and the remedy.
 const NOT_SUPPORTED: [NotSupported; 4] = [
     (
         "ROS_DISCOVERY_SERVER",

@@ -122,7 +122,7 @@ impl<'a> Field<'a> {
         self.key?.row
     }
 
-    /// For a key that is read as another type than its row declares.
+    /// Returns `None` for a key that is read as another type than its row declares, which is a defect.
     fn no_value<T>(&self, kind: Kind) -> Option<T> {
         debug_assert!(false, "{} is declared as {kind:?}", self.path);
         None

@@ -18,11 +18,12 @@ pub struct Listed {
 /// The entries that a user may add to these sections; each is one setting.
 const OPEN_SECTIONS: [&str; 2] = ["overrides.", "subscribers."];
 
-/// What cannot be set as a parameter, because anyone on the network can set parameters: a change of `safety`
-/// or `policy_hold_s` could stop critical lanes, and one of `security` could admit forged messages.
+/// The keys that cannot be set as parameters, because any host on the network can set parameters: a change
+/// of `safety` or `policy_hold_s` could stop critical lanes, and one of `security` could admit forged
+/// messages.
 const FILE_ONLY: [&str; 3] = ["safety.", "security.", "policy_hold_s"];
 
-/// The place of the secret, or the secret itself, is not listed.
+/// The key of the secret and of its source, which is not listed.
 const SECRET: &str = "security.hmac_secret";
 
 impl Listed {
@@ -56,7 +57,7 @@ impl Settings {
             let row = section.map_or_else(|| row_at(&path), |section| row_at(&format!("{section}id")));
             let Some(row) = row.filter(|_| path != SECRET) else { continue };
             let name = named_by_id(&path);
-            // The history of an output whose durability its publishers decide: its depth is in `history`.
+            // The depth of an output that follows its publishers' durability is already in `history`.
             if name.ends_with(".depth") && matches!(value, Value::Text(_)) {
                 continue;
             }

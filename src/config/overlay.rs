@@ -22,7 +22,7 @@ const OUTPUTS: [(&str, &str); 2] =
 /// Puts a value into the tree, in place of what is there.
 pub(super) fn put(root: &mut Node, name: &str, value: Node, problems: &Problems) {
     let tree = tree(name, value);
-    // Of a key that is given twice in one value, only the last one is left in the tree of the file.
+    // Before the merge, which keeps only the last one of repeated keys, so that they are reported.
     keys::check(&tree, problems);
     let Content::Map(entries) = &tree.content else { return };
     match entries.as_slice() {

@@ -70,7 +70,7 @@ impl PartialQos {
     }
 
     /// The profile of a writer that follows TRANSIENT_LOCAL publishers; `None` if a durability is given.
-    /// Discovery does not tell their depth. Where none is given, it is that of the latched topics of ROS 2.
+    /// Discovery does not announce their depth, so a depth that is not given is that of latched ROS 2 topics.
     pub fn latched(self, class: TrafficClass) -> Option<QosProfile> {
         let (durability, depth) = (Some(Durability::TransientLocal), self.depth.or(Some(LATCHED_DEPTH)));
         self.durability.is_none().then(|| Self { durability, depth, ..self }.complete(class))

@@ -114,7 +114,7 @@ fn reload_lane(lane: &Lane, new: &Settings) -> Lane {
 
 #[derive(Default)]
 struct Differences {
-    /// Whether settings that are equal are found, too.
+    /// Whether `found` also gets the settings that are equal.
     all: bool,
     /// The key path, the old value and the new one.
     found: Vec<(String, Value, Value)>,
@@ -128,8 +128,8 @@ impl Differences {
     }
 }
 
-/// Compares fields of two structures; each has the last part of its key, which is its name if there is none.
-/// The fields behind the semicolon are compared elsewhere.
+/// Compares fields of two structures. The literal after a field is the last part of its key, which without a
+/// literal is the field's name. The fields behind the semicolon are compared elsewhere.
 macro_rules! compare {
     ($d:ident, $of:expr, $old:expr, $new:expr, $type:ident {
         $($field:ident $(: $key:literal)?),+; $($other:ident),*

@@ -79,7 +79,7 @@ struct RouteDraft<'a> {
 struct OutputDraft<'a> {
     lane: usize,
     topic: TopicName,
-    /// The field of the topic, given or not.
+    /// The field of the topic in the file, whose value may be missing.
     field: Field<'a>,
     qos: QosProfile,
     latched_qos: Option<QosProfile>,

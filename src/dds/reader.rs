@@ -38,8 +38,8 @@ impl Payload {
     }
 }
 
-/// Of topics with samples of at most some KiB: graph entries, probes and their responses, requests. Anyone on
-/// the network can send fragments that claim more.
+/// The limits of topics whose samples have at most some KiB: graph entries, probes and their responses,
+/// requests. Any host on the network can send fragments that claim larger samples.
 struct SmallSamples {
     max_bytes: usize,
 }

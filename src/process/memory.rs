@@ -21,8 +21,8 @@ const PROGRAM_BYTES: u64 = 32 * MIB;
 /// up to 5 s although fragments share them, and freed memory that the allocator keeps.
 const MARGIN_BYTES: u64 = 32 * MIB;
 
-/// The other part of the margin is this part of the memory of the process, one divided by it. Shared memory
-/// needs none, because its size is exact.
+/// The other part of the margin is the need of the process divided by this: a quarter. Shared memory needs no
+/// margin, because its size is exact.
 const MARGIN_DIVISOR: u64 = 4;
 
 /// Limits are multiples of this, so that a small change of the configuration changes none.

@@ -28,8 +28,8 @@ pub(super) fn check(settings: &Settings, role: ProcessRole) {
         warn!(
             limit_mib = limit >> 20,
             needed_mib = need >> 20,
-            "this process may need more memory than it may have, and the kernel would end it; services get \
-             their limits from `adaptive-bridge units --write`"
+            "the limit of memory of this process is lower than its possible need, and the kernel ends it at the limit; \
+             `adaptive-bridge units --write` sets the limits of services"
         );
     }
 }

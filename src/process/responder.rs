@@ -84,7 +84,7 @@ pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleE
 }
 
 struct Responder {
-    /// Before the participant: the DDS library wants its readers and writers gone first.
+    /// Declared before the participant: the DDS library requires readers and writers to be dropped first.
     requests: Inbox,
     responses: RawWriter,
     participant: Participant,

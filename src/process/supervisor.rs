@@ -63,10 +63,10 @@ pub enum SupervisorError {
         error: io::Error,
     },
     /// Every child has failed in a way that a restart does not cure.
-    #[error("every process of the bridge has given up; see the log above")]
+    #[error("no process of the bridge can be restarted; see the log above for the reason of each")]
     AllGaveUp,
     /// Children did not end in time after SIGTERM and were killed.
-    #[error("killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))]
+    #[error("these processes did not end within {GRACE_MS} ms of SIGTERM and were killed: {}", names.join(", "))]
     Killed {
         /// Their names.
         names: Vec<String>,
@@ -380,7 +380,7 @@ impl Supervised {
         let Some(pid) = self.pid() else { return false };
         let threads = Threads::of(pid);
         let last = self.threads.replace((threads, now));
-        // A check before the present stall says nothing about it.
+        // A check that is older than two intervals belongs to an earlier stall.
         last.filter(|(_, at)| now.since(*at) < 2 * READ_BOARDS_MS * 1_000_000).is_some_and(|(last, at)| {
             let cpu_ns = threads.cpu_ns.saturating_sub(last.cpu_ns);
             last.ready && threads.ready && cpu_ns < now.since(at) / 2
@@ -390,7 +390,7 @@ impl Supervised {
     /// Kills the child if it runs and has not completed its first turn for too long.
     fn check_start(&mut self, now: MonotonicNs) {
         let starved = self.is_starved(now);
-        // It has made no progress at all.
+        // Progress at 0: the child has made none at all.
         if self.state == State::Running && self.start_watch.has_hung(MonotonicNs(0), starved, now) {
             error!(child = self.name, "no first turn within {START_MS} ms; killed, to be restarted");
             self.signal(&[Signal::SIGKILL]);

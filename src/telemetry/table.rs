@@ -72,7 +72,7 @@ type Widths = [u16; 7];
 /// The cells of a row, and the lines that follow it.
 type Row = ([String; 7], String);
 
-/// The tables of ingress and the lanes line up with each other.
+/// The widths of the tables of ingress and of the lanes: the same, so that their columns line up.
 const TOPIC_TABLE: Widths = [TOPIC_COLUMNS as u16, 5, 7, 7, 13, 13, 13];
 const SUBSCRIBER_TABLE: Widths = [24, 13, 12, 13, 7, 7, 15];
 

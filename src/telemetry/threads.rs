@@ -1,6 +1,6 @@
 //! What the threads of a process do, and the CPU time that they took.
 
-/// What the threads of a process do.
+/// The activity of the threads of a process.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Threads {
     /// The CPU time of all threads, in ns.
@@ -10,7 +10,7 @@ pub struct Threads {
 }
 
 impl Threads {
-    /// Reads them from `/proc`; none if the process does not exist or is not readable.
+    /// Reads the threads of a process from `/proc`; none if the process does not exist or is not readable.
     pub fn of(pid: u64) -> Self {
         let mut threads = Self::default();
         for thread in std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {

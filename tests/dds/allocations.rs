@@ -1,8 +1,8 @@
-//! What a sample costs in steady state: no heap allocation of ours, and no copy of its payload but those that
-//! must be. The roles run as they are, as threads of this process, over real shared memory and real RTPS,
-//! with an allocator that counts. What the libraries for DDS and shared memory allocate within their own
-//! calls is not ours; whose an allocation is, its backtrace says: the innermost frame that belongs to either
-//! of them or to us.
+//! The cost of a sample in steady state: no heap allocation by the bridge's own code, and only the copies of
+//! its payload that are necessary. The roles run unchanged, as threads of this process, over real shared
+//! memory and real RTPS, with an allocator that counts. Allocations of the libraries for DDS and shared
+//! memory do not count as ours: an allocation belongs to the code of the innermost frame of its backtrace
+//! that is of a library or of the bridge.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::backtrace::Backtrace;
@@ -48,7 +48,7 @@ static RECEIVING_THREAD: AtomicI32 = AtomicI32::new(0);
 thread_local! {
     /// The role that this thread runs.
     static ROLE: Cell<Option<usize>> = const { Cell::new(None) };
-    /// Whether this thread was asked for its number already.
+    /// Whether the number of this thread was compared already.
     static NUMBERED: Cell<bool> = const { Cell::new(false) };
 }
 
@@ -146,7 +146,7 @@ fn settings(folder: &Path) -> Settings {
     config::load(Some(&path), &|_| None).unwrap()
 }
 
-/// The only such thread that there is while ingress is the only role.
+/// The id of the receiving thread of ingress, which must be the only role so far.
 fn receiving_thread() -> i32 {
     let give_up = Instant::now() + Duration::from_secs(30);
     loop {
@@ -245,7 +245,7 @@ impl Bench {
 struct Cost {
     /// Allocations of ours, by role.
     ours: [u64; 3],
-    /// Samples that were put together in the pool.
+    /// Samples that were assembled in the pool.
     in_place: u64,
     /// Samples that each lane forwarded.
     forwarded: [u64; 2],
@@ -277,7 +277,7 @@ fn culprits() -> String {
     CULPRITS.lock().map(|culprits| culprits.join("\n")).unwrap_or_default()
 }
 
-/// As the program has them; none comes here.
+/// The reload requests of a role, as in the program; no test sends one.
 fn reloads(settings: &Settings) -> ReloadRequests {
     let settings = settings.clone();
     ReloadRequests::on_signal(move |_| Ok(settings.clone().into())).unwrap()
@@ -301,7 +301,7 @@ fn in_steady_state_no_step_of_ours_allocates_and_large_payloads_are_not_copied()
                 process::egress(settings, lane, reloads(settings), stop).unwrap();
             });
         }
-        // The roles stop also when an assertion fails, or the scope would wait for them for ever.
+        // Stops the roles also when an assertion fails; otherwise the scope would wait for them for ever.
         let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| check(settings)));
         stop.request();
         if let Err(panic) = outcome {
@@ -312,7 +312,7 @@ fn in_steady_state_no_step_of_ours_allocates_and_large_payloads_are_not_copied()
 
 fn check(settings: &Settings) {
     let bench = Bench::open(settings);
-    // Until discovery is through, and then until every buffer that is used again has been used once.
+    // Waits for discovery, then sends until each buffer that is reused has been allocated.
     let give_up = Instant::now() + Duration::from_secs(30);
     while bench.send(1, SMALL_BYTES) == 0 {
         assert!(Instant::now() < give_up, "nothing arrives");
@@ -343,9 +343,9 @@ fn check(settings: &Settings) {
     let of = |counts: &[AtomicU64; 3]| [0, 1, 2].map(|role: usize| counts[role].load(Ordering::Relaxed));
     let (dds, shared_memory) = (of(&DDS), of(&SHARED_MEMORY));
     println!("allocations in 1,060 samples by {ROLES:?}: DDS library {dds:?}, iceoryx2 {shared_memory:?}");
-    // Of itself iceoryx2 allocates a handle for each slot that it lends; our service variant (shm/service.rs)
-    // does not.
+    // iceoryx2 itself allocates a handle for each slot that it lends; the bridge's service variant
+    // (shm/service.rs) does not.
     assert_eq!(shared_memory, [0, 0, 0]);
-    // Nobody would have been counted otherwise.
+    // Shows that allocations were counted.
     assert!(dds.into_iter().all(|allocations| allocations > 0), "{dds:?}");
 }

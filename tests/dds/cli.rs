@@ -55,7 +55,6 @@ fn sample(number: u32) -> (Vec<u8>, Encapsulation) {
     (payload, Encapsulation(ENCAPSULATIONS[number as usize % ENCAPSULATIONS.len()]))
 }
 
-/// A publisher of `/scan` whom the bridge has found.
 /// A subscriber of an output, so that the lane has a reader to forward to.
 struct Subscriber {
     _reader: RawReader,
@@ -319,8 +318,8 @@ fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
         let rows = rows.take_while(|line| line.starts_with('|'));
         rows.map(|line| line.split('`').nth(1).unwrap().to_owned()).collect()
     };
-    // This bridge has no subscriber, parameter or sample, and every reader matches; a test of the report
-    // itself knows the keys of these lists.
+    // This bridge has no subscriber, parameter or sample, and every reader matches; a unit test of the report
+    // checks the keys of these lists.
     let unmatched = "routes[].lanes[].unmatched_readers[]";
     let lists = ["subscribers[]", "intruders[]", "absences[]", "routes[].publishers[]", "parameters.set[]"];
     let is_there = |key: &String| !lists.iter().chain([&unmatched]).any(|list| key.starts_with(*list));
@@ -525,13 +524,13 @@ fn a_tap_receives_payloads_bit_for_bit_and_disturbs_no_lane() {
         assert_eq!(lane["whole"], true, "{lane}");
     }
     let drops = lane(&status, "critical")["drops"].as_object().unwrap();
-    // No subscriber was there but the tap.
+    // There was no subscriber except the tap.
     let others = drops.iter().filter(|(reason, _)| *reason != "no_reader");
     assert!(others.into_iter().all(|(_, count)| *count == 0), "{drops:?}");
 }
 
 #[test]
-fn a_tap_that_cannot_be_says_why() {
+fn a_tap_that_cannot_start_reports_the_reason() {
     let bridge = bridge(107);
     let mut running = up(&bridge);
     let _publisher = Publisher::new(107).run();

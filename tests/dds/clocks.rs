@@ -30,7 +30,7 @@ fn participant(name: &str) -> Participant {
     .unwrap()
 }
 
-/// A subscriber of the noncritical lane: without one it forwards nothing.
+/// A subscriber of the noncritical lane, without which the lane forwards nothing.
 fn subscribe(bridge: &Bridge) -> (Participant, RawReader) {
     let mut participant = participant("subscriber");
     let qos = ReaderQos {
@@ -46,7 +46,7 @@ fn subscribe(bridge: &Bridge) -> (Participant, RawReader) {
 
 /// A publisher of 50 samples per second whose clock can be set.
 struct Publisher {
-    /// What its clock shows beyond the true time.
+    /// How far its clock is ahead of the true time.
     shift_ms: Arc<AtomicI64>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,

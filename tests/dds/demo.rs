@@ -18,7 +18,7 @@ use tempfile::TempDir;
 const BINARY: &str = env!("CARGO_BIN_EXE_adaptive-bridge");
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A demo with a temporary folder of its own, by which its processes can be told from others.
+/// A demo with a temporary folder of its own, by which its processes are found.
 struct Demo {
     process: Child,
     folder: TempDir,
@@ -254,7 +254,7 @@ fn ctrl_c_in_either_phase_ends_at_once_with_0_and_leaves_nothing_behind() {
 }
 
 #[test]
-fn a_demo_that_is_killed_takes_its_processes_and_their_shared_memory_along() {
+fn a_killed_demo_leaves_no_process_and_no_shared_memory() {
     let mut demo = Demo::start(&["--seconds", "6", "--json"]);
     demo.wait_until("the remote subscriber of the bridge is stopped", |demo| {
         demo.processes().iter().any(|(_, state)| *state == 'T') && !demo.shared_memory().is_empty()
@@ -264,7 +264,7 @@ fn a_demo_that_is_killed_takes_its_processes_and_their_shared_memory_along() {
 }
 
 #[test]
-fn a_process_of_the_demo_that_dies_is_named_with_its_log_and_the_rest_is_cleared_away() {
+fn a_dead_process_of_the_demo_is_named_with_its_log_and_the_others_are_removed() {
     let mut demo = Demo::start(&["--seconds", "6"]);
     demo.wait_until("the remote subscriber is stopped", |demo| {
         demo.processes().iter().any(|(_, state)| *state == 'T')
@@ -278,7 +278,7 @@ fn a_process_of_the_demo_that_dies_is_named_with_its_log_and_the_rest_is_cleared
 }
 
 #[test]
-fn a_demo_whose_reader_goes_away_ends_and_leaves_nothing_behind() {
+fn a_demo_whose_stdout_is_closed_ends_and_leaves_nothing_behind() {
     let mut demo = Demo::start(&["--seconds", "600"]);
     drop(demo.process.stdout.take());
     demo.wait_until("the demo has ended", |demo| {

@@ -1,4 +1,4 @@
-//! The RTPS edge against itself: two participants of this process, over real sockets.
+//! The DDS module of the bridge: two participants of this process exchange samples over real sockets.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -31,7 +31,7 @@ fn reader_qos(reliability: Reliability, durability: Durability) -> ReaderQos {
     ReaderQos { reliability, durability, depth: 64, deadline_ms: None }
 }
 
-/// Takes one sample, patiently; the waker must have announced it.
+/// Takes one sample. Waits for it for up to 20 s, and checks again only when the reader's waker was called.
 fn take_one(reader: &RawReader) -> Option<(Vec<u8>, Encapsulation, SourceTimestamp)> {
     let flag = ArrivalFlag::passive();
     let waker = Waker::from(Arc::clone(&flag));
@@ -68,8 +68,8 @@ fn wait_for_reader(writer: &RawWriter) {
     }
 }
 
-/// A writer matches a reader before the reader matches the writer, and DDS does not signal the end of that
-/// to a BEST_EFFORT writer.
+/// Waits until the reader has matched a writer. The writer matches the reader earlier, and DDS does not
+/// signal to a BEST_EFFORT writer when the reader has matched it.
 fn wait_for_writer(reader: &RawReader) {
     let give_up = Instant::now() + Duration::from_secs(20);
     while reader.poll_event() != Some(ReaderEvent::Matched { writers: 1 }) {
@@ -101,7 +101,7 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
 }
 
 #[test]
-fn a_sample_is_told_of_before_it_is_there() {
+fn a_sample_is_announced_before_it_is_received() {
     let (arrived, received) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicUsize::new(0)));
     let expected = Arc::new(Mutex::new(None));
     let on_arriving = {
@@ -135,7 +135,7 @@ fn a_sample_is_told_of_before_it_is_there() {
         writer.write(payload, Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
         assert_eq!(take_one(&reader).expect("nothing arrived").0.len(), length);
     };
-    let told = |sequence: i64| {
+    let left_bytes_of = |sequence: i64| {
         let arrived = arrived.lock().unwrap();
         let left: Vec<usize> =
             arrived.iter().filter(|(of, _)| *of == sequence).map(|(_, left)| *left).collect();
@@ -143,17 +143,18 @@ fn a_sample_is_told_of_before_it_is_there() {
     };
     for sequence in 1..=20 {
         send(2_948);
-        assert!(told(sequence).contains(&0), "sample {sequence} was not told of");
+        assert!(left_bytes_of(sequence).contains(&0), "sample {sequence} was not announced");
     }
-    // In fragments, of each of which it is told what comes after it.
+    // A sample in fragments, each of which is announced with the bytes that are still missing after it.
     send(1 << 20);
-    let left = told(21);
+    let left = left_bytes_of(21);
     assert!(left.len() > 10 && left.contains(&0), "{left:?}");
     assert!(left.is_sorted_by(|one, next| one >= next) && left[0] > 900_000, "{left:?}");
     assert!(received.load(Ordering::Acquire) > 20);
 }
 
-/// Lends memory full of what an older sample left, and counts what is lent and not dropped.
+/// Lends memory that is filled with 0xEE, as if by an older sample, and counts the pieces that are lent and
+/// not dropped.
 #[derive(Default)]
 struct Lender {
     lent: Arc<AtomicUsize>,
@@ -190,15 +191,15 @@ impl Drop for Lent {
 }
 
 #[test]
-fn an_onlooker_sees_samples_come_and_takes_none() {
+fn a_watch_of_arrivals_sees_samples_and_takes_none() {
     let network = DdsNetwork::of_domain(66);
-    // The thread that receives is held up here, so that the onlooker is in time.
+    // Holds up the receiving thread, so that the watching thread peeks first.
     let hold = Arc::new(Mutex::new(()));
     let on_received = support::waits_for(&hold);
     let mut there =
         Participant::open_receiving(&options("there", &network), [], |_, _, _| {}, on_received).unwrap();
     let mut here = participant("here", 66);
-    // A RELIABLE one would get what the onlooker took once more.
+    // BEST_EFFORT: a RELIABLE reader would receive a sample again that the watching thread had taken.
     let reader = there
         .create_reader("rt/blob", TYPE, &reader_qos(Reliability::BestEffort, Durability::Volatile))
         .unwrap();
@@ -207,12 +208,12 @@ fn an_onlooker_sees_samples_come_and_takes_none() {
     wait_for_writer(&reader);
     let arrivals = there.arrivals().unwrap();
     let closer = arrivals.closer();
-    let (tell, seen) = std::sync::mpsc::channel();
-    let onlooker = std::thread::spawn(move || {
+    let (sender, seen) = std::sync::mpsc::channel();
+    let watching = std::thread::spawn(move || {
         loop {
             match arrivals.wait() {
                 Arrival::Closed => return,
-                arrival => tell.send(arrival).unwrap(),
+                arrival => sender.send(arrival).unwrap(),
             }
         }
     });
@@ -227,7 +228,7 @@ fn an_onlooker_sees_samples_come_and_takes_none() {
         }
         false
     };
-    // Of several datagrams that wait the first one is looked at: a heartbeat may be before the sample.
+    // The watch peeks only at the first of several waiting datagrams, which may be a heartbeat.
     let times = (0..20).filter(|_| {
         let held = hold.lock().unwrap();
         there.ring();
@@ -236,16 +237,16 @@ fn an_onlooker_sees_samples_come_and_takes_none() {
         sequence += 1;
         let seen = is_seen(sequence);
         drop(held);
-        assert_eq!(take_one(&reader).expect("the onlooker took it").0.len(), 2_948);
+        assert_eq!(take_one(&reader).expect("the watch took it").0.len(), 2_948);
         seen
     });
     assert!(times.count() > 10, "seen too seldom");
     closer.close();
-    onlooker.join().unwrap();
+    watching.join().unwrap();
 }
 
 #[test]
-fn a_sample_in_fragments_is_put_together_in_memory_that_is_lent() {
+fn a_fragmented_sample_is_assembled_in_lent_memory() {
     let mut here = participant("here", 68);
     let mut there = participant("there", 68);
     let reader = there
@@ -283,17 +284,18 @@ fn a_sample_in_fragments_is_put_together_in_memory_that_is_lent() {
         assert_eq!(lent.load(Ordering::Acquire), 0, "all memory came back");
         is_lent
     };
-    // One datagram needs no memory; of what has fragments some is put together here, some there.
+    // A sample of one datagram borrows no memory. A fragmented one is assembled in lent memory, or in that of
+    // the library if none is lent.
     assert!(!pass(2_948, false));
     for length in [100_001, 1 << 20, 4 << 20, (4 << 20) - 3] {
         assert!(pass(length, false));
         assert!(!pass(length, true));
     }
-    // One who wants bytes gets them.
+    // `take` passes a payload in lent memory as bytes.
     lender.refuses.store(false, Ordering::Release);
     writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(6)).unwrap();
     assert!(take_one(&reader).expect("nothing arrived").0 == vec![9; 200_000]);
-    // And what nobody takes goes with its reader.
+    // A sample that is not taken returns its memory when its reader is dropped.
     writer.write(Bytes::from(vec![9; 200_000]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(7)).unwrap();
     let give_up = Instant::now() + Duration::from_secs(20);
     while lent.load(Ordering::Acquire) == 0 {
@@ -305,7 +307,7 @@ fn a_sample_in_fragments_is_put_together_in_memory_that_is_lent() {
 }
 
 #[test]
-fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
+fn a_writer_reports_the_present_reader_after_many_that_are_gone() {
     let mut here = participant("here", 79);
     let mut there = participant("there", 79);
     let writer = there.create_writer("rt/many", TYPE, &QosProfile::CRITICAL, 64).unwrap();
@@ -321,22 +323,23 @@ fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
         }
         present = Some(reader);
     }
-    // Nobody has asked the writer until now. The reader stays: what is gone before it was announced never is.
+    // The writer's events were not polled until now. The reader stays, because a reader that is gone before
+    // its event is read is not reported.
     let reader = present.unwrap();
     let present = reader.guid();
-    let mut heard = Vec::new();
+    let mut events = Vec::new();
     loop {
         match writer.poll_event() {
             Some(WriterEvent::Matched { reader, joined: true, readers: 1 }) if reader == present => return,
-            Some(event) => heard.push(event),
+            Some(event) => events.push(event),
             None => std::thread::sleep(Duration::from_millis(5)),
         }
-        assert!(Instant::now() < give_up, "the present reader {present:?} was not announced: {heard:#?}");
+        assert!(Instant::now() < give_up, "the present reader {present:?} was not reported: {events:#?}");
     }
 }
 
 #[test]
-fn a_newcomer_does_not_hear_of_readers_that_are_gone() {
+fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
     let mut here = participant("here", 81);
     let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
     for _ in 0..16 {
@@ -345,17 +348,17 @@ fn a_newcomer_does_not_hear_of_readers_that_are_gone() {
     let present = here.create_reader("rt/present", TYPE, &qos).unwrap();
     let newcomer = participant("newcomer", 81);
     let give_up = Instant::now() + Duration::from_secs(20);
-    let mut heard = Vec::new();
-    // SEDP announces in the order in which they were made, so the present one comes last.
-    while heard.last() != Some(&present.guid()) {
+    let mut announced = Vec::new();
+    // SEDP announces readers in the order of their creation, so the present one comes last.
+    while announced.last() != Some(&present.guid()) {
         assert!(Instant::now() < give_up, "the present reader was not announced");
         match newcomer.poll_discovery() {
-            Some(Discovery::Reader(reader)) if reader.topic.starts_with("rt/") => heard.push(reader.guid),
+            Some(Discovery::Reader(reader)) if reader.topic.starts_with("rt/") => announced.push(reader.guid),
             Some(_) => {}
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     }
-    assert_eq!(heard, [present.guid()]);
+    assert_eq!(announced, [present.guid()]);
 }
 
 #[test]
@@ -501,7 +504,7 @@ fn a_second_reader_of_a_participant_costs_the_first_no_sample() {
     assert!(numbers.iter().copied().eq(0..written), "{} of {written}", numbers.len());
 }
 
-/// Says when the payload it stands for is let go of.
+/// A payload that sets a flag when it is dropped.
 struct Held(Arc<AtomicBool>);
 
 impl AsRef<[u8]> for Held {
@@ -524,8 +527,8 @@ fn what_a_new_writer_writes_at_once_is_sent() {
     let reader = there.create_reader("rt/latched", TYPE, &latched).unwrap();
     let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::CRITICAL };
     let mut expected = BTreeSet::new();
-    // So many because the event loop has to be busy, with the discovery of the ones before, at the moment at
-    // which one is made.
+    // 200 writers, so that the event loop is still busy with the discovery of earlier writers when the next
+    // one is created and writes.
     let writers: Vec<_> = (0..200_u32)
         .map(|number| {
             let writer = here.create_writer("rt/latched", TYPE, &qos, 64).unwrap();
@@ -543,7 +546,7 @@ fn what_a_new_writer_writes_at_once_is_sent() {
 }
 
 #[test]
-fn an_acknowledged_sample_is_let_go_of_without_waiting_for_the_cache_cleaning() {
+fn an_acknowledged_sample_is_released_before_the_cache_cleaning() {
     let mut here = participant("here", 74);
     let mut there = participant("there", 74);
     let reader = there
@@ -594,7 +597,7 @@ fn a_process_that_was_stopped_and_continued_goes_on_receiving() {
         .unwrap();
     let writer = here.create_writer("rt/stopped", TYPE, &QosProfile::CRITICAL, 64).unwrap();
     wait_for_reader(&writer);
-    // Somebody has to continue this process; a shell does it from outside.
+    // A stopped process cannot continue itself: a shell stops and continues it.
     let stopped_and_continued = std::process::Command::new("sh")
         .args(["-c", "kill -STOP $0; sleep 0.2; kill -CONT $0", &std::process::id().to_string()])
         .status()

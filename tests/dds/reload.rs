@@ -14,7 +14,7 @@ use support::flow::{Flow, lane};
 use support::process::{self, Process};
 use support::{wait_for, wait_until};
 
-/// The file of a bridge of one route; `more` is what it says beside.
+/// The file of a bridge with one route; `more` is added to it.
 fn file(domain_id: u16, more: &str) -> String {
     format!(
         "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
@@ -27,7 +27,8 @@ fn settings(bridge: &Bridge) -> Settings {
     config::load(Some(&bridge.config()), &|name| std::env::var(name).ok()).unwrap()
 }
 
-/// What ingress and the two lanes show of themselves, of the bridge as these settings describe it.
+/// The health of ingress and the two lanes on the boards of the bridge with these settings; `None` until each
+/// has made a turn.
 fn healths(settings: &Settings) -> Option<[ProcessHealth; 3]> {
     let root = settings.shared_memory.root_path.as_deref().unwrap();
     let boards = Boards::find(root, &settings.instance, &BridgeShape::of(settings)).ok()??;
@@ -44,7 +45,7 @@ fn wait_in_force(shape: &Settings, fingerprint: u64) -> [ProcessHealth; 3] {
     })
 }
 
-/// Starts the whole bridge; yields it when every process turns, with what the processes show then.
+/// Starts the whole bridge and waits until every process turns; returns it with the health of the processes.
 fn up(bridge: &Bridge) -> (Process, [ProcessHealth; 3]) {
     let settings = settings(bridge);
     let process = bridge.start("up");
@@ -79,7 +80,7 @@ fn wait_rate(bridge: &Bridge, hz: f64) {
     });
 }
 
-/// Runs `reload`: its exit code, and all that it said.
+/// Runs `reload`; returns its exit code and its output.
 fn reload(bridge: &Bridge) -> (Option<i32>, String) {
     let output = bridge.run("reload");
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -92,7 +93,7 @@ fn assert_says(said: &str, parts: &[&str]) {
     }
 }
 
-/// The processes are the same as before, and were not restarted.
+/// Asserts that the processes are the same as before, and were not restarted.
 fn assert_same_processes(before: &[ProcessHealth; 3], now: &[ProcessHealth; 3]) {
     for (before, now) in before.iter().zip(now) {
         assert_eq!((now.pid, now.starts), (before.pid, before.starts));
@@ -257,7 +258,7 @@ fn a_process_that_does_not_answer_is_named_and_no_other_is_signalled() {
         let processes = status["processes"].as_array().unwrap();
         processes.iter().filter(|process| process["state"] == "running").count() == 2
     });
-    // One that died leaves its number behind, and somebody else may have it by now.
+    // The lock file of a dead process has its id, which another program may have by now.
     let lock = bridge.folder().join("root").join(bridge.instance()).join("role-egress-critical.lock");
     critical.kill9();
     let mut stranger = std::process::Command::new("sleep").arg("1000").spawn().unwrap();
@@ -275,7 +276,7 @@ fn a_process_that_does_not_answer_is_named_and_no_other_is_signalled() {
     wait_until("ingress to go on", || reload(&bridge).0 == Some(0));
 }
 
-/// The one process of the bridge that has this name in `status`, running with another number than `not`.
+/// Waits until the process with this name in `status` runs with another id than `not`; returns its id.
 fn pid_of(bridge: &Bridge, name: &str, not: Option<u64>) -> u64 {
     let mut found = None;
     bridge.wait_status(&format!("{name} to run"), |status| {
@@ -304,7 +305,7 @@ fn kill_each(bridge: &Bridge, names: &[&str]) {
 }
 
 #[test]
-fn processes_that_crash_come_back_whatever_the_file_says_by_then() {
+fn crashed_processes_restart_with_the_configuration_in_force() {
     let bridge = Bridge::new(&file(115, ""));
     let in_force = settings(&bridge);
     let (up, _) = up(&bridge);
@@ -323,7 +324,7 @@ fn processes_that_crash_come_back_whatever_the_file_says_by_then() {
     ] {
         up.wait_for_log(part);
     }
-    // What was reloaded stays in force in the processes that were started since.
+    // The reloaded settings are in force in the restarted processes, too.
     wait_rate(&bridge, 20.0);
     let check = bridge.run("check");
     let said = String::from_utf8_lossy(&check.stdout).into_owned();

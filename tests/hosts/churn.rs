@@ -1,4 +1,4 @@
-//! Participants that join and leave: the memory of the bridge does not grow with those who have left.
+//! Participants that join and leave: the memory of the bridge does not grow with those that have left.
 
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, SCAN_TYPE};
 use support::process::memory_kib;
@@ -7,19 +7,19 @@ use support::wait_until;
 
 /// The visitors that are present at the same time.
 const AT_ONCE: usize = 100;
-/// The visitors before memory is measured first. Most of what is kept of a limited number, such as the
-/// endpoints of the last 256 participants that are gone, is full then, and the allocator has its areas.
+/// The visitors before the first measurement of memory. By then most bounded tables are full, such as that of
+/// the endpoints of the last 256 participants that are gone, and the allocator has its areas.
 const FIRST: usize = 1_000;
 /// The visitors after that, or the variable's number rounded up to a multiple of [`FIRST`].
 const MORE: usize = 1_000;
 const MORE_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_VISITORS";
-/// The most that a process may have grown after that. When nothing of those who are gone was freed, 1,000
-/// visitors cost 6.5 to 7 MiB. Now it is 0.1 to 1.8 MiB: the areas of the allocator grow with the most
-/// datagrams that ever waited at the same time.
+/// The most that a process may grow after that. If the memory of participants that are gone is not freed,
+/// 1,000 visitors cost 6.5 to 7 MiB; now 0.1 to 1.8 MiB, because the areas of the allocator grow with the
+/// largest number of datagrams that waited at the same time.
 const MAX_GROWTH_KIB: i64 = 3_072;
 /// Half of the visitors end normally, half are killed.
 const WAYS: [Leave; 4] = [Leave::Close, Leave::Kill, Leave::CloseParticipant, Leave::Kill];
-/// The goodbyes are repeated after so many polls of 60 ms each. A visitor that is killed is gone after 3 s.
+/// The polls, of 60 ms each, after which visitors leave again. A visitor that is killed is gone after 3 s.
 const POLLS_PER_LEAVE: u32 = 80;
 /// The processes that have a DDS participant.
 const PROCESSES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
@@ -47,7 +47,7 @@ fn readers(bed: &Bed) -> Vec<u64> {
     outputs.filter_map(|output| output["readers"].as_u64()).collect()
 }
 
-/// Lets so many visitors join and leave.
+/// Lets `count` visitors join and leave.
 fn churn(bed: &Bed, visitors: &mut Visitors, count: usize) {
     for _ in 0..count / AT_ONCE {
         visitors.join(AT_ONCE);

@@ -1,5 +1,5 @@
-//! Readers on other hosts, as the RTPS edge sees them: hosts of their own (network namespaces), programs on
-//! Cyclone DDS, Fast DDS and RustDDS. Which of them is remote, and which node it is.
+//! Detection of intruders on separate hosts (network namespaces): which readers on Cyclone DDS, Fast DDS and
+//! RustDDS are remote, and which node each belongs to.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -23,8 +23,8 @@ use support::peer::{Library, Peer, Received, Sent};
 const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
 const LIBRARIES: [Library; 2] = [Library::Cyclone, Library::Fast];
 
-/// A robot and a laptop, both with more than one interface, and each with a bridge for containers whose
-/// address is the same everywhere.
+/// Creates a robot and a laptop. Both have more than one interface, and a network bridge for containers with
+/// the same address.
 fn robot_and_laptop(test: &str) -> Option<(Net, Host, Host)> {
     if let Some(reason) = support::testbed_missing() {
         support::skip(test, &reason);
@@ -60,7 +60,7 @@ fn read(node: &mut Participant, topic: &str) -> RawReader {
     node.create_reader(topic, SCAN_TYPE, &qos).unwrap()
 }
 
-/// The readers that a participant has seen, by topic.
+/// Adds the readers that a participant has discovered, by topic.
 fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) {
     while let Some(change) = participant.poll_discovery() {
         if let Discovery::Reader(reader) = change
@@ -91,7 +91,7 @@ fn readers_of_every_library_are_matched_to_their_host() {
         nodes.push((reader, node));
         expected.insert(topic, place);
     }
-    // Announces shared memory beside its addresses, or serves this host alone.
+    // One peer announces shared memory beside its addresses, one announces loopback only.
     peers.push(Peer::fast().shared_memory().subscriber().topic("rt/shared_memory").start_on(&robot));
     expected.insert("rt/shared_memory".to_owned(), Locality::Local);
     let loopback = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface address='127.0.0.1' \
@@ -127,7 +127,7 @@ fn readers_of_every_library_are_matched_to_their_host() {
     }
 }
 
-/// What a control process would do at each turn.
+/// The detection of intruders as in a turn of the control process.
 struct Turn {
     participant: Participant,
     graph: GraphWatch,
@@ -186,7 +186,7 @@ impl Turn {
         });
     }
 
-    /// Waits for one event more, and yields it.
+    /// Waits for the next event and returns it.
     fn next(&mut self, what: &str) -> IntruderEvent {
         let before = self.events.len();
         self.wait_until(what, |turn| turn.events.len() > before);
@@ -200,7 +200,7 @@ fn an_intruder_is_reported_with_host_and_node_until_it_leaves() {
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
     let mut turn = Turn::new(&robot);
 
-    // On the robot it may: neither of these is reported.
+    // Readers on the robot are no intruders: neither of these is reported.
     let mut planner = node_on(&robot, "planner", 16);
     let _planner_reader = read(&mut planner, "rt/scan");
     let local = Peer::fast().subscriber().start_on(&robot);
@@ -217,7 +217,7 @@ fn an_intruder_is_reported_with_host_and_node_until_it_leaves() {
         let text = intruder.to_string();
         assert!(text.contains("point it at /adaptive_bridge/noncritical/scan"), "{text}");
 
-        // One that is taken away while its participant stays, then the participant.
+        // First a reader is deleted while its participant stays, then the participant leaves.
         let (guid, second) = (reader.guid(), read(&mut rviz, "rt/scan"));
         let IntruderEvent::Appeared(_) = turn.next("a second warning") else { panic!("{:?}", turn.events) };
         reported += 1;
@@ -227,11 +227,11 @@ fn an_intruder_is_reported_with_host_and_node_until_it_leaves() {
         let guid = second.guid();
         drop((second, rviz));
         assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == guid));
-        // The reader's end and that of its participant are two messages.
+        // The reader and its participant are disposed of by separate messages.
         turn.wait_until("its node is forgotten", |turn| turn.graph.node_of(guid).is_none());
     }
 
-    // No node of ROS 2, and one that dies without a word: its lease has to end.
+    // Peers that are no ROS 2 nodes and are killed, so that their leases have to expire.
     for library in LIBRARIES {
         let mut peer = Peer::on(library).subscriber().start_on(&laptop);
         let IntruderEvent::Appeared(intruder) = turn.next("a warning") else { panic!("{:?}", turn.events) };
@@ -270,7 +270,7 @@ fn a_false_or_malformed_graph_entry_is_counted_and_names_no_node() {
     let mut turn = Turn::new(&robot);
     let mut rviz = node_on(&laptop, "rviz", 16);
     let reader = read(&mut rviz, "rt/scan");
-    // Another participant claims the reader for its own node, and does so in the name of the first.
+    // One entry of another participant has the first one's GUID, the next claims the reader for its own node.
     let lie = encode_graph(rviz.guid(), "/", "innocent", &[reader.guid()], &[], 16);
     let thief = encode_graph(Guid([7; 16]), "/", "thief", &[reader.guid()], &[], 24);
     let folder = tempfile::tempdir().unwrap();
@@ -288,7 +288,7 @@ fn a_false_or_malformed_graph_entry_is_counted_and_names_no_node() {
     }
 }
 
-/// A publisher on the graph's topic, once, of the bytes of a file.
+/// A publisher that publishes the bytes of a file once on the topic of the graph.
 fn say_on_the_graph(file: &Path) -> Peer {
     Peer::fast()
         .publisher()

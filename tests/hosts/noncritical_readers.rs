@@ -10,11 +10,11 @@ use support::ros;
 const LIBRARIES: [Library; 3] = [Library::Rclpy, Library::Fast, Library::Cyclone];
 /// A mean loss of 28 %, in bursts, of what a subscriber receives.
 const LOSS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 24";
-/// Of what it sends: HEARTBEATs are answered or not, independently.
+/// The same loss of what a subscriber sends, so that answers to HEARTBEATs are lost independently.
 const LOSS_OF_ANSWERS: &str = "--level mild --reading as-run --delay-ms 0 --jitter-ms 0 --seed 25 --queue 1";
 const RATE_HZ: f64 = 100.0;
 const SAMPLES: u64 = 1_500;
-/// The least that the lane forwards of those: 10 Hz for 15 s, less a tenth.
+/// The fewest samples that the lane forwards: 10 Hz for 15 s, less a tenth.
 const LEAST_FORWARDED: u64 = 135;
 
 fn bed(test: &str, yaml: &str) -> Option<Bed> {
@@ -135,7 +135,7 @@ fn bad_reliable_subscribers_of_a_noncritical_lane_change_nothing_for_the_others(
     bed.end();
 }
 
-/// Whether bad subscribers left the rate of the lane and the ages at the others as they were.
+/// Checks that bad subscribers changed neither the rate of the lane nor the ages at the others.
 fn are_unmoved(alone: &Outcome, beside: &Outcome) -> Result<(), String> {
     for flow in [alone, beside] {
         // Of the token bucket's 10 Hz, with the burst.
@@ -154,7 +154,7 @@ fn are_unmoved(alone: &Outcome, beside: &Outcome) -> Result<(), String> {
     beside.lossy.iter().all(is_repaired).then_some(()).ok_or_else(|| format!("{:?}", beside.lossy))
 }
 
-/// Whether the age of 95 % of the samples is at most 20 ms above that of the others.
+/// Checks that the age of 95 % of the samples is at most 20 ms above that in the other flow.
 fn is_as_young(received: &Received, than: &Received) -> Result<(), String> {
     let (age, than) = (p95_ms(received), p95_ms(than));
     let is_young = age <= than + 20.0;

@@ -1,5 +1,5 @@
-//! The responder from outside: the shipped binary on one host, and bridges on another that ask it, through
-//! our DDS edge. What they say is what the protocol's page says, or is hostile.
+//! The responder as a program: the shipped binary on one host answers bridges on another host, which use the
+//! bridge's DDS module. Their messages follow docs/probe-protocol.md, or are hostile.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -24,7 +24,7 @@ use support::{skip, wait_for, wait_until};
 
 const SECRET: &str = "an ill-kept secret of many bytes";
 
-/// Two hosts; `None` where they cannot be had, which is noted.
+/// Creates two hosts; `None` if the machine cannot, which records the test as skipped.
 fn net(test: &str) -> Option<Net> {
     match requires_root() {
         Some(reason) => {
@@ -35,7 +35,7 @@ fn net(test: &str) -> Option<Net> {
     }
 }
 
-/// A responder that is up.
+/// Starts a responder and waits until it is up.
 fn start(host: &Host, arguments: &[&str]) -> Process {
     let mut command = host.command(program());
     command.args(["responder", "--id", "laptop 1"]).args(arguments);
@@ -45,20 +45,21 @@ fn start(host: &Host, arguments: &[&str]) -> Process {
     responder
 }
 
-/// What a bridge has: a writer of requests and a reader of responses, matched with the responder's.
+/// The endpoints of a bridge: a writer of requests and a reader of responses, matched with the responder's.
 struct Asker {
     responses: RawReader,
     requests: RawWriter,
     _participant: Participant,
     name: &'static str,
-    asked: u64,
-    heard: Vec<(Vec<u8>, Encapsulation)>,
+    sent: u64,
+    received: Vec<(Vec<u8>, Encapsulation)>,
 }
 
 impl Asker {
     fn join(host: &Host, name: &'static str) -> Asker {
         let namespace = format!("/run/netns/{}", host.namespace());
-        // The threads and sockets of the DDS library are where the thread was that made it.
+        // The threads and sockets of the participant are in the network namespace of the thread that creates
+        // it.
         let joined = std::thread::spawn(move || {
             setns(File::open(namespace).unwrap(), CloneFlags::CLONE_NEWNET).unwrap();
             let mut participant = Participant::open(&ParticipantOptions {
@@ -75,7 +76,7 @@ impl Asker {
             let requests = participant
                 .create_writer("rt/adaptive_bridge/probe_req", PROBE_TYPE, &PROBE_WRITER_QOS, 16)
                 .unwrap();
-            Asker { responses, requests, _participant: participant, name, asked: 0, heard: Vec::new() }
+            Asker { responses, requests, _participant: participant, name, sent: 0, received: Vec::new() }
         });
         let asker = joined.join().unwrap();
         wait_until("a responder", || {
@@ -92,27 +93,27 @@ impl Asker {
         self.send_payload(cdr(json));
     }
 
-    /// The responses so far.
-    fn heard(&mut self) -> &[(Vec<u8>, Encapsulation)] {
-        let heard = &mut self.heard;
-        let mut keep = |payload: &[u8], encapsulation| heard.push((payload.to_vec(), encapsulation));
+    /// The responses received so far.
+    fn received(&mut self) -> &[(Vec<u8>, Encapsulation)] {
+        let received = &mut self.received;
+        let mut keep = |payload: &[u8], encapsulation| received.push((payload.to_vec(), encapsulation));
         while self.responses.take(&mut keep) != Take::Empty {}
-        &self.heard
+        &self.received
     }
 
-    /// A request of this bridge, of a number that none had before.
+    /// Makes a request of this bridge with a new number.
     fn request(&mut self) -> ProbeRequest {
-        self.asked += 1;
+        self.sent += 1;
         ProbeRequest {
-            seq: self.asked,
+            seq: self.sent,
             send_time: clock::wall(),
             sender_id: self.name.to_owned(),
-            probe_id: ProbeId::Text(format!("{}-{}", self.name, self.asked)),
+            probe_id: ProbeId::Text(format!("{}-{}", self.name, self.sent)),
             signature: None,
         }
     }
 
-    /// Sends requests that are to be answered until one is. BEST_EFFORT may lose some.
+    /// Sends valid requests until one is answered; a BEST_EFFORT reader may lose some.
     fn ask(&mut self, mut make: impl FnMut(ProbeRequest) -> ProbeRequest) -> (ProbeRequest, ProbeResponse) {
         wait_for("a response", || {
             let request = self.request();
@@ -131,31 +132,31 @@ impl Asker {
     }
 
     fn decoded(&mut self) -> Vec<ProbeResponse> {
-        let heard = self.heard().iter();
-        heard
+        let received = self.received().iter();
+        received
             .map(|(payload, encapsulation)| ProbeResponse::decode(payload, *encapsulation).unwrap())
             .collect()
     }
 
-    /// Asserts that nothing of these was answered.
+    /// Asserts that no request with a probe id that contains `what` was answered.
     fn assert_unanswered(&mut self, what: &str) {
         let answered = self.decoded().into_iter().find(|it| it.probe_id.to_string().contains(what));
         assert_eq!(answered, None);
     }
 }
 
-/// A `std_msgs/String` in little-endian CDR, as any publisher has it.
+/// Encodes a `std_msgs/String` in little-endian CDR.
 fn cdr(text: &str) -> Vec<u8> {
     [&(text.len() as u32 + 1).to_le_bytes()[..], text.as_bytes(), &[0]].concat()
 }
 
-/// The text of one.
+/// Decodes the text of a `std_msgs/String`.
 fn text(payload: &[u8]) -> &str {
     let length = u32::from_le_bytes(payload[..4].try_into().unwrap()) as usize;
     std::str::from_utf8(&payload[4..4 + length - 1]).unwrap()
 }
 
-/// What a bridge and a responder with that secret believe.
+/// Signs and checks messages with the secret in a file.
 fn trust(secret: &Path) -> Trust {
     let security = Security {
         trust_mode: TrustMode::DefaultDeny,
@@ -174,19 +175,21 @@ fn run(arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn requests_of_the_original_are_answered_whoever_asks() {
-    let Some(net) = net("requests_of_the_original_are_answered_whoever_asks") else { return };
+fn requests_of_the_original_package_and_of_several_bridges_are_answered() {
+    let Some(net) = net("requests_of_the_original_package_and_of_several_bridges_are_answered") else {
+        return;
+    };
     let mut responder = start(net.host("laptop"), &[]);
     let mut first = Asker::join(net.host("bridge"), "first");
 
-    // Word for word what the original's control says.
+    // The request of the original package, with exactly its fields.
     let response: Value = wait_for("a response", || {
         let request = json!({
             "v": 1, "seq": 1, "send_time_ns": clock::wall().0, "sender_id": "original", "probe_id": "p-1"
         });
         first.send(&request.to_string());
         std::thread::sleep(Duration::from_millis(100));
-        first.heard().first().map(|(payload, _)| serde_json::from_str(text(payload)).unwrap())
+        first.received().first().map(|(payload, _)| serde_json::from_str(text(payload)).unwrap())
     });
     let mut keys: Vec<&str> = response.as_object().unwrap().keys().map(String::as_str).collect();
     keys.sort_unstable();
@@ -199,7 +202,7 @@ fn requests_of_the_original_are_answered_whoever_asks() {
     assert!(times.is_sorted() && times[0] > Some(1_700_000_000_000_000_000), "{times:?}");
     responder.wait_for_log("probe requests arrive");
 
-    // Another bridge beside it, and one that numbers its probes.
+    // A second bridge, and one whose probe ids are numbers.
     let mut second = Asker::join(net.host("bridge"), "second");
     let (request, response) = second.ask(|request| request);
     assert_eq!(response.seq, request.seq);
@@ -214,8 +217,8 @@ fn requests_of_the_original_are_answered_whoever_asks() {
 }
 
 #[test]
-fn what_is_no_request_is_counted_by_its_name_and_disturbs_nothing() {
-    let Some(net) = net("what_is_no_request_is_counted_by_its_name_and_disturbs_nothing") else { return };
+fn invalid_requests_are_counted_by_reason_and_delay_no_other_bridge() {
+    let Some(net) = net("invalid_requests_are_counted_by_reason_and_delay_no_other_bridge") else { return };
     let mut responder = start(net.host("laptop"), &[]);
     let mut good = Asker::join(net.host("bridge"), "good");
     good.ask(|request| request);
@@ -243,7 +246,7 @@ fn what_is_no_request_is_counted_by_its_name_and_disturbs_nothing() {
                 }
                 _ => bad.send(&of_version(2)),
             }
-            // The limit of its rate would count all of them under its own name.
+            // Beyond the sender's rate, the responder would count all of them as `rate_limited`.
             std::thread::sleep(Duration::from_millis(500));
             responder.log().contains(&format!("reason=\"{name}\""))
         });
@@ -254,8 +257,8 @@ fn what_is_no_request_is_counted_by_its_name_and_disturbs_nothing() {
 }
 
 #[test]
-fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
-    let Some(net) = net("with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing") else {
+fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
+    let Some(net) = net("with_a_secret_only_signed_requests_are_answered_also_during_a_flood") else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
@@ -295,7 +298,7 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     }
     bad.assert_unanswered("bad");
 
-    // A flood of all of them, while a bridge goes on asking.
+    // A flood of forged and replayed requests, while a bridge continues to send its own.
     let before = memory_kib(responder.pid().as_raw(), "VmRSS");
     for round in 0..20 {
         for _ in 0..500 {
@@ -312,7 +315,7 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     }
     responder.wait_for_log("reason=\"rate_limited\"");
     bad.assert_unanswered("bad");
-    // Nor is a sender with the secret answered beyond its rate of 20 a second.
+    // A sender with the secret is answered at most 20 times a second, too.
     let mut greedy = Asker::join(net.host("bridge"), "greedy");
     let began = Instant::now();
     for _ in 0..500 {
@@ -333,7 +336,7 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
     );
     let grown = memory_kib(responder.pid().as_raw(), "VmRSS") - before;
     assert!(grown < 32 << 10, "{grown} KiB more");
-    // What was recorded was answered once.
+    // The recorded request was answered once.
     let answers = good.decoded().into_iter().filter(|it| it.probe_id == request.probe_id).count();
     assert_eq!(answers, 1);
 
@@ -342,7 +345,7 @@ fn with_a_secret_only_who_has_it_is_answered_and_a_flood_costs_nothing() {
 }
 
 #[test]
-fn a_responder_that_cannot_have_its_secret_says_what_to_do() {
+fn a_responder_without_its_secret_prints_what_to_do() {
     let output = run(&["--id", "a", "--secret-file", "/nonexistent/secret"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(78), "{said}");
@@ -358,7 +361,7 @@ fn a_responder_that_cannot_have_its_secret_says_what_to_do() {
 }
 
 #[test]
-fn a_command_line_that_makes_no_sense_is_refused() {
+fn an_invalid_command_line_is_refused() {
     let long = "x".repeat(128);
     for arguments in [
         &["--id", ""][..],

@@ -1,5 +1,5 @@
-//! The configuration from outside: the files that are shipped, the documentation, and files of any content.
-//! Pure but for the tests of `load`, which read real files.
+//! The configuration as a whole: the shipped files, the documentation, and files of any content. Pure except
+//! the tests of `load`, which read real files.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -235,7 +235,7 @@ fn twelve_mistakes_in_one_file_are_twelve_problems_with_their_lines() {
     );
 }
 
-/// The keys that the tables of the README document: all that stand in back quotes in the first cell of a row.
+/// The keys that the tables of the README document: those in back quotes in the first cell of a row.
 fn documented_keys() -> BTreeSet<&'static str> {
     let environment = README.find("\n## Environment").unwrap();
     let rows = README[..environment].lines().filter(|line| line.starts_with("| `"));
@@ -374,7 +374,7 @@ fn every_key_is_in_the_default_file() {
 
 #[test]
 fn every_key_is_read() {
-    // A list of lists is no value of any key, so that a key that lets it pass is a key that nothing reads.
+    // No key accepts a list of lists, so a key for which it is not reported is a key that no code reads.
     let text = block_default();
     let lines: Vec<&str> = text.lines().collect();
     let known: BTreeSet<&str> = KEYS.iter().copied().collect();
@@ -417,7 +417,7 @@ fn a_file_is_found_by_its_path_or_by_the_environment() {
 fn without_a_file_the_error_explains_how_to_give_one() {
     let default = Path::new(config::DEFAULT_PATH);
     if default.exists() {
-        // A machine that has a configuration of its own reads that one.
+        // On a machine with a file at the default path, that file is read.
         assert_eq!(config::load(None, &no_env), config::load(Some(default), &no_env));
         return;
     }
@@ -442,7 +442,7 @@ fn anything_but_a_regular_file_is_refused_without_blocking() {
     assert_eq!(error, format!("{}: must be at most 1048576 bytes long", long.display()));
 }
 
-/// Keys with two values each; both are allowed whatever the others are. As JSON, which is YAML.
+/// Keys with two values each, in JSON, which is YAML. Both are allowed in combination with any other ones.
 const CHOICES: &[(&str, &str, &str)] = &[
     ("instance", r#""robot""#, r#""robot_2""#),
     ("policy_hold_s", "5", "4.5"),
@@ -842,13 +842,13 @@ proptest! {
         prop_assert_eq!(reload.changed.is_empty(), reloaded == old);
         prop_assert_eq!(reloaded.fingerprint() == new.fingerprint(), reloaded == new);
 
-        // Nothing that can be taken over differs any more, and what was left is left again.
+        // A second reload of the same file applies nothing more, and the same changes wait.
         let (again, second) = reloaded.reloaded(new);
         prop_assert_eq!(&again, &reloaded);
         prop_assert_eq!(second.changed, Vec::new());
         prop_assert_eq!(second.waits, reload.waits);
 
-        // The way back leads to where it began: what was left as it is was not touched.
+        // A reload of the first file restores the first settings: settings that wait were not changed.
         let (back, third) = reloaded.reloaded(old.clone());
         prop_assert_eq!(back, old);
         prop_assert_eq!(third.waits, Vec::new());
@@ -990,7 +990,7 @@ fn a_file_of_parameters_applies_to_the_nodes_that_it_names() {
     let settings = load(file, &[]).unwrap();
     assert_eq!((settings.probes.rate_hz, settings.probes.timeout_ms), (3.0, 250));
 
-    // Of two sections the later one counts.
+    // A later section replaces values of an earlier one.
     for (first, second) in [("/**", "/adaptive_bridge"), ("/adaptive_bridge", "/**")] {
         let section =
             |node, rate_hz| format!("{node}: {{ros__parameters: {{probes: {{rate_hz: {rate_hz}}}}}}}\n");

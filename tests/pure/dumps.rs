@@ -1,4 +1,4 @@
-//! What `ros2 param dump` writes of a node of the bridge, given back as a file of parameters.
+//! The output of `ros2 param dump` for a node of the bridge, used as a file of parameters.
 
 use std::path::Path;
 
@@ -91,7 +91,7 @@ fn the_dump_of_a_bridge_with_parameters_gives_them_back() {
     // A parameter of the command line replaces a value of a dump, whichever comes first.
     let replaced = load(FILE, Some(&dump(&settings, "ingress")), &["probes.rate_hz:=3"]).unwrap();
     assert_eq!((replaced.probes.rate_hz, replaced.routes[1].priority), (3.0, 3));
-    // That of another node is not of this bridge.
+    // A section of another node does not apply to this bridge.
     let other = json!({ "/other/control": { "ros__parameters": { "probes": { "rate_hz": 4 }, "a": 1 } } });
     assert_eq!(load(FILE, Some(&other), &[]), load(FILE, None, &[]));
 }

@@ -19,7 +19,7 @@ fn routes(count: usize, more: &str) -> String {
     format!("topics:\n{}", (0..count).map(route).collect::<String>())
 }
 
-/// The need of each process, the lanes last, of which there may be more.
+/// The need of each process. Lanes come last, because their number varies.
 fn all(needs: &MemoryNeeds) -> Vec<MemoryNeed> {
     [vec![needs.ingress, needs.control], needs.lanes.clone()].concat()
 }
@@ -93,7 +93,7 @@ fn a_limit_is_all_parts_and_a_margin() {
         assert!((sum + margin..sum + margin + 16 * MIB).contains(&limit), "{limit}: {need:?}");
         assert_eq!(limit % MIB, 0);
     }
-    // What docs/hardening.md says of fragments: 16 samples, for the publishers of each reliability.
+    // As in docs/hardening.md: fragments of 16 samples, for the publishers of each reliability.
     assert_eq!(plain.ingress.fragments_bytes / MIB, 2 * 16);
     let reliable = needs(&routes(1, ", qos_overrides: {input: {reliability: RELIABLE}}"));
     assert_eq!(reliable.ingress.fragments_bytes / MIB, 16);

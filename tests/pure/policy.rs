@@ -129,7 +129,7 @@ impl Outcome {
     }
 }
 
-/// What decides between the publisher and the wire.
+/// The code under test between publisher and wire, which decides what to send.
 trait Gate {
     fn offer(&mut self, sequence: u64, stamps: SampleStamps);
     fn poll(&mut self, now: MonotonicNs) -> Decision<u64>;
@@ -137,7 +137,7 @@ trait Gate {
     fn rest(&self) -> u64;
 }
 
-/// What the lane uses.
+/// The gate of the bridge: the shaper of a noncritical lane.
 struct Shaper {
     shaper: RouteShaper<u64>,
     budget: ByteBudget,
@@ -166,7 +166,7 @@ impl Gate for Shaper {
     }
 }
 
-/// The same with a burst to choose.
+/// A gate like the shaper, but with a given burst.
 struct WithBurst {
     bucket: TokenBucket,
     queue: LaneQueue<u64>,
@@ -315,7 +315,8 @@ fn any_setup() -> impl Strategy<Value = Setup> {
     )
 }
 
-/// What many throttles do: a sample passes when an interval has gone by since the last that passed.
+/// A simple throttle, for comparison: a sample passes if an interval has elapsed since the last one that
+/// passed.
 struct IntervalGate {
     interval_ns: u64,
     passed_at: Option<u64>,
@@ -351,7 +352,7 @@ fn ten_hertz_throttled_to_eight_gives_eight() {
     }
 }
 
-/// The control: the same run, and the gate that this project's throttle must not be.
+/// Shows that the test above can fail: a simple throttle gives 5 Hz in the same run.
 #[test]
 fn ten_hertz_throttled_to_eight_by_an_interval_gate_gives_five() {
     let mut gate = IntervalGate { interval_ns: 125_000_000, passed_at: None, passed: None, dropped: 0 };

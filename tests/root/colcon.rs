@@ -1,9 +1,8 @@
 //! The bridge as a package of a ROS 2 workspace: built by a real colcon, found by the real ament index, its
 //! launch file run.
 //!
-//! `launch` itself comes with ROS 2 and from nowhere else; `tests/ros/launch` stands in for it. So that
-//! `ros2 launch` shows the arguments and the output as it should is not tested here. What it is told to run
-//! is run.
+//! `launch` is part of ROS 2 and has no other source; `tests/ros/launch` replaces it. So these tests run what
+//! the launch file starts, and do not test how `ros2 launch` shows arguments and output.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -17,7 +16,7 @@ use support::netns::Net;
 use support::peer::{Peer, Received, Sent};
 use support::process::Process;
 
-/// Reads a manifest as colcon, bloom and rosdep do, and takes its warnings for errors.
+/// Reads a manifest as colcon, bloom and rosdep do, and treats its warnings as errors.
 const PARSE: &str = "
 import sys
 from catkin_pkg.package import parse_package
@@ -43,7 +42,7 @@ fn source() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// A Python that has a module. That of the system is not always the first in the path.
+/// A Python interpreter that has a module. The system's is not always the first in the path.
 fn python_with(module: &str) -> Option<&'static str> {
     let has_it = |python: &&str| {
         let import = Command::new(python).args(["-c", &format!("import {module}")]).output();
@@ -66,7 +65,7 @@ struct Workspace {
 }
 
 impl Workspace {
-    /// Builds it; `None` where that can't be done, which is noted.
+    /// Builds the workspace; `None` if the machine cannot, which records the test as skipped.
     fn build(test: &str) -> Option<Self> {
         let lacks = |program: &str| Command::new(program).arg("--help").output().is_err();
         let lacking = ["colcon", "cmake"].into_iter().find(|program| lacks(program));
@@ -87,8 +86,8 @@ impl Workspace {
             "adaptive_bridge\tsrc/adaptive_bridge\t(ros.cmake)",
             "what else is a package?"
         );
-        // What these tests are built of, so that cargo has nothing left to build: the same features, and
-        // those that the dependencies of tests and examples ask for.
+        // The same features as these tests, and those that tests and examples need of dependencies, so that
+        // cargo has nothing to build.
         run(workspace.colcon().args(["build", "--cmake-args", "-DCMAKE_BUILD_TYPE=Debug"]).args([
             format!("-DADAPTIVE_BRIDGE_TARGET_DIR={}", source().join("target").display()),
             "-DADAPTIVE_BRIDGE_CARGO_OPTIONS=--example;rust_peer".to_owned(),
@@ -150,7 +149,7 @@ fn the_launch_file_of_a_built_workspace_starts_a_bridge_through_which_samples_fl
     );
     let share = run(Command::new("sh").args(["-c", &workspace.sourced(&asked)]));
     assert_eq!(Path::new(share.trim()), prefix.join("share/adaptive_bridge"));
-    // The example that a launch without arguments runs is there, and good.
+    // The example that a launch without arguments runs exists and is valid.
     let program = prefix.join("lib/adaptive_bridge/adaptive-bridge");
     run(Command::new(&program)
         .args(["check", "--config"])
@@ -163,7 +162,7 @@ fn the_launch_file_of_a_built_workspace_starts_a_bridge_through_which_samples_fl
     let launch =
         format!("{index} -c \"$1\" {} config_path:={}", launch_file.display(), bridge.config().display());
     command.args(["-c", &workspace.sourced(&launch), "sh", LAUNCH]);
-    // Behind what the workspace has: where there is a real one, that is taken.
+    // After the paths of the workspace, so that an installed `launch` takes precedence.
     command.env("PYTHONPATH", source().join("tests/ros")).env("PYTHONDONTWRITEBYTECODE", "1");
     let mut launched = Process::spawn("the launch file", command);
     let subscriber =

@@ -9,8 +9,7 @@ use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::peer::{Peer, Received, Sent};
 use support::process::signal;
 
-/// The image that the Dockerfile begins with. Where no registry is in reach, Debian's own tool makes the
-/// like.
+/// The base image of the Dockerfile. Without access to a registry, debootstrap makes an equivalent one.
 const BASE: &str = "debian:bookworm-slim";
 const BOOTSTRAPPED: &str = "adaptive-bridge-test-base";
 
@@ -27,7 +26,7 @@ fn succeeds(program: &str, arguments: &[&str]) -> bool {
     Command::new(program).args(arguments).output().is_ok_and(|output: Output| output.status.success())
 }
 
-/// How compose is called here: as a plugin, or as the program that it was before.
+/// The command of compose on this machine: the plugin, or the older program of its own.
 fn compose_program() -> Option<Vec<&'static str>> {
     let known = [vec!["docker", "compose"], vec!["docker-compose"]];
     known.into_iter().find(|words| succeeds(words[0], &[&words[1..], &["version"]].concat()))
@@ -35,7 +34,7 @@ fn compose_program() -> Option<Vec<&'static str>> {
 
 fn missing() -> Option<String> {
     if !succeeds("docker", &["info"]) {
-        return Some("no Docker Engine is in reach".to_owned());
+        return Some("the Docker Engine does not answer".to_owned());
     }
     if compose_program().is_none() {
         return Some("docker compose is not installed (make setup)".to_owned());
@@ -45,12 +44,12 @@ fn missing() -> Option<String> {
         && !has_base()
         && !succeeds("debootstrap", &["--version"])
     {
-        return Some(format!("neither {BASE} nor debootstrap is to be had (make setup)"));
+        return Some(format!("neither {BASE} nor debootstrap is available (make setup)"));
     }
     support::testbed_missing()
 }
 
-/// An image to begin with.
+/// The name of a base image, which is made if necessary.
 fn base(folder: &Path) -> &'static str {
     let is_there = |image| succeeds("docker", &["image", "inspect", image]);
     if is_there(BASE) {
@@ -77,7 +76,7 @@ impl Deployment {
     fn up() -> Self {
         let pid = std::process::id();
         let folder = tempfile::tempdir().unwrap();
-        // On the network of this machine, beside whatever else it runs.
+        // A domain of its own, because the containers share the network of this machine.
         let domain_id = 100 + (pid % 100) as u16;
         let deployment = Self { project: format!("abtest{pid}"), domain_id, folder };
         deployment.build();
@@ -91,12 +90,12 @@ impl Deployment {
         deployment
     }
 
-    /// All of the Dockerfile but for the build of the program, which is that of the tests.
+    /// Builds the image by the Dockerfile, with the program under test in place of one that it would build.
     fn build(&self) {
         let source = Path::new(env!("CARGO_MANIFEST_DIR"));
         let docker = || {
             let mut command = Command::new("docker");
-            // The builder that every engine has.
+            // Every engine has the classic builder.
             command.env("DOCKER_BUILDKIT", "0").args(["build", "--quiet"]);
             command
         };
@@ -132,7 +131,7 @@ impl Deployment {
         run(Command::new("docker").args(["inspect", "--format", format, id.trim()])).trim().to_owned()
     }
 
-    /// What of this deployment the engine knows.
+    /// The containers and volumes of this deployment.
     fn left(&self) -> String {
         let filter = format!("label=com.docker.compose.project={}", self.project);
         let containers = run(Command::new("docker").args(["ps", "--all", "--quiet", "--filter", &filter]));
@@ -156,8 +155,8 @@ impl Drop for Deployment {
 }
 
 #[test]
-fn samples_flow_across_containers_whichever_dies_and_down_leaves_nothing() {
-    let test = "samples_flow_across_containers_whichever_dies_and_down_leaves_nothing";
+fn samples_flow_after_any_container_is_killed_and_down_leaves_nothing() {
+    let test = "samples_flow_after_any_container_is_killed_and_down_leaves_nothing";
     if let Some(reason) = missing() {
         support::skip(test, &reason);
         return;

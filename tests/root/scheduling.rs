@@ -1,4 +1,4 @@
-//! Which thread of a bridge has which real-time priority: the shipped binary on the real kernel. Domain 115.
+//! The real-time priorities of the threads of a bridge: the shipped binary on the real kernel. Domain 115.
 
 use std::fs;
 use std::process::Command;
@@ -19,8 +19,8 @@ use support::{exclusive, netns, skip, wait_for};
 const DOMAIN_ID: u16 = 115;
 const TYPE: &str = "std_msgs/msg/String";
 
-/// Name and real-time priority of the main thread, and of the DDS library's: what receives, and discovery,
-/// with names as the kernel cuts them.
+/// Name and real-time priority of the main thread and of the DDS library's receiving and discovery threads.
+/// The kernel cuts the names.
 fn data_path(process: &Process) -> Vec<(String, u8)> {
     let pid = process.pid();
     let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();

@@ -55,7 +55,7 @@ impl Bed {
         Some(Self { machine, net })
     }
 
-    /// Starts the bridge, and yields when every process says that it is ready.
+    /// Starts the bridge and waits until every process has reported that it is ready.
     fn start(&self) {
         self.machine.run(&["systemctl", "start", TARGET]);
         for unit in UNITS {
@@ -63,7 +63,7 @@ impl Bed {
         }
     }
 
-    /// Stops it, and yields when every process has ended.
+    /// Stops the bridge and waits until every process has ended.
     fn stop(&self) {
         self.machine.run(&["systemctl", "stop", TARGET]);
         for unit in UNITS {
@@ -87,7 +87,7 @@ impl Bed {
         Flow { publisher, critical, slow }
     }
 
-    /// Waits until a unit was restarted so often, and is active again.
+    /// Waits until a unit was restarted `restarts` times and is active again.
     fn wait_restarts(&self, unit: &str, restarts: usize) {
         self.machine.wait_property(unit, "NRestarts", &restarts.to_string());
         self.machine.wait_property(unit, "ActiveState", "active");
@@ -118,7 +118,7 @@ impl Flow {
         self.critical.wait_received(self.critical.received() + samples);
     }
 
-    /// Ends it: nothing held up the publisher, and what came was sound.
+    /// Ends the flow. Asserts that the publisher was never blocked and that the received samples are sound.
     fn end(self) -> (Sent, Received) {
         let sent: Sent = self.publisher.end();
         sent.assert_not_blocked();
@@ -276,12 +276,12 @@ fn what_noncritical_lanes_may_take_is_limited_and_the_critical_one_flows() {
     bed.machine.run(&["systemctl", "daemon-reload"]);
     bed.start();
     let flow = bed.flow();
-    // What a lane would do that has gone mad.
-    let go_mad = |unit: &str, what: &str| {
+    // Starts a faulty program in the slice of the noncritical lanes.
+    let start_faulty = |unit: &str, what: &str| {
         let unit = format!("--unit={unit}");
         bed.machine.run(&["systemd-run", &unit, &format!("--slice={slice}"), "sh", "-c", what]);
     };
-    go_mad("spins.service", "while :; do :; done");
+    start_faulty("spins.service", "while :; do :; done");
     let ticks = || -> u64 {
         let stat =
             bed.machine.run(&["cat", &format!("/proc/{}/stat", bed.machine.main_pid("spins.service"))]);
@@ -289,16 +289,15 @@ fn what_noncritical_lanes_may_take_is_limited_and_the_critical_one_flows() {
     };
     let (began, before) = (Instant::now(), ticks());
     flow.wait_critical(600);
-    // In hundredths of a second.
+    // Ticks are hundredths of a second.
     let share = (ticks() - before) as f64 / 100.0 / began.elapsed().as_secs_f64();
     println!("of one CPU, a lane that spins has {share:.2}");
     assert!(share < 0.3, "CPUQuota does not bite: {share}");
     bed.machine.run(&["systemctl", "stop", "spins.service"]);
 
-    go_mad("grows.service", "head -c 400M /dev/zero | tail");
+    start_faulty("grows.service", "head -c 400M /dev/zero | tail");
     bed.machine.wait_property("grows.service", "ActiveState", "failed");
-    // What the shell says of a program that was killed: by the kernel, which has no more memory for the
-    // slice.
+    // The shell's exit code for a program that SIGKILL ended: the kernel has no more memory for the slice.
     assert_eq!(bed.machine.property("grows.service", "ExecMainStatus"), "137");
     flow.wait_critical(50);
     for unit in [INGRESS, EGRESS_CRITICAL, CONTROL] {
@@ -340,7 +339,7 @@ fn the_limits_of_memory_of_a_configuration_are_in_force_and_samples_flow() {
         let expected = memory.iter().find(|memory| memory["process"] == process).unwrap();
         let limit = number(unit, "MemoryMax");
         assert_eq!(Some(limit), expected["limit_bytes"].as_u64(), "{unit}");
-        // What the kernel counts, with sockets and shared memory.
+        // The memory that the kernel counts, including sockets and shared memory.
         let used = number(unit, "MemoryCurrent");
         println!("{unit}: {} of {} MiB", used >> 20, limit >> 20);
         assert!((1 << 20..limit).contains(&used), "{unit} uses {used} of {limit}");
@@ -358,7 +357,7 @@ fn the_limits_of_memory_of_a_configuration_are_in_force_and_samples_flow() {
 fn a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on() {
     let test = "a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on";
     let Some(bed) = Bed::boot(test, SCAN) else { return };
-    // Enough for all but the pool of samples, which ingress makes.
+    // Enough for everything except the pool of samples, which ingress creates.
     bed.machine.run(&["mount", "-t", "tmpfs", "-o", "size=4M,mode=1777", "tmpfs", "/dev/shm"]);
     bed.machine.run(&["systemctl", "start", "--no-block", TARGET]);
     support::wait_until("two restarts of ingress", || {
@@ -396,8 +395,8 @@ fn the_critical_lane_needs_nothing_that_is_not_critical() {
 }
 
 #[test]
-fn a_bad_configuration_is_not_tried_again_and_a_good_one_starts() {
-    let test = "a_bad_configuration_is_not_tried_again_and_a_good_one_starts";
+fn a_bad_configuration_causes_no_restart_and_a_good_one_starts() {
+    let test = "a_bad_configuration_causes_no_restart_and_a_good_one_starts";
     let Some(bed) = Bed::boot(test, "topics: nonsense\n") else { return };
     bed.machine.run(&["systemctl", "start", "--no-block", TARGET]);
     for unit in UNITS {
@@ -417,8 +416,8 @@ fn a_bad_configuration_is_not_tried_again_and_a_good_one_starts() {
 }
 
 #[test]
-fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
-    let test = "systemd_knows_what_the_bridge_does_and_stop_leaves_nothing";
+fn systemd_shows_the_state_of_the_bridge_and_stop_leaves_no_files() {
+    let test = "systemd_shows_the_state_of_the_bridge_and_stop_leaves_no_files";
     let yaml = "topics:\n  - {id: scan, input_topic: /scan, max_sample_bytes: 65536}\n";
     let Some(bed) = Bed::boot(test, yaml) else { return };
     bed.start();
@@ -460,7 +459,7 @@ fn systemd_knows_what_the_bridge_does_and_stop_leaves_nothing() {
     bed.stop();
     let up = ["--unit=whole", "--service-type=notify", "--uid=adaptive-bridge", "--property=WatchdogSec=5"];
     let up = [["systemd-run"].as_slice(), &up, &["adaptive-bridge", "up"]].concat();
-    // It comes back when the service says that it is ready.
+    // `systemd-run` returns when the service has reported that it is ready.
     bed.machine.run(&up);
     says("whole.service", "4 of 4 processes; in scan 0.0/s; out critical (normal) 0.0/s");
     bed.machine.run(&["systemctl", "stop", "whole.service"]);
@@ -531,7 +530,8 @@ fn a_lane_of_the_users_own_runs_once_its_units_are_written() {
         (nice_of(rviz), nice_of("adaptive-bridge-ingress.service")),
         ("10".to_owned(), "0".to_owned())
     );
-    // Where RestrictRealtime allows no more than the fair scheduler, too. Linux grants slices since 6.12.
+    // Slices also work in units whose RestrictRealtime= allows only the fair scheduler. Linux grants them
+    // since 6.12.
     let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap();
     let version: Vec<u32> = release.split('.').take(2).map(|number| number.parse().unwrap()).collect();
     if version >= vec![6, 12] {
@@ -586,7 +586,7 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
     let help = String::from_utf8(help.stdout).unwrap();
     let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1);
     let commands = commands.take_while(|line| !line.is_empty()).filter_map(|line| line.strip_prefix("  "));
-    // What a description that is too long for a line goes on with is indented further.
+    // The further lines of a long description are indented more.
     let commands = commands.filter(|line| !line.starts_with(' '));
     let commands: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
     assert!(commands.contains(&"egress"), "{help}");
@@ -614,7 +614,7 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
         fs::copy(&new, root.join("new.deb")).unwrap();
     });
     let bed = Bed { machine, net };
-    // Limits of this machine's own, in place of the kernel's, which it shares with the host.
+    // Files in place of the kernel's limits, because the machine shares the kernel with its host.
     let limits = ["rmem_max", "wmem_max"].map(|name| format!("/proc/sys/net/core/{name}"));
     // Older kernels (before 6.11) show them only outside of network namespaces.
     let has_limits = bed.machine.try_run(&["test", "-e", &limits[0]]).status.success();

@@ -1,4 +1,4 @@
-//! What the children of the tests do.
+//! The functions of the tests' child processes.
 
 use std::io::Read;
 use std::path::PathBuf;
@@ -80,7 +80,7 @@ impl Child {
             let copied = publisher.copy_in(&payload(sequence, bytes as usize));
             match copied {
                 Ok(slot) => {
-                    // Counted first: a number is never given twice.
+                    // Counted before it is published, so that no number is used twice.
                     counters.update(|counters| {
                         counters.received += 1;
                         counters.published += 1;
@@ -170,7 +170,8 @@ impl Child {
         }
     }
 
-    /// Changes a counter, a lane's counters and a histogram as fast as it can; what is shown is always whole.
+    /// Changes a counter, a lane's counters and a histogram as fast as it can. Each published value is
+    /// consistent.
     fn counter(&self) {
         let node = self.node("ingress");
         let boards = node.boards(&shape()).unwrap();

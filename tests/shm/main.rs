@@ -1,4 +1,5 @@
-//! The shared-memory edge on real shared memory, with real processes that are killed, stopped and restarted.
+//! The shared-memory module on real shared memory, with real processes that are killed, stopped and
+//! restarted.
 
 mod child;
 mod support;
@@ -368,7 +369,7 @@ fn other_users_cannot_read_shared_memory() {
     assert_eq!(instance.permissions().mode() & 0o7777, 0o700);
     for path in files.into_iter().chain(place.root_files()) {
         let metadata = fs::symlink_metadata(&path).unwrap();
-        // Folders deeper down are of iceoryx2's making; the instance's own, 0700, bars the way to them.
+        // iceoryx2 creates the deeper folders; the mode 0700 of the instance's folder protects them.
         if !metadata.is_dir() || path.parent() == Some(&place.root().join("test")) {
             assert_eq!(metadata.permissions().mode() & 0o077, 0, "{path:?}");
         }
@@ -420,7 +421,7 @@ fn instances_and_roots_are_separate() {
         assert_eq!(sequences(lane), [number]);
         assert_eq!(boards.ingress(0).unwrap().published, number);
     }
-    // One that ends, and sweeps, takes nothing of the others along.
+    // An instance that ends removes its files and none of the others'.
     let [first, second, third] = ends;
     let [first_node, second_node, third_node] = nodes;
     drop((first, first_node));
@@ -627,7 +628,8 @@ fn ingress_and_the_other_lane_continue_after_a_lane_is_killed_that_holds_samples
         victim.expect("holding");
         victim.kill();
     }
-    // With what the ten held, 70 slots, and their queues, the pool would be empty long since.
+    // If the slots of the ten killed processes (70) and their queues were lost, the pool would be empty by
+    // now.
     let fresh = Process::start("lane", &place, "1 2948 0");
     fresh.expect("ready");
     let before = boards.lane(1, 0).unwrap().last_sequence;
@@ -918,7 +920,7 @@ fn no_wake_is_missed() {
     let (waker, mut sleeper) = (boards.waker(0), boards.sleeper(1));
     assert_eq!(sleeper.sleep(Duration::ZERO), Woken::Woken, "the first sleep ends at once");
     for turn in 0..200_000 {
-        // The other side falls asleep meanwhile, or has done so, or not yet.
+        // Varies the moment of the wake: before, during or after the other side's falling asleep.
         (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
         if turn % 3 != 0 {
             waker.announce(ELSEWHERE);

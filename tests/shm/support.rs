@@ -15,7 +15,7 @@ use adaptive_bridge::shm::{BridgeShape, QueueLimits, RouteChannel, ShmNode};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-/// Patience of a test with what has to happen at last.
+/// The timeout of a test for an expected condition.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Reports that a test was not run; panics if `CI` is set.
@@ -24,7 +24,7 @@ pub fn skip(reason: &str) {
     assert!(std::env::var_os("CI").is_none(), "skipped in CI: {reason}");
 }
 
-/// A root of a test's own, with an instance name.
+/// A root folder for one test, with an instance name.
 pub struct Place {
     folder: tempfile::TempDir,
     pub instance: InstanceName,
@@ -46,7 +46,7 @@ impl Place {
         ShmNode::open(self.root(), &self.instance, "test").unwrap()
     }
 
-    /// With what the names of the instance's files in /dev/shm begin.
+    /// The beginning of the names of the instance's files in /dev/shm.
     pub fn prefix(&self) -> String {
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         let folder = fs::canonicalize(self.root()).unwrap().join(self.instance.as_str());
@@ -193,7 +193,7 @@ impl Process {
         kill(Pid::from_raw(self.child.id() as i32), signal).unwrap();
     }
 
-    /// kill -9, and waits until the kernel has buried it.
+    /// Kills the child (SIGKILL) and reaps it.
     pub fn kill(&mut self) {
         let _ = self.child.kill();
         self.child.wait().unwrap();
@@ -218,7 +218,7 @@ impl Drop for Process {
     }
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
     while !condition() {

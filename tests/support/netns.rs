@@ -133,7 +133,7 @@ impl Net {
         for (index, name) in hosts.iter().enumerate() {
             let namespace = format!("{}-{name}", net.id);
             let port = format!("p{index}");
-            // Uses a different subnet for each Net, so that no peer knows an address from an earlier one.
+            // Uses a different subnet for each Net, so that no peer remembers an address of an earlier one.
             let address = Ipv4Addr::new(10, 64 + (pid % 128) as u8, (number % 256) as u8, index as u8 + 1);
             ip(&format!("netns add {namespace}"));
             let host = Host { name: (*name).to_owned(), namespace, address, switch: switch.clone(), port };

@@ -1,5 +1,5 @@
 //! Forged ROS 2 participants in large numbers, each with the endpoints of a small node: they join, send a few
-//! samples, and leave with or without a goodbye.
+//! samples, and leave with or without announcing it.
 
 use std::net::SocketAddrV4;
 
@@ -13,7 +13,7 @@ use super::rtps::{
 };
 use super::wait_until;
 
-/// The lease that one announces before it is killed, so that its end is soon noticed.
+/// The lease that a visitor announces before it is killed, so that it expires soon.
 const LAST_LEASE_S: u32 = 1;
 /// The value of a QoS policy RELIABILITY with a blocking time of 100 ms; the first word is its kind.
 const BEST_EFFORT: [u32; 3] = [1, 0, 429_496_730];
@@ -108,7 +108,7 @@ impl Visitors {
         self.resident.announced().iter().map(|(prefix, announced)| (*prefix, announced.discovery)).collect()
     }
 
-    /// Adds visitors to those who are present. The caller announces them until the bridge has matched them.
+    /// Adds visitors to those that are present. The caller announces them until the bridge has matched them.
     pub fn join(&mut self, count: usize) {
         for _ in 0..count {
             self.joined += 1;
@@ -118,7 +118,7 @@ impl Visitors {
         }
     }
 
-    /// Announces those who are present and their endpoints, always with the same sequence numbers.
+    /// Announces those that are present and their endpoints, always with the same sequence numbers.
     pub fn announce(&mut self) {
         self.resident.receive();
         let address = self.resident.address();
@@ -149,7 +149,7 @@ impl Visitors {
         self.resident.send(&announcement, to);
     }
 
-    /// Sends the samples of those who are present, with the graph entry of each on `ros_discovery_info`.
+    /// Sends the samples of those that are present, with the graph entry of each on `ros_discovery_info`.
     pub fn write(&mut self) {
         let traffic: Vec<(Prefix, SocketAddrV4)> = self
             .resident
@@ -189,13 +189,14 @@ impl Visitors {
         encode_graph(Guid(guid(prefix, PARTICIPANT)), "/", "visitor", &guids(false), &guids(true), 16)
     }
 
-    /// Removes all visitors from those who are present.
+    /// Removes all visitors from those that are present.
     pub fn clear(&mut self) {
         self.present.clear();
     }
 
-    /// Lets all leave who are present, one after the other in the given ways. What it sends can be lost, so
-    /// repeat it if they do not go; each time those who are killed live on for their last lease.
+    /// Lets all visitors leave that are present, one after the other in the given ways. Its datagrams can be
+    /// lost, so the caller repeats it while visitors are still matched; each call renews the last lease of
+    /// killed ones.
     pub fn leave(&mut self, ways: &[Leave]) {
         self.resident.receive();
         let participants = self.participants();

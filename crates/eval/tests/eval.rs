@@ -1,5 +1,5 @@
-//! The evaluation harness from outside: quick runs without and with the bridge, whose results are consistent;
-//! and a harness that is interrupted or killed, after which nothing is left.
+//! The evaluation harness as a program: quick runs without and with the bridge, whose results are consistent;
+//! an interrupted or killed harness, which leaves nothing behind.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -29,7 +29,7 @@ fn run(out: &Path, arguments: &str) -> Output {
     command(out, arguments).output().unwrap()
 }
 
-/// As [`run`], of what is to end well.
+/// Like [`run`], and asserts success; returns the log.
 fn run_well(out: &Path, arguments: &str) -> String {
     let output = run(out, arguments);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -37,7 +37,7 @@ fn run_well(out: &Path, arguments: &str) -> String {
     said
 }
 
-/// A folder, or nothing where the machine can't; that is noted.
+/// Creates a folder; `None` if the machine lacks the requirements, which records the test as skipped.
 fn folder(test: &str) -> Option<TempDir> {
     match testbed_missing() {
         Some(reason) => {
@@ -48,7 +48,7 @@ fn folder(test: &str) -> Option<TempDir> {
     }
 }
 
-/// What processes of that id have on the machine: hosts, folders, shared memory.
+/// What a harness with this process id has on the machine: hosts, folders, shared memory.
 fn traces(pid: i32) -> Vec<String> {
     let mut found = Vec::new();
     for (folder, prefix) in [
@@ -96,7 +96,7 @@ impl Run {
         endpoints.iter().find(|endpoint| endpoint["name"] == name).unwrap()
     }
 
-    /// Every key and every column is on the page that describes them.
+    /// Asserts that the page of the results documents every key and every column.
     fn assert_documented(&self) {
         let page = include_str!("../../../docs/eval-results.md");
         let documented = |name: &str| page.contains(&format!("`{name}`"));
@@ -126,7 +126,7 @@ impl Run {
         }
     }
 
-    /// What each file says fits what the programs said at their end, and the window.
+    /// Asserts that each file agrees with the summaries of the programs and with the window.
     fn assert_consistent(&self) {
         let manifest = &self.manifest;
         assert_eq!((&manifest["format"], &manifest["problems"]), (&1.into(), &Value::Array(Vec::new())));
@@ -203,7 +203,7 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
     let link = &manifest["links"][0]["impairment"];
     assert_eq!((&manifest["links"][0]["name"], &link["loss_good"]), (&"slow<-publisher".into(), &0.5.into()));
     assert!(link["lost"].as_u64() > Some(0), "{link}");
-    // What is lost before the switch leaves incomplete datagrams to it.
+    // Packets lost before the switch leave it with incomplete datagrams.
     assert_eq!(manifest["links"][0]["before_switch"], true);
     let kernel = made.rows("kernel.csv");
     let held = kernel.iter().filter(|row| row["host"] == "switch").map(|row| &row["fragment_memory_bytes"]);
@@ -227,7 +227,7 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
         assert!(processes.contains(process), "{process} in {processes:?}");
     }
 
-    // What is there is left as it is, and what was made otherwise is not mixed with it.
+    // A finished run is not repeated, and a run with other settings is refused for the same folder.
     let before = fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap();
     let said = run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
     assert!(said.contains("0 finished, 1 already in the results, 0 failed"), "{said}");
@@ -304,7 +304,7 @@ fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
     let test = "quick_runs_on_containers_have_consistent_results_and_leave_no_container";
     let docker = |arguments: &str| Command::new("docker").args(arguments.split_whitespace()).output();
     if !docker("version").is_ok_and(|output| output.status.success()) {
-        skip(test, "no docker, or nobody who answers it");
+        skip(test, "the Docker Engine does not answer");
         return;
     }
     let Some(out) = folder(test) else { return };

@@ -1,5 +1,5 @@
-//! The impaired link on real hosts: what it loses and delays of real packets, against theory and against its
-//! own model run in virtual time with the same seed.
+//! The impaired link on real hosts: its loss and delay of real packets, compared with theory and with its own
+//! model in virtual time with the same seed.
 
 use std::collections::BTreeSet;
 use std::net::UdpSocket;
@@ -22,7 +22,7 @@ const BATCH: u32 = 50;
 /// A datagram of so many bytes is three fragments at an MTU of 1500.
 const THREE_FRAGMENTS_BYTES: usize = 4_000;
 
-/// Two hosts; `None` where they can't be made, which has then been recorded.
+/// Creates two hosts; `None` if the machine cannot, which records the test as skipped.
 fn two_hosts(test: &str) -> Option<(Net, Host, Host)> {
     if let Some(reason) = support::netns::requires_root() {
         support::skip(test, &reason);
@@ -51,7 +51,7 @@ struct Flow {
 impl Flow {
     fn new(from: &Host, to: &Host, bytes: usize) -> Self {
         let (from, to) = (from.udp_socket(), to.udp_socket());
-        // What the link lets pass must not be lost here.
+        // A large buffer, so that no datagram that the link lets pass is lost here.
         setsockopt(&to, sockopt::RcvBufForce, &(64 << 20)).unwrap();
         to.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
         from.connect(to.local_addr().unwrap()).unwrap();
@@ -82,7 +82,7 @@ impl Flow {
             let mut datagram = [0; 65_536];
             let mut came = Vec::new();
             loop {
-                // Who is asked to end takes what is there already.
+                // Takes the datagrams that have arrived also after a request to end.
                 let last = asked.load(Ordering::Acquire);
                 match socket.recv(&mut datagram) {
                     Ok(bytes) => {
@@ -99,7 +99,7 @@ impl Flow {
         Receiver { thread, end, count }
     }
 
-    /// What has come, in the order in which it came. Call it when nothing is on its way any more.
+    /// The datagrams in the order of their arrival. To be called when none is in transit any more.
     fn received(&self, receiver: Receiver) -> Vec<Received> {
         receiver.end.store(true, Ordering::Release);
         let came = receiver.thread.join().unwrap();
@@ -131,14 +131,14 @@ fn numbers(received: &[Received]) -> BTreeSet<u32> {
     numbers
 }
 
-/// Which of so many packets in a row a link lets pass, by its model.
+/// For each of a number of consecutive packets, whether the model of a link lets it pass.
 fn passing(loss: GilbertElliott, seed: u64, packets: u32) -> BTreeSet<u32> {
     let mut link = Link::new(&Model { loss, delay: NormalDelay::NONE, seed });
     let arrival = |packet| Arrival { packet, bytes: 0, fragment: false };
     (0..packets).filter(|packet| link.arrive(arrival(*packet), MonotonicNs(0)) == Fate::Pass).collect()
 }
 
-/// The rules that send packets to a queue, and the queues that are listened on.
+/// The number of rules that send packets to a queue, and of queues with a listening program.
 fn traces(host: &Host) -> (usize, usize) {
     let rules = host.run("iptables", &["-t", "mangle", "-S", "PREROUTING"]);
     let queues = host.run("cat", &["/proc/self/net/netfilter/nfnetlink_queue"]);
@@ -240,7 +240,7 @@ fn delays_are_those_of_the_seed_and_have_its_mean_and_spread() {
         drawn_ms[packet as usize] = release.0 as f64 / 1e6;
     }
 
-    // How late a thread wakes is the machine's: a busy one is given further chances to be calm for a second.
+    // A busy machine wakes threads late, so the measurement is repeated until it had an idle second.
     support::wait_until("delays whose mean and spread are those that were drawn", || {
         let mut link = Impairment::start(&slow, &publisher, "--delay-ms 20 --jitter-ms 10 --seed 3");
         let mut flow = Flow::new(&publisher, &slow, 100);
@@ -288,7 +288,7 @@ fn a_link_is_switched_while_packets_flow() {
     let counters = send(&mut link, &mut flow, 500);
     let received = numbers(&flow.received(receiver));
 
-    // The chain goes on where it stood when the link was cut.
+    // The chain continues in the state in which the link was cut.
     let judged = passing(Level::Strong.model(Reading::AsRun), 9, 1_000);
     let expected = |number: &u32| match number / 500 {
         1 => judged.contains(&(number - 500)),
@@ -325,7 +325,7 @@ fn a_trace_is_played_row_by_row_and_loses_what_its_model_loses() {
     let rows = [(0.0, 0.0), (0.3, 5.0), (1.0, 0.0), (0.1, 30.0)];
     let lines = rows.iter().enumerate().map(|(at, (loss, delay_ms))| format!("{at},{loss},{delay_ms}\n"));
     let (_folder, path) = trace_file(&lines.collect::<String>());
-    // A busy machine may sleep through a row: it is given further chances.
+    // A busy machine may miss a row, so the measurement is repeated.
     support::wait_until("packets in every row of the trace", || {
         let arguments = format!("--trace {path} --trace-speed 1.25 --seed 4 --state off");
         let mut link = Impairment::start(&slow, &publisher, &arguments);
@@ -400,7 +400,7 @@ fn a_trace_that_is_repeated_begins_anew_and_goes_on_while_the_link_is_off() {
     };
     let round = send_until_round(&mut link, 5)["trace"]["round"].as_u64().unwrap();
     let judged = link.off()["judged"].clone();
-    // It goes on.
+    // The trace continues while the link is off.
     assert_eq!(send_until_round(&mut link, round + 2)["judged"], judged);
     let counters = link.counters();
     let counts = counts_of_rows(&link.end());
@@ -429,8 +429,8 @@ fn only_the_source_is_impaired_and_a_large_burst_is_not_lost() {
     assert_eq!(numbers(&flow.received(receiver)).len(), 500);
     assert_eq!(link.counters()["seen"], 0);
 
-    // 850 fragments in one go: faster than the program can look, and less than a network queue of the kernel
-    // holds (1,000).
+    // 850 fragments at once: faster than the program handles them, and fewer than a network queue of the
+    // kernel holds (1,000).
     link.off();
     let mut flow = Flow::new(&publisher, &slow, 50_000);
     let receiver = flow.receive();
@@ -462,7 +462,7 @@ fn what_a_link_is_too_slow_for_is_counted_apart_from_what_its_model_loses() {
     let (seen, unseen) = (count(&counters, "seen"), count(&counters, "kernel_dropped"));
     assert!(seen > 0 && unseen > 0, "{counters}");
     assert_eq!(count(&counters, "seen"), count(&counters, "lost") + count(&counters, "passed"), "{counters}");
-    // Those that came first were in the queue; of them the model loses what it would have lost anyway.
+    // The first ones were in the queue; the model loses the same ones of them as without the overflow.
     assert_eq!(received, passing(Level::Strong.model(Reading::AsPrinted), 6, seen as u32));
 }
 
@@ -477,7 +477,7 @@ fn nothing_is_left_by_one_that_ends_and_one_that_is_killed_is_cleaned_up_after_b
 
     Impairment::start(&slow, &publisher, "--state down --queue 3").kill9();
     assert_eq!(traces(&slow), (1, 0), "a killed program leaves its rule");
-    // Nobody listens: the host is not cut off.
+    // Without a listening program the host is not cut off.
     let mut flow = Flow::new(&publisher, &slow, 100);
     let receiver = flow.receive();
     flow.send(10);
@@ -485,7 +485,7 @@ fn nothing_is_left_by_one_that_ends_and_one_that_is_killed_is_cleaned_up_after_b
 
     let link = Impairment::start(&slow, &publisher, "--state down");
     assert_eq!(traces(&slow), (1, 1), "{}", link.log());
-    // A second one beside it takes nothing from it.
+    // A second link beside it takes none of its packets.
     let second = Impairment::start(&slow, &publisher, "--state down --queue 3");
     assert_eq!(traces(&slow), (2, 2));
     second.end();

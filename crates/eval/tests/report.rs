@@ -1,5 +1,5 @@
-//! The report from outside: of results that the harness recorded (tests/data: smoke runs), read with
-//! a real XML parser, and of folders that are broken. Reads and writes files.
+//! The report of results that the harness recorded (tests/data: smoke runs), read with a real XML parser, and
+//! of damaged folders. Reads and writes files.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -27,7 +27,7 @@ fn report(results: &Path, out: &Path) -> Output {
     Command::new(program).arg("report").arg(results).arg("--out").arg(out).output().unwrap()
 }
 
-/// The report of a folder, which is to come about.
+/// Makes the report of a folder, which must succeed.
 fn report_of(results: &Path) -> (TempDir, String) {
     let out = tempfile::tempdir().unwrap();
     let output = report(results, out.path());
@@ -83,7 +83,7 @@ fn the_page_is_well_formed_and_needs_nothing_from_elsewhere() {
             }
         }
     }
-    // Name spaces are no addresses that anybody asks.
+    // A browser does not fetch the addresses of XML namespaces.
     let rest = page.replace("http://www.w3.org/1999/xhtml", "").replace("http://www.w3.org/2000/svg", "");
     for foreign in ["http:", "https:", "url(", "@import", "//"] {
         assert!(!rest.contains(foreign), "{foreign}");
@@ -113,8 +113,8 @@ fn text_in_plots_can_be_read_on_a_phone_and_stays_within() {
             }
             if node.tag_name().name() == "text" {
                 assert!(node.attribute("class").unwrap().split(' ').any(|class| class == "t"));
-                // No wide font: half the size for each character. The end may stand out of a frame, not of
-                // a plot.
+                // Assumes half the font size for each character. A text may extend beyond a frame, not a
+                // plot.
                 let width = node.text().unwrap_or_default().chars().count() as f64 * TEXT_PX * 0.5;
                 let x = number("x").unwrap();
                 let (left, right) = match node.attribute("text-anchor").unwrap() {
@@ -159,7 +159,7 @@ fn it_shows_what_was_run_and_what_was_not() {
     assert!(
         captions.contains("Figure 4") && captions.contains("Figure 5") && captions.contains("bridge_toggle")
     );
-    // The paper's value stands beside ours, and where nothing was run beside that.
+    // The paper's value is beside ours, also where no run was made.
     let cells = texts(&document, "td");
     assert!(
         cells.iter().any(|cell| cell.starts_with("not run") && cell.contains("paper 11,666")),
@@ -169,7 +169,7 @@ fn it_shows_what_was_run_and_what_was_not() {
         cells.iter().any(|cell| cell.contains("paper 15,043") && !cell.contains("not run")),
         "Table II, strong"
     );
-    // Smoke runs are no evidence, and the page says so.
+    // Smoke runs are no evidence: the page shows each hypothesis as not tested.
     let badges: Vec<Node> =
         document.descendants().filter(|node| node.attribute("class") == Some("badge")).collect();
     assert_eq!(badges.len(), 5);

@@ -98,12 +98,12 @@ impl Key {
         &TREE
     }
 
-    /// The key of this name below this one: one of that name, else one that stands for names of the user.
+    /// The key of this name below this one: the declared one, else a placeholder such as `<lane>`.
     pub fn get(&self, name: &str) -> Option<&Self> {
         self.entry(name).map(|(_, key)| key)
     }
 
-    /// As `get`, with the name as declared.
+    /// Like `get`, and also returns the declared name.
     fn entry(&self, name: &str) -> Option<&(&'static str, Self)> {
         let named = |own: &&(&str, Self)| own.0 == name;
         let placeholder = |own: &&(&str, Self)| own.0.starts_with('<');

@@ -97,8 +97,8 @@ pub(super) const ROWS: &[Row] = &[
     restarts(&["topics[].priority"], Whole(0, 99, ""), "0").doc(
         "Which routes go first: each lane sends waiting samples of a higher number first, and ingress \
          receives critical routes above the lowest number in use on a UDP port of their own; a route on \
-         noncritical lanes alone has none. A noncritical lane does not interrupt what its tokens allow of a \
-         lower number.",
+         noncritical lanes alone has none. A noncritical lane that has begun to send samples of a lower number \
+         sends all that its tokens allow before it checks for samples of a higher number.",
     ),
     restarts(
         &["topics[].retained_samples"],

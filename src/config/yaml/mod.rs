@@ -229,7 +229,7 @@ impl<'de> Visitor<'de> for NodeSeed<'_> {
     }
 }
 
-/// Fails without reading: whether there is a key, while the next seed reads it.
+/// A seed that fails before it reads the key: it shows whether a key follows, which the next seed reads.
 struct Unread;
 
 impl<'de> DeserializeSeed<'de> for Unread {
@@ -342,7 +342,7 @@ mod tests {
         assert_eq!(error(&lists(MAX_DEPTH)), None);
         let deep = "must be nested at most 32 deep".to_owned();
         assert_eq!(error(&lists(MAX_DEPTH + 1)), Some((1, deep.clone())));
-        // Three lists, written out inside of 29, one of which is the file.
+        // An alias of three nested lists, within 29 more lists, one of which is the whole file.
         let aliased = |depth: usize| {
             let (open, close) = ("[".repeat(depth - 1), "]".repeat(depth - 1));
             format!("- &a [[[x]]]\n- {open}*a{close}\n")

@@ -60,9 +60,9 @@ pub(super) fn line_after(source: &str, characters: usize) -> usize {
     line
 }
 
-/// What an alias of a value adds to the file.
+/// An anchored value: what an alias of it adds to the file.
 struct Anchor {
-    /// Of the value and all below it.
+    /// The shapes of the value and of all below it.
     shapes: Range<usize>,
     /// The number of collections that are nested in each other, 0 for a scalar.
     height: usize,
@@ -91,7 +91,7 @@ struct Outline<'a> {
     documents: usize,
     shapes: Vec<Shape>,
     open: Vec<Open>,
-    /// By the number that the parser gives them. An anchor of an open collection is not in it.
+    /// The anchors by the numbers that the parser gives them, without those of open collections.
     anchors: HashMap<usize, Anchor>,
     aliases: usize,
     text_bytes: usize,

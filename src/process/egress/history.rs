@@ -104,7 +104,7 @@ struct Publishers {
 }
 
 impl Publishers {
-    /// Records that a publisher wrote, and returns the one that has to give way to it.
+    /// Records that a publisher wrote, and returns the one that it replaces, if there is no room for both.
     fn wrote(&mut self, publisher: Guid, present: impl FnOnce() -> Vec<Guid>) -> Option<Guid> {
         if self.known.last() == Some(&publisher) {
             return None;

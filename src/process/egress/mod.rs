@@ -99,8 +99,8 @@ pub fn end_unused(name: &str) {
 
 struct Egress {
     index: usize,
-    /// Those of the highest priority first. Before the participant: the DDS library wants its readers and
-    /// writers gone first.
+    /// Those of the highest priority first. Declared before the participant, because the DDS library requires
+    /// readers and writers to be dropped first.
     outputs: Vec<Output>,
     /// For each output, how many before it have a higher priority.
     more_urgent: Vec<usize>,
@@ -187,7 +187,7 @@ impl Egress {
         }
         let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
         for place in 0..self.outputs.len() {
-            // How many samples of higher priorities may go ahead of these, and the wakes at the last look.
+            // The samples of higher priorities that may still go first; the count of wakes at the last check.
             let (mut ahead, mut seen) = (SAMPLES_PER_TURN, None);
             for _ in 0..SAMPLES_PER_TURN {
                 let Some(sample) = self.outputs[place].take() else { break };
@@ -261,7 +261,7 @@ impl Egress {
         }
         for output in &mut self.outputs {
             output.housekeeping(&mut self.participant, now);
-            // Afterwards: housekeeping may only now learn that a reader did not match.
+            // After housekeeping, which may have recorded a reader that is already gone as unmatched.
             if !gone.is_empty() {
                 output.forget_unmatched(|reader| gone.iter().any(|change| takes_away(change, reader)));
             }
@@ -275,7 +275,8 @@ impl Egress {
             lane.follow_durability(&mut self.outputs, now);
         }
         self.reload(now);
-        // A turn of this thread forwards nothing if a thread of the DDS library hangs.
+        // While a thread of the DDS library hangs, the lane forwards nothing. Without this report the
+        // watchdog restarts the process.
         if self.participant.have_threads_turned(now) {
             let refusals = self.participant.network_refusals();
             self.role.report_turn(self.policy.mode as u8, self.policy.policy.epoch, refusals);

@@ -18,13 +18,14 @@ pub(super) struct Noncritical {
     latched_queue: usize,
     mode: LaneMode,
     budget: ByteBudget,
-    /// The outputs of each priority, the highest first; those of one take turns.
+    /// The outputs of each priority, the highest first. Outputs of the same priority take turns.
     turn_orders: Vec<(Range<usize>, PollOrder)>,
     shapers: Vec<RouteShaper<ShmSample>>,
 }
 
 impl Noncritical {
-    /// `more_urgent` has for each output how many before it have a higher priority.
+    /// Starts in normal mode. `more_urgent` is, for each output, the number of outputs before it that have a
+    /// higher priority.
     pub fn new(
         lane: &Lane,
         more_urgent: &[usize],
@@ -119,7 +120,8 @@ impl Noncritical {
                         }
                         Decision::SleepUntil(at) => {
                             token_at = MonotonicNs(token_at.0.min(at.0));
-                            // The channel has room for fewer samples than several publishers may have.
+                            // Samples wake the lane also without a token: several latched publishers may
+                            // send more samples at once than the channel has room for.
                             waits_for_sample |= output.durability.get() == Durability::TransientLocal;
                             break;
                         }

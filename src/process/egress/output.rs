@@ -54,13 +54,13 @@ pub(super) struct Output {
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
-    /// `None` of a VOLATILE output.
+    /// `None` for a VOLATILE output.
     history: Option<History>,
     tracker: SequenceTracker,
     pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
-    /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
-    /// receive the samples written until they match.
+    /// Readers that were matched with the predecessor of this process and are not matched with this one yet.
+    /// They do not receive the samples that are written before they match.
     former_readers: Vec<Guid>,
     /// The publisher of the last sample taken.
     last_publisher: Guid,

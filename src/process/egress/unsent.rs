@@ -48,7 +48,7 @@ impl<T> UnsentSamples<T> {
         self.samples.pop_front().map(|sent| sent.account)
     }
 
-    /// Removes all samples; how many there were.
+    /// Removes all samples and returns their number.
     pub fn clear(&mut self) -> usize {
         let unsent = self.samples.len();
         self.samples.clear();

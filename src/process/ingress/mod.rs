@@ -71,7 +71,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
 }
 
 struct Ingress {
-    /// Before the participant, whose sockets it watches.
+    /// Declared before the participant, so that it is dropped first: it watches the participant's sockets.
     _early_waker: Option<EarlyWaker>,
     receiving: Arc<Receiving>,
     participant: Participant,

@@ -16,16 +16,16 @@ pub(super) struct Pool {
     /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
     connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
-    /// What became of a loan that has ended, until `fill` takes it, at once.
+    /// The result of a loan that has ended, which `fill` takes immediately.
     finished: Finished,
 }
 
 type Finished = Arc<Mutex<Option<Result<Slot, LoanError>>>>;
 
-/// The samples of a route that the DDS library assembles in its own memory at most, because only two slots
-/// are lent at a time: those of half a second at 30 Hz while fragments are repaired.
+/// The most unfinished samples of a route in the DDS library's own memory, which it uses because only two
+/// slots are lent at a time: the samples of half a second at 30 Hz while fragments are repaired.
 const UNFINISHED_SAMPLES: usize = 16;
-/// The memory of the DDS library for them, but always enough for two.
+/// The most memory of the DDS library for unfinished samples; two always have room.
 const UNFINISHED_BYTES: usize = 128 << 20;
 
 /// The pool, as the input of the route owns it.

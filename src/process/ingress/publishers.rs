@@ -194,12 +194,12 @@ impl Publishers {
         result
     }
 
-    /// Notes that the writer is gone. Its account stays, because the writer may return.
+    /// Records that a writer is gone. Its account stays, because the writer may return.
     pub fn writer_gone(&mut self, writer: Guid) {
         self.mark_gone(|known| known == writer, true);
     }
 
-    /// Notes whether the writers that `matches` chooses are gone.
+    /// Records whether the writers that `matches` chooses are gone.
     pub fn mark_gone(&mut self, matches: impl Fn(Guid) -> bool, is_gone: bool) {
         for (account, gone) in self.accounts.iter().zip(&mut self.gone) {
             if matches(account.get().writer) {
@@ -212,8 +212,8 @@ impl Publishers {
 /// The highest sequence number taken of each publisher, readable without the lock of the route.
 ///
 /// The thread that holds the route's lock writes; any thread may read meanwhile, without a lock. A read while
-/// a publisher replaces another may see a mix of both, so that a lane is woken in vain, or only when the
-/// sample is published.
+/// a publisher replaces another may see a mix of both, so that a lane is woken without a sample, or only when
+/// the sample is published.
 pub(super) struct HighWaterMarks {
     marks: [Mark; MAX_PUBLISHERS],
 }

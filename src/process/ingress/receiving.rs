@@ -32,7 +32,7 @@ const TURNS_URGENT: u64 = 4;
 
 const NONE: u64 = u64::MAX;
 const IN_VAIN: u64 = u64::MAX - 1;
-/// Below the route's number are the turns that are left.
+/// The bits of the state below the route's number, which hold the turns that are left.
 const ROUTE_SHIFT: u32 = 32;
 
 /// One route, as the receiving thread and the main thread share it.
@@ -63,7 +63,7 @@ pub(super) struct Receiving {
 }
 
 impl Receiving {
-    /// `has_urgent`: whether topics are urgent, so that their datagrams go before others.
+    /// Shares routes and lanes. `has_urgent`: whether topics are urgent, so that their datagrams go first.
     pub fn new(inputs: Vec<(Input, Arc<ArrivalFlag>)>, lanes: Vec<ServedLane>, has_urgent: bool) -> Self {
         let is_critical = |route: usize| {
             lanes.iter().any(|lane| lane.class == TrafficClass::Critical && lane.serves[route])
@@ -83,9 +83,8 @@ impl Receiving {
         }
     }
 
-    /// What the DDS library's receiving thread calls: when a datagram arrives that seems to hold a sample,
-    /// with its writer, its sequence number and the bytes that are missing; and after the datagram was
-    /// received.
+    /// The two callbacks of the DDS library's receiving thread: one for a datagram that seems to hold a
+    /// sample, with its writer, its sequence number and the bytes that are missing; one after each datagram.
     pub fn hooks(
         self: &Arc<Self>,
     ) -> (impl FnMut([u8; 16], i64, usize) + use<>, impl FnMut() -> bool + use<>) {

@@ -17,7 +17,7 @@ pub(super) struct Page {
     text: String,
     /// The head of the current family until its first sample is written. A family without samples is omitted.
     head: Option<String>,
-    /// Of the names of all families.
+    /// The prefix of the names of all families.
     prefix: &'static str,
     name: &'static str,
 }

@@ -89,7 +89,7 @@ impl MetricsServer {
             runtime.block_on(async {
                 // Ends when the runtime is dropped, as the tasks of the clients do.
                 tokio::spawn(serve(listening, reports));
-                // Until the other end is dropped.
+                // Returns when `MetricsServer` drops the sender.
                 let _ = stopped.await;
             });
         };

@@ -1,4 +1,4 @@
-//! A DDS peer on RustDDS, through the bridge's own RTPS edge, with the command line and the output of those
+//! A DDS peer on RustDDS, through the bridge's own DDS module, with the command line and the output of those
 //! on Cyclone DDS and Fast DDS. `tests/peers/README.md` describes it. It is an example of the package and not
 //! a program of it, so that it is never installed.
 
@@ -20,7 +20,7 @@ use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
 
 use options::{Options, Role};
 
-/// What signals have asked for.
+/// The requests that signals have made.
 #[derive(Default)]
 struct Signals {
     /// SIGINT, SIGTERM.
@@ -47,29 +47,29 @@ impl Signals {
     }
 }
 
-/// One line of JSON to stdout, at once.
+/// Prints an event as one line of JSON to stdout and flushes it.
 fn emit(event: &Value) {
     let mut out = std::io::stdout().lock();
     // An error means that the pipe is closed; nothing can be reported then.
     let _ = writeln!(out, "{event}").and_then(|()| out.flush());
 }
 
-/// The library that is built.
+/// The manifest of the library, which has its version.
 const RUSTDDS: &str = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/third_party/rustdds/Cargo.toml"));
 
-/// The endpoints exist.
+/// Reports that the endpoints exist.
 fn emit_ready() {
     let version = RUSTDDS.lines().find_map(|line| line.strip_prefix("version = "));
     let library = format!("RustDDS {}", version.unwrap_or_default().trim_matches('"'));
     emit(&json!({"event": "ready", "library": library}));
 }
 
-/// Microseconds, to a tenth.
+/// Converts to microseconds, rounded to a tenth.
 fn microseconds(ns: i64) -> f64 {
     (ns as f64 / 100.0).round() / 10.0
 }
 
-/// Order statistics in microseconds; null of nothing.
+/// Order statistics in microseconds; null without values.
 fn distribution(ns: &[i64]) -> Value {
     let mut sorted = ns.to_vec();
     sorted.sort_unstable();

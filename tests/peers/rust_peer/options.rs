@@ -1,4 +1,4 @@
-//! The command line: that of the other peers, as far as RustDDS has what it is about.
+//! The command line: that of the other peers, as far as RustDDS has the features.
 
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
@@ -64,7 +64,7 @@ pub struct Options {
     pub hold: bool,
     #[arg(long)]
     pub prime: bool,
-    /// Taken and left alone, as by the peer on Cyclone DDS: the library has no such setting
+    /// Accepted without effect, as by the peer on Cyclone DDS: the library has no such setting
     #[arg(long)]
     heartbeat_ms: Option<f64>,
     #[arg(long, default_value = "0", value_parser = seconds)]
@@ -80,7 +80,7 @@ pub struct Options {
     pub stall_every: Duration,
     #[arg(long, default_value = "0", value_parser = seconds)]
     pub stall_for: Duration,
-    /// Of this peer's own entry in the ROS 2 graph
+    /// Bytes of an identifier in this peer's entry in the ROS 2 graph
     #[arg(long, default_value = "24", value_parser = ["16", "24"])]
     gid_bytes: String,
 }
@@ -91,11 +91,12 @@ pub enum Role {
     Sub,
 }
 
-/// Of a sample, when a publisher is not told another one.
+/// The size of a publisher's samples unless `--size` sets another one.
 const DEFAULT_SIZE: usize = 2948;
 
-/// What may wait between the library and a KEEP_ALL subscriber. The edge has no KEEP_ALL readers, and the
-/// library keeps what was read until so many samples are there.
+/// The bytes that may wait in the library for a KEEP_ALL subscriber, from which its depth follows. The DDS
+/// module has no KEEP_ALL readers, and the library keeps samples that were read until newer ones fill the
+/// depth.
 const WAITING_BYTES: usize = 64 << 20;
 
 impl Options {
@@ -108,7 +109,7 @@ impl Options {
         self.expected_size(sequence).unwrap_or(DEFAULT_SIZE)
     }
 
-    /// The size that a subscriber checks; `None` when it was not told any.
+    /// The size that a subscriber checks; `None` without `--size`.
     pub fn expected_size(&self, sequence: u64) -> Option<usize> {
         let turns = self.size.len() as u64;
         Some(self.size[sequence.checked_rem(turns)? as usize])

@@ -1,15 +1,15 @@
-//! What is in a sample: the same bytes, and the same hash of them, as in `tests/peers/common.cpp`.
+//! The payload of a sample and its hash, the same as in `tests/peers/common.cpp`.
 
 /// Bytes of sequence, time of sending and source timestamp.
 pub const FRONT_BYTES: usize = 24;
 
-/// The sequence number of a sample that only opens the way for others.
+/// The sequence number of a priming sample, which does not count.
 pub const PRIMING: u64 = u64::MAX;
 
 /// Most zeros by which RTPS lengthens a payload to whole words.
 const MAX_PADDING: usize = 3;
 
-/// What a payload begins with, as far as its size allows.
+/// The beginning of a payload, as far as its size allows.
 #[derive(Clone, Copy, Debug)]
 pub struct Front {
     pub sequence: u64,
@@ -39,7 +39,7 @@ pub fn make(front: Front, size: usize, seed: u64) -> Vec<u8> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
     Whole,
-    /// Whole, with zeros of RTPS behind it.
+    /// Whole, followed by padding of RTPS.
     Padded,
     Bad,
 }
@@ -66,8 +66,8 @@ pub fn check(payload: &[u8], size: Option<usize>, seed: u64, sequence: u64) -> V
     Verdict::Bad
 }
 
-/// Of header and payload, as if the padding were always there, so that both sides agree whether or not the
-/// reader sees it.
+/// The hash of header and payload. It counts padding as if it were always present, so that both sides agree
+/// whether or not the reader gets it.
 pub fn hash(sample: &[u8]) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325 ^ (sample.len() as u64).div_ceil(4);
     for part in sample.chunks(8) {

@@ -1,4 +1,4 @@
-//! The publisher.
+//! The publisher role of the peer.
 
 use std::time::Duration;
 
@@ -13,13 +13,13 @@ use super::payload::{self, FRONT_BYTES, Front};
 use super::record::Record;
 use super::{Signals, distribution, emit, emit_ready, microseconds};
 
-/// How long a wait may be deaf to signals and to the library's events.
+/// How long a wait may take before signals and the library's events are handled.
 const SLICE: Duration = Duration::from_millis(10);
 const PROGRESS_PERIOD_NS: u64 = 100_000_000;
-/// How long the last samples are given to be acknowledged.
+/// How long the publisher waits for the acknowledgement of its last samples.
 const ACKNOWLEDGEMENT_NS: u64 = 10_000_000_000;
 
-/// Publishes as the options say, until all is sent or a signal came.
+/// Publishes according to the options until all samples are sent or a signal arrives.
 pub fn publish(options: &Options, signals: &Signals) -> Result<(), String> {
     let file = match &options.payload_file {
         Some(path) => Some(std::fs::read(path).map_err(|error| format!("{}: {error}", path.display()))?),
@@ -57,15 +57,15 @@ struct Publisher<'p> {
     options: &'p Options,
     signals: &'p Signals,
     writer: RawWriter,
-    /// In place of a payload of its own.
+    /// A payload from a file, in place of generated ones.
     file: Option<Vec<u8>>,
     record: Record,
-    /// Matched at present.
+    /// The readers that are matched at present.
     readers: u64,
     tally: Tally,
 }
 
-/// What was sent so far.
+/// The counts of the samples sent so far.
 #[derive(Default)]
 struct Tally {
     attempted: u64,
@@ -80,7 +80,7 @@ struct Tally {
 }
 
 impl Publisher<'_> {
-    /// Waits until it may send, and opens the way if that was asked for.
+    /// Waits until it may send, and sends the priming sample if the options require one.
     fn begin(&mut self) {
         while !self.signals.stop() && self.readers < self.options.wait_match {
             self.pause(SLICE);
@@ -92,7 +92,7 @@ impl Publisher<'_> {
             let mut bytes = vec![0; FRONT_BYTES];
             bytes[..8].copy_from_slice(&payload::PRIMING.to_le_bytes());
             let source = SourceTimestamp::from_wall(clock::wall());
-            // If there is no room for it now, the samples after it will tell.
+            // An error is ignored: the writes after it fail for the same reason, and are counted.
             let _ = self.writer.write(Bytes::from(bytes), self.options.encap, source);
             while !self.signals.stop() && !self.acknowledged() {}
         }
@@ -106,7 +106,7 @@ impl Publisher<'_> {
         loop {
             if self.tally.attempted > 0 {
                 due_ns += period_ns;
-                // A timer that skips the ticks it was too late for: a stalled write lowers the rate.
+                // Skips the ticks that have passed, as a timer does: a stalled write lowers the rate.
                 let late_ns = clock::monotonic().0.saturating_sub(due_ns);
                 if let Some(skipped) = late_ns.checked_div(period_ns) {
                     self.tally.skipped_ticks += skipped;
@@ -171,7 +171,8 @@ impl Publisher<'_> {
         acknowledged
     }
 
-    /// Whether every RELIABLE reader has acknowledged everything, which is waited for a little.
+    /// Waits for up to 100 ms until every RELIABLE reader has acknowledged all samples; returns whether they
+    /// have.
     fn acknowledged(&mut self) -> bool {
         self.tell_matches();
         self.writer.wait_acknowledged(Duration::from_millis(100))
@@ -207,7 +208,7 @@ impl Publisher<'_> {
 }
 
 impl Tally {
-    /// One call of write, with the sample's hash if it succeeded.
+    /// Counts one call of write, with the sample's hash if it succeeded.
     fn record(&mut self, sequence: u64, hash: Option<u64>, before_ns: u64, now_ns: u64) {
         self.attempted += 1;
         self.ok += u64::from(hash.is_some());

@@ -1,15 +1,15 @@
-//! A file of rows, each written at once, so that it is whole when the program is killed.
+//! A CSV file whose rows are written one by one, so that it is complete when the program is killed.
 
 use std::fmt::Arguments;
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
-/// A CSV file; without a name there is none.
+/// A CSV file; without a path nothing is written.
 pub struct Record(Option<File>);
 
 impl Record {
-    /// Begins the file.
+    /// Creates the file with its header.
     pub fn create(path: Option<&Path>, header: &str) -> Result<Self, String> {
         let create = |path: &Path| {
             let mut file = File::create(path)?;

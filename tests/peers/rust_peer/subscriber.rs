@@ -1,4 +1,4 @@
-//! The subscriber.
+//! The subscriber role of the peer.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -24,7 +24,7 @@ const MAX_MISSING_RANGES: usize = 1000;
 const SOURCE_TOLERANCE_NS: u64 = 10;
 const HEADER_BYTES: usize = 4;
 
-/// Subscribes as the options say, until enough has come or a signal.
+/// Subscribes according to the options until enough samples or a signal have arrived.
 pub fn subscribe(options: &Options, signals: &Signals) -> Result<(), String> {
     let mut participant = options.join().map_err(|error| error.to_string())?;
     let qos = ReaderQos {
@@ -58,9 +58,9 @@ struct Subscriber<'s> {
     signals: &'s Signals,
     reader: RawReader,
     record: Record,
-    /// The latest sample: its encapsulation header, and what follows.
+    /// The latest sample: its encapsulation header and its payload.
     sample: Vec<u8>,
-    /// Matched at present.
+    /// The writers that are matched at present.
     writers: u64,
     begin_ns: u64,
     stalled_ns: u64,
@@ -69,7 +69,7 @@ struct Subscriber<'s> {
     last_arrival_ns: Option<u64>,
     max_gap_ns: u64,
 
-    /// Without duplicates.
+    /// Samples received, without duplicates.
     received: u64,
     unnumbered: u64,
     duplicates: u64,
@@ -119,7 +119,7 @@ impl<'s> Subscriber<'s> {
         }
     }
 
-    /// Takes what is there, up to a batch; how many samples that were.
+    /// Takes the waiting samples, up to a batch, and returns their number.
     fn take_batch(&mut self) -> usize {
         for taken in 0..BATCH {
             let sample = &mut self.sample;
@@ -202,7 +202,7 @@ impl<'s> Subscriber<'s> {
         }
     }
 
-    /// Says how far it is, and stalls when it is time to.
+    /// Reports progress, and stalls when a stall is due.
     fn keep_house(&mut self) {
         let now_ns = clock::monotonic().0;
         let news = self.received != self.progress_received;

@@ -81,7 +81,7 @@ fn a_silent_responder_is_demoted_and_too_little_data_decides_nothing() {
     let few = reading(MIN_SETTLED - 1, 1.0, 0.0);
     assert_eq!(run(&mut classifier, &[few; 5]), [Unknown; 5]);
     assert_eq!(run(&mut classifier, &[reading(50, 1.0, 0.0); 3])[2], Noncritical);
-    // A window that holds fewer is enough when it is full.
+    // A full window is enough, also if it holds fewer probes than a reading needs otherwise.
     let mut classifier = SubscriberClassifier::default();
     let small = LinkReading { full: true, ..reading(5, 0.0, 1.0) };
     assert_eq!(run(&mut classifier, &[small; 3])[2], Critical);
@@ -123,7 +123,7 @@ fn an_unclassified_subscriber_keeps_no_state_and_no_override() {
     let change = classifier.unclassified(&thresholds).unwrap();
     assert_eq!((change.from, change.to), (Noncritical, Unknown));
     assert_eq!((change.reason, classifier.unclassified(&thresholds)), (TransitionReason::Unclassified, None));
-    // Nor do two of three readings.
+    // Two of three readings towards a change are forgotten, too.
     run(&mut classifier, &[full(SLOW); 2]);
     classifier.unclassified(&thresholds);
     assert_eq!(run(&mut classifier, &[full(SLOW); 3]), [Unknown, Unknown, Noncritical]);
@@ -183,7 +183,7 @@ proptest! {
             ClassifierThresholds { hysteresis_count, allow_unknown_state, ..ClassifierThresholds::default() };
         let needed = hysteresis_count.max(1) as usize;
         let mut classifier = SubscriberClassifier::default();
-        // The readings since the last that was forced.
+        // The readings since the last forced state.
         let mut kinds: Vec<Kind> = Vec::new();
         let mut changes = 0;
         for (kind, random, forced) in steps {

@@ -1,4 +1,4 @@
-//! The safety supervisor: who can bring about what, and the way up and back.
+//! The safety supervisor: which fault leads to which mode, and escalation and recovery.
 
 use adaptive_bridge::model::{SafetyMode, SafetyRules, TrafficClass};
 use adaptive_bridge::policy::{
@@ -14,7 +14,7 @@ const INGRESS: ProcessLoad<'static> = ProcessLoad::idle("ingress", Critical);
 const CRITICAL: ProcessLoad<'static> =
     ProcessLoad { queue_capacity: 64, ..ProcessLoad::idle("critical", Critical) };
 const NONCRITICAL: ProcessLoad<'static> = ProcessLoad::idle("noncritical", Noncritical);
-/// Beyond the threshold of EMERGENCY, and of DEGRADED.
+/// Loads beyond the threshold of EMERGENCY, and beyond that of DEGRADED.
 const EXTREME: ProcessLoad<'static> = ProcessLoad { writer_lag_ms: Some(2_000.0), ..CRITICAL };
 const NEAR: ProcessLoad<'static> = ProcessLoad { writer_lag_ms: Some(500.0), ..CRITICAL };
 
@@ -37,7 +37,7 @@ impl Bench {
         self.supervisor.evaluate(processes, &self.rules, at_ms(self.now_ms))
     }
 
-    /// The modes after each of `times` evaluations of the same.
+    /// The modes after each of `times` evaluations of the same load.
     fn modes(&mut self, process: ProcessLoad<'_>, times: usize) -> Vec<SafetyMode> {
         (0..times).map(|_| self.next(&[INGRESS, process]).mode).collect()
     }
@@ -103,7 +103,7 @@ fn a_safety_decision_names_the_process_and_the_cause() {
     assert_eq!((cause.process.as_str(), cause.class, cause.speaks_for), ("critical", Critical, Emergency));
     assert_eq!(cause.trouble, SafetyTrouble::WriterLag { lag_ms: 2_000.0, limit_ms: 2_000.0 });
     assert!(decision.critical_trouble && !decision.clean);
-    // It stays known on the way back, and no longer.
+    // The decision names the cause until the bridge is in NORMAL again.
     let decision = bench.next(&[CRITICAL]);
     assert!(decision.clean && decision.cause == Some(cause));
     assert_eq!(bench.last(CRITICAL, 10), Normal);
@@ -328,7 +328,7 @@ proptest! {
         };
         let (up, back) = (hysteresis_count.max(1) as usize, recovery_count.max(1) as usize);
         let mut bench = Bench::new(rules);
-        // Levels since the last change.
+        // The levels of the readings since the last change of the mode.
         let mut since: Vec<usize> = Vec::new();
         for level in levels {
             let before = bench.supervisor.mode();

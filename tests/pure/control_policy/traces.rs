@@ -1,4 +1,4 @@
-//! Links, simulated and recorded, and what the classifier makes of them.
+//! The transitions of the classifier on simulated and recorded links.
 //!
 //! A trace is a CSV file with a line for each probe: when it was sent, in milliseconds, and its RTT in
 //! milliseconds, or nothing for a probe that was not answered. `#` begins a comment.
@@ -94,11 +94,11 @@ fn link(level: Level, length_s: u64, seed: u64, impaired: impl Fn(u64) -> bool) 
     probes.collect()
 }
 
-/// What the classifier makes of the probes, evaluated at 2 Hz: each transition with its time.
+/// Passes the probes to a classifier that is evaluated at 2 Hz; returns each transition with its time.
 fn replay(probes: &[Probe], thresholds: &ClassifierThresholds) -> Vec<(u64, Transition)> {
     let mut window = ProbeWindow::new(50, 500);
     let mut classifier = SubscriberClassifier::default();
-    // Sending, answers and evaluations by their time; what happens at the same time, in this order.
+    // Sending, answers and evaluations by their time; those of the same time in this order.
     let mut events: Vec<(u64, u8, u64)> = Vec::new();
     for (seq, probe) in probes.iter().enumerate() {
         events.push((probe.sent_ms * MS, 1, seq as u64));
@@ -127,7 +127,7 @@ fn states(transitions: &[(u64, Transition)]) -> Vec<(u64, SubscriberState)> {
     transitions.iter().map(|(ms, transition)| (*ms, transition.to)).collect()
 }
 
-/// When the state becomes `to` for the first time from `from_ms` on, or has been it since before.
+/// When the state first becomes `to` at `from_ms` or later; `from_ms` if it is `to` already.
 fn reached_ms(transitions: &[(u64, Transition)], to: SubscriberState, from_ms: u64) -> Option<u64> {
     let before = transitions.iter().rev().find(|(ms, _)| *ms <= from_ms).map(|(_, last)| last.to);
     if before == Some(to) {
@@ -179,8 +179,8 @@ fn the_papers_toggle_takes_nine_transitions_or_fewer_each_within_20_s() {
 
 #[test]
 fn at_the_mild_level_windows_without_loss_are_common() {
-    // 2.3 % of loss each way leaves every fifth window of 50 probes whole: by the paper's thresholds the link
-    // is well then. It is followed all the same, in most runs.
+    // With 2.3 % of loss each way, every fifth window of 50 probes is without loss: by the paper's thresholds
+    // the link is good then. In most runs the state follows the toggle nevertheless.
     let (few, timely) = toggle_runs(MILD);
     assert!(few >= 45 && timely >= 75, "{few} {timely}");
 }
@@ -222,8 +222,8 @@ fn the_traces_have_their_expected_transitions() {
         (190_500, Critical),
     ];
     assert_eq!(toggle, expected);
-    // As the running control decided when the link was recorded: after 3.5, 70.0, 108.0, 110.5, 120.5, 187.0
-    // and 237.5 s.
+    // The transitions of the running control when the link was recorded: after 3.5, 70.0, 108.0, 110.5,
+    // 120.5, 187.0 and 237.5 s.
     let recorded = states_of(include_str!("../../data/probe_traces/recorded_toggle.csv"));
     let expected = [
         (3_000, Critical),

@@ -55,7 +55,7 @@ fn a_clock_that_steps_forth_and_back_lets_no_replay_in() {
     assert_eq!(guard.admit(nonce(1), wall(0), wall(0)), Admission::Fresh);
     assert_eq!(guard.admit(nonce(2), wall(3_600_000), wall(3_600_000)), Admission::Fresh);
     assert_eq!(guard.admit(nonce(1), wall(0), wall(10)), Admission::Forgotten);
-    // What is new is admitted all the same.
+    // A new message is admitted.
     assert_eq!(guard.admit(nonce(3), wall(10), wall(10)), Admission::Fresh);
 }
 
@@ -93,7 +93,7 @@ fn messages_held_up_by_an_outage_are_within_the_burst_and_a_flood_is_not() {
 #[test]
 fn each_sender_has_its_own_rate() {
     let mut limits = SenderLimits::new(20.0, 8, at_ms(0));
-    // One floods, one sends at 5 Hz.
+    // One sender floods, another one sends at 5 Hz.
     let (mut flood, mut honest) = (0, 0);
     for ms in 0..10_000 {
         flood += u32::from(limits.allow(1, at_ms(ms)));
@@ -118,7 +118,7 @@ fn a_flood_from_many_names_costs_as_much_as_a_few_senders() {
     }
     assert_eq!(honest, 500, "it keeps its place");
     assert_eq!(limits.len(), 8);
-    // 20 Hz for all that have no place, and 7 places a round of idleness.
+    // 20 Hz for all senders without a place, and 7 new places after each period of idleness.
     let places = 8 * (100_000 / IDLE_SENDER_MS as u32 + 1);
     assert!(flood <= 2_000 + 4 + places, "{flood}");
 }
@@ -134,7 +134,8 @@ fn a_sender_without_a_burst_starts_with_one_message() {
 
 #[test]
 fn a_sender_keeps_its_place_until_it_was_silent_for_longer_than_the_limit() {
-    // A new place has one message, and what the senders without a place share has gathered two by then.
+    // A new place allows one message, and the bucket that senders without a place share has two tokens by
+    // then.
     let messages_of_a_second_sender = |after_ms: u64| {
         let mut limits = SenderLimits::new(1.0, 1, at_ms(0));
         assert!(limits.allow("first", at_ms(0)));

@@ -1,4 +1,4 @@
-//! The window of probes: what counts, what doesn't, and that no probe is lost from the account.
+//! The window of probes: which probes count, and that each probe has exactly one outcome.
 
 use adaptive_bridge::model::{ClassifierThresholds, MonotonicNs, SubscriberState};
 use adaptive_bridge::policy::{MAX_OUTSTANDING, ProbeWindow, ResponseOutcome, SubscriberClassifier};
@@ -64,7 +64,7 @@ fn a_subscriber_that_never_answered_has_no_data_and_one_that_stops_answering_has
     let reading = window.reading(at_ms(60_000));
     assert_eq!((reading.settled, reading.loss, reading.rtt_mean_ms), (0, 0.0, None));
     assert!(window.last_response_at().is_none() && is_accounted_for(&window));
-    // The probe before the first one that is answered doesn't count either.
+    // A probe before the first answered one does not count.
     window.sent(100, at_ms(60_000));
     window.sent(101, at_ms(60_200));
     window.answered(101, at_ms(60_210));
@@ -94,7 +94,7 @@ fn a_subscriber_whose_answers_are_all_late_has_loss() {
 #[test]
 fn probes_pending_while_the_control_process_was_stopped_are_excused() {
     let mut window = open_window(50);
-    // Lost before the stop, under way at its beginning, and sent at its very end.
+    // One probe is lost before the stop, one is outstanding at its beginning, one is sent at its end.
     window.sent(1, at_ms(200));
     window.sent(2, at_ms(900));
     window.excuse_pause(at_ms(1_000), at_ms(61_000));
@@ -144,7 +144,7 @@ fn responses_to_the_newest_64_settled_probes_are_recognized() {
     send(&mut window, 1..100);
     assert_eq!(window.answered(36, at_ms(40)), ResponseOutcome::Repeated);
     assert_eq!(window.answered(35, at_ms(40)), ResponseOutcome::Unknown);
-    // One that waits for its response keeps those behind it.
+    // An outstanding probe keeps the later ones in the list.
     window.sent(100, at_ms(40));
     send(&mut window, 101..300);
     assert_eq!(window.answered(101, at_ms(50)), ResponseOutcome::Repeated);
@@ -270,7 +270,7 @@ proptest! {
         }
     }
 
-    /// Against a plain count, for a link that answers each probe after a time or never.
+    /// Compares with a plain count, for a link that answers each probe after some time or never.
     #[test]
     fn loss_and_mean_rtt_are_those_of_the_newest_probes(
         fates in prop::collection::vec(prop::option::weighted(0.8, 0..500_u64), 10..200),

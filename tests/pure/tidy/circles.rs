@@ -49,7 +49,7 @@ fn are_related(one: &str, other: &str) -> bool {
 fn uses(sources: &[(String, String)]) -> Uses {
     let modules: BTreeSet<&str> = sources.iter().map(|(module, _)| module.as_str()).collect();
     let of = |module: &str, text: &str| {
-        // What is in a module of its own inside a file is a test.
+        // Inline modules contain tests, which do not count.
         let paths = Rust::new(text).paths().into_iter().filter(|path| path.inline_modules == 0);
         let used = paths.filter_map(|path| module_used(module, &path, &modules));
         used.filter(|used| !are_related(module, used)).collect::<BTreeSet<_>>()
@@ -57,7 +57,7 @@ fn uses(sources: &[(String, String)]) -> Uses {
     sources.iter().map(|(module, text)| (module.clone(), of(module, text))).collect()
 }
 
-/// Each use of a file from which the uses lead back.
+/// Each use that is part of a circle.
 fn circles(uses: &Uses) -> Vec<String> {
     let leads_to = |from: &str, to: &str| {
         let (mut seen, mut next) = (BTreeSet::from([from]), vec![from]);

@@ -1,4 +1,4 @@
-//! What the documents promise: links that lead somewhere, numbers that are unique, a changelog.
+//! Checks of the documents: links lead to files, numbers of decisions are unique, there is a changelog.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};

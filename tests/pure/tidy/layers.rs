@@ -1,4 +1,4 @@
-//! Who may use whom.
+//! The layers: which module may use which other one, and which library.
 
 use super::source::{Rust, SourceFile, SourcePath, files};
 
@@ -13,10 +13,10 @@ const STRANGERS: &[(&str, &str)] = &[("dds", "shm"), ("shm", "dds")];
 const EVALUATION: &str = "crates/eval/src/";
 const USED_BY_EVALUATION: &[&str] = &["clock", "model", "telemetry"];
 
-/// Folders of figures and reports, which have the standard library and are as pure as policy nevertheless.
+/// Folders of figures and reports, which use the standard library but have no side effects, like policy.
 const PURE: &[&str] = &["crates/measure/src/", "crates/eval/src/statistics/"];
 
-/// What a pure folder may not reach: clocks, threads, the outside, logs.
+/// The paths that a pure folder may not use: clocks, threads, IO, logs.
 const IMPURE: &[&[&str]] = &[
     &["std", "time", "Instant"],
     &["std", "time", "SystemTime"],
@@ -34,7 +34,7 @@ const IMPURE: &[&[&str]] = &[
 
 const PRINTING: &[&str] = &["print", "println", "eprint", "eprintln"];
 
-/// Libraries, and the only places that know them.
+/// Libraries, and the only places that may use them.
 const LIBRARIES: &[(&str, &[&str])] = &[
     ("iceoryx2", &["src/shm/"]),
     ("iceoryx2_bb_posix", &["src/shm/"]),
@@ -46,7 +46,7 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("granit_parser", &["src/config/yaml/"]),
 ];
 
-/// What breaks the rules in a file of a library or program.
+/// The violations of the rules in a file of a library or program.
 fn violations(path: &str, text: &str) -> Vec<String> {
     let rust = Rust::new(text);
     let paths = rust.paths();

@@ -1,4 +1,4 @@
-//! Finds the files of the project, and takes Rust apart far enough for the rules: tokens, comments and paths.
+//! Finds the files of the project, and parses Rust as far as the rules need: tokens, comments and paths.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ pub struct SourceFile {
     pub text: String,
 }
 
-/// Every file below `folder` with that extension; a folder that is not there has none.
+/// Every file below `folder` with that extension; none if the folder does not exist.
 pub fn files(folder: &str, extension: &str) -> Vec<SourceFile> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut found = Vec::new();
@@ -24,7 +24,7 @@ fn walk(root: &Path, folder: &Path, extension: &str, found: &mut Vec<SourceFile>
         let path: PathBuf = entry.unwrap().path();
         let name = path.file_name().unwrap().to_string_lossy().into_owned();
         let relative = path.strip_prefix(root).unwrap().to_string_lossy().into_owned();
-        // Not ours: what is built, what git keeps, and other people's code.
+        // Build results, git's data and third-party code.
         let foreign =
             ["target", "third_party", ".git"].contains(&relative.as_str()) || name == "node_modules";
         if path.is_dir() && !foreign {
@@ -43,7 +43,7 @@ pub struct Token {
     pub text: String,
 }
 
-/// Rust, taken apart.
+/// The parts of a Rust source.
 #[derive(Default)]
 pub struct Rust {
     pub tokens: Vec<Token>,
@@ -151,7 +151,7 @@ impl Rust {
                 at += 1;
                 while at < self.tokens.len() && !self.reads(at, &["}"]) {
                     let end = self.tree(at, &names, paths);
-                    // Something else than a name: no group of imports after all.
+                    // Not a name, so the braces are not a group of imports.
                     at = if end == at { at + 1 } else { end };
                     while at < self.tokens.len() && !self.reads(at, &[","]) && !self.reads(at, &["}"]) {
                         at += 1;
@@ -180,9 +180,9 @@ enum Kind {
 pub struct SourcePath {
     pub line: usize,
     pub names: Vec<String>,
-    /// Whether it stands in a `use`.
+    /// Whether it is in a `use`.
     pub imported: bool,
-    /// Modules of the file itself that it stands in.
+    /// The number of inline modules of the file that contain it.
     pub inline_modules: usize,
 }
 
@@ -196,7 +196,7 @@ impl SourcePath {
     }
 }
 
-/// The `mod name { … }` that a token stands in.
+/// The inline modules (`mod name { … }`) that contain a token.
 #[derive(Default)]
 struct Modules {
     braces: usize,

@@ -1,17 +1,17 @@
-//! What a file of Rust may look like: sizes, words, `unsafe`.
+//! The form of a file of Rust: sizes, words, `unsafe`.
 
 use super::source::{Rust, SourceFile, files};
 
 const MAX_COLUMNS: usize = 110;
-/// Of a line with a string in it, which rustfmt leaves alone: a message is found by its words only where it
-/// stands in one line.
+/// The limit of a line with a string, which rustfmt does not break: a search for the words of a message finds
+/// it only if it is in one line.
 const MAX_STRING_COLUMNS: usize = 120;
-/// Of libraries and programs. Tests may be longer.
+/// The limit of files of libraries and programs. Tests may be longer.
 const MAX_LINES: usize = 600;
-/// The roots of the programs only dispatch.
+/// The limit of the root of a program, which only dispatches.
 const MAX_MAIN_LINES: usize = 20;
 
-/// Files that may contain `unsafe`, each for what safe Rust has no means for.
+/// Files that may contain `unsafe`, each for a purpose that safe Rust cannot serve.
 const UNSAFE: &[&str] = &[
     // Memory that other processes write, and the futex in it.
     "src/shm/cell.rs",
@@ -23,7 +23,7 @@ const UNSAFE: &[&str] = &[
     "src/shm/wake.rs",
     // System calls without a safe wrapper.
     "src/process/scheduling.rs",
-    // What a child does between fork and exec.
+    // Code of a child process between fork and exec.
     "benches/hop/beds.rs",
     "src/cli/demo/children.rs",
     "tests/support/process.rs",
@@ -35,7 +35,7 @@ const UNSAFE: &[&str] = &[
     "tests/shm/main.rs",
 ];
 
-/// What breaks the rules in a file of Rust.
+/// The violations of the rules in a file of Rust.
 fn violations(path: &str, text: &str) -> Vec<String> {
     let rust = Rust::new(text);
     let mut found = Vec::new();

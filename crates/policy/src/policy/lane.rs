@@ -16,7 +16,7 @@ pub enum Decision<T> {
     SleepUntil(MonotonicNs),
     /// Wait: none is queued, and the next sample can be sent as soon as it arrives.
     WaitForSample,
-    /// The mode forwards nothing. Offered samples are dropped; they may wait in shared memory until then.
+    /// The mode forwards nothing: samples are dropped when they are offered, and may wait in shared memory.
     Closed,
 }
 

@@ -67,7 +67,7 @@ const WINDOW_SAMPLES: usize = 4;
 /// Readers of one participant that a reply is sent to. It has one for each client of the service.
 const MAX_READERS: usize = 64;
 
-/// How many of them at once: no more than the history keeps.
+/// Readers that a reply is sent to at once: no more than the history keeps samples.
 const READERS_AT_ONCE: usize = WINDOW_SAMPLES;
 
 /// How long a reply is kept for readers of its client's participant: a request may arrive before discovery
@@ -75,7 +75,7 @@ const READERS_AT_ONCE: usize = WINDOW_SAMPLES;
 /// earlier sample to a VOLATILE reader.
 const MATCH_MS: u64 = 1_000;
 
-/// How often a reply that is kept looks for new readers.
+/// Interval at which the thread checks for new readers of the replies that it keeps.
 const LOOK: Duration = Duration::from_millis(10);
 
 /// Replies that are kept for further readers at the same time.
@@ -123,7 +123,7 @@ impl Service {
     }
 }
 
-/// Each with the names of its topics and its type.
+/// All services, each with the name in its topics and the name of its type.
 const SERVICES: [(Service, &str, &str); 7] = [
     (Service::List, "list_parameters", "ListParameters"),
     (Service::Get, "get_parameters", "GetParameters"),
@@ -396,7 +396,7 @@ impl Services {
         let give_up_at = clock::monotonic().plus_ms(APPLY.as_millis() as u64);
         loop {
             let is_last = give_up_at <= clock::monotonic();
-            // This thread may have had no CPU time since the last look.
+            // Several changes may wait, because this thread gets little CPU time on a busy machine.
             while let Ok(settings) = self.reloaded.try_recv() {
                 self.parameters = Parameters::new(settings);
             }
@@ -416,7 +416,7 @@ impl Services {
         }
     }
 
-    /// Makes room for a reply: the oldest that was sent goes, else the oldest.
+    /// Discards a kept reply to make room: the oldest that was sent to a reader, else the oldest.
     fn forget_one(&mut self) {
         let sent = self.waiting.iter().position(|reply| !reply.sent.is_empty());
         if let Some(reply) = self.waiting.remove(sent.unwrap_or(0)) {
@@ -464,7 +464,7 @@ impl Services {
     }
 }
 
-/// The number of a reader or writer in its participant: the libraries count them up.
+/// The number of a reader or writer in its participant, which DDS libraries increment for each new one.
 fn number(of: &Guid) -> u32 {
     u32::from_be_bytes([0, of.0[12], of.0[13], of.0[14]])
 }

@@ -177,7 +177,7 @@ fn is_settable(parameter: &Parameter, current: &Parameters) -> Result<(), String
     let name = parameter.name.as_str();
     let declared: Option<&Row> = current.find(name).map(|listed| listed.row).or_else(|| Listed::unset(name));
     match declared {
-        None => Err("no parameter of the bridge: `ros2 param list` shows them".to_owned()),
+        None => Err("not a parameter of the bridge: `ros2 param list` lists them".to_owned()),
         Some(row) if !row.reloads => {
             Err("read-only: edit the configuration file and restart the bridge".to_owned())
         }
