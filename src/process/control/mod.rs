@@ -195,6 +195,7 @@ impl Control {
     fn sleep(&mut self, until: MonotonicNs) {
         let wait_ns = until.since(clock::monotonic());
         if wait_ns > 0 {
+            #[allow(clippy::disallowed_methods, reason = "control handles no samples")]
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
         self.subscribers.expected_awake_at = until;
