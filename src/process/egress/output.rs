@@ -66,7 +66,7 @@ pub(super) struct Output {
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
     unmatched: Vec<(Guid, UnmatchedPolicy)>,
-    /// When this process opened the output. Samples published before were missed by its predecessor.
+    /// When this process opened the output. Samples published before were missed by the former one.
     started_at: MonotonicNs,
     /// Whether a sample published since `started_at` has been taken.
     caught_up: bool,
@@ -92,7 +92,7 @@ impl Output {
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
         counters.update(|counters| {
-            // The samples that waited in a killed predecessor are lost with it.
+            // The samples that waited in a killed former process are lost with it.
             let accounted = counters.forwarded + counters.drops.total();
             counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
             counters.waiting = 0;

@@ -169,7 +169,7 @@ impl Receiving {
     fn wake_critical(&self, route: usize, cpu: u32) {
         for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
             if lane.serves[route] {
-                lane.waker.announce(cpu);
+                lane.waker.wake_early(cpu);
             }
         }
     }
