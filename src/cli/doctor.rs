@@ -35,9 +35,9 @@ enum Severity {
     Ok,
     /// A fact to know.
     Note,
-    /// It impairs the bridge under load, or after some time.
+    /// A condition that impairs the bridge under load, or after some time.
     Warning,
-    /// The bridge will not start or not work.
+    /// A condition with which the bridge will not start or not work.
     Error,
 }
 

@@ -45,8 +45,8 @@ const SEARCHING_MS: u64 = 10;
 /// nothing, also blocks a publisher whose history is full.
 const RESUME_MS: u64 = 1_000;
 
-/// The same once each publisher has sent the first of these samples. One request names 256 samples, so the
-/// remaining ones may take two or three more requests.
+/// How long that participant is kept once each publisher has sent the first of these samples. One request
+/// names 256 samples, so the remaining ones may take two or three more requests.
 const RESUMED_MS: u64 = 200;
 
 /// Runs ingress until `stop` is requested. No reloadable setting concerns ingress.
