@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use support::netns::{Host, Net};
-use support::peer::{Library, Peer, Received, RunningPeer, Said, Sent};
+use support::peer::{Library, LinesSent, Peer, Received, RunningPeer, Sent};
 use support::process::Process;
 
 const LIBRARIES: [Library; 3] = [Library::Cyclone, Library::Fast, Library::Rust];
@@ -373,8 +373,8 @@ fn a_published_string_is_decoded_by_a_peer_with_the_message_definition() {
     let heard: Vec<&str> = decoded.iter().filter_map(|message| message["data"].as_str()).collect();
     assert_eq!(heard[..4], lines);
     assert_eq!(heard.len(), 5);
-    let said: Said = speaker.finish();
-    assert_eq!((said.attempted, said.ok, said.failed, said.acknowledged), (5, 5, 0, true));
+    let summary: LinesSent = speaker.finish();
+    assert_eq!((summary.attempted, summary.ok, summary.failed, summary.acknowledged), (5, 5, 0, true));
 }
 
 /// CDR of `diagnostic_msgs/msg/DiagnosticArray`, little endian, without its header.

@@ -35,9 +35,9 @@ enum Severity {
     Ok,
     /// A fact to know.
     Note,
-    /// It impairs the bridge under load, or after some time.
+    /// A condition that impairs the bridge under load, or after some time.
     Warning,
-    /// The bridge will not start or not work.
+    /// A condition with which the bridge will not start or not work.
     Error,
 }
 
@@ -181,6 +181,11 @@ fn number(path: &str) -> Option<i64> {
 fn output(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).output().ok()?;
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}
+
+/// A number of bytes in MiB, rounded up.
+const fn mib(bytes: u64) -> u64 {
+    bytes.div_ceil(1 << 20)
 }
 
 fn list<T: fmt::Display>(items: impl IntoIterator<Item = T>) -> String {

@@ -246,7 +246,7 @@ impl<'a> Field<'a> {
         self.report_with(allowed, None)
     }
 
-    /// As [`report`](Self::report), with a hint at the remedy.
+    /// Reports this field as [`report`](Self::report) does, with a hint at the remedy.
     pub fn report_with<T>(&self, allowed: &str, hint: Option<String>) -> Option<T> {
         match self.value() {
             Some(node) => self.add(self.shown(node), allowed.to_owned(), hint),

@@ -56,8 +56,8 @@ struct Encoded {
 pub struct DecodeError(String);
 
 impl Configuration {
-    /// As [`Settings::reloaded`]: this configuration with all changes in `new` that a running bridge can
-    /// apply.
+    /// This configuration with all changes in `new` that a running bridge can apply, and the list of the
+    /// changes.
     pub fn reloaded(&self, new: Self) -> (Self, Reload) {
         let (settings, reload) = self.settings.reloaded(new.settings);
         (Self { settings, inline_secret: new.inline_secret }, reload)

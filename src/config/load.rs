@@ -30,8 +30,8 @@ pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result
     load_configuration(path, &[], env).map(|configuration| configuration.settings)
 }
 
-/// As [`load`], with the values of `parameters` in place of those of the file, and with the secret if there
-/// is one.
+/// Loads the settings as [`load`] does, with the values of `parameters` in place of those of the file, and
+/// the secret if there is one.
 ///
 /// # Errors
 /// As for [`load`].
@@ -52,8 +52,8 @@ pub fn load_configuration(
     parse_configuration(&bytes, &name, parameters, env)
 }
 
-/// As [`load_configuration`], for a program that does not need a file: without one, loads the defaults with
-/// this environment. They contain one placeholder route.
+/// Loads the configuration as [`load_configuration`] does; without a file, the defaults with this environment
+/// and one placeholder route.
 ///
 /// # Errors
 /// As for [`load`], except that a missing default file is no error.

@@ -348,11 +348,11 @@ pub struct Safety {
 /// How the bridge treats probe messages that are not authenticated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum TrustMode {
-    /// It refuses them.
+    /// Refuses probe messages that are not authenticated.
     DefaultDeny,
-    /// It accepts and logs them.
+    /// Accepts and logs probe messages that are not authenticated.
     Permissive,
-    /// It accepts them.
+    /// Accepts probe messages that are not authenticated.
     Off,
 }
 
@@ -402,15 +402,15 @@ pub struct Diagnostics {
 /// The least severe level that is logged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Verbosity {
-    /// Failures.
+    /// Logs failures.
     Error,
-    /// Also problems after which the process continues.
+    /// Logs also problems after which the process continues.
     Warn,
-    /// Also rare events.
+    /// Logs also rare events.
     Info,
-    /// Also details for finding a fault.
+    /// Logs also details for finding a fault.
     Debug,
-    /// Everything.
+    /// Logs everything.
     Trace,
 }
 

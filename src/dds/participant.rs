@@ -219,7 +219,7 @@ impl Participant {
     /// The process has no file descriptor left, the participant is not from
     /// [`open_receiving`](Self::open_receiving), or this was called before.
     pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
-        Arrivals::new(self.participant.onlooker_sockets())
+        Arrivals::new(self.participant.sockets_to_peek())
     }
 
     /// Announces that a participant whose process died has left. Remote participants then drop its readers

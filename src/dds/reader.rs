@@ -166,7 +166,7 @@ impl RawReader {
         self.take_payload().read(read)
     }
 
-    /// Like [`take`](Self::take), but returns the payload, also one in [lent memory](Self::lend_memory).
+    /// Takes the next sample, and returns its payload, also one in [lent memory](Self::lend_memory).
     pub fn take_payload(&self) -> TakePayload {
         match self.inner.try_take_one_with(PayloadDecoder) {
             Ok(Some(change)) => {

@@ -21,7 +21,7 @@ pub(super) type DropLog = CountLog<DropReason, { DropReason::COUNT }>;
 pub(super) type RefusalLog = CountLog<ProbeRefusal, { ProbeRefusal::COUNT }>;
 
 impl<R: Reason, const N: usize> CountLog<R, N> {
-    /// Starts at `counts`, so that the counts of a predecessor of this process are not logged again.
+    /// Starts at `counts`, so that the counts of the former process are not logged again.
     pub fn new(counts: Counts<R, N>) -> Self {
         Self { logged: counts, next_at: [MonotonicNs(0); N] }
     }

@@ -71,6 +71,7 @@ pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleE
         }
         let wait_ns = responder.housekeeping_at.since(clock::monotonic());
         if wait_ns > 0 {
+            #[allow(clippy::disallowed_methods, reason = "the responder handles no samples")]
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
     }

@@ -62,7 +62,7 @@ pub(super) struct Role {
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
     pub notifier: Notifier,
-    /// The participant of the predecessor of this process; all zero for none, and once it is disposed of.
+    /// The participant of the former process; all zero for none, and once it is disposed of.
     former_participant: Guid,
     /// The last field, so that the lock is released only after everything else is dropped.
     _lock: RoleLock,
@@ -109,8 +109,8 @@ impl Role {
         Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former_participant, _lock: lock })
     }
 
-    /// Opens the DDS participant. If the predecessor of this process was killed, the participant disposes of
-    /// the predecessor's participant, so that the others remove it.
+    /// Opens the DDS participant. If the former process was killed, the participant disposes of
+    /// that process's participant, so that the others remove it.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
         self.dispose_former(&participant);
@@ -119,7 +119,7 @@ impl Role {
     }
 
     /// Like [`join`](Self::join), with callbacks for the receiving thread; see
-    /// [`Participant::open_receiving`]. Leaves the predecessor's participant to a later call of
+    /// [`Participant::open_receiving`]. Leaves the participant of the former process to a later call of
     /// [`dispose_former`](Self::dispose_former).
     pub fn join_receiving(
         &mut self,
@@ -133,8 +133,8 @@ impl Role {
         Ok(participant)
     }
 
-    /// Announces to the other participants, once, that the participant of a killed predecessor is gone. A
-    /// writer then releases the samples that only the predecessor had not acknowledged.
+    /// Announces to the other participants, once, that the participant of a killed former process is gone. A
+    /// writer then releases the samples that only the former process had not acknowledged.
     pub fn dispose_former(&mut self, participant: &Participant) {
         participant.dispose_participant(std::mem::take(&mut self.former_participant));
     }

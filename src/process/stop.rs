@@ -19,7 +19,7 @@ impl Stop {
         Self::on(&[SIGINT, SIGTERM])
     }
 
-    /// As [`Stop::on_signals`], for other signals.
+    /// Creates a flag that `signals` set.
     ///
     /// # Errors
     /// The operating system refused the signal handlers.

@@ -1,8 +1,8 @@
 //! Boards: latest values in shared memory, which readers poll without waiting.
 //!
 //! All boards of an instance are in one segment. The first process creates it and the last process that
-//! leaves the instance removes it, so a process that is restarted continues with the counters of its
-//! predecessor.
+//! leaves the instance removes it, so a process that is restarted continues with the counters of the former
+//! process.
 //!
 //! Each value is a [`Cell`]. A histogram is not: its counts are single words, which are incremented in place.
 
@@ -199,7 +199,7 @@ macro_rules! boards {
             }
 
             #[doc = concat!("The writer of [`Self::", stringify!($name), "`]. It begins")]
-            /// with what its predecessor wrote. One writer at a time: the holder of the role's lock.
+            /// with what the former process wrote. One writer at a time: the holder of the role's lock.
             pub fn $writer(&self, $($arg: $of),*) -> BoardWriter<$value> {
                 self.writer(self.layout.$name($($arg),*))
             })+

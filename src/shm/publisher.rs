@@ -76,7 +76,7 @@ impl SamplePublisher {
                 .create()
         };
         let port = match create() {
-            // A dead predecessor counts until it is cleaned up.
+            // A dead former process counts until it is cleaned up.
             Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
                 shared.clean_up(&start);
                 create()

@@ -168,7 +168,9 @@ impl<T: Send + Debug + Abandonable> Abandonable for RecycledArc<T> {
         // SAFETY: the caller passes a valid handle, and does not use or drop it afterwards.
         let handle = unsafe { this.as_mut() };
         if handle.shared().handles.load(Ordering::Acquire) == 1 {
-            if let Ok(mut value) = handle.mutex().lock() {
+            #[allow(clippy::disallowed_methods, reason = "there is no other handle")]
+            let locked = handle.mutex().lock();
+            if let Ok(mut value) = locked {
                 // SAFETY: there is no other handle, and the value is not used afterwards.
                 unsafe { T::abandon_in_place(NonNull::from(&mut *value)) };
             }
@@ -215,7 +217,9 @@ impl<T: Send + Debug + Abandonable> ArcSyncPolicy<T> for RecycledArc<T> {
     }
 
     fn lock(&self) -> Guard<'_, T> {
-        match self.mutex().lock() {
+        #[allow(clippy::disallowed_methods, reason = "threads use a publisher in turns (ingress/pool.rs)")]
+        let locked = self.mutex().lock();
+        match locked {
             Ok(guard) => Guard(guard),
             // Locking a recursive mutex of this process fails only when one thread has locked it 2^32 times
             // or when its memory is corrupted; neither can be recovered from.

@@ -95,7 +95,7 @@ impl SampleSubscriber {
                 .create()
         };
         let port = match create() {
-            // A dead predecessor counts until it is cleaned up.
+            // A dead former process counts until it is cleaned up.
             Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                 shared.clean_up(&start);
                 create()

@@ -6,9 +6,8 @@
 //! of them sees the write of the other: no wake is lost. There is no descriptor and no buffer that could fill
 //! up while a lane is stopped. `docs/decisions/0004-shared-memory.md` has the measurements.
 //!
-//! Ingress can announce a wake to a lane that sleeps on another CPU: the lane then leaves its sleep while the
-//! sample is still being received (`docs/decisions/0006-hand-overs.md` and
-//! `0013-early-waker.md`).
+//! Ingress can wake a lane early that sleeps on another CPU: the lane then leaves its sleep while the sample
+//! is still being received (`docs/decisions/0006-hand-overs.md` and `0013-early-waker.md`).
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -22,17 +21,17 @@ use super::segment::Segment;
 use crate::clock;
 use crate::model::MonotonicNs;
 
-/// The shortest and the longest time for which a lane spins until an announced wake. The shortest is about
-/// the time that a sleep and a wake-up take. The lane waits for one copy of the sample, for the last 64 KiB
-/// of a large one, or for the wake-up of the receiving thread, which normally take far less than the longest
-/// time. A later wake is like one that was not announced.
+/// The shortest and the longest time for which a lane spins for the wake after an early one. The shortest is
+/// about the time that a sleep and a wake-up take. The lane waits for one copy of the sample, for the last
+/// 64 KiB of a large one, or for the wake-up of the receiving thread, which normally take far less than the
+/// longest time. A later wake is like one without an early wake.
 const SPIN_LIMITS_NS: [u64; 2] = [50_000, 200_000];
 
 /// Between these limits a lane spins for the time that it slept before, divided by this number. At 1 kHz that
-/// is 56 µs, within which most wakes happen: the median is 37 µs after the announcement.
+/// is 56 µs, within which most wakes happen: the median is 37 µs after the early wake.
 const SLEEP_PER_SPIN: u64 = 16;
 
-/// The time for which a lane spins until an announced wake, after a sleep of `slept_ns`.
+/// The time for which a lane spins for the wake after an early one, after a sleep of `slept_ns`.
 fn spin_ns(slept_ns: u64) -> u64 {
     let [at_least, at_most] = SPIN_LIMITS_NS;
     (slept_ns / SLEEP_PER_SPIN).clamp(at_least, at_most)
@@ -43,10 +42,10 @@ fn spin_ns(slept_ns: u64) -> u64 {
 pub enum Woken {
     /// There was a wake since the last return, or a signal interrupted the sleep.
     Woken,
-    /// A wake was announced; the next sleep spins until the wake. A lane that runs one turn in between,
+    /// The lane was woken early; the next sleep spins until the wake. A lane that runs one turn in between,
     /// although it has no work, has code and data in the CPU's caches when the sample arrives. Also returned
     /// after a wake that the lane had already seen when the waker called the kernel.
-    Announced,
+    Early,
     /// The sleep timed out without a wake.
     TimedOut,
 }
@@ -74,10 +73,10 @@ impl LaneWaker {
         self.segment.half(self.at + 1)
     }
 
-    /// Announces that a wake will follow from `cpu`, a number from [`this_cpu`], so that a lane that sleeps
-    /// on another CPU leaves its sleep early. A lane on the same CPU is not affected, because it would only
-    /// delay the wake. A wake need not follow.
-    pub fn announce(&self, cpu: u32) {
+    /// Wakes the lane early if it sleeps on another CPU than `cpu`, a number from [`this_cpu`], on which the
+    /// caller expects to call [`wake`](Self::wake) soon. A lane on the same CPU is not affected, because it
+    /// would only delay the wake. A wake need not follow.
+    pub fn wake_early(&self, cpu: u32) {
         let sleeping_cpu = self.sleeping_cpu().load(Ordering::Relaxed);
         if sleeping_cpu != 0 && sleeping_cpu != cpu {
             futex_wake(self.wake_count());
@@ -100,11 +99,10 @@ pub struct LaneSleeper {
     words: LaneWaker,
     /// The wake count at the last check.
     seen_count: u32,
-    /// Whether the last announcement was followed by a wake in time. After one that was not, the lane ignores
-    /// announcements until the next wake, so that samples that are announced but never forwarded do not keep
-    /// it busy.
-    trusts_announcements: bool,
-    /// The time until which the next sleep spins for an announced wake.
+    /// Whether a wake followed the last early wake in time. After one without, the lane ignores early wakes
+    /// until the next wake, so that samples that are never forwarded do not keep it busy.
+    trusts_early_wakes: bool,
+    /// The time until which the next sleep spins for the wake after an early one.
     spin_until: Option<MonotonicNs>,
 }
 
@@ -113,7 +111,7 @@ impl LaneSleeper {
         let words = LaneWaker::new(segment, at);
         // There may have been wakes for an earlier process, so the first sleep returns at once.
         let seen_count = words.wake_count().load(Ordering::SeqCst).wrapping_sub(1);
-        Self { words, seen_count, trusts_announcements: true, spin_until: None }
+        Self { words, seen_count, trusts_early_wakes: true, spin_until: None }
     }
 
     /// The number of wakes so far. While it is the same, no sample has arrived.
@@ -130,7 +128,7 @@ impl LaneSleeper {
         let woken = self.take_wake() || self.spin(deadline);
         self.spin_until = None;
         if woken {
-            self.trusts_announcements = true;
+            self.trusts_early_wakes = true;
             return Woken::Woken;
         }
         let woken = loop {
@@ -147,18 +145,18 @@ impl LaneSleeper {
             if self.take_wake() || outcome == Err(Errno::EINTR) {
                 break Woken::Woken;
             }
-            if outcome.is_ok() && std::mem::take(&mut self.trusts_announcements) {
+            if outcome.is_ok() && std::mem::take(&mut self.trusts_early_wakes) {
                 let now = clock::monotonic();
                 self.spin_until = Some(now.plus_ns(spin_ns(now.since(began))));
-                break Woken::Announced;
+                break Woken::Early;
             }
         };
         self.words.sleeping_cpu().store(0, Ordering::Relaxed);
-        self.trusts_announcements |= woken == Woken::Woken;
+        self.trusts_early_wakes |= woken == Woken::Woken;
         woken
     }
 
-    /// Spins for an announced wake, until `deadline` at most, and returns whether there was one.
+    /// Spins for the wake after an early one, until `deadline` at most, and returns whether there was one.
     fn spin(&mut self, deadline: MonotonicNs) -> bool {
         let Some(spin_until) = self.spin_until else {
             return false;
@@ -184,7 +182,7 @@ impl LaneSleeper {
 /// One more than the number of the CPU that this thread runs on.
 pub fn this_cpu() -> u32 {
     let cpu = sched_getcpu().ok().and_then(|cpu| u32::try_from(cpu).ok());
-    // If the number is unknown, all CPUs count as the same one, and announcements have no effect.
+    // If the number is unknown, all CPUs count as the same one, and early wakes have no effect.
     cpu.map_or(1, |cpu| cpu.saturating_add(1))
 }
 

@@ -34,7 +34,7 @@ struct Places {
 
 struct Place {
     bucket: TokenBucket,
-    /// Such as `event src/process/egress/output.rs:380`.
+    /// The name of the call site, such as `event src/process/egress/output.rs:380`.
     name: &'static str,
     left_out: u64,
 }

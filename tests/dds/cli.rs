@@ -189,9 +189,9 @@ fn without_a_bridge_status_and_tap_say_so_and_create_nothing() {
         let output = bridge.run(arguments);
         assert_eq!(output.status.code(), Some(1), "{arguments}");
         assert_eq!(text(&output.stdout), "", "{arguments}");
-        let said = text(&output.stderr);
+        let stderr = text(&output.stderr);
         for part in ["no bridge runs as instance test_", "/root)", "`adaptive-bridge up`"] {
-            assert!(said.contains(part), "{arguments}: {part} is not in: {said}");
+            assert!(stderr.contains(part), "{arguments}: {part} is not in: {stderr}");
         }
         assert!(!bridge.folder().join("root").exists(), "{arguments} created the root folder");
     }
@@ -343,10 +343,10 @@ fn status_says_in_words_what_is_wrong() {
         let running = |process: &&Value| process["state"] == "running";
         status["processes"].as_array().unwrap().iter().filter(running).count() == 2
     });
-    let said = problems(&status(&bridge));
+    let found = problems(&status(&bridge));
     assert!(
-        said.contains("egress-noncritical was never started: lane noncritical forwards nothing"),
-        "{said}"
+        found.contains("egress-noncritical was never started: lane noncritical forwards nothing"),
+        "{found}"
     );
 
     let pid = ingress.pid();
@@ -536,18 +536,18 @@ fn a_tap_that_cannot_start_reports_the_reason() {
     let _publisher = Publisher::new(107).run();
     let unknown = bridge.run("tap /imu");
     assert_eq!(unknown.status.code(), Some(1));
-    let said = text(&unknown.stderr);
-    assert!(said.contains("/imu; the routes are: /scan (front_laser)"), "{said}");
+    let stderr = text(&unknown.stderr);
+    assert!(stderr.contains("/imu; the routes are: /scan (front_laser)"), "{stderr}");
     assert_eq!(bridge.run("tap /scan --hz --raw").status.code(), Some(2));
 
     let mut first = bridge.start("tap /scan");
     first.wait_for_line("a sample", 0, |line| line.starts_with("sequence=").then_some(()));
     let second = bridge.run("tap /scan");
     assert_eq!(second.status.code(), Some(1));
-    let said = text(&second.stderr);
+    let stderr = text(&second.stderr);
     assert!(
-        said.contains("all 1 places on route front_laser are taken; raise shared_memory.max_taps"),
-        "{said}"
+        stderr.contains("all 1 places on route front_laser are taken; raise shared_memory.max_taps"),
+        "{stderr}"
     );
     // A tap that was killed leaves its place to the next.
     first.kill9();
@@ -576,17 +576,20 @@ fn commands_read_the_configuration_in_force_and_not_another_file_of_the_instance
         let output = Command::new(program()).args(command).arg("--config").arg(&path).output().unwrap();
         (output.status.code(), text(&output.stdout) + &text(&output.stderr))
     };
-    let (code, said) = run(&["status", "--interval-ms", "50"]);
-    assert_eq!(code, Some(0), "{said}");
-    assert!(said.contains("front_laser") && !said.contains("rear_laser"), "{said}");
-    let (code, said) = run(&["mode", "noncritical", "degraded"]);
-    assert_eq!(code, Some(0), "{said}");
-    let (code, said) = run(&["tap", "/other"]);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the routes are: /scan (front_laser)"), "{said}");
-    let (code, said) = run(&["check"]);
-    assert_eq!(code, Some(0), "{said}");
-    assert!(said.contains("restart of the whole bridge: topics: [front_laser] -> [rear_laser]"), "{said}");
+    let (code, output) = run(&["status", "--interval-ms", "50"]);
+    assert_eq!(code, Some(0), "{output}");
+    assert!(output.contains("front_laser") && !output.contains("rear_laser"), "{output}");
+    let (code, output) = run(&["mode", "noncritical", "degraded"]);
+    assert_eq!(code, Some(0), "{output}");
+    let (code, output) = run(&["tap", "/other"]);
+    assert_eq!(code, Some(1), "{output}");
+    assert!(output.contains("the routes are: /scan (front_laser)"), "{output}");
+    let (code, output) = run(&["check"]);
+    assert_eq!(code, Some(0), "{output}");
+    assert!(
+        output.contains("restart of the whole bridge: topics: [front_laser] -> [rear_laser]"),
+        "{output}"
+    );
 }
 
 #[test]
@@ -604,10 +607,10 @@ fn exit_codes_tell_what_was_wrong() {
     for unknown in ["egress --lane nope", "mode nope normal"] {
         let output = bridge.run(unknown);
         assert_eq!(output.status.code(), Some(1), "{unknown}");
-        let said = text(&output.stderr);
+        let stderr = text(&output.stderr);
         assert!(
-            said.contains("there is no lane nope; the configuration has: critical, noncritical"),
-            "{said}"
+            stderr.contains("there is no lane nope; the configuration has: critical, noncritical"),
+            "{stderr}"
         );
     }
     bridge.write_config("topics:\n  - {id: a b, input_topic: scan}\nnonsense: 1\n");
@@ -616,9 +619,9 @@ fn exit_codes_tell_what_was_wrong() {
     {
         let output = bridge.run(arguments);
         assert_eq!(output.status.code(), Some(78), "{arguments}");
-        let said = text(&output.stderr);
+        let stderr = text(&output.stderr);
         for key in ["topics[0].id", "topics[0].input_topic", "nonsense"] {
-            assert!(said.contains(key), "{arguments}: {key} is not in: {said}");
+            assert!(stderr.contains(key), "{arguments}: {key} is not in: {stderr}");
         }
     }
 }

@@ -87,9 +87,9 @@ fn reload(bridge: &Bridge) -> (Option<i32>, String) {
     (output.status.code(), text(&output.stdout) + &text(&output.stderr))
 }
 
-fn assert_says(said: &str, parts: &[&str]) {
+fn assert_says(output: &str, parts: &[&str]) {
     for part in parts {
-        assert!(said.contains(part), "{part:?} is not in:\n{said}");
+        assert!(output.contains(part), "{part:?} is not in:\n{output}");
     }
 }
 
@@ -111,10 +111,10 @@ fn rates_and_staleness_change_under_flow_and_no_sample_is_lost() {
         110,
         "lanes: {noncritical: {max_rate_hz: 20, stale_threshold_ms: 100, queue_samples: 2}}\npolicy_hold_s: 9",
     ));
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(0), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(0), "{output}");
     assert_says(
-        &said,
+        &output,
         &[
             "changed: lanes.noncritical.max_rate_hz: 10 -> 20\n",
             "changed: lanes.noncritical.stale_threshold_ms: 200 -> 100\n",
@@ -124,16 +124,16 @@ fn rates_and_staleness_change_under_flow_and_no_sample_is_lost() {
             &format!("ingress (pid {}): reloaded\n", before[0].pid),
         ],
     );
-    assert!(!said.contains("restarted"), "{said}");
+    assert!(!output.contains("restarted"), "{output}");
     wait_rate(&bridge, 20.0);
     let after = healths(&settings(&bridge)).unwrap();
     assert_same_processes(&before, &after);
     let fingerprint = settings(&bridge).fingerprint();
     assert!(after.iter().all(|health| health.settings_fingerprint == fingerprint), "{after:?}");
 
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(0), "{said}");
-    assert_says(&said, &["): nothing differs\n"]);
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(0), "{output}");
+    assert_says(&output, &["): nothing differs\n"]);
     flow.end_whole(&bridge);
 }
 
@@ -146,9 +146,9 @@ fn a_bad_file_changes_nothing_and_is_reported() {
     bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: -1}}\nclassifyer: {}"));
 
     // The command contacts no process.
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(78), "{said}");
-    assert_says(&said, &["lanes.noncritical.max_rate_hz = -1: must be", "did you mean `classifier`?"]);
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(78), "{output}");
+    assert_says(&output, &["lanes.noncritical.max_rate_hz = -1: must be", "did you mean `classifier`?"]);
     assert!(healths(&good).unwrap().iter().all(|health| health.refused_reloads == 0));
 
     // A signal does, and each process refuses, names all problems and counts.
@@ -165,8 +165,8 @@ fn a_bad_file_changes_nothing_and_is_reported() {
     wait_rate(&bridge, 10.0);
 
     bridge.write_config(&file(111, "lanes: {noncritical: {max_rate_hz: 5}}"));
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(0), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(0), "{output}");
     wait_rate(&bridge, 5.0);
     assert!(healths(&good).unwrap().iter().all(|health| health.refused_reloads == 1));
     flow.end_whole(&bridge);
@@ -183,10 +183,10 @@ fn what_needs_a_restart_is_named_and_left_as_it_is() {
         "lanes: {rviz: {}, noncritical: {domain_id: 113, max_rate_hz: 20}}\n\
          subscribers: {laptop: rviz, tablet: noncritical}",
     ));
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(5), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(5), "{output}");
     assert_says(
-        &said,
+        &output,
         &[
             "changed: lanes.noncritical.max_rate_hz: 10 -> 20\n",
             "changed: subscribers.tablet: none -> noncritical\n",
@@ -229,8 +229,8 @@ fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
     };
     storm();
     let last = settings(&bridge);
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(0), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(0), "{output}");
     assert_same_processes(&before, &wait_in_force(&last, last.fingerprint()));
     flow.end_whole(&bridge);
 
@@ -248,9 +248,9 @@ fn no_storm_of_hang_ups_ends_a_process_or_loses_a_sample() {
 #[test]
 fn a_process_that_does_not_answer_is_named_and_no_other_is_signalled() {
     let bridge = Bridge::new(&file(114, ""));
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(1), "{said}");
-    assert_says(&said, &["no bridge runs as instance"]);
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(1), "{output}");
+    assert_says(&output, &["no bridge runs as instance"]);
 
     let ingress = bridge.start("ingress");
     let mut critical = bridge.start("egress --lane critical");
@@ -264,10 +264,10 @@ fn a_process_that_does_not_answer_is_named_and_no_other_is_signalled() {
     let mut stranger = std::process::Command::new("sleep").arg("1000").spawn().unwrap();
     std::fs::write(&lock, format!("{}\n", stranger.id())).unwrap();
     ingress.stop();
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(1), "{said}");
-    assert_says(&said, &[&format!("ingress (pid {}): no answer", ingress.pid())]);
-    assert!(!said.contains("egress-critical"), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(1), "{output}");
+    assert_says(&output, &[&format!("ingress (pid {}): no answer", ingress.pid())]);
+    assert!(!output.contains("egress-critical"), "{output}");
     assert!(stranger.try_wait().unwrap().is_none(), "a stranger was signalled");
     stranger.kill().unwrap();
     stranger.wait().unwrap();
@@ -315,8 +315,8 @@ fn crashed_processes_restart_with_the_configuration_in_force() {
 
     // A lane more.
     bridge.write_config(&file(115, "lanes: {rviz: {}, noncritical: {max_rate_hz: 20}}"));
-    let (code, said) = reload(&bridge);
-    assert_eq!(code, Some(5), "{said}");
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(5), "{output}");
     kill_each(&bridge, &all);
     for part in [
         "using the configuration in force of the running bridge, not the configuration file",
@@ -327,9 +327,9 @@ fn crashed_processes_restart_with_the_configuration_in_force() {
     // The reloaded settings are in force in the restarted processes, too.
     wait_rate(&bridge, 20.0);
     let check = bridge.run("check");
-    let said = String::from_utf8_lossy(&check.stdout).into_owned();
-    assert_eq!(check.status.code(), Some(0), "{said}");
-    assert_says(&said, &["waits for a restart of the whole bridge: lanes: [critical, noncritical] -> "]);
+    let output = String::from_utf8_lossy(&check.stdout).into_owned();
+    assert_eq!(check.status.code(), Some(0), "{output}");
+    assert_says(&output, &["waits for a restart of the whole bridge: lanes: [critical, noncritical] -> "]);
 
     // A broken file, no file, and another instance.
     for yaml in
@@ -387,13 +387,13 @@ fn a_bridge_that_runs_is_not_started_a_second_time() {
     let bridge = Bridge::new(&file(117, ""));
     let (up, before) = up(&bridge);
     let again = bridge.run("up");
-    let said = String::from_utf8_lossy(&again.stderr).into_owned();
-    assert_eq!(again.status.code(), Some(1), "{said}");
-    assert_says(&said, &[&format!("runs already as instance {}, process {}", bridge.instance(), up.pid())]);
+    let output = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{output}");
+    assert_says(&output, &[&format!("runs already as instance {}, process {}", bridge.instance(), up.pid())]);
     let again = bridge.run("ingress");
-    let said = String::from_utf8_lossy(&again.stderr).into_owned();
-    assert_eq!(again.status.code(), Some(1), "{said}");
-    assert_says(&said, &[&format!("ingress is served already, by process {}", before[0].pid)]);
+    let output = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{output}");
+    assert_says(&output, &[&format!("ingress is served already, by process {}", before[0].pid)]);
     assert_same_processes(&before, &healths(&settings(&bridge)).unwrap());
 }
 
@@ -408,10 +408,10 @@ fn processes_started_one_by_one_agree_on_the_first_ones_configuration() {
     critical.wait_for_log("waits for a restart of the whole bridge: lanes:");
     // `up` beside them names one of them.
     let again = bridge.run("up");
-    let said = String::from_utf8_lossy(&again.stderr).into_owned();
-    assert_eq!(again.status.code(), Some(1), "{said}");
+    let output = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert_eq!(again.status.code(), Some(1), "{output}");
     assert!(
-        [ingress.pid(), critical.pid()].iter().any(|pid| said.contains(&format!("process {pid}"))),
-        "{said}"
+        [ingress.pid(), critical.pid()].iter().any(|pid| output.contains(&format!("process {pid}"))),
+        "{output}"
     );
 }

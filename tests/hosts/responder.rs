@@ -347,17 +347,17 @@ fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
 #[test]
 fn a_responder_without_its_secret_prints_what_to_do() {
     let output = run(&["--id", "a", "--secret-file", "/nonexistent/secret"]);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(78), "{said}");
-    assert!(said.contains("/nonexistent/secret"), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(78), "{stderr}");
+    assert!(stderr.contains("/nonexistent/secret"), "{stderr}");
 
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bridge.yaml");
     fs::write(&path, "topics: [{id: a, input_topic: /a}]\nsecurity: {enable_probe_hmac: true}\n").unwrap();
     let output = run(&["--id", "a", "--config", path.to_str().unwrap()]);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(78), "{said}");
-    assert!(said.contains("hmac_secret_file") && said.contains("enable_probe_hmac"), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(78), "{stderr}");
+    assert!(stderr.contains("hmac_secret_file") && stderr.contains("enable_probe_hmac"), "{stderr}");
 }
 
 #[test]
@@ -373,7 +373,7 @@ fn an_invalid_command_line_is_refused() {
         &[],
     ] {
         let output = run(arguments);
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {stderr}");
     }
 }

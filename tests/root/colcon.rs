@@ -53,9 +53,9 @@ fn python_with(module: &str) -> Option<&'static str> {
 
 fn run(command: &mut Command) -> String {
     let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let said = String::from_utf8_lossy(&output.stderr);
+    let stderr = String::from_utf8_lossy(&output.stderr);
     let printed = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{command:?}: {}\n{printed}\n{said}", output.status);
+    assert!(output.status.success(), "{command:?}: {}\n{printed}\n{stderr}", output.status);
     printed.into_owned()
 }
 

@@ -186,7 +186,7 @@ fn the_early_waker_wakes_a_lane_before_ingress_has_received_the_sample() {
         let received = published() - before;
         burner.kill9();
         wait_for("the sample", || (published() > before).then_some(()));
-        woken == Woken::Announced && received == 0
+        woken == Woken::Early && received == 0
     });
     // A datagram that is not a sample may have arrived just before it.
     assert!(times.count() > 5, "{}", ingress.log());

@@ -153,8 +153,8 @@ fn the_units_are_sound_and_hardened() {
         let mut command = Command::new("systemd-analyze");
         command.arg(format!("--root={}", root.path().display())).args(arguments).arg(unit);
         let output = command.output().unwrap();
-        let said = [output.stdout, output.stderr].concat();
-        assert!(output.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&said));
+        let printed = [output.stdout, output.stderr].concat();
+        assert!(output.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&printed));
     };
     for unit in UNITS.into_iter().chain([RESPONDER]) {
         analyze(&["security", "--offline=true", MAX_EXPOSURE], unit);
@@ -561,10 +561,10 @@ fn package(version: &str) -> Result<PathBuf, String> {
     let mut command = Command::new(source.join("scripts/package.sh"));
     command.args(["--deb-version", version]).env("PROGRAM", support::bridge::program());
     let output = command.output().map_err(|error| error.to_string())?;
-    let said = String::from_utf8_lossy(&output.stderr);
+    let stderr = String::from_utf8_lossy(&output.stderr);
     match String::from_utf8_lossy(&output.stdout).lines().last() {
         Some(path) if output.status.success() => Ok(source.join(path)),
-        _ => Err(said.into_owned()),
+        _ => Err(stderr.into_owned()),
     }
 }
 

@@ -65,7 +65,7 @@ impl Child {
         self.stop.load(Ordering::SeqCst)
     }
 
-    /// Arguments: pause in µs, bytes. Numbers samples on from where its predecessor stopped.
+    /// Arguments: pause in µs, bytes. Numbers samples on from where the former process stopped.
     fn publisher(&self) {
         let [pause_us, bytes] = self.arguments[..] else { panic!() };
         let _role = RoleLock::acquire(&self.root, &self.instance, "ingress").unwrap();
@@ -224,7 +224,7 @@ impl Child {
         println!("@ ready");
         while !self.stopping() {
             match sleeper.sleep(PATIENCE * 2) {
-                Woken::Announced => continue,
+                Woken::Early => continue,
                 woken => assert_eq!(woken, Woken::Woken),
             }
             waker.wake();

@@ -923,13 +923,13 @@ fn no_wake_is_missed() {
         // Varies the moment of the wake: before, during or after the other side's falling asleep.
         (0..turn * 7_919 % 400).for_each(|_| std::hint::spin_loop());
         if turn % 3 != 0 {
-            waker.announce(ELSEWHERE);
+            waker.wake_early(ELSEWHERE);
             (0..turn * 6_091 % 400).for_each(|_| std::hint::spin_loop());
         }
         waker.wake();
-        // A wake whose system call is delayed is reported as an announcement.
+        // A wake whose system call is delayed is reported as an early one.
         let woken = sleeper.sleep(support::PATIENCE);
-        let woken = if woken == Woken::Announced { sleeper.sleep(support::PATIENCE) } else { woken };
+        let woken = if woken == Woken::Early { sleeper.sleep(support::PATIENCE) } else { woken };
         assert_eq!(woken, Woken::Woken, "turn {turn}");
     }
     pong.finish();
@@ -947,7 +947,7 @@ fn no_wake_is_missed() {
 const ELSEWHERE: u32 = 0;
 
 #[test]
-fn an_announcement_is_distinguished_from_a_wake() {
+fn an_early_wake_is_distinguished_from_a_wake() {
     let place = Place::new();
     let node = place.node();
     let boards = node.boards(&shape()).unwrap();
@@ -957,11 +957,11 @@ fn an_announcement_is_distinguished_from_a_wake() {
     std::thread::scope(|scope| {
         scope.spawn(|| {
             while !done.load(Ordering::Relaxed) {
-                waker.announce(ELSEWHERE);
+                waker.wake_early(ELSEWHERE);
             }
         });
-        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Announced, "an announcement ends the sleep");
-        // No sample follows, so the lane ignores further announcements until its next wake.
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Early, "an early wake ends the sleep");
+        // No sample follows, so the lane ignores further early wakes until its next wake.
         let start = std::time::Instant::now();
         assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
         assert!(start.elapsed() >= Duration::from_millis(100), "the sleep lasts until its timeout");
@@ -969,25 +969,21 @@ fn an_announcement_is_distinguished_from_a_wake() {
         assert_eq!(
             sleeper.sleep(support::PATIENCE),
             Woken::Woken,
-            "a wake ends the sleep among ignored announcements"
+            "a wake ends the sleep among ignored early wakes"
         );
         assert_eq!(
             sleeper.sleep(support::PATIENCE),
-            Woken::Announced,
-            "announcements end the sleep again after a wake"
+            Woken::Early,
+            "early wakes end the sleep again after a wake"
         );
         waker.wake();
-        assert_eq!(
-            sleeper.sleep(support::PATIENCE),
-            Woken::Woken,
-            "a wake during an announced wake-up is not lost"
-        );
+        assert_eq!(sleeper.sleep(support::PATIENCE), Woken::Woken, "a wake during an early wake is not lost");
         done.store(true, Ordering::Relaxed);
     });
 }
 
 #[test]
-fn an_announcement_from_the_cpu_that_the_lane_sleeps_on_is_ignored() {
+fn an_early_wake_from_the_cpu_that_the_lane_sleeps_on_is_ignored() {
     let place = Place::new();
     let node = place.node();
     let boards = node.boards(&shape()).unwrap();
@@ -998,7 +994,7 @@ fn an_announcement_from_the_cpu_that_the_lane_sleeps_on_is_ignored() {
     std::thread::scope(|scope| {
         scope.spawn(|| {
             while !done.load(Ordering::Relaxed) {
-                waker.announce(cpu.load(Ordering::Relaxed));
+                waker.wake_early(cpu.load(Ordering::Relaxed));
             }
         });
         // This thread stays on its CPU.
@@ -1006,12 +1002,12 @@ fn an_announcement_from_the_cpu_that_the_lane_sleeps_on_is_ignored() {
         here.set(nix::sched::sched_getcpu().unwrap()).unwrap();
         nix::sched::sched_setaffinity(nix::unistd::Pid::from_raw(0), &here).unwrap();
         cpu.store(this_cpu(), Ordering::Relaxed);
-        while sleeper.sleep(Duration::from_millis(10)) == Woken::Announced {}
+        while sleeper.sleep(Duration::from_millis(10)) == Woken::Early {}
         waker.wake();
         assert_eq!(
             sleeper.sleep(support::PATIENCE),
             Woken::Woken,
-            "after a wake announcements are not ignored"
+            "after a wake early wakes are not ignored"
         );
         assert_eq!(sleeper.sleep(Duration::from_millis(100)), Woken::TimedOut);
         done.store(true, Ordering::Relaxed);

@@ -509,7 +509,7 @@ impl Display for MissingSamples<'_> {
 
 /// The summary of a peer of [`Peer::say`].
 #[derive(Clone, Debug, Deserialize)]
-pub struct Said {
+pub struct LinesSent {
     /// Lines read from stdin.
     pub attempted: u64,
     /// Lines that were published.

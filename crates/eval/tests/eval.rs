@@ -32,9 +32,9 @@ fn run(out: &Path, arguments: &str) -> Output {
 /// Like [`run`], and asserts success; returns the log.
 fn run_well(out: &Path, arguments: &str) -> String {
     let output = run(out, arguments);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{arguments}: {}\n{said}", output.status);
-    said
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments}: {}\n{stderr}", output.status);
+    stderr
 }
 
 /// Creates a folder; `None` if the machine lacks the requirements, which records the test as skipped.
@@ -229,14 +229,14 @@ fn quick_runs_without_and_with_the_bridge_have_consistent_results_and_are_not_ma
 
     // A finished run is not repeated, and a run with other settings is refused for the same folder.
     let before = fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap();
-    let said = run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
-    assert!(said.contains("0 finished, 1 already in the results, 0 failed"), "{said}");
+    let stderr = run_well(out, "run bridge_strong --quick --seed 3 --switch plain");
+    assert!(stderr.contains("0 finished, 1 already in the results, 0 failed"), "{stderr}");
     assert_eq!(fs::metadata(made.folder.join("manifest.json")).unwrap().modified().unwrap(), before);
     for (arguments, differs) in [("--quick --seed 4", "--seed"), ("--seed 3", "--quick")] {
         let output = run(out, &format!("run bridge_strong --switch plain {arguments}"));
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert!(said.contains(&format!("other settings ({differs})")), "{said}");
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        assert!(stderr.contains(&format!("other settings ({differs})")), "{stderr}");
     }
     assert!(!out.join(".partial").exists() && !out.join("failed").exists());
 }
@@ -290,13 +290,13 @@ fn a_run_over_a_trace_keeps_it_and_says_what_each_of_its_rows_lost() {
     // Another trace is another run.
     fs::write(&trace, of_file.replace("0.5778", "0.6")).unwrap();
     let output = run(out.path(), &arguments);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success() && said.contains("other settings (a trace of a link)"), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && stderr.contains("other settings (a trace of a link)"), "{stderr}");
     fs::write(&trace, of_file.replace("0.5778", "57.78")).unwrap();
     let output = run(out.path(), &arguments);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
     let mistake = "drive_away_and_back.csv:65: loss is '57.78', but must be 0 to 1 (a share, not percent)";
-    assert!(!output.status.success() && said.contains(mistake), "{said}");
+    assert!(!output.status.success() && stderr.contains(mistake), "{stderr}");
 }
 
 #[test]
@@ -363,13 +363,13 @@ fn what_a_harness_that_is_killed_leaves_is_removed_by_the_next() {
     let pid = harness.pid().as_raw();
     // A second one has to wait for its turn.
     let output = run(out.path(), "run baseline_clean --quick");
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success() && said.contains("another harness writes into"), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && stderr.contains("another harness writes into"), "{stderr}");
 
     harness.kill9();
     assert!(!traces(pid).is_empty(), "a killed harness can't clean up");
-    let said = run_well(out.path(), "run baseline_clean --quick");
-    assert!(said.contains("removed the leftovers of a harness that no longer runs"), "{said}");
+    let stderr = run_well(out.path(), "run baseline_clean --quick");
+    assert!(stderr.contains("removed the leftovers of a harness that no longer runs"), "{stderr}");
     assert_eq!(traces(pid), Vec::<String>::new());
     Run::read(out.path(), "baseline_clean.fast.none.netns.plain.r1").assert_consistent();
     assert!(!out.path().join(".partial").exists());
@@ -388,9 +388,9 @@ fn a_run_that_fails_is_kept_with_its_reason_and_the_next_is_made() {
     let peers = peers.display();
     let arguments = format!("run baseline_clean --quick --library fast,cyclone --peers {peers}");
     let output = run(out.path(), &arguments);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("1 finished, 0 already in the results, 1 failed"), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("1 finished, 0 already in the results, 1 failed"), "{stderr}");
     let failed = out.path().join("failed/baseline_clean.fast.none.netns.plain.r1");
     let reason = fs::read_to_string(failed.join("reason.txt")).unwrap();
     assert!(reason.contains("ended during the run"), "{reason}");
@@ -406,7 +406,7 @@ fn wrong_command_lines_are_said_before_anything_is_made() {
     for name in ["baseline_clean", "bridge_strong", "bridge_toggle", "bridge_ablation"] {
         assert!(listed.lines().any(|line| line.starts_with(name)), "{listed}");
     }
-    for (arguments, code, said) in [
+    for (arguments, code, message) in [
         ("run nothing_of_the_kind", 1, "no scenario 'nothing_of_the_kind'"),
         ("run /nowhere/a.yaml", 1, "/nowhere/a.yaml"),
         ("run baseline_clean --peers /nowhere", 1, "fast_peer is not in /nowhere"),
@@ -418,6 +418,6 @@ fn wrong_command_lines_are_said_before_anything_is_made() {
         let output = run(out.path(), arguments);
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(code), "{arguments}: {error}");
-        assert!(error.contains(said), "{arguments}: {error}");
+        assert!(error.contains(message), "{arguments}: {error}");
     }
 }

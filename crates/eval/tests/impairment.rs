@@ -505,7 +505,7 @@ fn what_can_not_be_is_said() {
         let output = command.stdin(std::process::Stdio::null()).output().unwrap();
         (output.status.code(), String::from_utf8(output.stderr).unwrap())
     };
-    for (arguments, code, said) in [
+    for (arguments, code, message) in [
         ("impair --source 10.0.0.1 --backend nfqueue --queue 4", 1, "another program listens on NFQUEUE 4"),
         ("impair --source 10.0.0.1 --gilbert-elliott 2 0 0 0", 2, "p is 2, but must be 0 to 1"),
         ("impair --source 10.0.0.1 --delay-ms -1", 2, "unexpected argument"),
@@ -526,7 +526,7 @@ fn what_can_not_be_is_said() {
     ] {
         let (status, stderr) = run(arguments);
         assert_eq!(status, Some(code), "{arguments}: {stderr}");
-        assert!(stderr.contains(said), "{arguments}: {stderr}");
+        assert!(stderr.contains(message), "{arguments}: {stderr}");
     }
     assert_eq!(traces(&slow), (1, 1), "the one that runs is not disturbed");
 }

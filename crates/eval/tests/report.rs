@@ -276,10 +276,10 @@ fn a_folder_without_runs_is_an_error() {
     let empty = tempfile::tempdir().unwrap();
     let output = report(empty.path(), empty.path());
     assert_eq!(output.status.code(), Some(1));
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(
-        said.contains("has no finished run; first record some with `adaptive-bridge-eval run` or `matrix`"),
-        "{said}"
+        stderr.contains("has no finished run; first record some with `adaptive-bridge-eval run` or `matrix`"),
+        "{stderr}"
     );
     assert_eq!(fs::read_dir(empty.path()).unwrap().count(), 0);
 }

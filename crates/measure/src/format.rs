@@ -27,6 +27,25 @@ pub fn number(value: Option<f64>) -> String {
     let text = format!("{value:.decimals$}");
     let (whole, rest) = text.split_once('.').map_or((text.as_str(), ""), |(whole, rest)| (whole, rest));
     let (sign, digits) = whole.strip_prefix('-').map_or(("", whole), |digits| ("-", digits));
+    let grouped = grouped(digits);
+    if rest.is_empty() { format!("{sign}{grouped}") } else { format!("{sign}{grouped}.{rest}") }
+}
+
+/// A value with this many decimals and a comma between thousands.
+pub fn decimal(value: f64, decimals: usize) -> String {
+    let text = format!("{:.decimals$}", value.abs());
+    let (whole, fraction) = text.split_once('.').unwrap_or((&text, ""));
+    let mut shown = grouped(whole);
+    if !fraction.is_empty() {
+        shown.push('.');
+        shown.push_str(fraction);
+    }
+    let is_zero = shown.chars().all(|c| matches!(c, '0' | '.'));
+    if value < 0.0 && !is_zero { format!("−{shown}") } else { shown }
+}
+
+/// Digits with a comma between thousands.
+fn grouped(digits: &str) -> String {
     let mut grouped = String::new();
     for (index, digit) in digits.chars().enumerate() {
         if index > 0 && (digits.len() - index).is_multiple_of(3) {
@@ -34,7 +53,7 @@ pub fn number(value: Option<f64>) -> String {
         }
         grouped.push(digit);
     }
-    if rest.is_empty() { format!("{sign}{grouped}") } else { format!("{sign}{grouped}.{rest}") }
+    grouped
 }
 
 /// The range from the lowest to the highest value.
@@ -51,6 +70,16 @@ pub fn count(value: u64) -> String {
     number(Some(value as f64)).split('.').next().unwrap_or_default().to_owned()
 }
 
+/// A number of bytes with one decimal, in the largest unit that gives at least 1.
+pub fn bytes(value: f64) -> String {
+    for (unit, size) in [("GiB", 1_073_741_824.0), ("MiB", 1_048_576.0), ("KiB", 1024.0)] {
+        if value >= size {
+            return format!("{} {unit}", decimal(value / size, 1));
+        }
+    }
+    format!("{} B", decimal(value, 0))
+}
+
 /// The size of a payload with a unit: `64 B`, `2,948 B`, `64 KiB`, `1 MiB`, `2 MB`.
 pub fn payload(bytes: usize) -> String {
     match bytes {
@@ -64,6 +93,16 @@ pub fn payload(bytes: usize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn values_have_commas_and_units() {
+        assert_eq!((decimal(1_234_567.0, 0), decimal(999.0, 0)), ("1,234,567".into(), "999".into()));
+        assert_eq!((decimal(-1_500.26, 1), decimal(-0.01, 1)), ("−1,500.3".into(), "0.0".into()));
+        assert_eq!(
+            (bytes(512.0), bytes(614_400.0), bytes(4_194_304.0)),
+            ("512 B".into(), "600.0 KiB".into(), "4.0 MiB".into())
+        );
+    }
 
     #[test]
     fn markup_and_control_characters_are_escaped() {

@@ -10,6 +10,7 @@
 //! - [`hop`]: the report of the benchmark `benches/hop`.
 
 #![cfg_attr(not(test), warn(clippy::disallowed_methods, clippy::expect_used, clippy::unwrap_used))]
+#![warn(clippy::print_stderr, clippy::print_stdout)]
 
 pub mod cpu_time;
 pub mod format;

@@ -113,6 +113,7 @@ impl<'a> Children<'a> {
     }
 
     /// The next report of a process; `None` after the timeout.
+    #[allow(clippy::disallowed_methods, reason = "the demo is no part of the bridge")]
     pub fn next_report(&self, timeout: Duration) -> Option<(Role, Report)> {
         // `self` holds a sender too, so the only possible error is the timeout.
         self.reports.recv_timeout(timeout).ok()

@@ -122,6 +122,7 @@ fn subscribe(arguments: &SubscriberArguments) -> Result<Infallible, Box<dyn Erro
             }
         }
         while !flag.clear() {
+            #[allow(clippy::disallowed_methods, reason = "the demo is no part of the bridge")]
             thread::park();
         }
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 use nix::sys::statvfs::statvfs;
 use nix::unistd::geteuid;
 
-use super::Finding;
+use super::{Finding, mib};
 use crate::config::Settings;
 use crate::shm::{OTHER_SHARED_BYTES, RoleHolder, RouteChannel, instance_files, root_of};
 
@@ -51,7 +51,6 @@ struct Space {
 
 fn free_space(needed: u64, space: &Space) -> Finding {
     let check = "shared memory";
-    let mib = |bytes: u64| bytes.div_ceil(1 << 20);
     let found =
         format!("needs {} MiB; {SHM} has {} MiB, {} free", mib(needed), mib(space.size), mib(space.free));
     let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(needed) + mib(space.size)).max(64));

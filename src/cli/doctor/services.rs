@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use super::super::units::{self, DropIns};
-use super::{Finding, list, output};
+use super::{Finding, list, mib, output};
 use crate::config::Settings;
 use crate::shm::{RoleHolder, root_of};
 
@@ -98,7 +98,6 @@ fn memory_limits(
     in_force: impl Fn(&str) -> Option<String>,
 ) -> Finding {
     let check = "memory limits";
-    let mib = |bytes: u64| bytes.div_ceil(1 << 20);
     let (mut too_low, mut unlimited) = (Vec::new(), Vec::new());
     for (unit, needed) in needed {
         match in_force(unit).and_then(|limit| limit.parse::<u64>().ok()) {

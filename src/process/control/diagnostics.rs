@@ -117,7 +117,9 @@ impl Reporter {
         let mut next_report_at = clock::monotonic();
         loop {
             let now = clock::monotonic();
-            match reloaded.recv_timeout(Duration::from_nanos(next_report_at.since(now))) {
+            #[allow(clippy::disallowed_methods, reason = "control handles no samples")]
+            let reload = reloaded.recv_timeout(Duration::from_nanos(next_report_at.since(now)));
+            match reload {
                 Ok(settings) => self.settings = settings,
                 Err(RecvTimeoutError::Disconnected) => return,
                 Err(RecvTimeoutError::Timeout) => {

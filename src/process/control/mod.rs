@@ -116,7 +116,7 @@ impl Control {
         for network in &networks {
             let options = participant_options(settings, network, "control");
             // Only the first participant joins through the role: the health board records one participant,
-            // which a restarted control disposes of if its predecessor was killed.
+            // which a restarted control disposes of if the former process was killed.
             let opened =
                 if participants.is_empty() { role.join(&options)? } else { Participant::open(&options)? };
             participants.push(opened);
@@ -195,6 +195,7 @@ impl Control {
     fn sleep(&mut self, until: MonotonicNs) {
         let wait_ns = until.since(clock::monotonic());
         if wait_ns > 0 {
+            #[allow(clippy::disallowed_methods, reason = "control handles no samples")]
             std::thread::park_timeout(Duration::from_nanos(wait_ns));
         }
         self.subscribers.expected_awake_at = until;

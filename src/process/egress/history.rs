@@ -8,7 +8,8 @@ use tracing::warn;
 
 use super::late_joiners::{self, KeptSample, LateJoiners};
 use crate::dds::RawWriter;
-use crate::model::{Guid, MAX_PUBLISHERS, MonotonicNs, SampleHeader};
+use crate::model::{Guid, MAX_PUBLISHERS, MonotonicNs, PublisherAccount, SampleHeader};
+use crate::shm::Boards;
 
 /// Shortest interval between two log lines of an output about a full history.
 const LOG_MS: u64 = 30_000;
@@ -121,6 +122,14 @@ impl Publishers {
         self.known.push(publisher);
         evicted
     }
+}
+
+/// The publishers of a route that ingress knows to be there.
+pub(super) fn present_publishers(boards: &Boards, route: usize) -> Vec<Guid> {
+    let accounts = (0..MAX_PUBLISHERS).filter_map(|place| boards.publisher(route, place));
+    let is_present =
+        |account: &PublisherAccount| account.offered_reliability != PublisherAccount::OFFER_UNKNOWN;
+    accounts.filter(is_present).map(|account| account.writer).collect()
 }
 
 #[cfg(test)]

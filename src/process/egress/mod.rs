@@ -29,8 +29,8 @@ use crate::clock;
 use crate::config::{self, Configuration, Forwarding, Settings};
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
-use crate::policy::{critical_drop, mode_and_source};
-use crate::shm::{Boards, LaneSleeper, ProcessRole, ShmSample};
+use crate::policy::mode_and_source;
+use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use arena::CopyArena;
 use noncritical::Noncritical;
 use output::Output;
@@ -199,25 +199,17 @@ impl Egress {
                             && let Some(sample) = self.outputs[urgent].take()
                         {
                             ahead -= 1;
-                            self.forward(urgent, sample, mode);
+                            self.outputs[urgent].send(sample, &mut self.participant, &mut self.arena);
                         }
                     }
                 }
-                self.forward(place, sample, mode);
+                self.outputs[place].send(sample, &mut self.participant, &mut self.arena);
                 if ahead == 0 {
                     break;
                 }
             }
         }
         turn
-    }
-
-    fn forward(&mut self, place: usize, sample: ShmSample, mode: LaneMode) {
-        let output = &mut self.outputs[place];
-        match critical_drop(mode) {
-            Some(reason) => output.drop_sample(&sample, reason),
-            None => output.send(sample, &mut self.participant, &mut self.arena),
-        }
     }
 
     fn sleep(&mut self, turn: &Turn) {

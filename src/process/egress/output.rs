@@ -6,18 +6,17 @@ use tracing::{error, info, warn};
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
-use super::history::History;
+use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
-use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
+use super::unsent::{Forwarded, Unsent, UnsentSamples};
 use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
-    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_PUBLISHERS, MAX_UNMATCHED_READERS,
-    MonotonicNs, OutputReaders, PublisherAccount, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
-    UnmatchedReader,
+    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
+    OutputReaders, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
 };
-use crate::policy::{SequenceOutcome, SequenceTracker};
+use crate::policy::{SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
     BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
     ShmSample, Stage, SubscriberRole, TakeError,
@@ -66,7 +65,7 @@ pub(super) struct Output {
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
     unmatched: Vec<(Guid, UnmatchedPolicy)>,
-    /// When this process opened the output. Samples published before were missed by its predecessor.
+    /// When this process opened the output. Samples published before were missed by the former one.
     started_at: MonotonicNs,
     /// Whether a sample published since `started_at` has been taken.
     caught_up: bool,
@@ -92,7 +91,7 @@ impl Output {
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
         counters.update(|counters| {
-            // The samples that waited in a killed predecessor are lost with it.
+            // The samples that waited in a killed former process are lost with it.
             let accounted = counters.forwarded + counters.drops.total();
             counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
             counters.waiting = 0;
@@ -195,8 +194,12 @@ impl Output {
         }
     }
 
-    /// Writes a taken sample to DDS and accounts for it.
+    /// Writes a taken sample to DDS, unless the mode drops it, and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
+        // A noncritical lane polls no sample in such a mode.
+        if let Some(reason) = critical_drop(self.mode) {
+            return self.drop_sample(&sample, reason);
+        }
         if self.writer.is_none() || (self.is_to_latch() && self.counters.get().readers == 0) {
             self.announce_type(participant);
         }
@@ -563,18 +566,22 @@ impl Output {
     }
 }
 
-/// The publishers of a route that ingress knows to be there.
-fn present_publishers(boards: &Boards, route: usize) -> Vec<Guid> {
-    let accounts = (0..MAX_PUBLISHERS).filter_map(|place| boards.publisher(route, place));
-    let is_present =
-        |account: &PublisherAccount| account.offered_reliability != PublisherAccount::OFFER_UNKNOWN;
-    accounts.filter(is_present).map(|account| account.writer).collect()
-}
-
 /// Records the sequence numbers that are accounted for, up to the last sample taken.
 fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.first_sequence = tracker.first();
     counters.last_sequence = tracker.last();
+}
+
+/// Counts a sample that was sent.
+fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
+    counters.forwarded += 1;
+    counters.forwarded_bytes += sample.bytes;
+    counters.by_reference += u64::from(sample.by_reference);
+    counters.caught_up += u64::from(sample.caught_up);
+    counters.last_forwarded_sequence = sample.sequence;
+    counters.last_forwarded_at = sample.written_at;
+    counters.last_writer_guid = sample.writer;
+    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 /// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too

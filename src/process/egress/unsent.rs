@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use crate::model::{Guid, LaneCounters, MonotonicNs};
+use crate::model::{Guid, MonotonicNs};
 
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,17 +65,6 @@ pub(super) struct Forwarded {
     pub written_at: MonotonicNs,
     pub writer: Guid,
     pub writer_sequence: i64,
-}
-
-pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
-    counters.forwarded += 1;
-    counters.forwarded_bytes += sample.bytes;
-    counters.by_reference += u64::from(sample.by_reference);
-    counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_sequence = sample.sequence;
-    counters.last_forwarded_at = sample.written_at;
-    counters.last_writer_guid = sample.writer;
-    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 #[cfg(test)]

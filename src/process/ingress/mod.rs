@@ -40,13 +40,13 @@ const LAST_SAMPLES_MS: u64 = 200;
 /// samples that the publisher sends before the reader exists.
 const SEARCHING_MS: u64 = 10;
 
-/// After a restart, how long at most the participant of a killed predecessor is kept. Until it is disposed
+/// After a restart, how long at most the participant of a killed former process is kept. Until it is disposed
 /// of, publishers retain the samples that they wrote while no ingress ran; but its reader, which acknowledges
 /// nothing, also blocks a publisher whose history is full.
 const RESUME_MS: u64 = 1_000;
 
-/// The same once each publisher has sent the first of these samples. One request names 256 samples, so the
-/// remaining ones may take two or three more requests.
+/// How long that participant is kept once each publisher has sent the first of these samples. One request
+/// names 256 samples, so the remaining ones may take two or three more requests.
 const RESUMED_MS: u64 = 200;
 
 /// Runs ingress until `stop` is requested. No reloadable setting concerns ingress.
@@ -76,9 +76,9 @@ struct Ingress {
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
-    /// Whether each publisher that wrote until the predecessor died has sent a sample to this process.
+    /// Whether each publisher that wrote until the former process died has sent a sample to this process.
     has_resumed: bool,
-    /// The latest time to dispose of the participant of a killed predecessor.
+    /// The latest time to dispose of the participant of a killed former process.
     resume_until: MonotonicNs,
     housekeeping_at: MonotonicNs,
     received: Meter,

@@ -51,12 +51,12 @@ pub(super) enum SequenceCheck {
 }
 
 impl Publishers {
-    /// Opens the accounts as the predecessor of this process left them.
+    /// Opens the accounts as the former process left them.
     pub fn open(boards: &Boards, route: usize, counters: &IngressCounters, now: MonotonicNs) -> Self {
         let writer = |place| boards.publisher_writer(route, place);
         let mut accounts: Vec<_> = (0..MAX_PUBLISHERS).map(writer).collect();
-        // `update` writes an account twice: with the counts, then in its place. If the predecessor was killed
-        // in between, the second write is made here.
+        // `update` writes an account twice: with the counts, then in its place. If the former process was
+        // killed in between, the second write is made here.
         let changed = usize::try_from(counters.changed_place).ok().and_then(|place| accounts.get_mut(place));
         if let Some(account) = changed
             && !counters.changed_account.is_vacant()
@@ -168,8 +168,8 @@ impl Publishers {
         }
     }
 
-    /// Whether each publisher that wrote until the predecessor of this process died has sent a sample to this
-    /// process, or is gone.
+    /// Whether each publisher that wrote until the former process died has sent a sample to this process, or
+    /// is gone.
     pub fn have_resumed(&self) -> bool {
         !self.expected.iter().zip(self.gone).any(|(is_expected, is_gone)| *is_expected && !is_gone)
     }

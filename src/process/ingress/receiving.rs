@@ -23,8 +23,8 @@ const LEFT_BYTES: usize = 64 << 10;
 /// Turns within which the missing fragments must arrive: one for each datagram, and the smallest fragments
 /// that publishers choose by default have 1.3 KB.
 const TURNS: u64 = 64;
-/// The same for a whole sample, whose own turn does not count: one that was under way when the early waker
-/// woke the lanes.
+/// Turns within which a whole sample must arrive, whose own turn does not count: one that was under way when
+/// the early waker woke the lanes.
 const TURNS_WHOLE: u64 = 1;
 /// The datagrams of urgent topics that the DDS library receives before each other one, each with a turn:
 /// `URGENT_DATAGRAMS_AHEAD` in `dp_event_loop.rs`.
@@ -168,7 +168,7 @@ impl Receiving {
     fn wake_critical(&self, route: usize, cpu: u32) {
         for lane in self.lanes.iter().take_while(|lane| lane.class == TrafficClass::Critical) {
             if lane.serves[route] {
-                lane.waker.announce(cpu);
+                lane.waker.wake_early(cpu);
             }
         }
     }

@@ -32,7 +32,7 @@ pub struct ProbesReport {
 /// The parameters of the bridge's ROS 2 nodes.
 #[derive(Clone, Debug, Default, serde::Serialize)]
 pub struct ParametersReport {
-    /// Those that were set while the bridge runs, each as `key: value` in YAML.
+    /// The parameters that were set while the bridge runs, each as `key: value` in YAML.
     pub(crate) set: Vec<String>,
     pub(crate) requests: ParameterRequests,
 }

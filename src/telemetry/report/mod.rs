@@ -173,7 +173,7 @@ pub struct EndpointOrigin {
 }
 
 impl Snapshot {
-    /// As [`Snapshot::report_since`], with these problems.
+    /// The report of [`Snapshot::report_since`], with these problems.
     pub(super) fn report_with(&self, earlier: &Self, problems: Vec<Problem>) -> Report {
         let window_ms = self.at.since(earlier.at) as f64 / 1e6;
         Report {

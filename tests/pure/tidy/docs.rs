@@ -3,11 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
-use super::source::{Rust, files};
+use support::root;
 
-fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-}
+use super::source::{Rust, files};
 
 /// Links of a page that lead nowhere. `exists` answers for paths from the root of the project.
 fn dead_links(path: &str, text: &str, exists: &dyn Fn(&Path) -> bool) -> Vec<String> {

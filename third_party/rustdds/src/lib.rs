@@ -13,8 +13,6 @@
 //!
 //! Additionally, there is a [ROS2](https://index.ros.org/doc/ros2/) interface, that is simpler to use than DDS
 //! when communicating to ROS2 components. See package [ros2-client](https://crates.io/crates/ros2-client).
-//! Note: Do not use module [`ros2`] contained within RustDDS. It is no longer
-//! being developed.
 //!
 //! # DDS usage summary
 //!
@@ -205,8 +203,6 @@ mod mio_source;
 // Public modules
 pub mod dds; // this is public, but not advertised
 
-#[deprecated(since = "0.8.5", note = "Use crate ros2-client instead.")]
-pub mod ros2;
 /// Helpers for (De)serialization and definitions of (De)serializer adapters
 pub mod serialization;
 

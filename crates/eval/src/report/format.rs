@@ -1,26 +1,8 @@
 //! Formats figures for the tables and plots of the report.
 
-use std::fmt::Write as _;
+pub use adaptive_bridge_measure::format::{bytes, decimal as number};
 
 use crate::statistics::Estimate;
-
-/// Formats a number with this many decimals, and commas between thousands.
-pub fn number(value: f64, decimals: usize) -> String {
-    let text = format!("{:.decimals$}", value.abs());
-    let (whole, fraction) = text.split_once('.').unwrap_or((&text, ""));
-    let mut grouped = String::new();
-    for (index, digit) in whole.chars().enumerate() {
-        if index > 0 && (whole.len() - index).is_multiple_of(3) {
-            grouped.push(',');
-        }
-        grouped.push(digit);
-    }
-    if !fraction.is_empty() {
-        let _ = write!(grouped, ".{fraction}");
-    }
-    let is_zero = grouped.chars().all(|c| matches!(c, '0' | '.'));
-    if value < 0.0 && !is_zero { format!("−{grouped}") } else { grouped }
-}
 
 /// Formats milliseconds with the precision of the paper's tables: two decimals below 10, one below 100.
 pub fn ms(value: f64) -> String {
@@ -43,16 +25,6 @@ pub fn hz(value: f64) -> String {
 pub fn count(value: f64) -> String {
     // The median of an even number of repetitions may lie between two counts.
     number(value, usize::from(value.fract() != 0.0))
-}
-
-/// Formats bytes in the largest unit that gives at least 1.
-pub fn bytes(value: f64) -> String {
-    for (unit, size) in [("GiB", 1_073_741_824.0), ("MiB", 1_048_576.0), ("KiB", 1024.0)] {
-        if value >= size {
-            return format!("{} {unit}", number(value / size, 1));
-        }
-    }
-    format!("{} B", number(value, 0))
 }
 
 /// Formats a share as percent.
@@ -98,11 +70,6 @@ mod tests {
         );
         assert_eq!((hz(30.04), hz(-0.01), hz(-0.06)), ("30.0".into(), "0.0".into(), "−0.1".into()));
         assert_eq!((count(5400.0), count(2.5)), ("5,400".into(), "2.5".into()));
-        assert_eq!((number(1_234_567.0, 0), number(999.0, 0)), ("1,234,567".into(), "999".into()));
-        assert_eq!(
-            (bytes(512.0), bytes(614_400.0), bytes(4_194_304.0)),
-            ("512 B".into(), "600.0 KiB".into(), "4.0 MiB".into())
-        );
         assert_eq!((percent(0.071), percent(0.42)), ("7.1 %".into(), "42 %".into()));
     }
 

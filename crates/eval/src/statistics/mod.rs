@@ -4,6 +4,8 @@
 //! arguments. Definitions are the paper's where it gives them (section IV-D); otherwise the function's
 //! comment gives the choice.
 
+#![warn(clippy::print_stderr, clippy::print_stdout)]
+
 mod sequence;
 mod states;
 mod windows;

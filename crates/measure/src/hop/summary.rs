@@ -112,7 +112,7 @@ pub struct Latency {
     /// The median, over the repetitions, of the difference of this p50 and the p50 of direct in the same
     /// repetition.
     pub hop_p50_us: Option<f64>,
-    /// The same for the p99.
+    /// The median, over the repetitions, of the difference of the p99, as for `hop_p50_us`.
     pub hop_p99_us: Option<f64>,
     /// The CPU time of all threads of relay or bridge.
     pub cpu_us_per_sample: Option<f64>,

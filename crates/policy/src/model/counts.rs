@@ -109,7 +109,7 @@ impl<R: Reason, const N: usize> Counts<R, N> {
         difference
     }
 
-    /// As [`Counts::since`]; none without an earlier reading.
+    /// The events since an earlier reading; none without one.
     pub fn since_reading(&self, earlier: Option<Self>) -> Self {
         earlier.map_or_else(Self::default, |earlier| self.since(&earlier))
     }

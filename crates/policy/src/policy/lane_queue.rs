@@ -35,9 +35,9 @@ impl SampleStamps {
 /// What a lane may send at one instant, and the age from which samples are stale.
 #[derive(Clone, Copy, Debug)]
 pub struct Allowance {
-    /// The instant.
+    /// The instant on the monotonic clock.
     pub now: MonotonicNs,
-    /// The same instant on the wall clock, for comparison with source timestamps.
+    /// The instant `now` on the wall clock, for comparison with source timestamps.
     pub now_wall: WallNs,
     /// Whole tokens; with 0 nothing is sent.
     pub tokens: u64,

@@ -135,7 +135,8 @@ impl<K: PartialEq> SenderLimits<K> {
         Self::with_burst(rate_hz, 0.0, capacity, now)
     }
 
-    /// As [`new`](Self::new), but the messages of `burst_s` may arrive at once, as after an outage of a link.
+    /// A limit of `rate_hz` for each sender, of whom the messages of `burst_s` may arrive at once, as after
+    /// an outage of a link.
     pub fn with_burst(rate_hz: f64, burst_s: f64, capacity: usize, now: MonotonicNs) -> Self {
         let others = TokenBucket::new(rate_hz, burst_for(rate_hz), now);
         let senders = Vec::with_capacity(capacity);

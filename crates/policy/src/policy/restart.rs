@@ -17,18 +17,18 @@ pub const HEALTHY_RUN_MS: u64 = 10_000;
 /// How a child process ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildExit {
-    /// It exited with this code.
+    /// The child exited with this code.
     Code(i32),
-    /// This signal killed it.
+    /// This signal killed the child.
     Signal(i32),
 }
 
 /// Why the supervisor does not restart a child: it would end in the same way each time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GiveUpReason {
-    /// It exited with 2: wrong command line.
+    /// The child exited with 2: its command line is wrong.
     WrongCommandLine,
-    /// It exited with 78 (`EX_CONFIG`): bad configuration.
+    /// The child exited with 78 (`EX_CONFIG`): the configuration is bad.
     BadConfiguration,
 }
 

@@ -66,7 +66,7 @@ impl TokenBucket {
         bucket
     }
 
-    /// Like [`new`](Self::new), but full.
+    /// A bucket that holds its whole burst.
     pub fn full(rate_hz: f64, burst: f64, now: MonotonicNs) -> Self {
         let mut bucket = Self::new(rate_hz, burst, now);
         bucket.credit = bucket.cap;

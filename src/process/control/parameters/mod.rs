@@ -310,6 +310,7 @@ impl Services {
             }
             self.send_waiting();
             if is_idle {
+                #[allow(clippy::disallowed_methods, reason = "control handles no samples")]
                 thread::park_timeout(if self.waiting.is_empty() { IDLE } else { LOOK });
             }
         }
@@ -408,7 +409,9 @@ impl Services {
             if late.is_empty() || is_last {
                 return late;
             }
-            match self.reloaded.recv_timeout(LOOK) {
+            #[allow(clippy::disallowed_methods, reason = "control handles no samples")]
+            let reload = self.reloaded.recv_timeout(LOOK);
+            match reload {
                 Ok(settings) => self.parameters = Parameters::new(settings),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return late,

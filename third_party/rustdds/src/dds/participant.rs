@@ -672,12 +672,12 @@ impl DomainParticipant {
   /// otherwise, or if there were no descriptors. The ports stay bound as long as they
   /// are open.
   #[cfg(unix)]
-  pub fn onlooker_sockets(&self) -> io::Result<Vec<std::net::UdpSocket>> {
+  pub fn sockets_to_peek(&self) -> io::Result<Vec<std::net::UdpSocket>> {
     let sockets = match self.dpi.lock() {
-      Ok(mut dpi) => dpi.dpi.onlooker_sockets.take(),
+      Ok(mut dpi) => dpi.dpi.sockets_to_peek.take(),
       Err(_) => None,
     };
-    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets for an onlooker")))
+    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets to peek")))
   }
 
 
@@ -1404,9 +1404,9 @@ pub(crate) struct DomainParticipantInner {
 
   only_networks: Option<Arc<[NetworkSelector]>>,
 
-  /// See `DomainParticipant::onlooker_sockets`.
+  /// See `DomainParticipant::sockets_to_peek`.
   #[cfg(unix)]
-  onlooker_sockets: Option<io::Result<Vec<std::net::UdpSocket>>>,
+  sockets_to_peek: Option<io::Result<Vec<std::net::UdpSocket>>>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1565,7 +1565,7 @@ impl DomainParticipantInner {
     }
 
     #[cfg(unix)]
-    let onlooker_sockets = hooks.on_sample_arriving.is_some().then(|| {
+    let sockets_to_peek = hooks.on_sample_arriving.is_some().then(|| {
       [
         USER_TRAFFIC_LISTENER_TOKEN,
         USER_TRAFFIC_MUL_LISTENER_TOKEN,
@@ -1573,7 +1573,7 @@ impl DomainParticipantInner {
       ]
       .iter()
       .filter_map(|token| listeners.get(token))
-      .map(UDPListener::onlooker)
+      .map(UDPListener::socket_to_peek)
       .collect()
     });
 
@@ -1724,7 +1724,7 @@ impl DomainParticipantInner {
       security_plugins_handle,
       only_networks,
       #[cfg(unix)]
-      onlooker_sockets,
+      sockets_to_peek,
     })
   }
 

@@ -277,9 +277,9 @@ impl UDPListener {
     Ok(listener)
   }
 
-  /// The socket once more, for one who looks at what comes and takes nothing.
+  /// A duplicate of the socket, for a thread that peeks at datagrams and receives none.
   #[cfg(unix)]
-  pub fn onlooker(&self) -> io::Result<std::net::UdpSocket> {
+  pub fn socket_to_peek(&self) -> io::Result<std::net::UdpSocket> {
     use std::os::fd::AsFd;
     Ok(self.socket.as_fd().try_clone_to_owned()?.into())
   }

@@ -176,7 +176,7 @@ mod tests {
   }
 
   #[test]
-  fn of_fragments_it_is_told_what_is_yet_to_come() {
+  fn the_bytes_after_a_fragment_are_counted() {
     for flags in [0, 1] {
       let left = |first, count, size, sample_size| {
         let found = sample_in(&message(&[fragments(flags, first, count, size, sample_size)]));

@@ -1220,7 +1220,7 @@ mod tests {
   use super::*;
 
   #[test]
-  fn replies_do_not_go_where_a_datagram_says() {
+  fn replies_do_not_go_to_the_address_in_a_datagram() {
     let waker = LoopWaker::new();
     let (acknack_sender, _acknacks) = wake_channel(1, &waker);
     let (spdp_liveness_sender, _spdp_liveness) = wake_channel(1, &waker);
@@ -1453,7 +1453,7 @@ mod tests {
   }
 
   #[test]
-  fn announcements_are_limited_whoever_they_claim_to_be_from() {
+  fn announcements_are_limited_by_their_source_address() {
     const SPDP_WRITER: [u8; 4] = [0, 1, 0, 0xc2];
     const SPDP_READER: [u8; 4] = [0, 1, 0, 0xc7];
     const OTHER: [u8; 4] = [0, 0, 1, 0x03];

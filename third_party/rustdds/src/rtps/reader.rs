@@ -2308,7 +2308,7 @@ mod tests {
   }
 
   #[test]
-  fn what_a_writer_left_unfinished_goes_with_it_and_so_does_what_nobody_took() {
+  fn unfinished_and_untaken_samples_of_a_lost_writer_are_released() {
     let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
     let qos_policy = QosPolicyBuilder::new()
       .reliability(Reliability::Reliable {

@@ -4235,7 +4235,7 @@ mod tests {
     // An ACKNACK that lies moves neither another reader's frontier nor, beyond what was
     // written, its own.
     #[test]
-    fn lies_in_acknacks_harm_nobody() {
+    fn a_false_acknack_acknowledges_no_more_than_was_written() {
       let mut f = keep_last();
       write(&f, 300, 8);
       acknowledge(&mut f, i64::MAX / 2, &[], 1);

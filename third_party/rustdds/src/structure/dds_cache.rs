@@ -719,6 +719,7 @@ mod tests {
     messages::submessages::elements::serialized_payload::SerializedPayload,
     structure::{
       cache_change::CacheChange,
+      duration::Duration,
       guid::{EntityId, EntityKind, GuidPrefix, GUID},
       sequence_number::SequenceNumber,
       time::Timestamp,
@@ -817,6 +818,28 @@ mod tests {
         .collect();
       assert_eq!(numbers, [4, 5], "{is_reliable}");
     }
+  }
+
+  // The first sample was received before the wall clock was set back by an hour, the second one after it.
+  #[test]
+  fn a_best_effort_reader_gets_what_is_received_after_the_clock_was_set_back() {
+    let mut topic_cache = keep_all_topic_cache();
+    let after_step = Timestamp::now();
+    let before_step = after_step + Duration::from_secs(3600);
+    for (sn, received) in [(1, before_step), (2, after_step)] {
+      let change = CacheChange::new(
+        user_writer(),
+        SequenceNumber::new(sn),
+        WriteOptions::default(),
+        DDSData::new(SerializedPayload::default()),
+      );
+      topic_cache.add_change(&received, change);
+    }
+    let numbers: Vec<i64> = topic_cache
+      .get_changes_in_range(false, before_step, &BTreeMap::new())
+      .map(|(_, change)| i64::from(change.sequence_number))
+      .collect();
+    assert_eq!(numbers, [2]);
   }
 
   fn keep_all_topic_cache() -> TopicCache {

@@ -4,17 +4,13 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
 
 use adaptive_bridge_measure::hop::{
     Attempt, Call, Isolation, Latency, Loss, Lossy, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
     Throughput, figures, fill, readme, runs_named, soak_failures,
 };
 use adaptive_bridge_measure::statistics::{growth, median, median_interval, quantile};
-
-fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-}
+use support::root;
 
 fn quantiles(p50_us: f64, p999_us: f64) -> Quantiles {
     Quantiles {
