@@ -327,7 +327,9 @@ fn a_writer_hears_of_the_present_reader_after_many_that_are_gone() {
     let mut heard = Vec::new();
     loop {
         match writer.poll_event() {
-            Some(WriterEvent::Matched { reader, joined: true, readers: 1 }) if reader == present => return,
+            Some(WriterEvent::Matched { reader, joined: true, readers: 1, .. }) if reader == present => {
+                return;
+            }
             Some(event) => heard.push(event),
             None => std::thread::sleep(Duration::from_millis(5)),
         }
