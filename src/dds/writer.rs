@@ -45,6 +45,8 @@ pub enum WriterEvent {
         joined: bool,
         /// The number of readers that are matched now.
         readers: u64,
+        /// If it was unmatched: samples that had left the history and that it had not acknowledged.
+        missed: u64,
     },
     /// A reader requests a stronger QoS than the writer offers.
     Incompatible {
@@ -194,6 +196,13 @@ impl RawWriter {
         })
     }
 
+    /// The samples that all readers have missed so far, which never decreases: the sum of the overruns of the
+    /// matched readers and of those that have left. For one that has left, it includes what had left the
+    /// history and it had not acknowledged.
+    pub fn overrun(&self) -> u64 {
+        self.inner.overrun()
+    }
+
     /// Waits for `timeout` at most until every matched RELIABLE reader has acknowledged all samples, and
     /// returns whether they have.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
@@ -204,11 +213,12 @@ impl RawWriter {
     pub fn poll_event(&self) -> Option<WriterEvent> {
         loop {
             match self.inner.try_recv_status()? {
-                DataWriterStatus::PublicationMatched { current, reader, .. } => {
+                DataWriterStatus::PublicationMatched { current, reader, missed, .. } => {
                     return Some(WriterEvent::Matched {
                         reader: Guid(reader.to_bytes()),
                         joined: current.count_change() > 0,
                         readers: u64::try_from(current.count()).unwrap_or(0),
+                        missed,
                     });
                 }
                 DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {

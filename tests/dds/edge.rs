@@ -330,7 +330,9 @@ fn a_writer_reports_the_present_reader_after_many_that_are_gone() {
     let mut events = Vec::new();
     loop {
         match writer.poll_event() {
-            Some(WriterEvent::Matched { reader, joined: true, readers: 1 }) if reader == present => return,
+            Some(WriterEvent::Matched { reader, joined: true, readers: 1, .. }) if reader == present => {
+                return;
+            }
             Some(event) => events.push(event),
             None => std::thread::sleep(Duration::from_millis(5)),
         }

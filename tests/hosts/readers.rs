@@ -182,6 +182,10 @@ fn critical_subscribers_stopped_beyond_their_lease_cost_the_others_no_sample_and
         for victim in bridged {
             victim.end::<Received>().assert_sound();
         }
+        // When a lease ended, the lane had evicted thousands of samples that the subscriber lacked.
+        bed.bridge.wait_status("the losses of the stopped subscribers", |status| {
+            critical(status)["reader_overrun"].as_u64() > Some(0)
+        });
     });
     scene.end();
     bed.end();

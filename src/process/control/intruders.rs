@@ -13,7 +13,7 @@ use crate::config::{Lane, Settings};
 use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
 use crate::model::{
     FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
-    TrafficClass,
+    ReaderRecord, TrafficClass,
 };
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
 use crate::shm::{BoardWriter, Boards, write_rows};
@@ -37,8 +37,22 @@ struct WatchedNetwork {
 /// Overrun samples of one reader that were already logged.
 #[derive(Default)]
 struct LoggedOverrun {
+    /// Of the present match.
     samples: u64,
+    /// The record of a second ago.
+    last: ReaderRecord,
     next_warning_at: MonotonicNs,
+}
+
+impl LoggedOverrun {
+    /// Samples that the reader has missed and that are not logged yet.
+    fn missed(&mut self, record: &ReaderRecord) -> u64 {
+        if record.is_of_later_match(&self.last) {
+            self.samples = 0;
+        }
+        self.last = *record;
+        record.overrun.saturating_sub(self.samples)
+    }
 }
 
 /// Monitors remote readers and writers of the bridge's topics on all networks.
@@ -208,7 +222,7 @@ impl EndpointMonitor {
                 for record in readers.iter() {
                     matched.push(record.reader);
                     let logged = self.overruns.entry(record.reader).or_default();
-                    let missed = record.overrun.saturating_sub(logged.samples);
+                    let missed = logged.missed(record);
                     if missed == 0 || now < logged.next_warning_at {
                         continue;
                     }
@@ -304,4 +318,24 @@ fn noncritical_output(settings: &Settings, route: usize) -> Option<crate::model:
     let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
     outputs.find(|output| output.route == route).map(|output| output.topic.clone())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_losses_of_a_reader_that_is_matched_anew_are_logged_from_its_first() {
+        let mut logged = LoggedOverrun::default();
+        let record = |offered, overrun| ReaderRecord { offered, overrun, ..ReaderRecord::default() };
+        assert_eq!(logged.missed(&record(1_000, 40)), 40);
+        logged.samples = 40;
+        assert_eq!(logged.missed(&record(1_100, 45)), 5);
+        // Matched anew: it has missed nothing yet, then more than what was logged before.
+        assert_eq!(logged.missed(&record(300, 0)), 0);
+        assert_eq!(logged.missed(&record(1_200, 50)), 50);
+        logged.samples = 50;
+        // Matched anew, with more samples than before and fewer missed.
+        assert_eq!(logged.missed(&record(1_300, 30)), 30);
+    }
 }

@@ -12,6 +12,7 @@ pub(super) mod memory;
 mod noncritical;
 mod offer;
 mod output;
+mod overrun;
 mod unsent;
 
 use std::fmt::Write;

@@ -8,6 +8,7 @@ use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
+use super::overrun::{Overrun, log_left};
 use super::unsent::{Forwarded, Unsent, UnsentSamples};
 use crate::clock;
 use crate::config::{self, DropPolicy, Forwarding, Settings};
@@ -58,6 +59,7 @@ pub(super) struct Output {
     tracker: SequenceTracker,
     pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
+    overrun: Overrun,
     /// Readers that were matched with the predecessor of this process and are not matched with this one yet.
     /// They do not receive the samples that are written before they match.
     former_readers: Vec<Guid>,
@@ -132,6 +134,7 @@ impl Output {
             drop_log: DropLog::new(former.drops),
             counters,
             readers,
+            overrun: Overrun::default(),
             former_readers,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
@@ -371,13 +374,14 @@ impl Output {
         };
         while let Some(event) = writer.poll_event() {
             match event {
-                WriterEvent::Matched { reader, joined, readers } => {
+                WriterEvent::Matched { reader, joined, readers, missed } => {
                     self.counters.update(|counters| counters.readers = readers);
                     if joined {
                         self.former_readers.retain(|former| *former != reader);
                         self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
+                    log_left(&self.id, &self.lane, self.class, reader, missed);
                     let history = self.history.as_mut();
                     if let Some(late_joiners) = history.and_then(|it| it.late_joiners.as_mut()) {
                         if !joined {
@@ -415,7 +419,7 @@ impl Output {
         }
     }
 
-    /// Writes the matched readers to their board, and counts the overruns of each.
+    /// Writes the matched readers to their board, as many as it has room for, and counts the overruns of all.
     fn record_readers(&mut self, now: MonotonicNs) {
         if now >= self.started_at.plus_ms(FORMER_READERS_MS) {
             self.former_readers.clear();
@@ -424,19 +428,14 @@ impl Output {
             return;
         };
         let mut current = OutputReaders::default();
-        let mut overrun = 0;
         for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
-            let former = self.readers.get().iter().find(|record| record.reader == reader.reader);
-            overrun += reader.overrun.saturating_sub(former.map_or(0, |record| record.overrun));
             *place = reader;
         }
         for (place, (reader, policy)) in current.unmatched.iter_mut().zip(&self.unmatched) {
             *place = UnmatchedReader { reader: *reader, policy: *policy as u64 };
         }
         self.readers.set(current);
-        if overrun > 0 {
-            self.counters.update(|counters| counters.reader_overrun += overrun);
-        }
+        self.overrun.count(writer, &mut self.counters);
     }
 
     /// Reads the durability with the first sample of each publisher: ingress publishes type and durability
@@ -473,6 +472,8 @@ impl Output {
             self.unmatched.clear();
             self.readers.set(OutputReaders::default());
             self.counters.update(|counters| counters.readers = 0);
+            self.overrun.count(&volatile, &mut self.counters);
+            self.overrun = Overrun::default();
             let guid = volatile.guid();
             drop(volatile);
             participant.remove_endpoint(guid);

@@ -216,7 +216,7 @@ fn slow_readers(
     for record in output.readers.iter() {
         let mut earlier = former.iter().flat_map(|former| former.readers.iter());
         let Some(earlier) = earlier.find(|earlier| earlier.reader == record.reader) else { continue };
-        let missed = record.overrun.saturating_sub(earlier.overrun);
+        let missed = record.missed_since(earlier);
         // The lane offered samples within the window and the reader acknowledged none of them, nor any of
         // the older unacknowledged ones.
         let offered = record.offered.saturating_sub(earlier.offered);
@@ -262,8 +262,9 @@ pub(super) mod tests {
     use super::*;
     use crate::config::SetParameters;
     use crate::model::{
-        ControlRecord, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy, LatencyHistogram,
-        ModeReason, MonotonicNs, OutputReaders, ProcessHealth, RouteId, RouteInfo, TopicName, WallNs,
+        ControlRecord, Guid, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy,
+        LatencyHistogram, ModeReason, MonotonicNs, OutputReaders, ProcessHealth, ReaderRecord, RouteId,
+        RouteInfo, TopicName, WallNs,
     };
 
     /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.
@@ -445,6 +446,32 @@ pub(super) mod tests {
         let mut before = healthy();
         drop_on(&mut before, 0, DropReason::WriteFailed, 3);
         assert_eq!(of(&before, &before), []);
+    }
+
+    #[test]
+    fn a_reader_that_missed_samples_is_a_problem_also_if_it_was_matched_anew_meanwhile() {
+        let missed_since = |offered, overrun| {
+            let record = |offered, overrun| ReaderRecord {
+                reader: Guid([1; 16]),
+                offered,
+                overrun,
+                reliable: 1,
+                ..ReaderRecord::default()
+            };
+            let mut before = healthy();
+            before.routes[0].outputs[0].readers.records[0] = record(1_000, 40);
+            let mut now = before.clone();
+            now.at = now.at.plus_ms(1_000);
+            now.routes[0].outputs[0].readers.records[0] = record(offered, overrun);
+            of(&now, &before).into_iter().map(|problem| problem.text).collect::<Vec<_>>()
+        };
+        assert_eq!(missed_since(1_100, 40), [""; 0]);
+        assert_eq!(missed_since(300, 0), [""; 0]);
+        for (offered, overrun, missed) in [(1_100, 45, 5), (300, 45, 45), (300, 40, 40), (1_100, 30, 30)] {
+            let found = missed_since(offered, overrun);
+            let expected = format!("missed {missed} samples in the last 1.0 s");
+            assert!(found.len() == 1 && found[0].contains(&expected), "{offered}, {overrun}: {found:?}");
+        }
     }
 
     #[test]

@@ -188,6 +188,18 @@ pub struct ReaderRecord {
     pub reliable: u64,
 }
 
+impl ReaderRecord {
+    /// Whether the reader was matched anew since this earlier record, which starts its counts at 0.
+    pub fn is_of_later_match(&self, earlier: &Self) -> bool {
+        self.offered < earlier.offered || self.overrun < earlier.overrun
+    }
+
+    /// Samples that the reader has missed since this earlier record.
+    pub fn missed_since(&self, earlier: &Self) -> u64 {
+        if self.is_of_later_match(earlier) { self.overrun } else { self.overrun - earlier.overrun }
+    }
+}
+
 /// The most readers of one output that are listed as not matched.
 pub const MAX_UNMATCHED_READERS: usize = 8;
 

@@ -555,6 +555,9 @@ pub enum DataWriterStatus {
     total: CountWithChange,
     current: CountWithChange,
     reader: GUID,
+    /// If the reader is no longer matched: how many samples added to its overrun by that,
+    /// because they had left the history and it had not acknowledged them.
+    missed: u64,
     // last_subscription_key:
   },
 }

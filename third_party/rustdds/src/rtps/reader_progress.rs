@@ -105,6 +105,10 @@ impl ReaderProgress {
     self.first_offered
   }
 
+  pub fn is_reliable(&self) -> bool {
+    self.reliable
+  }
+
   pub fn set_acked_before(&self, acked_before: SequenceNumber) {
     self
       .acked_before
@@ -113,6 +117,10 @@ impl ReaderProgress {
 
   pub fn add_overrun(&self, samples: u64) {
     self.overrun.fetch_add(samples, Ordering::Relaxed);
+  }
+
+  pub fn overrun(&self) -> u64 {
+    self.overrun.load(Ordering::Relaxed)
   }
 
   pub fn snapshot(&self, last: SequenceNumber) -> MatchedReader {
@@ -126,7 +134,7 @@ impl ReaderProgress {
       } else {
         0
       },
-      overrun: self.overrun.load(Ordering::Relaxed),
+      overrun: self.overrun(),
     }
   }
 }

@@ -905,6 +905,13 @@ impl RtpsReaderProxy {
     self.all_acked_before
   }
 
+  /// The first offered sample that the reader has neither acknowledged nor, as far as is
+  /// counted, missed.
+  pub fn unknown_from(&self) -> SequenceNumber {
+    let known_before = max(self.all_acked_before, self.overrun_counted_before);
+    max(known_before, self.first_offered())
+  }
+
   // Fragment handling
 
   /// `fragment_count` is how many fragments the sample has. What the set claims

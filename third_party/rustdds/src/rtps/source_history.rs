@@ -98,6 +98,16 @@ impl SourceHistory {
     later.next().map(|(number, _)| *number)
   }
 
+  /// The kept samples of this range, which is empty if it ends before it begins.
+  pub fn kept_between(
+    &self,
+    first: SequenceNumber,
+    before: SequenceNumber,
+  ) -> impl Iterator<Item = SequenceNumber> + '_ {
+    let kept = self.kept.range(first..first.max(before));
+    kept.map(|(number, _)| *number)
+  }
+
   /// The numbers of the history of all sources; `None` while there is one source at most,
   /// whose history is what the send buffer retained last.
   pub fn numbers(&self) -> Option<BTreeSet<SequenceNumber>> {

@@ -2527,6 +2527,7 @@ impl Writer {
             // current: How many readers we are matched with?
             current: CountWithChange::new(self.readers.len() as i32, 1),
             reader: reader_proxy.remote_reader_guid,
+            missed: 0,
           });
           self.send_participant_status(DomainParticipantStatusEvent::RemoteReaderMatched {
             local_writer: self.my_guid,
@@ -2819,9 +2820,13 @@ impl Writer {
     self.recompute_min_datagram_payload();
   }
 
-  fn matched_reader_remove(&mut self, guid: GUID) -> Option<RtpsReaderProxy> {
+  // Returns how many samples add to the reader's overrun by that.
+  fn matched_reader_remove(&mut self, guid: GUID) -> u64 {
     let removed = self.readers.remove(&guid);
-    self.send_buffer.reader_unmatched(guid);
+    // Before `refresh_acked_frontier`, which releases what only this reader lacks.
+    let missed = removed.as_ref().map_or(0, |reader| {
+      self.send_buffer.reader_unmatched(guid, reader.unknown_from())
+    });
     if let Some(ref removed_reader) = removed {
       info!(
         "Removed reader proxy. topic={:?} reader={:?}",
@@ -2837,7 +2842,7 @@ impl Writer {
         .unregister_remote_reader(&self.my_guid, &guid)
         .unwrap_or_else(|e| error!("{e}"));
     }
-    removed
+    missed
   }
 
   pub fn reader_lost(&mut self, guid: GUID) {
@@ -2847,7 +2852,7 @@ impl Writer {
         self.topic_name(),
         guid
       );
-      self.matched_reader_remove(guid);
+      let missed = self.matched_reader_remove(guid);
       // Removing a reader may relax (raise) the writer-wide minimum budget.
       self.recompute_min_datagram_payload();
       // self.matched_readers_count_total -= 1; // this never decreases
@@ -2855,6 +2860,7 @@ impl Writer {
         total: CountWithChange::new(self.matched_readers_count_total, 0),
         current: CountWithChange::new(self.readers.len() as i32, -1),
         reader: guid,
+        missed,
       });
     }
     // A matched reader going away may complete a pending wait_for_acknowledgments
@@ -3441,7 +3447,7 @@ mod tests {
       writer: Writer,
       reader_guid: GUID,
       timer: SharedTimer<DpTimerEvent>,
-      _status: StatusChannelReceiver<DataWriterStatus>,
+      status: StatusChannelReceiver<DataWriterStatus>,
       _participant_status: StatusChannelReceiver<DomainParticipantStatusEvent>,
     }
 
@@ -3537,7 +3543,7 @@ mod tests {
           writer,
           reader_guid,
           timer,
-          _status: status,
+          status,
           _participant_status: participant_status,
         }
       }
@@ -4041,6 +4047,73 @@ mod tests {
       assert_eq!(first, 20_001 - 8_192);
       acknowledge(&mut f, first, &[], 1);
       assert_eq!(only_reader(&f).overrun, first as u64 - 1);
+    }
+
+    // A reader that leaves will not tell what it lacks. What is gone of what it was offered
+    // and has not acknowledged counts as missed, once; what is retained does not.
+    #[test]
+    fn what_is_gone_and_a_reader_that_leaves_has_not_acknowledged_counts_as_missed() {
+      for (base, requested, counted_before, missed) in [
+        (1, vec![], 0, 744),
+        (301, vec![], 0, 444),
+        (10, vec![10, 12], 2, 732),
+        (745, vec![], 0, 0),
+        (990, vec![], 0, 0),
+        (1_001, vec![], 0, 0),
+      ] {
+        let mut f = keep_last();
+        write(&f, 1_000, 8); // 1 to 744 are gone
+        acknowledge(&mut f, base, &requested, 1);
+        if !requested.is_empty() {
+          f.repair_round();
+        }
+        assert_eq!(f.writer.send_buffer.overrun(), counted_before, "{base}");
+        f.writer.reader_lost(f.reader_guid);
+        let overrun = f.writer.send_buffer.overrun();
+        assert_eq!(overrun, counted_before + missed, "{base}");
+        let reported = std::iter::from_fn(|| f.status.try_recv().ok()).map(|status| match status {
+          DataWriterStatus::PublicationMatched { missed, .. } => missed,
+          other => panic!("{other:?}"),
+        });
+        assert!(reported.eq([0, missed]), "of the match and of its end: {base}");
+      }
+    }
+
+    // The sum has each loss once, of any number of readers, also of one that leaves and
+    // returns with the same GUID. A reader is not owed what was written before its match.
+    #[test]
+    fn the_overruns_of_all_readers_add_up_when_some_leave_and_return() {
+      let mut f = keep_last();
+      let qos = f.writer.qos_policies.clone();
+      let join = |f: &mut Fixture, guid: GUID| {
+        let proxy = RtpsReaderProxy::new(guid, qos.clone(), false);
+        f.writer.update_reader_proxy(&proxy, &qos);
+      };
+      let entity = f.reader_guid.entity_id;
+      let others: Vec<GUID> = (11..=50)
+        .map(|number| GUID::new(GuidPrefix::new(&[number; 12]), entity))
+        .collect();
+      others.iter().for_each(|guid| join(&mut f, *guid));
+      write(&f, 300, 8); // 1 to 44 are gone
+      acknowledge(&mut f, 10, &[10, 12], 1);
+      f.repair_round();
+      assert_eq!(f.writer.send_buffer.overrun(), 2);
+
+      f.writer.reader_lost(others[0]);
+      assert_eq!(f.writer.send_buffer.overrun(), 2 + 44);
+      join(&mut f, others[0]);
+      write(&f, 300, 8); // 1 to 344 are gone
+      let matched = f.writer.send_buffer.matched_readers();
+      assert_eq!(matched.iter().map(|reader| reader.overrun).sum::<u64>(), 2);
+      assert_eq!(f.writer.send_buffer.overrun(), 2 + 44);
+
+      f.writer.reader_lost(others[0]);
+      assert_eq!(f.writer.send_buffer.overrun(), 2 + 44 + 44, "301 to 344");
+      others.iter().for_each(|guid| f.writer.reader_lost(*guid));
+      assert_eq!(f.writer.send_buffer.overrun(), 2 + 44 + 44 + 39 * 344);
+      f.writer.reader_lost(f.reader_guid);
+      let of_the_first = 2 + (344 - 12);
+      assert_eq!(f.writer.send_buffer.overrun(), of_the_first + 44 + 44 + 39 * 344);
     }
 
     // One reader's acknowledgements do not depend on another's, and a joining reader is

@@ -56,6 +56,8 @@ struct Inner {
 
   // What each matched reader was offered and has acknowledged.
   readers: BTreeMap<GUID, Arc<ReaderProgress>>,
+  // What the readers missed that are no longer matched.
+  left_overrun: u64,
 
   // --- flow control ---
   // Maximum number of unacknowledged samples a reliable writer may have
@@ -119,6 +121,14 @@ impl Inner {
   fn first_available(&self) -> SequenceNumber {
     let kept = self.history.kept_range();
     kept.map_or(self.first_seq, |(first, _)| first.min(self.first_seq))
+  }
+
+  // How many samples from `first` on, of those that the reader is offered, are gone.
+  fn gone_from(&self, first: SequenceNumber, reader: &ReaderProgress) -> u64 {
+    let kept = self.history.kept_between(first, self.first_seq);
+    let kept = kept.filter(|number| reader.offered_after(*number).is_none()).count();
+    let not_retained = reader.offered_between(first, self.first_seq);
+    not_retained.saturating_sub(kept as u64)
   }
 
   fn advertised_first(&self) -> SequenceNumber {
@@ -191,6 +201,7 @@ impl WriterSendBuffer {
           retained_bytes: 0,
           written_bytes: 0,
           readers: BTreeMap::new(),
+          left_overrun: 0,
           history: SourceHistory::default(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
@@ -606,9 +617,29 @@ impl WriterSendBuffer {
     }
   }
 
-  /// Forgets a reader that is gone.
-  pub fn reader_unmatched(&self, reader: GUID) {
-    self.shared.inner.lock().unwrap().readers.remove(&reader);
+  /// Forgets a reader that is gone. Returns how many samples add to its overrun by that: those
+  /// from `unknown_from` on that it was offered and that are gone, because it will not tell
+  /// any more whether it has them. What is still available adds nothing: a reader that leaves
+  /// in order has not acknowledged the latest samples yet.
+  pub fn reader_unmatched(&self, reader: GUID, unknown_from: SequenceNumber) -> u64 {
+    let mut inner = self.shared.inner.lock().unwrap();
+    let Some(progress) = inner.readers.remove(&reader) else {
+      return 0;
+    };
+    let missed = if progress.is_reliable() && !self.shared.is_builtin {
+      inner.gone_from(unknown_from, &progress)
+    } else {
+      0
+    };
+    inner.left_overrun += progress.overrun() + missed;
+    missed
+  }
+
+  /// The overruns of all matched readers, and of those that have left. It never decreases.
+  pub fn overrun(&self) -> u64 {
+    let inner = self.shared.inner.lock().unwrap();
+    let matched: u64 = inner.readers.values().map(|reader| reader.overrun()).sum();
+    inner.left_overrun + matched
   }
 
   /// Every matched reader, with what it was offered, acknowledged and missed.
@@ -756,7 +787,7 @@ mod tests {
   use crate::{
     dds::{ddsdata::DDSData, with_key::datawriter::WriteOptionsBuilder},
     messages::submessages::elements::serialized_payload::SerializedPayload,
-    structure::guid::GUID,
+    structure::guid::{EntityId, GuidPrefix, GUID},
     RepresentationIdentifier,
   };
 
@@ -1075,5 +1106,43 @@ mod tests {
     assert_eq!(buf.advertised_first(), SequenceNumber::new(1));
     buf.offer_only_retained();
     assert_eq!(buf.advertised_first(), SequenceNumber::new(6));
+  }
+
+  // What the history keeps for late joiners is no loss, nor what a late joiner was not offered.
+  #[test]
+  fn a_reader_that_leaves_has_missed_nothing_that_the_history_has() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      /* reliable_writer */ true,
+      /* is_builtin */ false,
+      /* volatile */ false,
+      /* window_limit */ 8,
+      /* backlog_limit */ 1000,
+      /* max_retain */ 1,
+    )
+    .keep_last(1);
+    let guid = |number: u8| GUID::new(GuidPrefix::new(&[number; 12]), EntityId::UNKNOWN);
+    let write = |source: u8| {
+      let options = WriteOptionsBuilder::new().history_source(guid(source));
+      assert!(admit_now(&buf, options.build()));
+    };
+    let first = SequenceNumber::new(1);
+    let [early, late, best_effort] = [101, 102, 103].map(guid);
+    buf.reader_matched(early, true, true);
+    buf.reader_matched(best_effort, false, true);
+    buf.set_acked_frontier(Some(first));
+    (1..=3).for_each(write);
+    (0..97).for_each(|_| write(100));
+    buf.direct_send().set_last_sent(SequenceNumber::new(100));
+    buf.reader_matched(late, true, true); // it is offered 1, 2, 3 and 100
+    write(2);
+    assert_eq!(buf.first_change_sequence_number(), SequenceNumber::new(94));
+
+    assert_eq!(buf.reader_unmatched(late, first), 1, "sample 2 was replaced");
+    assert_eq!(buf.reader_unmatched(early, first), 93 - 2, "1 and 3 are kept");
+    assert_eq!(buf.reader_unmatched(best_effort, first), 0);
+    assert_eq!(buf.reader_unmatched(late, first), 0, "it is not matched any more");
+    assert_eq!(buf.overrun(), 1 + 93 - 2);
   }
 }

@@ -148,6 +148,13 @@ where
     self.keyed_datawriter.matched_readers()
   }
 
+  /// What all readers missed since the writer was created: the overruns of those that are
+  /// matched, and of those that have left. Of one that has left, also what had left the
+  /// history before it acknowledged it. It never decreases.
+  pub fn overrun(&self) -> u64 {
+    self.keyed_datawriter.overrun()
+  }
+
   /// Waits for all acknowledgements to finish
   ///
   /// # Examples

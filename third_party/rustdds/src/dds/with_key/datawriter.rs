@@ -483,6 +483,13 @@ where
     self.send_buffer.matched_readers()
   }
 
+  /// What all readers missed since the writer was created: the overruns of those that are
+  /// matched, and of those that have left. Of one that has left, also what had left the
+  /// history before it acknowledged it. It never decreases.
+  pub fn overrun(&self) -> u64 {
+    self.send_buffer.overrun()
+  }
+
   /// This operation blocks the calling thread until either all data written by
   /// the reliable DataWriter entities is acknowledged by all
   /// matched reliable DataReader entities, or else the duration specified by
