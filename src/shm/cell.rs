@@ -62,7 +62,7 @@ plain! {
     RouteInfo: 2 * (16 + 4) + 3,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 3 + 2 + 3,
-    OutputReaders: MAX_OUTPUT_READERS * 6 + MAX_UNMATCHED_READERS * 3,
+    OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 1,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
 }
 

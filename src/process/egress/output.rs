@@ -6,6 +6,7 @@ use tracing::{error, info, warn};
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
+use super::former_readers::FormerReaders;
 use super::history::History;
 use super::offer::{Offer, RouteDurability};
 use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
@@ -22,11 +23,6 @@ use crate::shm::{
     BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
     ShmSample, Stage, SubscriberRole, TakeError,
 };
-
-/// After a restart, how long the lane expects the readers of its predecessor to match again. A live one
-/// matches within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that has not
-/// matched by then counts as gone.
-const FORMER_READERS_MS: u64 = 5_000;
 
 /// One output of a lane: the DDS writer of one route, and its account.
 pub(super) struct Output {
@@ -59,9 +55,7 @@ pub(super) struct Output {
     tracker: SequenceTracker,
     pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
-    /// Readers that the predecessor of this process was matched with and this process is not yet. They do not
-    /// receive the samples written until they match.
-    former_readers: Vec<Guid>,
+    former_readers: FormerReaders,
     /// The publisher of the last sample taken.
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
@@ -100,8 +94,8 @@ impl Output {
         });
         let former = *counters.get();
         let mut readers = boards.output_readers_writer(lane_index, output.route);
-        let former_readers = readers.get().iter().map(|record| record.reader).collect();
-        readers.update(|readers| *readers = OutputReaders::default());
+        let former_readers = FormerReaders::of(readers.get(), clock::monotonic());
+        readers.set(former_readers.on_board());
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
@@ -371,7 +365,7 @@ impl Output {
                 WriterEvent::Matched { reader, joined, readers } => {
                     self.counters.update(|counters| counters.readers = readers);
                     if joined {
-                        self.former_readers.retain(|former| *former != reader);
+                        self.former_readers.matched(reader);
                         self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
@@ -414,13 +408,11 @@ impl Output {
 
     /// Writes the matched readers to their board, and counts the overruns of each.
     fn record_readers(&mut self, now: MonotonicNs) {
-        if now >= self.started_at.plus_ms(FORMER_READERS_MS) {
-            self.former_readers.clear();
-        }
+        self.former_readers.expire(now);
         let Some(writer) = &self.writer else {
             return;
         };
-        let mut current = OutputReaders::default();
+        let mut current = self.former_readers.on_board();
         let mut overrun = 0;
         for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
             let former = self.readers.get().iter().find(|record| record.reader == reader.reader);
@@ -468,7 +460,7 @@ impl Output {
         let Some(latched) = self.latched_offer.take() else { return };
         if let Some(volatile) = self.writer.take() {
             self.unmatched.clear();
-            self.readers.set(OutputReaders::default());
+            self.readers.set(self.former_readers.on_board());
             self.counters.update(|counters| counters.readers = 0);
             let guid = volatile.guid();
             drop(volatile);

@@ -47,12 +47,22 @@ pub struct OutputReaders {
     pub records: [ReaderRecord; MAX_OUTPUT_READERS],
     /// Readers that are not matched, those in use first.
     pub unmatched: [UnmatchedReader; MAX_UNMATCHED_READERS],
+    /// Readers that a former process of the lane was matched with and the present one is not yet, those in
+    /// use first.
+    pub former: [Guid; MAX_OUTPUT_READERS],
+    /// 1 if there may be former readers besides; 0 otherwise.
+    pub more_former: u64,
 }
 
 impl OutputReaders {
     /// The records in use.
     pub fn iter(&self) -> impl Iterator<Item = &ReaderRecord> {
         self.records.iter().filter(|record| record.reader != Guid::default())
+    }
+
+    /// The former readers that are not matched again yet.
+    pub fn former(&self) -> impl Iterator<Item = Guid> {
+        self.former.iter().copied().filter(|reader| *reader != Guid::default())
     }
 
     /// The readers that are not matched, each with the policy.
@@ -72,14 +82,19 @@ mod tests {
     #[test]
     fn the_readers_of_an_output_are_those_whose_records_are_in_use() {
         let mut readers = OutputReaders::default();
-        assert_eq!((readers.iter().count(), readers.unmatched().count()), (0, 0));
+        assert_eq!(
+            (readers.iter().count(), readers.unmatched().count(), readers.former().count()),
+            (0, 0, 0)
+        );
         let [matched, strict, foreign] = [1, 2, 3].map(|number| Guid([number; 16]));
         readers.records[0].reader = matched;
+        readers.former[0] = matched;
         let policy = UnmatchedPolicy::Durability as u64;
         readers.unmatched[0] = UnmatchedReader { reader: strict, policy };
         // A number that only a foreign program writes.
         readers.unmatched[1] = UnmatchedReader { reader: foreign, policy: 1 << 40 };
         assert_eq!(readers.iter().map(|record| record.reader).collect::<Vec<_>>(), [matched]);
+        assert_eq!(readers.former().collect::<Vec<_>>(), [matched]);
         let unmatched: Vec<_> = readers.unmatched().collect();
         assert_eq!(unmatched, [(strict, UnmatchedPolicy::Durability), (foreign, UnmatchedPolicy::default())]);
     }
