@@ -255,6 +255,39 @@ fn all_samples_forwarded_by_a_critical_egress_killed_twice_in_a_moment_reach_eve
     });
 }
 
+/// The samples that the subscribers lack when the lane dies count as forwarded, and no process can repair
+/// them.
+#[test]
+fn samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed() {
+    let test = "samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed";
+    let Some(bed) = bed(test) else { return };
+    let subscribers = LIBRARIES.map(|library| subscribe(&bed, "slow", library, "planner", CRITICAL));
+    let publisher = bed.publish(Peer::rclpy("scanner").keep_last(1000).rate_hz(RATE_HZ), INPUT);
+    wait_more(&subscribers, 100);
+    bed.host("slow").lose_incoming(1.0);
+    // 100 samples at 200 Hz; the lane retains 256 for repairs.
+    std::thread::sleep(Duration::from_millis(500));
+    kill_critical(&bed);
+    bed.host("slow").lose_incoming(0.0);
+    wait_more(&subscribers, 100);
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    let status = bed.wait_accounted();
+    let critical = critical(&status);
+    let dropped: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
+    let unconfirmed = critical["unconfirmed"].as_u64().unwrap();
+    let missed = subscribers.map(|subscriber| {
+        subscriber.wait_for("the last sample", |event| event["last"] == sent.last);
+        let received: Received = subscriber.end();
+        received.assert_sound();
+        assert!(received.missing_count <= dropped + unconfirmed, "{received:?} of {critical}");
+        received.missing_count
+    });
+    println!("missed {missed:?}, dropped {dropped}, unconfirmed {unconfirmed}");
+    assert!(missed.into_iter().any(|missed| missed > dropped + 50), "the lane repaired all: {critical}");
+    bed.end();
+}
+
 /// Kills the critical egress and waits until the next process was started.
 fn kill_critical(bed: &Bed) {
     let started = bed.pids("egress-critical").len();

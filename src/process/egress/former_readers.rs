@@ -54,9 +54,10 @@ impl FormerReaders {
         }
     }
 
-    /// The board of an output with these former readers and no others.
-    pub fn on_board(&self) -> OutputReaders {
-        let mut board = OutputReaders::default();
+    /// The board of an output with these former readers and no others, of a lane that has forwarded so many
+    /// samples.
+    pub fn on_board(&self, forwarded: u64) -> OutputReaders {
+        let mut board = OutputReaders { forwarded, ..OutputReaders::default() };
         for (place, missing) in board.former.iter_mut().zip(&self.missing) {
             *place = *missing;
         }
@@ -78,7 +79,7 @@ mod tests {
     fn matched(former: &mut FormerReaders, readers: impl IntoIterator<Item = usize>) -> OutputReaders {
         let readers: Vec<Guid> = readers.into_iter().map(guid).collect();
         readers.iter().for_each(|reader| former.matched(*reader));
-        let mut board = former.on_board();
+        let mut board = former.on_board(0);
         for (record, reader) in board.records.iter_mut().zip(readers) {
             record.reader = reader;
         }
@@ -104,13 +105,13 @@ mod tests {
         assert!(!process.is_empty());
         board = matched(&mut process, [1]);
         process = FormerReaders::of(&board, at(1_300));
-        board = process.on_board();
+        board = process.on_board(0);
         process = FormerReaders::of(&board, at(1_600));
         for (reader, all) in [(2, false), (1, false), (0, true)] {
             process.matched(guid(reader));
             assert_eq!(process.is_empty(), all, "{process:?}");
         }
-        assert_eq!(process.on_board(), OutputReaders::default());
+        assert_eq!(process.on_board(0), OutputReaders::default());
     }
 
     #[test]
@@ -125,7 +126,7 @@ mod tests {
     fn the_wait_for_readers_that_are_gone_ends_5_s_after_the_last_restart() {
         let mut board = matched(&mut first(), [0, 1]);
         for restarted_at in [0, 300, 4_000] {
-            board = FormerReaders::of(&board, at(restarted_at)).on_board();
+            board = FormerReaders::of(&board, at(restarted_at)).on_board(0);
         }
         let mut process = FormerReaders::of(&board, at(8_000));
         process.expire(at(12_999));
@@ -145,7 +146,7 @@ mod tests {
         for (readers, known) in [(MAX_OUTPUT_READERS - 1, true), (MAX_OUTPUT_READERS, false)] {
             let board = matched(&mut first(), 0..readers);
             // Over a crash in between, too.
-            let board = FormerReaders::of(&board, at(0)).on_board();
+            let board = FormerReaders::of(&board, at(0)).on_board(0);
             let mut process = FormerReaders::of(&board, at(0));
             (0..readers).for_each(|reader| process.matched(guid(reader)));
             assert_eq!(process.is_empty(), known, "{readers} readers");
@@ -157,7 +158,7 @@ mod tests {
         let board = matched(&mut FormerReaders::of(&board, at(0)), 20..40);
         let process = FormerReaders::of(&board, at(0));
         assert_eq!((process.missing.len(), process.more), (40, false));
-        let board = process.on_board();
+        let board = process.on_board(0);
         assert_eq!((board.former().count(), board.more_former), (MAX_OUTPUT_READERS, 1));
     }
 }

@@ -336,6 +336,8 @@ impl Egress {
         }
         for output in &mut self.outputs {
             output.drop_unsent();
+            // The next process counts as unconfirmed what is not acknowledged now.
+            output.record_readers(clock::monotonic());
         }
     }
 }

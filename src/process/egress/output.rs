@@ -85,17 +85,19 @@ impl Output {
         let route = &settings.routes[output.route];
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
+        let mut readers = boards.output_readers_writer(lane_index, output.route);
+        // Before `readers` loses the records: if this process dies in between, they are counted twice.
         counters.update(|counters| {
             // The samples that waited in a killed predecessor are lost with it.
             let accounted = counters.forwarded + counters.drops.total();
             counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
+            counters.unconfirmed = counters.unconfirmed.saturating_add(readers.get().unconfirmed(counters));
             counters.waiting = 0;
             counters.readers = 0;
         });
         let former = *counters.get();
-        let mut readers = boards.output_readers_writer(lane_index, output.route);
         let former_readers = FormerReaders::of(readers.get(), clock::monotonic());
-        readers.set(former_readers.on_board());
+        readers.set(former_readers.on_board(former.forwarded));
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
@@ -407,12 +409,12 @@ impl Output {
     }
 
     /// Writes the matched readers to their board, and counts the overruns of each.
-    fn record_readers(&mut self, now: MonotonicNs) {
+    pub fn record_readers(&mut self, now: MonotonicNs) {
         self.former_readers.expire(now);
         let Some(writer) = &self.writer else {
             return;
         };
-        let mut current = self.former_readers.on_board();
+        let mut current = self.former_readers.on_board(self.counters.get().forwarded);
         let mut overrun = 0;
         for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
             let former = self.readers.get().iter().find(|record| record.reader == reader.reader);
@@ -460,7 +462,7 @@ impl Output {
         let Some(latched) = self.latched_offer.take() else { return };
         if let Some(volatile) = self.writer.take() {
             self.unmatched.clear();
-            self.readers.set(self.former_readers.on_board());
+            self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
             self.counters.update(|counters| counters.readers = 0);
             let guid = volatile.guid();
             drop(volatile);

@@ -164,6 +164,10 @@ pub struct LaneCounters {
     /// Overruns summed over all readers ever matched: samples that left the writer's history before one
     /// reader acknowledged them. The lane forwarded these samples, and other readers may have received them.
     pub reader_overrun: u64,
+    /// Of the forwarded, the most that one reader may have missed because a process of the lane ended before
+    /// it had repaired them: [`OutputReaders::unconfirmed`](super::OutputReaders::unconfirmed), summed over
+    /// the ends.
+    pub unconfirmed: u64,
 }
 
 impl LaneCounters {

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::health::LaneCounters;
 use super::modes::UnmatchedPolicy;
 use super::sample::Guid;
 
@@ -52,6 +53,8 @@ pub struct OutputReaders {
     pub former: [Guid; MAX_OUTPUT_READERS],
     /// 1 if there may be former readers besides; 0 otherwise.
     pub more_former: u64,
+    /// The forwarded samples of the lane when the records were written.
+    pub forwarded: u64,
 }
 
 impl OutputReaders {
@@ -63,6 +66,18 @@ impl OutputReaders {
     /// The former readers that are not matched again yet.
     pub fn former(&self) -> impl Iterator<Item = Guid> {
         self.former.iter().copied().filter(|reader| *reader != Guid::default())
+    }
+
+    /// How many samples that count as forwarded one RELIABLE reader may have missed at most, if the process
+    /// ended with these records and `counters`: those that the one furthest behind had not acknowledged, and
+    /// those that were forwarded since the records were written.
+    pub fn unconfirmed(&self, counters: &LaneCounters) -> u64 {
+        let reliable = self.iter().filter(|record| record.reliable == 1);
+        // A reader without a record was matched since.
+        let is_new = counters.readers > self.iter().count() as u64;
+        let behind = reliable.map(|record| record.unacknowledged).chain(is_new.then_some(0)).max();
+        let since = counters.forwarded.saturating_sub(self.forwarded);
+        behind.map_or(0, |behind| behind.saturating_add(since))
     }
 
     /// The readers that are not matched, each with the policy.
@@ -97,5 +112,29 @@ mod tests {
         assert_eq!(readers.former().collect::<Vec<_>>(), [matched]);
         let unmatched: Vec<_> = readers.unmatched().collect();
         assert_eq!(unmatched, [(strict, UnmatchedPolicy::Durability), (foreign, UnmatchedPolicy::default())]);
+    }
+
+    #[test]
+    fn unconfirmed_is_what_the_reader_furthest_behind_may_have_missed_when_the_process_ended() {
+        let mut readers = OutputReaders { forwarded: 1_000, ..OutputReaders::default() };
+        let mut counters = LaneCounters { forwarded: 1_020, ..LaneCounters::default() };
+        assert_eq!(readers.unconfirmed(&counters), 0);
+        // A reader that was matched after the records were written.
+        counters.readers = 1;
+        assert_eq!(readers.unconfirmed(&counters), 20);
+        for (place, (unacknowledged, reliable)) in [(0, 0), (7, 1), (3, 1)].into_iter().enumerate() {
+            let reader = Guid([1 + place as u8; 16]);
+            readers.records[place] =
+                ReaderRecord { reader, unacknowledged, reliable, ..ReaderRecord::default() };
+        }
+        counters.readers = 3;
+        assert_eq!(readers.unconfirmed(&counters), 27);
+        // BEST_EFFORT readers are promised nothing.
+        (readers.records[1].reliable, readers.records[2].reliable) = (0, 0);
+        assert_eq!(readers.unconfirmed(&counters), 0);
+        // A lane that was told to end, and of which all has been acknowledged.
+        readers.forwarded = counters.forwarded;
+        readers.records[1] = ReaderRecord { unacknowledged: 0, reliable: 1, ..readers.records[1] };
+        assert_eq!(readers.unconfirmed(&counters), 0);
     }
 }
