@@ -58,6 +58,7 @@ fn report() -> Report {
         waiting: 4,
         readers: 2,
         reader_overrun: 23,
+        unconfirmed: 24,
         ..LaneCounters::default()
     };
     lane.drops.add(DropReason::LaneDown, 5);
@@ -191,6 +192,7 @@ fn the_parser_of_prometheus_reads_the_page() {
         ("route_unmarked_samples_total", 44.0),
         ("lane_subscribers", 2.0),
         ("lane_reader_overrun_samples_total", 23.0),
+        ("lane_unconfirmed_samples_total", 24.0),
         ("lane_offered_samples_total", 99.0),
         ("lane_forwarded_samples_total", 90.0),
         ("lane_forwarded_bytes_total", 9_000.0),

@@ -228,16 +228,86 @@ fn twenty_visits(bed: &Bed, planner: &RunningPeer) {
 #[test]
 fn all_samples_forwarded_by_a_critical_egress_killed_five_times_reach_every_subscriber() {
     let test = "all_samples_forwarded_by_a_critical_egress_killed_five_times_reach_every_subscriber";
+    kill_beside_subscribers(test, |bed, subscribers| {
+        for _ in 1..=5 {
+            kill_critical(bed);
+            wait_more(subscribers, 100);
+        }
+    });
+}
+
+/// The process between the two kills has not matched all subscribers again, and the next one must wait for
+/// those, too. A subscriber that dies with the lane never matches again, and the wait for it must end.
+#[test]
+fn all_samples_forwarded_by_a_critical_egress_killed_twice_in_a_moment_reach_every_subscriber() {
+    let test = "all_samples_forwarded_by_a_critical_egress_killed_twice_in_a_moment_reach_every_subscriber";
+    kill_beside_subscribers(test, |bed, subscribers| {
+        let forwarded = || critical(&bed.bridge.status())["forwarded"].as_u64().unwrap();
+        for with_a_subscriber in [false, false, true] {
+            if with_a_subscriber {
+                let mut victim = subscribe(bed, "slow", Library::Fast, "victim", CRITICAL);
+                victim.wait_received(10);
+                victim.kill9();
+            }
+            kill_critical(bed);
+            std::thread::sleep(Duration::from_millis(300));
+            kill_critical(bed);
+            let before = forwarded();
+            support::wait_until("samples that count as forwarded", || forwarded() > before + 100);
+            wait_more(subscribers, 100);
+        }
+    });
+}
+
+/// The samples that the subscribers lack when the lane dies count as forwarded, and no process can repair
+/// them.
+#[test]
+fn samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed() {
+    let test = "samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed";
+    let Some(bed) = bed(test) else { return };
+    let subscribers = LIBRARIES.map(|library| subscribe(&bed, "slow", library, "planner", CRITICAL));
+    let publisher = bed.publish(Peer::rclpy("scanner").keep_last(1000).rate_hz(RATE_HZ), INPUT);
+    wait_more(&subscribers, 100);
+    bed.host("slow").lose_incoming(1.0);
+    // 100 samples at 200 Hz; the lane retains 256 for repairs.
+    std::thread::sleep(Duration::from_millis(500));
+    kill_critical(&bed);
+    bed.host("slow").lose_incoming(0.0);
+    wait_more(&subscribers, 100);
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    let status = bed.wait_accounted();
+    let critical = critical(&status);
+    let dropped: u64 = critical["drops"].as_object().unwrap().values().filter_map(Value::as_u64).sum();
+    let unconfirmed = critical["unconfirmed"].as_u64().unwrap();
+    let missed = subscribers.map(|subscriber| {
+        subscriber.wait_for("the last sample", |event| event["last"] == sent.last);
+        let received: Received = subscriber.end();
+        received.assert_sound();
+        assert!(received.missing_count <= dropped + unconfirmed, "{received:?} of {critical}");
+        received.missing_count
+    });
+    println!("missed {missed:?}, dropped {dropped}, unconfirmed {unconfirmed}");
+    assert!(missed.into_iter().any(|missed| missed > dropped + 50), "the lane repaired all: {critical}");
+    bed.end();
+}
+
+/// Kills the critical egress and waits until the next process was started.
+fn kill_critical(bed: &Bed) {
+    let started = bed.pids("egress-critical").len();
+    signal(bed.pid("egress-critical"), Signal::SIGKILL);
+    support::wait_until("a restart", || bed.pids("egress-critical").len() > started);
+}
+
+/// Does some work that kills the critical egress beside a subscriber of each library. Asserts that the
+/// account is complete and that each of them received every sample that counts as forwarded.
+fn kill_beside_subscribers(test: &str, work: impl FnOnce(&Bed, &[RunningPeer])) {
     let Some(bed) = bed(test) else { return };
     let subscribers = LIBRARIES.map(|library| subscribe(&bed, "critical", library, "planner", CRITICAL));
     let publisher = Peer::rclpy("scanner").keep_last(1000).rate_hz(RATE_HZ);
     let publisher = bed.publish(publisher, INPUT);
     subscribers[0].wait_received(100);
-    for restarts in 1..=5 {
-        signal(bed.pid("egress-critical"), Signal::SIGKILL);
-        support::wait_until("a restart", || bed.pids("egress-critical").len() == restarts + 1);
-        wait_more(&subscribers, 100);
-    }
+    work(&bed, &subscribers);
     let sent: Sent = publisher.end();
     assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
     let status = bed.wait_accounted();

@@ -6,6 +6,7 @@
 //! to send and when; [`output`] writes samples and accounts for them.
 
 mod arena;
+mod former_readers;
 mod history;
 mod late_joiners;
 pub(super) mod memory;
@@ -329,6 +330,8 @@ impl Egress {
         }
         for output in &mut self.outputs {
             output.drop_unsent();
+            // The next process counts as unconfirmed what is not acknowledged now.
+            output.record_readers(clock::monotonic());
         }
     }
 }

@@ -6,6 +6,7 @@ use tracing::{error, info, warn};
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
+use super::former_readers::FormerReaders;
 use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
 use super::overrun::{Overrun, log_left};
@@ -22,11 +23,6 @@ use crate::shm::{
     BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
     ShmSample, Stage, SubscriberRole, TakeError,
 };
-
-/// After a restart, how long the lane expects the readers of its predecessor to match again. A live one
-/// matches within 1 to 3 s (Fast DDS and Cyclone DDS answer a new participant at once); one that has not
-/// matched by then counts as gone.
-const FORMER_READERS_MS: u64 = 5_000;
 
 /// One output of a lane: the DDS writer of one route, and its account.
 pub(super) struct Output {
@@ -60,9 +56,7 @@ pub(super) struct Output {
     pub counters: BoardWriter<LaneCounters>,
     readers: BoardWriter<OutputReaders>,
     overrun: Overrun,
-    /// Readers that were matched with the predecessor of this process and are not matched with this one yet.
-    /// They do not receive the samples that are written before they match.
-    former_readers: Vec<Guid>,
+    former_readers: FormerReaders,
     /// The publisher of the last sample taken.
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
@@ -92,17 +86,19 @@ impl Output {
         let route = &settings.routes[output.route];
         let boards = role.boards.clone();
         let mut counters = boards.lane_writer(lane_index, output.route);
+        let mut readers = boards.output_readers_writer(lane_index, output.route);
+        // Before `readers` loses the records: if this process dies in between, they are counted twice.
         counters.update(|counters| {
             // The samples that waited in a killed former process are lost with it.
             let accounted = counters.forwarded + counters.drops.total();
             counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
+            counters.unconfirmed = counters.unconfirmed.saturating_add(readers.get().unconfirmed(counters));
             counters.waiting = 0;
             counters.readers = 0;
         });
         let former = *counters.get();
-        let mut readers = boards.output_readers_writer(lane_index, output.route);
-        let former_readers = readers.get().iter().map(|record| record.reader).collect();
-        readers.update(|readers| *readers = OutputReaders::default());
+        let former_readers = FormerReaders::of(readers.get(), clock::monotonic());
+        readers.set(former_readers.on_board(former.forwarded));
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
@@ -377,7 +373,7 @@ impl Output {
                 WriterEvent::Matched { reader, joined, readers, missed } => {
                     self.counters.update(|counters| counters.readers = readers);
                     if joined {
-                        self.former_readers.retain(|former| *former != reader);
+                        self.former_readers.matched(reader);
                         self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
                     }
                     info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
@@ -420,14 +416,12 @@ impl Output {
     }
 
     /// Writes the matched readers to their board, as many as it has room for, and counts the overruns of all.
-    fn record_readers(&mut self, now: MonotonicNs) {
-        if now >= self.started_at.plus_ms(FORMER_READERS_MS) {
-            self.former_readers.clear();
-        }
+    pub fn record_readers(&mut self, now: MonotonicNs) {
+        self.former_readers.expire(now);
         let Some(writer) = &self.writer else {
             return;
         };
-        let mut current = OutputReaders::default();
+        let mut current = self.former_readers.on_board(self.counters.get().forwarded);
         for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
             *place = reader;
         }
@@ -470,7 +464,7 @@ impl Output {
         let Some(latched) = self.latched_offer.take() else { return };
         if let Some(volatile) = self.writer.take() {
             self.unmatched.clear();
-            self.readers.set(OutputReaders::default());
+            self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
             self.counters.update(|counters| counters.readers = 0);
             self.overrun.count(&volatile, &mut self.counters);
             self.overrun = Overrun::default();

@@ -142,6 +142,8 @@ fn outputs(page: &mut Page, report: &Report) {
     each("lane_subscribers", Gauge, "Matched subscribers.", |output| output.counters.readers);
     let help = "Samples that left the lane's history before single subscribers acknowledged them.";
     each("lane_reader_overrun_samples_total", Counter, help, |output| output.counters.reader_overrun);
+    let help = "The most forwarded samples that one subscriber may have missed because a process ended.";
+    each("lane_unconfirmed_samples_total", Counter, help, |output| output.counters.unconfirmed);
     let help = "Samples offered to the lane.";
     each("lane_offered_samples_total", Counter, help, |output| output.received);
     let help = "Samples given to DDS.";

@@ -4,7 +4,6 @@
 use serde::Serialize;
 
 use super::drops::DropCounts;
-use super::modes::UnmatchedPolicy;
 use super::network::NetworkRefusals;
 use super::qos::Durability;
 use super::sample::Guid;
@@ -165,78 +164,10 @@ pub struct LaneCounters {
     /// Overruns summed over all readers ever matched: samples that left the writer's history before one
     /// reader acknowledged them. The lane forwarded these samples, and other readers may have received them.
     pub reader_overrun: u64,
-}
-
-/// The most readers of one output that have a record each; further ones are only counted.
-pub const MAX_OUTPUT_READERS: usize = 32;
-
-/// The record of one reader that is matched with an output.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-#[repr(C)]
-pub struct ReaderRecord {
-    /// The reader; all zero for none.
-    #[serde(rename = "guid")]
-    pub reader: Guid,
-    /// Samples written since it was matched, plus the history that it was offered then.
-    pub offered: u64,
-    /// Of those, samples that a RELIABLE reader has not acknowledged; 0 for a BEST_EFFORT one.
-    pub unacknowledged: u64,
-    /// Of those, samples that left the writer's history before the reader received them.
-    pub overrun: u64,
-    /// 1 for a RELIABLE reader, 0 for a BEST_EFFORT one.
-    #[serde(skip)]
-    pub reliable: u64,
-}
-
-impl ReaderRecord {
-    /// Whether the reader was matched anew since this earlier record, which starts its counts at 0.
-    pub fn is_of_later_match(&self, earlier: &Self) -> bool {
-        self.offered < earlier.offered || self.overrun < earlier.overrun
-    }
-
-    /// Samples that the reader has missed since this earlier record.
-    pub fn missed_since(&self, earlier: &Self) -> u64 {
-        if self.is_of_later_match(earlier) { self.overrun } else { self.overrun - earlier.overrun }
-    }
-}
-
-/// The most readers of one output that are listed as not matched.
-pub const MAX_UNMATCHED_READERS: usize = 8;
-
-/// A reader of an output's topic that requests a stricter QoS than the output offers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(C)]
-pub struct UnmatchedReader {
-    /// The reader; all zero for none.
-    pub reader: Guid,
-    /// The number of the [`UnmatchedPolicy`](super::UnmatchedPolicy).
-    pub policy: u64,
-}
-
-/// The readers of one output.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(C)]
-pub struct OutputReaders {
-    /// The records of matched readers, those in use first.
-    pub records: [ReaderRecord; MAX_OUTPUT_READERS],
-    /// Readers that are not matched, those in use first.
-    pub unmatched: [UnmatchedReader; MAX_UNMATCHED_READERS],
-}
-
-impl OutputReaders {
-    /// The records in use.
-    pub fn iter(&self) -> impl Iterator<Item = &ReaderRecord> {
-        self.records.iter().filter(|record| record.reader != Guid::default())
-    }
-
-    /// The readers that are not matched, each with the policy.
-    pub fn unmatched(&self) -> impl Iterator<Item = (Guid, UnmatchedPolicy)> {
-        let used = self.unmatched.iter().filter(|record| record.reader != Guid::default());
-        used.map(|record| {
-            let number = u8::try_from(record.policy).unwrap_or(0);
-            (record.reader, UnmatchedPolicy::from_u8(number).unwrap_or_default())
-        })
-    }
+    /// Of the forwarded, the most that one reader may have missed because a process of the lane ended before
+    /// it had repaired them: [`OutputReaders::unconfirmed`](super::OutputReaders::unconfirmed), summed over
+    /// the ends.
+    pub unconfirmed: u64,
 }
 
 impl LaneCounters {
@@ -488,7 +419,7 @@ impl LatencyHistogram {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{DropReason, UnmatchedPolicy};
+    use crate::model::DropReason;
 
     #[test]
     fn quantiles_are_within_one_bucket_of_the_exact_value() {
@@ -543,21 +474,6 @@ mod tests {
         assert_eq!((account.last_sequence, account.last_at), (10, MonotonicNs(10)));
         account.take(i64::MAX, MonotonicNs(11));
         assert_eq!(account.lost_upstream, 3 + i64::MAX.unsigned_abs() - 11);
-    }
-
-    #[test]
-    fn the_readers_of_an_output_are_those_whose_records_are_in_use() {
-        let mut readers = OutputReaders::default();
-        assert_eq!((readers.iter().count(), readers.unmatched().count()), (0, 0));
-        let [matched, strict, foreign] = [1, 2, 3].map(|number| Guid([number; 16]));
-        readers.records[0].reader = matched;
-        let policy = UnmatchedPolicy::Durability as u64;
-        readers.unmatched[0] = UnmatchedReader { reader: strict, policy };
-        // A number that only a foreign program writes.
-        readers.unmatched[1] = UnmatchedReader { reader: foreign, policy: 1 << 40 };
-        assert_eq!(readers.iter().map(|record| record.reader).collect::<Vec<_>>(), [matched]);
-        let unmatched: Vec<_> = readers.unmatched().collect();
-        assert_eq!(unmatched, [(strict, UnmatchedPolicy::Durability), (foreign, UnmatchedPolicy::default())]);
     }
 
     #[test]

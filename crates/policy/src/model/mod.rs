@@ -14,6 +14,7 @@ mod network;
 mod probe;
 mod qos;
 mod rates;
+mod readers;
 mod sample;
 mod thresholds;
 mod time;
@@ -28,9 +29,8 @@ pub use counts::{Counts, Reason};
 pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
-    FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS,
-    MAX_PUBLISHERS, MAX_UNMATCHED_READERS, OutputReaders, ProcessHealth, PublisherAccount, ReaderRecord,
-    RouteInfo, UnmatchedReader,
+    FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_PUBLISHERS, ProcessHealth,
+    PublisherAccount, RouteInfo,
 };
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
 pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
@@ -38,6 +38,7 @@ pub use network::{NetworkRefusal, NetworkRefusals};
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
+pub use readers::{MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, OutputReaders, ReaderRecord, UnmatchedReader};
 pub use sample::{AgeBasis, Encapsulation, Guid, SampleHeader};
 pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
