@@ -305,6 +305,12 @@ impl RtpsReaderProxy {
     progress.offered_after(sequence_number)
   }
 
+  /// Whether the reader is offered this sample of the history.
+  pub fn offers_of_history(&self, sequence_number: SequenceNumber) -> bool {
+    let progress = self.progress.as_ref();
+    progress.is_some_and(|progress| progress.offers_of_history(sequence_number))
+  }
+
   // How many samples of this range the reader is offered.
   fn offered_between(&self, first: SequenceNumber, before: SequenceNumber) -> u64 {
     match &self.progress {
@@ -320,8 +326,7 @@ impl RtpsReaderProxy {
     let first = self.first_unsent_change()?;
     let before = self.offered_after(first)?;
     self.unsent_changes = self.unsent_changes.split_off(&before);
-    let progress = self.progress.as_ref();
-    let is_offered = progress.is_some_and(|progress| progress.offers_of_history(before));
+    let is_offered = self.offers_of_history(before);
     if is_offered && !self.repairs_under_way.is_under_way(before, Instant::now()) {
       self.unsent_changes.insert(before);
     }
