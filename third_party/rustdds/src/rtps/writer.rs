@@ -1392,6 +1392,9 @@ impl Writer {
             }
             return;
           }
+          if went_back && serves_history {
+            reader_proxy.offer_again(self.send_buffer.kept_before(acked_before));
+          }
           has_progressed = reader_proxy.all_acked_before > acked_before;
           if let Some(last_sent) = last_sent {
             reader_proxy.forget_unsent_after(last_sent);
@@ -1458,6 +1461,15 @@ impl Writer {
             self.send_small_datagrams_to(reader_guid_prefix);
           }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
+        }
+
+        // Acknowledgement frontier may have advanced: push it into the shared send
+        // buffer so any back-pressured producer (or `wait_for_acknowledgments`
+        // waiter) can make progress. It looks at every reader, so not for each of the
+        // ACKNACKs that move nothing. Before the answer: a HEARTBEAT that goes with a
+        // sample meanwhile would begin after what this one offers again.
+        if frontier_moved {
+          self.refresh_acked_frontier();
         }
 
         // See if we need to respond by GAP message
@@ -1533,7 +1545,12 @@ impl Writer {
               .heartbeat_msg(
                 self.entity_id(),
                 if went_back {
-                  max(advertised_first, reader_proxy.all_acked_before)
+                  let first = if reader_proxy.is_offered_again() {
+                    min(advertised_first, self.send_buffer.first_available())
+                  } else {
+                    advertised_first
+                  };
+                  max(first, reader_proxy.all_acked_before)
                 } else {
                   max(advertised_first, reader_proxy.first_offered())
                 },
@@ -1553,13 +1570,6 @@ impl Writer {
               &mut std::iter::once(reader_proxy),
             );
           }
-        }
-        // Acknowledgement frontier may have advanced: push it into the shared send
-        // buffer so any back-pressured producer (or `wait_for_acknowledgments`
-        // waiter) can make progress. It looks at every reader, so not for each of the
-        // ACKNACKs that move nothing.
-        if frontier_moved {
-          self.refresh_acked_frontier();
         }
       } // AckNack
       AckSubmessage::NackFrag(ref nackfrag) => {
@@ -4314,6 +4324,64 @@ mod tests {
       assert_eq!(f.repair_round(), 4);
       assert_eq!(received_messages(&socket), (1, vec![(103, 110)]));
       assert_eq!(only_reader(&f).overrun, 2);
+    }
+
+    // A reader that was matched anew on its side is offered the history of the present, also
+    // of what was written since the match, and what is retained. The rest is no loss, and is
+    // withdrawn without a HEARTBEAT, which would withdraw the history before it.
+    #[test]
+    fn a_late_joiner_that_went_back_gets_the_last_sample_of_each_source_again() {
+      let mut f = of_several_sources();
+      (1..=3).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 97, 8);
+      let socket = late_joiner(&mut f);
+      acknowledge(&mut f, 101, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      write_with(&f, of(100), 99, 8); // 200 is retained, 1, 3 and 101 are kept
+      acknowledge(&mut f, 201, &[], 2);
+      received_messages(&socket);
+      assert_eq!(f.writer.send_buffer.retained_len(), 1);
+
+      acknowledge(&mut f, 1, &[], 1);
+      assert_eq!(received_messages(&socket), (0, vec![(1, 200)]));
+      assert_eq!(f.writer.send_buffer.advertised_first(), SequenceNumber::new(1));
+      let requested: Vec<i64> = (1..=200).collect();
+      acknowledge(&mut f, 1, &requested, 2);
+      assert_eq!(f.repair_round(), 200);
+      assert_eq!(received_messages(&socket), (4, vec![]));
+      acknowledge(&mut f, 2, &[2], 3);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(2, 3)]);
+      acknowledge(&mut f, 102, &requested[101..199], 4);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(102, 200)]);
+      acknowledge(&mut f, 201, &[], 5);
+      let reader = only_reader(&f);
+      assert_eq!((reader.unacknowledged, reader.overrun), (0, 0));
+      assert!(!f.reader_proxy().is_offered_again());
+    }
+
+    // What a source replaces after the reader went back is withdrawn when the reader has what
+    // precedes it, as from a new late joiner.
+    #[test]
+    fn what_is_replaced_after_a_late_joiner_went_back_is_withdrawn_in_order() {
+      let mut f = of_several_sources();
+      (1..=3).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 97, 8);
+      let socket = late_joiner(&mut f);
+      acknowledge(&mut f, 101, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      write_with(&f, of(100), 99, 8); // 200 is retained, 1, 3 and 101 are kept
+      acknowledge(&mut f, 201, &[], 2);
+      acknowledge(&mut f, 1, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      received_messages(&socket);
+      acknowledge(&mut f, 1, &[1, 2, 3, 101], 2);
+      assert_eq!(f.repair_round(), 4);
+      assert_eq!(received_messages(&socket), (2, vec![]), "1 and 3, nothing withdrawn");
+      acknowledge(&mut f, 101, &[101], 3);
+      assert_eq!(f.repair_round(), 1);
+      assert_eq!(received_messages(&socket), (0, vec![(102, 201)]));
     }
 
     // An ACKNACK that lies moves neither another reader's frontier nor, beyond what was
