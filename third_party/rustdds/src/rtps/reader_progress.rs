@@ -43,11 +43,23 @@ pub(crate) struct ReaderProgress {
 
 /// A history with holes, such as the last samples of several sources: of what was written
 /// before the reader was matched, it is offered these only.
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct OfferedHistory {
   pub listed: BTreeSet<SequenceNumber>,
-  /// The first number that was written, or is to be sent to all, after the match.
+  /// The first number after this history: the first one that was written, or is to be sent
+  /// to all, after the match.
   pub before: SequenceNumber,
+}
+
+impl OfferedHistory {
+  /// If this sample is not offered, the next one that is.
+  pub fn offered_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
+    if sequence_number >= self.before || self.listed.contains(&sequence_number) {
+      return None;
+    }
+    let later = self.listed.range(sequence_number..self.before).next();
+    Some(later.copied().unwrap_or(self.before))
+  }
 }
 
 impl ReaderProgress {
@@ -70,12 +82,7 @@ impl ReaderProgress {
 
   /// If the reader is not offered this sample, the next one that it is offered.
   pub fn offered_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
-    let history = self.history.as_ref()?;
-    if sequence_number >= history.before || history.listed.contains(&sequence_number) {
-      return None;
-    }
-    let later = history.listed.range(sequence_number..history.before).next();
-    Some(later.copied().unwrap_or(history.before))
+    self.history.as_ref()?.offered_after(sequence_number)
   }
 
   /// Whether the reader is offered this sample of the history.

@@ -26,7 +26,9 @@ use crate::{
   },
 };
 use super::{
-  reader::ReaderIngredients, reader_progress::SharedProgress, repairs_under_way::RepairsUnderWay,
+  reader::ReaderIngredients,
+  reader_progress::{OfferedHistory, SharedProgress},
+  repairs_under_way::RepairsUnderWay,
 };
 
 // Requested samples that are gone, from which on a reader is taken to lack all that
@@ -91,6 +93,9 @@ pub(crate) struct RtpsReaderProxy {
 
   // What the DataWriter may know of this reader. `None` until the reader is matched.
   progress: Option<SharedProgress>,
+  // Of the samples that the reader acknowledged before it went back and that are no longer
+  // retained, those that the history has. `None` once it has acknowledged them again.
+  offered_again: Option<OfferedHistory>,
   // Samples before this that the reader missed are counted in `progress`.
   overrun_counted_before: SequenceNumber,
 
@@ -153,6 +158,7 @@ impl RtpsReaderProxy {
       acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
+      offered_again: None,
       overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
@@ -301,8 +307,45 @@ impl RtpsReaderProxy {
 
   // If the reader is not offered this sample of the history, the next one that it is.
   fn offered_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
-    let progress = self.progress.as_ref()?;
-    progress.offered_after(sequence_number)
+    match self.again_with(sequence_number) {
+      Some(again) => again.offered_after(sequence_number),
+      None => self.progress.as_ref()?.offered_after(sequence_number),
+    }
+  }
+
+  /// Whether the reader is offered this sample of the history.
+  pub fn offers_of_history(&self, sequence_number: SequenceNumber) -> bool {
+    match self.again_with(sequence_number) {
+      Some(again) => again.listed.contains(&sequence_number),
+      None => {
+        let progress = self.progress.as_ref();
+        progress.is_some_and(|progress| progress.offers_of_history(sequence_number))
+      }
+    }
+  }
+
+  // What is offered again, if it ends after this sample.
+  fn again_with(&self, sequence_number: SequenceNumber) -> Option<&OfferedHistory> {
+    let again = self.offered_again.as_ref();
+    again.filter(|again| sequence_number < again.before)
+  }
+
+  /// The reader went back behind samples that it has acknowledged. It gets those of them that
+  /// the history has, as a new late joiner does. A GAP alone tells it that the others are gone,
+  /// of which no fragment is sent to it any more.
+  ///
+  /// One that goes back once more before it has them keeps this list: it may have fragments of
+  /// a listed sample that is gone by then.
+  pub fn offer_again(&mut self, history: OfferedHistory) {
+    let has_some = history.listed.range(self.all_acked_before..).next().is_some();
+    if self.offered_again.is_none() && has_some {
+      self.offered_again = Some(history);
+    }
+  }
+
+  /// Whether it went back, and has not acknowledged the kept samples again.
+  pub fn is_offered_again(&self) -> bool {
+    self.offered_again.is_some()
   }
 
   // How many samples of this range the reader is offered.
@@ -320,8 +363,7 @@ impl RtpsReaderProxy {
     let first = self.first_unsent_change()?;
     let before = self.offered_after(first)?;
     self.unsent_changes = self.unsent_changes.split_off(&before);
-    let progress = self.progress.as_ref();
-    let is_offered = progress.is_some_and(|progress| progress.offers_of_history(before));
+    let is_offered = self.offers_of_history(before);
     if is_offered && !self.repairs_under_way.is_under_way(before, Instant::now()) {
       self.unsent_changes.insert(before);
     }
@@ -462,6 +504,7 @@ impl RtpsReaderProxy {
       acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
+      offered_again: None,
       overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
@@ -548,6 +591,7 @@ impl RtpsReaderProxy {
       acknacks_while_joining: None,
       all_acked_before: SequenceNumber::zero(),
       progress: None,
+      offered_again: None,
       overrun_counted_before: SequenceNumber::zero(),
       unsent_changes: BTreeSet::new(),
       pending_gap: BTreeSet::new(),
@@ -801,6 +845,10 @@ impl RtpsReaderProxy {
           progress.set_acked_before(new_all_acked_before);
         }
         self.frags_requested = self.frags_requested.split_off(&new_all_acked_before);
+        self.offered_again = self
+          .offered_again
+          .take()
+          .filter(|again| new_all_acked_before < again.before);
 
         // Insert the requested changes. These are (by construction) greater
         // then new_all_acked_before.

@@ -92,6 +92,11 @@ impl SourceHistory {
     Some((*first, *self.kept.last_key_value()?.0))
   }
 
+  /// The kept samples before this number.
+  pub fn kept_before(&self, before: SequenceNumber) -> BTreeSet<SequenceNumber> {
+    self.kept.range(..before).map(|(number, _)| *number).collect()
+  }
+
   /// The first kept sample after this number.
   pub fn kept_after(&self, sequence_number: SequenceNumber) -> Option<SequenceNumber> {
     let mut later = self.kept.range(sequence_number.plus_1()..);

@@ -1392,6 +1392,9 @@ impl Writer {
             }
             return;
           }
+          if went_back && serves_history {
+            reader_proxy.offer_again(self.send_buffer.kept_before(acked_before));
+          }
           has_progressed = reader_proxy.all_acked_before > acked_before;
           if let Some(last_sent) = last_sent {
             reader_proxy.forget_unsent_after(last_sent);
@@ -1458,6 +1461,15 @@ impl Writer {
             self.send_small_datagrams_to(reader_guid_prefix);
           }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
+        }
+
+        // Acknowledgement frontier may have advanced: push it into the shared send
+        // buffer so any back-pressured producer (or `wait_for_acknowledgments`
+        // waiter) can make progress. It looks at every reader, so not for each of the
+        // ACKNACKs that move nothing. Before the answer: a HEARTBEAT that goes with a
+        // sample meanwhile would begin after what this one offers again.
+        if frontier_moved {
+          self.refresh_acked_frontier();
         }
 
         // See if we need to respond by GAP message
@@ -1533,7 +1545,12 @@ impl Writer {
               .heartbeat_msg(
                 self.entity_id(),
                 if went_back {
-                  max(advertised_first, reader_proxy.all_acked_before)
+                  let first = if reader_proxy.is_offered_again() {
+                    min(advertised_first, self.send_buffer.first_available())
+                  } else {
+                    advertised_first
+                  };
+                  max(first, reader_proxy.all_acked_before)
                 } else {
                   max(advertised_first, reader_proxy.first_offered())
                 },
@@ -1553,13 +1570,6 @@ impl Writer {
               &mut std::iter::once(reader_proxy),
             );
           }
-        }
-        // Acknowledgement frontier may have advanced: push it into the shared send
-        // buffer so any back-pressured producer (or `wait_for_acknowledgments`
-        // waiter) can make progress. It looks at every reader, so not for each of the
-        // ACKNACKs that move nothing.
-        if frontier_moved {
-          self.refresh_acked_frontier();
         }
       } // AckNack
       AckSubmessage::NackFrag(ref nackfrag) => {
@@ -1773,6 +1783,8 @@ impl Writer {
         // No HEARTBEAT that begins after them, as in `withdraw_msg`: the reader has no
         // fragment of these, and may still lack earlier samples of the history.
         gap = gap.gap_msg_range(first, before, self.entity_id(), self.endianness, reader_guid);
+      } else if gone_before.is_some() && self.is_withdrawn_later(reader_proxy, unsent_sn) {
+        reader_proxy.mark_change_sent(unsent_sn);
       } else if let Some(first_available) = gone_before {
         // The reader requests samples that are gone.
         let evicted = reader_proxy.take_evicted_requests(first_available);
@@ -1785,6 +1797,9 @@ impl Writer {
       } else if !pending_gaps.contains(&unsent_sn) {
         match self.send_buffer.get_by_sn(unsent_sn) {
           Some(cc) => cache_change = Some(cc),
+          None if self.is_withdrawn_later(reader_proxy, unsent_sn) => {
+            reader_proxy.mark_change_sent(unsent_sn);
+          }
           None => {
             // A write has evicted it since `gone_before` was read, or the send
             // buffer has a hole there.
@@ -1857,6 +1872,23 @@ impl Writer {
       reader_proxy.repair_mode = false;
     }
   } // fn
+
+  // Whether a late joiner is not told yet that this sample of the history is gone, which a
+  // later one of its source has replaced: the HEARTBEAT of `withdraw_msg` would withdraw
+  // the earlier samples of the history, too, of which the reader may still lack fragments.
+  // It requests the sample with each ACKNACK until it has those. Meanwhile it waits for
+  // them in any case, because it gives samples to its application in order.
+  //
+  // What was written after the match is gone only when the reader is a whole window behind.
+  // It does not wait then.
+  fn is_withdrawn_later(&self, reader_proxy: &RtpsReaderProxy, gone: SequenceNumber) -> bool {
+    if !reader_proxy.qos().is_reliable() || !reader_proxy.offers_of_history(gone) {
+      return false;
+    }
+    let first_lacking = reader_proxy.all_acked_before;
+    let first_to_come = self.send_buffer.available_after(first_lacking);
+    first_to_come.unwrap_or(first_lacking) < gone
+  }
 
   // Tells a reader that it gets these samples no more: a HEARTBEAT that begins after
   // them, then a GAP.
@@ -4233,10 +4265,8 @@ mod tests {
       }
     }
 
-    // Each source has a history of its own. One GAP withdraws any number of other samples,
-    // which do not count as missed.
-    #[test]
-    fn a_late_joiner_gets_the_last_sample_of_each_source() {
+    // A writer with depth 1 of the samples of several sources.
+    fn of_several_sources() -> Fixture {
       let mut f = Fixture::user(0, 8, None);
       f.writer.send_buffer = WriterSendBuffer::new(
         f.writer.my_guid,
@@ -4249,27 +4279,43 @@ mod tests {
         1,
       )
       .keep_last(1);
-      let of = |source: u8| {
-        let source = GUID::new(GuidPrefix::new(&[source; 12]), EntityId::UNKNOWN);
-        WriteOptionsBuilder::new().history_source(source).build()
-      };
-      let few = 3;
-      (1..=few).for_each(|source| write_with(&f, of(source), 1, 8));
-      write_with(&f, of(100), 100_000, 8);
-      let last = 100_003;
       let former = f.writer.readers.remove(&f.reader_guid);
       assert!(former.is_some());
+      f.writer.nack_response_delay = StdDuration::ZERO;
+      f
+    }
 
+    fn of(source: u8) -> WriteOptions {
+      let source = GUID::new(GuidPrefix::new(&[source; 12]), EntityId::UNKNOWN);
+      WriteOptionsBuilder::new().history_source(source).build()
+    }
+
+    // A late joiner at a socket, of which `received_messages` shows the first HEARTBEAT.
+    fn late_joiner(f: &mut Fixture) -> std::net::UdpSocket {
       let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
       let late = GUID::new(GuidPrefix::new(&[3; 12]), f.reader_guid.entity_id);
       let qos = f.writer.qos_policies.clone();
       f.writer
         .update_reader_proxy(&RtpsReaderProxy::new(late, qos.clone(), false), &qos);
+      // As if it were no loopback locator, which is not used before the route is resolved.
       let reader = f.writer.readers.get_mut(&late).unwrap();
       reader.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
       f.reader_guid = late;
-      f.writer.nack_response_delay = StdDuration::ZERO;
       f.writer.offer_to_new_reader(late);
+      socket
+    }
+
+    // Each source has a history of its own. One GAP withdraws any number of other samples,
+    // which do not count as missed.
+    #[test]
+    fn a_late_joiner_gets_the_last_sample_of_each_source() {
+      let mut f = of_several_sources();
+      let few = 3;
+      (1..=few).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 100_000, 8);
+      let last = 100_003;
+
+      let socket = late_joiner(&mut f);
       assert_eq!(received_messages(&socket), (0, vec![(1, last)]));
       let reader = only_reader(&f);
       assert_eq!((reader.offered, reader.unacknowledged), (4, 4));
@@ -4294,6 +4340,7 @@ mod tests {
       acknowledge(&mut f, last + 2, &[], 4);
       write_with(&f, of(100), 20, 8);
       let later = GUID::new(GuidPrefix::new(&[4; 12]), f.reader_guid.entity_id);
+      let qos = f.writer.qos_policies.clone();
       f.writer
         .update_reader_proxy(&RtpsReaderProxy::new(later, qos.clone(), false), &qos);
       let before = SequenceNumber::new(last + 1_000);
@@ -4303,6 +4350,111 @@ mod tests {
       );
       f.reader_guid = later;
       assert_eq!(only_reader(&f).offered, 4);
+    }
+
+    // The other publisher's sample is withdrawn when the reader has what precedes it, because
+    // the HEARTBEAT that begins after it withdraws both. The last number is of source 100.
+    #[test]
+    fn a_sample_of_the_history_stays_on_offer_while_another_source_replaces_a_later_one() {
+      let mut f = of_several_sources();
+      write_with(&f, of(1), 1, 20_000);
+      (2..=3).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 97, 8);
+      let socket = late_joiner(&mut f);
+      assert_eq!(received_messages(&socket), (0, vec![(1, 100)]));
+
+      // It has some fragments of the first sample.
+      nack_frag(&mut f, 1, frags(3..=9), 1);
+      write_with(&f, of(2), 1, 8);
+      acknowledge(&mut f, 1, &[2, 3], 1);
+      assert_eq!(f.repair_round(), 2);
+      assert_eq!(received_messages(&socket), (1, vec![]), "one sample, nothing withdrawn");
+      // It may have fragments of the replaced one.
+      nack_frag(&mut f, 2, frags(1..=2), 2);
+      assert_eq!(f.repair_round(), 1);
+      assert_eq!(received_messages(&socket), (0, vec![]));
+      assert_eq!(only_reader(&f).overrun, 0);
+      assert!(f.writer.handle_heartbeat_tick(false));
+      assert_eq!(received_messages(&socket), (0, vec![(1, 101)]));
+
+      // It has the first sample by now.
+      acknowledge(&mut f, 2, &[2], 2);
+      assert_eq!(f.repair_round(), 1);
+      assert_eq!(received_messages(&socket), (0, vec![(3, 101)]));
+      assert_eq!(only_reader(&f).overrun, 1);
+    }
+
+    // A reader that has not acknowledged a whole window goes on with what is retained.
+    #[test]
+    fn the_history_does_not_hold_back_a_late_joiner_that_misses_later_samples() {
+      let mut f = of_several_sources();
+      write_with(&f, of(1), 1, 20_000);
+      write_with(&f, of(100), 99, 8);
+      let socket = late_joiner(&mut f);
+      write_with(&f, of(100), 10, 8); // 103 to 110 are retained
+      received_messages(&socket);
+      acknowledge(&mut f, 1, &[100, 101, 102, 103], 1);
+      assert_eq!(f.repair_round(), 4);
+      assert_eq!(received_messages(&socket), (1, vec![(103, 110)]));
+      assert_eq!(only_reader(&f).overrun, 2);
+    }
+
+    // A reader that was matched anew on its side is offered the history of the present, also
+    // of what was written since the match, and what is retained. The rest is no loss, and is
+    // withdrawn without a HEARTBEAT, which would withdraw the history before it.
+    #[test]
+    fn a_late_joiner_that_went_back_gets_the_last_sample_of_each_source_again() {
+      let mut f = of_several_sources();
+      (1..=3).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 97, 8);
+      let socket = late_joiner(&mut f);
+      acknowledge(&mut f, 101, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      write_with(&f, of(100), 99, 8); // 200 is retained, 1, 3 and 101 are kept
+      acknowledge(&mut f, 201, &[], 2);
+      received_messages(&socket);
+      assert_eq!(f.writer.send_buffer.retained_len(), 1);
+
+      acknowledge(&mut f, 1, &[], 1);
+      assert_eq!(received_messages(&socket), (0, vec![(1, 200)]));
+      assert_eq!(f.writer.send_buffer.advertised_first(), SequenceNumber::new(1));
+      let requested: Vec<i64> = (1..=200).collect();
+      acknowledge(&mut f, 1, &requested, 2);
+      assert_eq!(f.repair_round(), 200);
+      assert_eq!(received_messages(&socket), (4, vec![]));
+      acknowledge(&mut f, 2, &[2], 3);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(2, 3)]);
+      acknowledge(&mut f, 102, &requested[101..199], 4);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(102, 200)]);
+      acknowledge(&mut f, 201, &[], 5);
+      let reader = only_reader(&f);
+      assert_eq!((reader.unacknowledged, reader.overrun), (0, 0));
+      assert!(!f.reader_proxy().is_offered_again());
+    }
+
+    // What a source replaces after the reader went back is withdrawn when the reader has what
+    // precedes it, as from a new late joiner.
+    #[test]
+    fn what_is_replaced_after_a_late_joiner_went_back_is_withdrawn_in_order() {
+      let mut f = of_several_sources();
+      (1..=3).for_each(|source| write_with(&f, of(source), 1, 8));
+      write_with(&f, of(100), 97, 8);
+      let socket = late_joiner(&mut f);
+      acknowledge(&mut f, 101, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      write_with(&f, of(100), 99, 8); // 200 is retained, 1, 3 and 101 are kept
+      acknowledge(&mut f, 201, &[], 2);
+      acknowledge(&mut f, 1, &[], 1);
+      write_with(&f, of(2), 1, 8);
+      received_messages(&socket);
+      acknowledge(&mut f, 1, &[1, 2, 3, 101], 2);
+      assert_eq!(f.repair_round(), 4);
+      assert_eq!(received_messages(&socket), (2, vec![]), "1 and 3, nothing withdrawn");
+      acknowledge(&mut f, 101, &[101], 3);
+      assert_eq!(f.repair_round(), 1);
+      assert_eq!(received_messages(&socket), (0, vec![(102, 201)]));
     }
 
     // An ACKNACK that lies moves neither another reader's frontier nor, beyond what was

@@ -597,6 +597,16 @@ impl WriterSendBuffer {
     numbers
   }
 
+  /// What only the history has of the samples that a reader acknowledged, before this one.
+  pub fn kept_before(&self, acknowledged_before: SequenceNumber) -> OfferedHistory {
+    let inner = self.shared.inner.lock().unwrap();
+    let before = acknowledged_before.min(inner.first_seq);
+    OfferedHistory {
+      listed: inner.history.kept_before(before),
+      before,
+    }
+  }
+
   /// Forgets the history of a source.
   pub fn forget_history_of(&self, source: GUID) {
     self.shared.inner.lock().unwrap().history.forget(source);
