@@ -417,7 +417,7 @@ fn an_address_that_is_assigned_after_the_start_is_used() {
 mod long {
     use super::*;
 
-    /// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`.
+    /// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`; 300 s in `make soak`.
     #[test]
     fn all_flows_recover_from_a_long_outage() {
         let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());
