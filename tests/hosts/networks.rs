@@ -11,7 +11,7 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL};
 use support::bridge::Bridge;
-use support::netns::Net;
+use support::netns::{Host, Net};
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::process::Process;
 use support::ros;
@@ -387,30 +387,50 @@ fn a_second_interface_reaches_subscribers_behind_it() {
     bed.end();
 }
 
+/// Tests a network of the bridge's host that is there only after the bridge has started.
+fn late_network(what: &str, networks: &str, take_away: impl FnOnce(&Host), give: impl FnOnce(&Host)) {
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let robot = net.host("bridge").clone();
+    take_away(&robot);
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{networks}{}", routes()));
+    let up = bridge.start_on(&robot, "up");
+    let bed = Bed { up, bridge, net };
+    bed.wait_up();
+    let is_configured = !networks.is_empty();
+    if is_configured {
+        bed.up.wait_for_log("network interface eth0 is not on this host or has no IPv4 address");
+    }
+    let scene = Scene::start_unmatched(&bed, "slow", &LOOPBACK);
+    scene.wait_more_local(30);
+    // The bridge does not miss an interface that neither the configuration names nor a peer was reached by.
+    if is_configured {
+        wait_absence(&bed, "eth0");
+    }
+    scene.wait_recovered(&bed, what, || give(&robot));
+    wait_absences_ended(&bed);
+    scene.end(&bed);
+    bed.end();
+}
+
 #[test]
 fn an_address_that_is_assigned_after_the_start_is_used() {
     let test = "an_address_that_is_assigned_after_the_start_is_used";
     if let Some(reason) = missing() {
-        support::skip(test, &reason);
-        return;
+        return support::skip(test, &reason);
     }
-    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
-    let robot = net.host("bridge").clone();
-    robot.set_address(None);
-    // The interface is configured by name and has no address yet.
-    let yaml = format!("instance: {{instance}}\nros: {{networks: [eth0]}}\n{}", routes());
-    let bridge = Bridge::new(&yaml);
-    let up = bridge.start_on(&robot, "up");
-    let bed = Bed { up, bridge, net };
-    bed.wait_up();
-    bed.up.wait_for_log("network interface eth0 is not on this host or has no IPv4 address");
-    let scene = Scene::start_unmatched(&bed, "slow", &LOOPBACK);
-    scene.wait_more_local(30);
-    wait_absence(&bed, "eth0");
-    scene.wait_recovered(&bed, "a late address", || robot.set_address(Some(robot.address())));
-    wait_absences_ended(&bed);
-    scene.end(&bed);
-    bed.end();
+    let remove = |robot: &Host| robot.set_address(None);
+    let assign = |robot: &Host| robot.set_address(Some(robot.address()));
+    late_network("a late address of a configured interface", "ros: {networks: [eth0]}\n", remove, assign);
+    late_network("a late address", "", remove, assign);
+}
+
+#[test]
+fn a_link_that_comes_up_after_the_start_is_used() {
+    let test = "a_link_that_comes_up_after_the_start_is_used";
+    if let Some(reason) = missing() {
+        return support::skip(test, &reason);
+    }
+    late_network("a late link", "", |robot| robot.set_link(false), |robot| robot.set_link(true));
 }
 
 /// Tests of a minute or more: `make test-long`.
