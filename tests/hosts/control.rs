@@ -15,6 +15,7 @@ use support::impairment::Impairment;
 use support::netns::Host;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::Process;
+use support::ros;
 
 /// Settings for tests that do not depend on the paper's values: a window of 2 s instead of 10, and RTT limits
 /// that a busy machine does not exceed, so that only loss changes a state.
@@ -544,13 +545,23 @@ fn remote_readers_of_the_input_and_of_the_critical_output_are_logged_once() {
 }
 
 #[test]
-fn the_log_names_a_stopped_critical_subscriber() {
-    let test = "the_log_names_a_stopped_critical_subscriber";
+fn log_status_and_diagnostics_name_the_node_of_a_stopped_critical_subscriber() {
+    let test = "log_status_and_diagnostics_name_the_node_of_a_stopped_critical_subscriber";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
     let yaml = format!("{SCAN}lanes: {{critical: {{window_samples: 64}}}}\n");
     let Some(bed) = Bed::start(test, &yaml) else { return };
     bed.up.wait_for_log("control is up");
-    let stopped = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let mut listener = node_on(bed.host("publisher"), "listener");
+    let reports = read(&mut listener, "rt/adaptive_bridge/diagnostics", "std_msgs::msg::dds_::String_");
+    let stopped = bed.subscribe("critical", Peer::rclpy("debugged").keep_all(), CRITICAL);
     let other = bed.subscribe("slow", Peer::fast().keep_all(), CRITICAL);
+    // The graph entry of the node arrives after the discovery of its reader.
+    let record = |status: &Value| {
+        find_by(&output(status, "critical")["matched_readers"], "node", "/debugged").cloned()
+    };
+    bed.bridge.wait_status("the node of the reader", |status| record(status).is_some());
     let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(1_000.0), INPUT);
     stopped.wait_received(20);
     stopped.stop();
@@ -561,9 +572,21 @@ fn the_log_names_a_stopped_critical_subscriber() {
     let log = bed.up.log();
     let warning = log.lines().find(|line| line.contains("a subscriber does not keep up")).unwrap();
     println!("{warning}");
+    let name = format!("/debugged on {}", bed.host("critical").address());
     assert!(warning.contains("WARN") && warning.contains("critical"), "{warning}");
-    let address = bed.host("critical").address().to_string();
-    assert!(warning.contains(&address), "{address} in {warning}");
+    assert!(warning.contains("reader_overrun") && warning.contains(&name), "{name} in {warning}");
+    let status = bed.bridge.status();
+    let reader = record(&status).unwrap_or_else(|| panic!("/debugged in {status}"));
+    assert!(reader["overrun"].as_u64() > Some(0), "{reader}");
+    // The reports follow each other without a pause, so that one of them covers the loss.
+    let problem = wait_payload(&reports, "the problem in the diagnostics", |payload| {
+        let report = json(payload);
+        let problems = report["problems"].as_array().unwrap().iter();
+        let mut problems = problems.filter_map(|problem| problem.as_str().map(str::to_owned));
+        problems.find(|problem| problem.contains("(reader_overrun)"))
+    });
+    println!("{problem}");
+    assert!(problem.contains(&format!("{name} missed ")), "{name} in {problem}");
     let before = stopped.received();
     stopped.wait_received(before + 100);
     let sent: Sent = publisher.end();

@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, outputs};
 use support::impairment::Impairment;
+use support::netns::Host;
 use support::pacer::paced;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
@@ -104,6 +105,33 @@ fn mute(bed: &Bed, host: &str) {
     bed.host(host).run("iptables", &["-A", "OUTPUT", "-p", "udp", "-d", &bridge, "-j", "DROP"]);
 }
 
+/// Compares the lane's account of the readers on a host with the counts of its subscribers: a reader that was
+/// offered every sample and has no overrun belongs to a subscriber that received every sample.
+///
+/// An overrun is exact only for a reader that is less than 256 samples behind, so that it is not compared.
+fn assert_account(status: &Value, host: &Host, subscribers: &[RunningPeer], sent: &Sent) {
+    let address = host.address().to_string();
+    let readers = critical(status)["matched_readers"].as_array().unwrap().iter();
+    let readers: Vec<&Value> = readers.filter(|reader| reader["host"] == address).collect();
+    println!("readers on {}: {readers:?}", host.name());
+    let is_whole = |reader: &&&Value| reader["offered"] == sent.ok && reader["overrun"] == 0;
+    let whole = readers.iter().filter(is_whole).count();
+    support::wait_until(format!("every sample at {whole} subscribers on {}", host.name()), || {
+        subscribers.iter().filter(|subscriber| subscriber.received() == sent.ok).count() >= whole
+    });
+}
+
+/// Waits until the readers on some hosts have acknowledged what is retained; returns the status.
+fn wait_acknowledged(bed: &Bed, hosts: &[&Host]) -> Value {
+    let addresses: Vec<String> = hosts.iter().map(|host| host.address().to_string()).collect();
+    bed.bridge.wait_status("all samples acknowledged", |status| {
+        let mut readers = critical(status)["matched_readers"].as_array().unwrap().iter();
+        readers.all(|reader| {
+            reader["unacknowledged"] == 0 || addresses.iter().all(|address| reader["host"] != *address)
+        })
+    })
+}
+
 /// Runs a flow to subscribers that are killed, that stop for 1 s, for 10 s and beyond their lease, that lose
 /// 28 % in bursts, that are 200 ms away, that read nothing, and whose acknowledgements never arrive; and to
 /// subscribers that keep up, which must receive every sample.
@@ -117,13 +145,13 @@ fn crowd(test: &str, flow: &Flow) {
         flow.max_sample_bytes
     );
     let _alone = support::exclusive();
-    let Some(bed) = Bed::start_with(test, &yaml, &["lossy", "far", "mute"]) else { return };
+    let Some(bed) = Bed::start_with(test, &yaml, &["lossy", "far", "mute", "short"]) else { return };
     let bridge = bed.host("bridge");
-    let [near, slow] = if flow.on_robot { ["bridge"; 2] } else { ["critical", "slow"] };
+    let [near, slow, short] = if flow.on_robot { ["bridge"; 3] } else { ["critical", "slow", "short"] };
     let healthy = flow.subscribe(&bed, &LIBRARIES, (near, "planner"), HEALTHY_DEPTH);
     let bad = [
         (slow, "killed"),
-        (slow, "stopped_1s"),
+        (short, "stopped_1s"),
         (slow, "stopped_10s"),
         (slow, "stopped_25s"),
         ("lossy", "lossy"),
@@ -146,7 +174,7 @@ fn crowd(test: &str, flow: &Flow) {
     let idle: Vec<RunningPeer> = idle.collect();
     let publisher = flow.peer(Library::Cyclone, "").keep_last(1_000).rate_hz(flow.rate_hz);
     let publisher = bed.publish(publisher, INPUT);
-    let _impairments = paced(&publisher, &healthy, flow.lag, || {
+    let (mut loss, _delay) = paced(&publisher, &healthy, flow.lag, || {
         let crowd = [&killed, &short, &long, &beyond_lease, &lossy, &far, &muted];
         for subscribers in crowd.into_iter().chain([&healthy]) {
             wait_more(subscribers, 5);
@@ -182,6 +210,16 @@ fn crowd(test: &str, flow: &Flow) {
     }
     let status = bed.wait_accounted();
     assert_eq!(critical(&status)["forwarded"], sent.ok, "{status}");
+    // A subscriber with a shorter history may itself discard samples that it has acknowledged.
+    if f64::from(flow.depth) >= 5.0 * flow.rate_hz {
+        loss.off();
+        let never_unmatched = [("short", &short), ("lossy", &lossy), ("far", &far)];
+        let hosts = never_unmatched.map(|(host, _)| bed.host(host));
+        let status = wait_acknowledged(&bed, &hosts);
+        for (host, (_, subscribers)) in hosts.into_iter().zip(never_unmatched) {
+            assert_account(&status, host, subscribers, &sent);
+        }
+    }
     for subscriber in [short, long, beyond_lease, lossy, far, muted].into_iter().flatten() {
         let received: Received = subscriber.end();
         received.assert_sound();

@@ -7,6 +7,7 @@ use std::time::Duration;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, missing_from};
 use support::peer::{Graph, Library, Peer, Received, RunningPeer, Sent};
+use support::ros;
 
 const LIBRARIES: [Library; 3] = [Library::Cyclone, Library::Fast, Library::Rust];
 
@@ -166,6 +167,56 @@ fn a_reliable_publisher_is_repaired_beside_best_effort_ones_that_join_and_leave(
         let _: Received = critical.end();
     }
     bed.wait_accounted();
+    bed.end();
+}
+
+/// The same with ROS 2 nodes, whose names the bridge knows.
+#[test]
+fn a_best_effort_node_beside_a_reliable_one_is_named_and_the_reliable_one_is_repaired() {
+    let test = "a_best_effort_node_beside_a_reliable_one_is_named_and_the_reliable_one_is_repaired";
+    if let Some(reason) = ros::missing() {
+        return support::skip(test, &reason);
+    }
+    // Fast DDS sends a HEARTBEAT every 3 s; until a repair the samples after the lost one wait: 150 at 50 Hz.
+    let yaml = format!("{SCAN}lanes:\n  critical: {{queue_depth: 1024}}\n");
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    let critical = bed.subscribe("critical", Peer::cyclone().keep_all().each_sample(), CRITICAL);
+    let spare = Peer::rclpy("spare_lidar").best_effort().rate_hz(50.0).first_seq(1_000_000);
+    let spare = bed.publish(spare, INPUT);
+    critical.wait_received(1);
+    let reliable = Peer::rclpy("lidar").keep_all().rate_hz(50.0).count(400).linger_s(20.0);
+    let reliable = bed.publish(reliable, INPUT);
+    let reliable_numbers = || sequences_below(&critical, 1_000_000);
+    support::wait_until("a sample of the RELIABLE node", || !reliable_numbers().is_empty());
+    bed.host("bridge").lose_incoming(0.05);
+    let before = reliable_numbers().len();
+    support::wait_until("repaired samples", || reliable_numbers().len() > before + 200);
+    let named = format!(
+        "BEST_EFFORT publishers beside RELIABLE ones of /scan: /spare_lidar on {};",
+        bed.host("publisher").address()
+    );
+    let status = bed.bridge.wait_status("a problem that names the BEST_EFFORT node", |status| {
+        let mut problems = status["problems"].as_array().unwrap().iter().filter_map(Value::as_str);
+        problems.any(|problem| problem.contains(&named))
+    });
+    println!("{}", status["problems"]);
+    bed.host("bridge").lose_incoming(0.0);
+    let _: Sent = spare.end();
+    reliable.wait_sent();
+    let status = bed.bridge.status();
+    let accounts = status["routes"][0]["publishers"].as_array().unwrap();
+    let account = accounts.iter().find(|account| account["reliability"] == "RELIABLE").unwrap();
+    assert_eq!((&account["node"], &account["lost_upstream"]), (&"/lidar".into(), &0.into()), "{status}");
+    let sent: Sent = reliable.end();
+    support::wait_until(format!("the last sample of the RELIABLE node, {sent:?}"), || {
+        reliable_numbers().last() == Some(&sent.last)
+    });
+    // Samples before the first received one were written before ingress's RELIABLE reader matched.
+    let numbers = reliable_numbers();
+    assert!(numbers.iter().copied().eq(numbers[0]..=sent.last), "in order, each once: {numbers:?}");
+    assert_eq!(sent.failed, 0, "{sent:?}");
+    bed.wait_accounted();
+    let _: Received = critical.end();
     bed.end();
 }
 

@@ -11,7 +11,7 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL};
 use support::bridge::Bridge;
-use support::netns::Net;
+use support::netns::{Host, Net};
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::process::Process;
 use support::ros;
@@ -189,6 +189,18 @@ impl Scene {
             }
             is_over && answered
         });
+        for (flow, _) in self.flows.iter().zip(recovered).filter(|(_, recovered)| !recovered) {
+            println!("after {what}: {}: not yet", flow.name);
+        }
+    }
+
+    /// Waits until every subscriber of the bridge has received so many more samples: those that are served
+    /// without the bridge again are served through it too, and not just once.
+    fn wait_more_of_the_bridge(&self, samples: u64) {
+        let flows = self.flows.iter().zip(self.counts());
+        for (flow, before) in flows.filter(|(flow, _)| flow.through_bridge) {
+            flow.subscriber.wait_received(before + samples);
+        }
     }
 
     /// Ends the flows. Asserts that each local subscriber received every sample, and that the others received
@@ -199,6 +211,7 @@ impl Scene {
 
     /// Like [`end`](Self::end), but a subscriber on the other host may have received so many duplicates.
     fn end_with(self, bed: &Bed, max_duplicates: u64) {
+        self.wait_more_of_the_bridge(2 * RECOVERY_SAMPLES);
         let sent: Sent = self.scanner.end();
         for subscriber in self.local {
             subscriber.wait_received(sent.ok);
@@ -332,6 +345,13 @@ fn a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_s
     let Some(bed) = bed(test) else { return };
     let robot = bed.host("bridge").clone();
     let scene = Scene::start(&bed, "slow", &LOOPBACK);
+    // Without the bridge, nodes of one host do not need its address.
+    let plain = |node| Peer::rclpy(node).keep_last(1000).topic("rt/plain_local").rate_hz(30.0);
+    let plain_planner = plain("plain_planner").subscriber().start_on(&robot);
+    let plain_source = plain("plain_source").publisher().wait_match(1).hold().start_on(&robot);
+    plain_planner.wait_matched(1);
+    plain_source.go();
+    plain_planner.wait_received(RECOVERY_SAMPLES);
 
     robot.set_address(None);
     scene.wait_more_local(60);
@@ -346,6 +366,9 @@ fn a_changed_address_of_the_bridge_is_announced_and_costs_local_subscribers_no_s
     // A subscriber that discovers the bridge again receives a second time the samples whose acknowledgements
     // were lost with the address.
     scene.end_with(&bed, 3);
+    let sent: Sent = plain_source.end();
+    plain_planner.wait_received(sent.ok);
+    plain_planner.end::<Received>().assert_all_of(&sent);
     bed.end();
 }
 
@@ -387,37 +410,57 @@ fn a_second_interface_reaches_subscribers_behind_it() {
     bed.end();
 }
 
+/// Tests a network of the bridge's host that is there only after the bridge has started.
+fn late_network(what: &str, networks: &str, take_away: impl FnOnce(&Host), give: impl FnOnce(&Host)) {
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let robot = net.host("bridge").clone();
+    take_away(&robot);
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{networks}{}", routes()));
+    let up = bridge.start_on(&robot, "up");
+    let bed = Bed { up, bridge, net };
+    bed.wait_up();
+    let is_configured = !networks.is_empty();
+    if is_configured {
+        bed.up.wait_for_log("network interface eth0 is not on this host or has no IPv4 address");
+    }
+    let scene = Scene::start_unmatched(&bed, "slow", &LOOPBACK);
+    scene.wait_more_local(30);
+    // The bridge does not miss an interface that neither the configuration names nor a peer was reached by.
+    if is_configured {
+        wait_absence(&bed, "eth0");
+    }
+    scene.wait_recovered(&bed, what, || give(&robot));
+    wait_absences_ended(&bed);
+    scene.end(&bed);
+    bed.end();
+}
+
 #[test]
 fn an_address_that_is_assigned_after_the_start_is_used() {
     let test = "an_address_that_is_assigned_after_the_start_is_used";
     if let Some(reason) = missing() {
-        support::skip(test, &reason);
-        return;
+        return support::skip(test, &reason);
     }
-    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
-    let robot = net.host("bridge").clone();
-    robot.set_address(None);
-    // The interface is configured by name and has no address yet.
-    let yaml = format!("instance: {{instance}}\nros: {{networks: [eth0]}}\n{}", routes());
-    let bridge = Bridge::new(&yaml);
-    let up = bridge.start_on(&robot, "up");
-    let bed = Bed { up, bridge, net };
-    bed.wait_up();
-    bed.up.wait_for_log("network interface eth0 is not on this host or has no IPv4 address");
-    let scene = Scene::start_unmatched(&bed, "slow", &LOOPBACK);
-    scene.wait_more_local(30);
-    wait_absence(&bed, "eth0");
-    scene.wait_recovered(&bed, "a late address", || robot.set_address(Some(robot.address())));
-    wait_absences_ended(&bed);
-    scene.end(&bed);
-    bed.end();
+    let remove = |robot: &Host| robot.set_address(None);
+    let assign = |robot: &Host| robot.set_address(Some(robot.address()));
+    late_network("a late address of a configured interface", "ros: {networks: [eth0]}\n", remove, assign);
+    late_network("a late address", "", remove, assign);
+}
+
+#[test]
+fn a_link_that_comes_up_after_the_start_is_used() {
+    let test = "a_link_that_comes_up_after_the_start_is_used";
+    if let Some(reason) = missing() {
+        return support::skip(test, &reason);
+    }
+    late_network("a late link", "", |robot| robot.set_link(false), |robot| robot.set_link(true));
 }
 
 /// Tests of a minute or more: `make test-long`.
 mod long {
     use super::*;
 
-    /// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`.
+    /// An outage of 60 s, or of `ADAPTIVE_BRIDGE_TEST_OUTAGE_S`; 300 s in `make soak`.
     #[test]
     fn all_flows_recover_from_a_long_outage() {
         let seconds = std::env::var("ADAPTIVE_BRIDGE_TEST_OUTAGE_S").ok().and_then(|text| text.parse().ok());

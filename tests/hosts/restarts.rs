@@ -50,6 +50,8 @@ fn kill_ingress_five_times(bed: &Bed, publisher: Peer) -> (Sent, Value) {
     let received: Received = subscriber.end();
     received.assert_sound();
     assert_eq!(received.received, forwarded, "{received:?} {lane}");
+    // Samples were written while there was no ingress.
+    assert!(received.max_gap_ms > 2.0 * 1e3 / RATE_HZ, "{received:?}");
     let summary = format!(
         "{} sent, {} received; repeated {}, lost_upstream {}, dropped by the lane {dropped}",
         sent.ok, received.received, route["repeated"], route["lost_upstream"]
@@ -61,9 +63,15 @@ fn kill_ingress_five_times(bed: &Bed, publisher: Peer) -> (Sent, Value) {
 #[test]
 fn a_reliable_publisher_is_forwarded_once_and_in_order_when_ingress_is_killed() {
     let test = "a_reliable_publisher_is_forwarded_once_and_in_order_when_ingress_is_killed";
-    let Some(bed) = Bed::start(test, SCAN) else { return };
-    kill_ingress_five_times(&bed, Peer::cyclone().keep_last(1000));
-    bed.end();
+    // A publisher retains 1,000 samples, which are 5 s, for the killed ingress. The next one takes what was
+    // written meanwhile, before it declares its predecessor gone a second after its start: on a busy machine
+    // it may not have discovered the publisher by then.
+    support::attempts(|| {
+        let Some(bed) = Bed::start(test, SCAN) else { return Ok(()) };
+        let (_, route) = kill_ingress_five_times(&bed, Peer::cyclone().keep_last(1000));
+        bed.end();
+        if route["lost_upstream"] == 0 { Ok(()) } else { Err(format!("lost, although retained: {route}")) }
+    });
 }
 
 #[test]
