@@ -232,10 +232,7 @@ impl Output {
             bytes: bytes as u64,
             by_reference,
             caught_up: header.published_at < self.started_at,
-            sequence: header.sequence,
             written_at: began_at,
-            writer: header.writer_guid,
-            writer_sequence: header.writer_sequence,
         };
         let sent_through = writer.sent_through();
         let (unsent, queued) = (&mut self.unsent, self.queued);

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use crate::model::{Guid, LaneCounters, MonotonicNs};
+use crate::model::{LaneCounters, MonotonicNs};
 
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,10 +61,7 @@ pub(super) struct Forwarded {
     pub bytes: u64,
     pub by_reference: bool,
     pub caught_up: bool,
-    pub sequence: u64,
     pub written_at: MonotonicNs,
-    pub writer: Guid,
-    pub writer_sequence: i64,
 }
 
 pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
@@ -72,10 +69,7 @@ pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
     counters.forwarded_bytes += sample.bytes;
     counters.by_reference += u64::from(sample.by_reference);
     counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_sequence = sample.sequence;
     counters.last_forwarded_at = sample.written_at;
-    counters.last_writer_guid = sample.writer;
-    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 #[cfg(test)]
