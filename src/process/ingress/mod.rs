@@ -16,7 +16,7 @@ use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tracing::{debug, info};
+use tracing::info;
 
 use super::HOUSEKEEPING_MS;
 use super::memory_limit;
@@ -150,9 +150,6 @@ impl Ingress {
                 Discovery::WriterGone(guid) => self.for_each_input(|input, _| input.writer_gone(guid)),
                 Discovery::ParticipantGone { prefix, .. } => {
                     self.for_each_input(|input, _| input.participant_gone(prefix));
-                }
-                Discovery::Incompatible { local, remote } => {
-                    debug!(?local, ?remote, "endpoints are not compatible");
                 }
                 _ => {}
             }
