@@ -15,20 +15,12 @@ use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter};
-use crate::model::{
-    Durability, Encapsulation, History, MonotonicNs, QosProfile, Reliability, SourceTimestamp,
-};
+use crate::model::{Encapsulation, History, MonotonicNs, QosProfile, SourceTimestamp};
 use crate::shm::Boards;
 use crate::telemetry::{self, Decision, MetricsServer, Report, Snapshot};
 
 /// The QoS with which ROS 2 nodes publish diagnostics and `diagnostic_aggregator` subscribes to them.
-const QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
-    history: History::KeepLast { depth: 10 },
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+const QOS: QosProfile = QosProfile { history: History::KeepLast { depth: 10 }, ..QosProfile::CRITICAL };
 
 /// Unacknowledged messages that a writer retains; older ones are evicted, and a slow reader misses them.
 const WINDOW_SAMPLES: usize = 64;
