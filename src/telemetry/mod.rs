@@ -28,7 +28,7 @@ pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problem::{Level, Problem};
 pub use report::{Report, SubscriberReport};
 pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
-pub use text::{bytes_text, wrapped};
+pub use text::{bytes_text, shortened, wrapped};
 pub use threads::Threads;
 
 impl Snapshot {

@@ -8,7 +8,7 @@ pub(super) fn printable(text: &str) -> String {
 }
 
 /// Cuts the text to at most `max_bytes`; an ellipsis marks the cut.
-pub(super) fn shortened(text: &str, max_bytes: usize) -> String {
+pub fn shortened(text: &str, max_bytes: usize) -> String {
     const ELLIPSIS: &str = "…";
     if text.len() <= max_bytes {
         return text.to_owned();
