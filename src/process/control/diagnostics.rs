@@ -52,11 +52,12 @@ impl Diagnostics {
         participant: &mut Participant,
     ) -> Result<Self, RoleError> {
         // Creates all writers even while diagnostics are off: a reload may switch them on.
-        let mut writer =
-            |topic: &str, dds_type| participant.create_writer(topic, dds_type, &QOS, WINDOW_SAMPLES);
-        let decisions = writer(&dds_topic(telemetry::DECISION_TOPIC), telemetry::STRING_TYPE)?;
-        let array = writer(&dds_topic(telemetry::DIAGNOSTICS_TOPIC), telemetry::DIAGNOSTIC_ARRAY_TYPE)?;
-        let json = writer(&settings.diagnostics.topic.to_dds(), telemetry::STRING_TYPE)?;
+        let mut writer = |topic: &str, dds_type| {
+            participant.create_writer(&format!("rt{topic}"), dds_type, &QOS, WINDOW_SAMPLES)
+        };
+        let decisions = writer(telemetry::DECISION_TOPIC, telemetry::STRING_TYPE)?;
+        let array = writer(telemetry::DIAGNOSTICS_TOPIC, telemetry::DIAGNOSTIC_ARRAY_TYPE)?;
+        let json = writer(settings.diagnostics.topic.as_str(), telemetry::STRING_TYPE)?;
         // A failed metrics page does not stop the bridge.
         let metrics = settings.diagnostics.metrics.as_ref().and_then(|listener| {
             MetricsServer::start(listener).inspect_err(|error| error!(%error, "metrics are not served")).ok()
@@ -153,9 +154,4 @@ fn write(writer: &RawWriter, payload: Bytes) {
     {
         debug!(%error, "cannot publish a diagnostics message");
     }
-}
-
-fn dds_topic(topic: &str) -> String {
-    // The DDS name of a ROS 2 topic (design.ros2.org, "Topic and Service name mapping to DDS").
-    format!("rt{topic}")
 }
