@@ -74,8 +74,6 @@ pub struct RouteChannel {
 pub struct PoolSize {
     /// The number of slots.
     pub slots: usize,
-    /// Bytes of one slot, headers included.
-    pub slot_bytes: usize,
     /// Bytes of shared memory for the pool.
     pub bytes: u64,
 }
@@ -113,7 +111,7 @@ impl RouteChannel {
         let slot_bytes = (headers + self.max_sample_bytes).next_multiple_of(align);
         // In addition, a free list of 4 bytes for each slot, and the description of the segment.
         let bytes = (slots * (slot_bytes + 4) + 1024).next_multiple_of(4096) as u64;
-        PoolSize { slots, slot_bytes, bytes }
+        PoolSize { slots, bytes }
     }
 
     /// The depth of a queue, with room for the retained samples that a new subscriber receives first.
