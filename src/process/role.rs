@@ -16,26 +16,17 @@ use crate::telemetry;
 
 /// Why a process could not start, or had to end.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the message says what the fields are")]
 pub enum RoleError {
     /// The configuration has no lane of that name.
     #[error("there is no lane {name}; the configuration has: {}", .lanes.join(", "))]
-    NoSuchLane {
-        /// The name.
-        name: String,
-        /// The lanes that the configuration has.
-        lanes: Vec<String>,
-    },
+    NoSuchLane { name: String, lanes: Vec<String> },
     /// No process serves the lane.
     #[error(
         "no process serves lane {lane} of instance {instance}; start it with \
          `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
     )]
-    NotRunning {
-        /// The instance.
-        instance: String,
-        /// The lane.
-        lane: String,
-    },
+    NotRunning { instance: String, lane: String },
     /// Shared memory failed.
     #[error(transparent)]
     Shm(#[from] ShmError),
