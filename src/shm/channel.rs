@@ -26,7 +26,6 @@ pub(super) const LENT_SLOTS: usize = 2;
 /// The most slots that ingress holds before it publishes them: one that it copies into, and those in which
 /// the DDS library assembles samples.
 pub(super) const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
-/// The queue of a tap.
 pub(super) const TAP: QueueLimits = QueueLimits { queue_depth: 4, max_borrowed: 2 };
 /// The most publishers of a route: ingress, and one for a future standby.
 const PUBLISHERS: usize = 2;

@@ -57,7 +57,6 @@ impl<S: Subscriber> Layer<S> for Journal {
     }
 }
 
-/// One entry of the journal.
 struct Entry {
     priority: u8,
     target: String,

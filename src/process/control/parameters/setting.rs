@@ -272,7 +272,6 @@ fn drop_equal_to_file(store: &ParameterStore, accepted: &mut SetParameters, para
     }
 }
 
-/// The problems in one line.
 fn listed(error: &ConfigError) -> String {
     let problems: Vec<String> = error.problems.iter().map(ToString::to_string).collect();
     problems.join("; ")
