@@ -16,17 +16,26 @@ use crate::telemetry;
 
 /// Why a process could not start, or had to end.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "the message says what the fields are")]
 pub enum RoleError {
     /// The configuration has no lane of that name.
     #[error("there is no lane {name}; the configuration has: {}", .lanes.join(", "))]
-    NoSuchLane { name: String, lanes: Vec<String> },
+    NoSuchLane {
+        /// The name.
+        name: String,
+        /// The lanes that the configuration has.
+        lanes: Vec<String>,
+    },
     /// No process serves the lane.
     #[error(
         "no process serves lane {lane} of instance {instance}; start it with \
          `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
     )]
-    NotRunning { instance: String, lane: String },
+    NotRunning {
+        /// The instance.
+        instance: String,
+        /// The lane.
+        lane: String,
+    },
     /// Shared memory failed.
     #[error(transparent)]
     Shm(#[from] ShmError),

@@ -52,17 +52,24 @@ const SUPERVISOR_VARIABLE: &str = "ADAPTIVE_BRIDGE_SUPERVISOR";
 
 /// Why `up` had to end.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "the message says what the fields are")]
 pub enum SupervisorError {
     /// A child could not be started.
     #[error("cannot start {name}: {error}")]
-    Start { name: String, error: io::Error },
+    Start {
+        /// Its name.
+        name: String,
+        /// The operating system's error.
+        error: io::Error,
+    },
     /// Every child has failed in a way that a restart does not cure.
     #[error("every process of the bridge has given up; see the log above")]
     AllGaveUp,
     /// Children did not end in time after SIGTERM and were killed.
     #[error("killed, because not ended {GRACE_MS} ms after SIGTERM: {}", names.join(", "))]
-    Killed { names: Vec<String> },
+    Killed {
+        /// Their names.
+        names: Vec<String>,
+    },
     /// The bridge runs already, or the folder of the instance cannot be used.
     #[error(transparent)]
     Shm(#[from] ShmError),

@@ -8,26 +8,43 @@ use crate::model::{InstanceName, RouteId};
 
 /// Why shared memory could not be set up. `Display` names what failed, where, and what to do next.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "the message says what the fields are")]
 pub enum ShmError {
     /// The folder could not be created or made private.
     #[error("cannot create the folder {path}: {source}; choose another with shared_memory.root_path")]
-    CannotCreateRoot { path: PathBuf, source: io::Error },
+    CannotCreateRoot {
+        /// The folder.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: io::Error,
+    },
     /// The folder belongs to another user, or other users may write to it.
     #[error(
         "the folder {path} is not safe to use: {reason}; run as its owner, or choose another with \
          shared_memory.root_path"
     )]
-    RootNotOurs { path: PathBuf, reason: String },
+    RootNotOurs {
+        /// The folder.
+        path: PathBuf,
+        /// Why the folder is refused.
+        reason: String,
+    },
     /// The folder's path is too long for the files below it.
     #[error(
         "the path {path} has {length} bytes, at most {max} are allowed; choose a shorter \
          shared_memory.root_path"
     )]
-    PathTooLong { path: PathBuf, length: usize, max: usize },
+    PathTooLong {
+        /// The folder.
+        path: PathBuf,
+        /// Its length in bytes.
+        length: usize,
+        /// The longest length that is allowed.
+        max: usize,
+    },
     /// Another process already serves the role.
     #[error("{role} is served already, by process {pid}; stop it first")]
     AlreadyServed {
+        /// The role.
         role: String,
         /// The process that serves it; 0 when it has not written its process id yet.
         pid: u32,
@@ -35,6 +52,7 @@ pub enum ShmError {
     /// The whole bridge is to be started, but processes of its instance are running.
     #[error("the bridge runs already as instance {instance}, process {pid}; stop it first")]
     AlreadyRuns {
+        /// The instance.
         instance: InstanceName,
         /// One of these processes, preferably `up`; 0 when it has not written its process id yet.
         pid: u32,
@@ -46,10 +64,13 @@ pub enum ShmError {
          queue_depth or max_taps"
     )]
     NoRoom {
+        /// What the memory is for.
         what: String,
+        /// The bytes that are needed.
         needed_bytes: u64,
         /// The bytes that are free; 0 when the file system does not report them.
         free_bytes: u64,
+        /// The file system.
         path: PathBuf,
     },
     /// The operating system refused access.
@@ -57,20 +78,32 @@ pub enum ShmError {
     Permission {
         /// The operation, as `to` and a verb.
         what: String,
+        /// The file or folder.
         path: PathBuf,
     },
     /// Running processes of this instance use another version or another configuration.
     #[error("{what} ({path}); stop all processes of this instance, then start them again")]
-    Incompatible { what: String, path: PathBuf },
+    Incompatible {
+        /// What does not match.
+        what: String,
+        /// The folder of the instance.
+        path: PathBuf,
+    },
     /// A route has as many taps or lanes as it allows.
     #[error("all {max} places on route {route} are taken; raise shared_memory.max_taps, or stop a tap")]
-    TooManySubscribers { route: RouteId, max: usize },
+    TooManySubscribers {
+        /// The route.
+        route: RouteId,
+        /// The most that the route allows.
+        max: usize,
+    },
     /// Another process has held a lock for longer than a start takes; it may be stopped.
     #[error(
         "process {pid} has held the lock {path} for longer than a start takes; if that process is \
          stopped, continue or kill it"
     )]
     Busy {
+        /// The lock file.
         path: PathBuf,
         /// The process that holds it; 0 if unknown.
         pid: u32,
@@ -80,7 +113,9 @@ pub enum ShmError {
     Failed {
         /// The operation, as `to` and a verb.
         what: String,
+        /// The file or folder.
         path: PathBuf,
+        /// The error that was reported.
         reason: String,
     },
 }

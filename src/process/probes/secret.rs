@@ -20,7 +20,6 @@ const STRONG_BYTES: usize = 16;
 
 /// Why the secret could not be loaded. No variant contains any part of a secret.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "the message says what the fields are")]
 pub enum SecretError {
     /// A secret is required and none is configured.
     #[error(
@@ -34,6 +33,7 @@ pub enum SecretError {
          secret"
     )]
     Unreadable {
+        /// The path of the file.
         path: PathBuf,
         /// What is wrong, as the rest of a sentence: "cannot be read: …".
         problem: String,
@@ -43,13 +43,19 @@ pub enum SecretError {
         "the first line of the secret file {path} is empty; create a secret with `openssl rand -hex 32 \
          > {path}`, and give the bridge and its responders the same file"
     )]
-    EmptyFile { path: PathBuf },
+    EmptyFile {
+        /// The path of the file.
+        path: PathBuf,
+    },
     /// The environment variable is not set or is empty.
     #[error(
         "the environment variable {name}, which security.hmac_secret_env names, is not set or is \
          empty; set it to the secret"
     )]
-    EmptyVariable { name: String },
+    EmptyVariable {
+        /// The name of the variable.
+        name: String,
+    },
     /// `security.hmac_secret` of the configuration file is empty.
     #[error("security.hmac_secret in the configuration file is empty")]
     EmptyInline,
