@@ -64,6 +64,9 @@ impl Configuration {
     }
 
     /// Encodes the configuration, including the secret, for [`decode`](Self::decode).
+    ///
+    /// # Errors
+    /// None known: every value of the settings can be encoded.
     pub fn encode(&self) -> Result<Vec<u8>, serde_json::Error> {
         serde_json::to_vec(&Encoded {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),

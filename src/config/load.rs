@@ -32,6 +32,9 @@ pub fn load(path: Option<&Path>, env: &dyn Fn(&str) -> Option<String>) -> Result
 
 /// As [`load`], with the values of `parameters` in place of those of the file, and with the secret if there
 /// is one.
+///
+/// # Errors
+/// As for [`load`].
 pub fn load_configuration(
     path: Option<&Path>,
     parameters: &[Parameters],

@@ -20,6 +20,9 @@ pub(super) fn selectors(asked: &[NetworkSelector]) -> impl Iterator<Item = rustd
 }
 
 /// A message for each configured interface that has no IPv4 address at present.
+///
+/// # Errors
+/// The kernel cannot list the interfaces.
 pub(super) fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<String>, DdsError> {
     if asked.is_empty() {
         return Ok(Vec::new());
@@ -34,6 +37,9 @@ pub(super) fn absent_interfaces(asked: &[NetworkSelector]) -> Result<Vec<String>
 /// The IPv4 and IPv6 addresses of this host at present, with which
 /// [`Location::locality`](crate::policy::Location::locality) compares. They change when the host joins
 /// or leaves a network.
+///
+/// # Errors
+/// The kernel cannot list the interfaces.
 pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
     Ok(interface_addresses()?
         .filter_map(|interface| {
@@ -46,6 +52,9 @@ pub fn host_addresses() -> Result<Vec<IpAddr>, DdsError> {
 
 /// The interfaces of this host at present: one entry for each IPv4 address, and one for each interface
 /// without an IPv4 address.
+///
+/// # Errors
+/// The kernel cannot list the interfaces.
 pub fn interfaces() -> Result<Vec<HostInterface>, DdsError> {
     let mut interfaces: Vec<HostInterface> = Vec::new();
     for listed in interface_addresses()? {

@@ -107,6 +107,9 @@ impl Participant {
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
     /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
     /// true if it has left work undone; it is then called again soon.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
         urgent_topics: impl IntoIterator<Item = String>,
@@ -237,6 +240,9 @@ impl Participant {
     }
 
     /// Creates a reader of `topic`, a DDS topic name, and adds it to the node's graph entry.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
     pub fn create_reader<'t>(
         &mut self,
         topic: &str,
@@ -250,6 +256,9 @@ impl Participant {
     /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that continues after an earlier
     /// one, of this process or of another. For each writer in `taken` it neither requests nor returns samples
     /// up to and including that sequence number. It returns every sample that arrives after its creation.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
     pub fn create_reader_after(
         &mut self,
         topic: &str,
@@ -269,6 +278,9 @@ impl Participant {
 
     /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the
     /// same topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from its creation on.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
     pub fn create_reader_beside_reliable(
         &mut self,
         topic: &str,
@@ -288,6 +300,9 @@ impl Participant {
 
     /// Creates a [`GraphWatch`], which reads the graph entries of the other participants. As in ROS 2 itself,
     /// its reader is not in the node's graph entry.
+    ///
+    /// # Errors
+    /// The DDS library cannot create the reader.
     pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
         let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS, |_, _| Ok(()))?;
         reader.expect_small_samples();
@@ -315,6 +330,9 @@ impl Participant {
     /// Creates a writer of `topic`, a DDS topic name, and adds it to the node's graph entry. A RELIABLE
     /// writer retains `window_samples` that readers have not acknowledged. Beyond that it evicts the oldest
     /// sample, which is an overrun for each reader that has not acknowledged it.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
     pub fn create_writer<'t>(
         &mut self,
         topic: &str,
@@ -328,6 +346,9 @@ impl Participant {
     /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
     /// `max_blocking` for room in a full window, as ROS 2 publishers do (100 ms). For demo and tests: the
     /// bridge itself never waits.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
     pub fn create_blocking_writer<'t>(
         &mut self,
         topic: &str,

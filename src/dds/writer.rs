@@ -100,6 +100,9 @@ impl RawWriter {
     /// Like [`write`](Self::write), and with the publisher that the sample comes from: a RELIABLE,
     /// TRANSIENT_LOCAL writer keeps the last samples of each publisher for late joiners, as many as its
     /// HISTORY has, until [`forget_history_of`](Self::forget_history_of).
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
     pub fn write_from(
         &self,
         publisher: Option<Guid>,
@@ -129,6 +132,9 @@ impl RawWriter {
 
     /// Like [`write`](Self::write), but to one matched reader only: a late joiner of a BEST_EFFORT writer, to
     /// which the DDS protocol does not deliver the history.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
     pub fn write_to(
         &self,
         reader: Guid,
@@ -144,6 +150,9 @@ impl RawWriter {
 
     /// Writes the reply of a service to one matched reader of the client that sent `request`, in plain
     /// little-endian CDR. The inline QoS names the request, as DDS-RPC 1.0 clause 7.8.2 defines.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
     pub fn write_reply(
         &self,
         reader: Guid,

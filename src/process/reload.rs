@@ -46,6 +46,9 @@ struct Request {
 impl ReloadRequests {
     /// Handles SIGHUP from now on. `load` reads the configuration as at the start: from the same file, with
     /// the same environment, and with the parameters that were set since.
+    ///
+    /// # Errors
+    /// The operating system refused the signal handler.
     pub fn on_signal(
         load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError> + Send + Sync + 'static,
     ) -> io::Result<Self> {
@@ -78,6 +81,9 @@ pub(super) enum HangUpMeaning {
 
 impl HangUp {
     /// Handles SIGHUP from now on.
+    ///
+    /// # Errors
+    /// The operating system refused the signal handler.
     pub fn on_signal() -> io::Result<Self> {
         let received = Arc::new(AtomicBool::new(false));
         signal_hook::flag::register(SIGHUP, Arc::clone(&received))?;
@@ -356,6 +362,9 @@ pub(super) fn request_reload(root: &Path, instance: &InstanceName) -> Result<Vec
 
 /// Sends SIGHUP to every process of the bridge and waits for the answers. Returns an empty list if the bridge
 /// does not run. `root` is the folder of its shared files.
+///
+/// # Errors
+/// The processes of the bridge cannot be listed.
 pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnswer>, ShmError> {
     let asked_at = clock::monotonic();
     let holders = request_reload(root, instance)?;

@@ -55,6 +55,9 @@ pub struct ResponderOptions<'a> {
 }
 
 /// Runs the responder until `stop` is requested.
+///
+/// # Errors
+/// The DDS participant or an endpoint cannot be created.
 pub fn responder(options: ResponderOptions<'_>, stop: &Stop) -> Result<(), RoleError> {
     let (id, topic) = (options.id.to_owned(), options.request_topic.to_string());
     let domain_id = options.network.domain_id;

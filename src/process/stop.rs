@@ -12,11 +12,17 @@ pub struct Stop(Arc<AtomicBool>);
 
 impl Stop {
     /// Creates a flag that SIGINT and SIGTERM set.
+    ///
+    /// # Errors
+    /// The operating system refused the signal handlers.
     pub fn on_signals() -> io::Result<Self> {
         Self::on(&[SIGINT, SIGTERM])
     }
 
     /// As [`Stop::on_signals`], for other signals.
+    ///
+    /// # Errors
+    /// The operating system refused the signal handlers.
     pub fn on(signals: &[i32]) -> io::Result<Self> {
         let stop = Self::default();
         for &signal in signals {

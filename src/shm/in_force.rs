@@ -191,16 +191,25 @@ impl InForceFile {
     }
 
     /// Reads the content; `None` when there is no file.
+    ///
+    /// # Errors
+    /// The operating system cannot read the file.
     pub fn read(&self) -> io::Result<Option<Vec<u8>>> {
         self.read_file(FILE)
     }
 
     /// Reads the parameters that were set; `None` when none was.
+    ///
+    /// # Errors
+    /// The operating system cannot read the file.
     pub fn read_parameters(&self) -> io::Result<Option<Vec<u8>>> {
         self.read_file(PARAMETERS)
     }
 
     /// Replaces the parameters that were set, atomically. Only control calls this.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
     pub fn write_parameters(&self, bytes: &[u8]) -> io::Result<()> {
         write_privately(&self.dir.join(PARAMETERS), bytes)
     }
