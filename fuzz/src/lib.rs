@@ -15,7 +15,7 @@ use adaptive_bridge::model::{
 };
 use adaptive_bridge::policy::mode_and_source;
 use adaptive_bridge::process::probes::{MAX_MESSAGE_BYTES, ProbeRequest, ProbeResponse};
-use adaptive_bridge::shm::{Boards, BridgeShape, HEADER_BYTES, ProcessRole, ShmNode, Stage, decode_header};
+use adaptive_bridge::shm::{Boards, BridgeShape, ProcessRole, ShmNode, Stage};
 use ros2_client::dds::rustdds::{RepresentationIdentifier, fuzzing, sample_arriving};
 
 /// A target's name and function.
@@ -24,7 +24,6 @@ pub type Target = (&'static str, fn(&[u8]));
 /// All targets, by the names under which cargo-fuzz and the folders of inputs know them.
 pub const TARGETS: &[Target] = &[
     ("config", config),
-    ("shm_header", shm_header),
     ("boards", boards),
     ("names", names),
     ("graph", graph),
@@ -71,27 +70,6 @@ pub fn config(bytes: &[u8]) {
             }
         }
     }
-}
-
-/// A sample's header in shared memory.
-pub fn shm_header(bytes: &[u8]) {
-    let Ok(header) = decode_header(bytes) else { return };
-    assert_eq!(bytes.len(), HEADER_BYTES);
-    assert!(header.sequence > 0);
-    let mut again = Vec::with_capacity(HEADER_BYTES);
-    for word in [
-        header.sequence,
-        header.source_timestamp.0,
-        header.taken_at.0,
-        header.published_at.0,
-        header.writer_sequence.cast_unsigned(),
-    ] {
-        again.extend(word.to_ne_bytes());
-    }
-    again.extend(header.writer_guid.0);
-    again.extend(header.encapsulation.0);
-    again.extend(header.age_basis.bits().to_ne_bytes());
-    assert_eq!(again, bytes);
 }
 
 /// The boards of a bridge of one lane and one route, filled with these bytes by a foreign process.

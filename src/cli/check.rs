@@ -1,7 +1,7 @@
 //! `check`: checks a configuration file and shows the shared memory that it needs; explains a key.
 
 use std::ffi::OsStr;
-use std::fmt::{self, Write as _};
+use std::fmt;
 use std::process::ExitCode;
 use std::sync::LazyLock;
 
@@ -227,12 +227,11 @@ impl fmt::Display for Summary<'_> {
 fn differences(running: &Settings, file: Settings) -> String {
     let (_, reload) = running.reloaded(file);
     let mut text = String::new();
-    // Writing to a String cannot fail.
     for change in &reload.changed {
-        let _ = writeln!(text, "waits for a reload: {change}");
+        text += &format!("waits for a reload: {change}\n");
     }
     for change in &reload.waits {
-        let _ = writeln!(text, "waits for a restart of the whole bridge: {change}");
+        text += &format!("waits for a restart of the whole bridge: {change}\n");
     }
     if !text.is_empty() {
         text.insert_str(0, "\nthe configuration in force in the running bridge differs from this file:\n");

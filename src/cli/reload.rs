@@ -1,6 +1,5 @@
 //! `reload`: applies the changes of the configuration file to the running bridge.
 
-use std::fmt::Write as _;
 use std::process::ExitCode;
 
 use super::{ConfigArguments, EXIT_WAITS, bad_configuration, failed, no_bridge, print};
@@ -59,7 +58,7 @@ fn summary(answers: &[ReloadAnswer], fingerprint: u64) -> String {
     let mut add = |line: String| {
         // Processes report the same changes: each line is printed once.
         if !text.lines().any(|printed| printed == line) {
-            let _ = writeln!(text, "{line}");
+            text += &format!("{line}\n");
         }
     };
     let accepted = answers.iter().filter_map(|answer| match &answer.result {

@@ -24,6 +24,7 @@ const REPORT_MS: u64 = 1_000;
 /// How often a tap checks that the bridge still runs. A tap that stayed would keep the shared memory of a
 /// bridge that has ended, and a bridge with other routes could not start.
 const BRIDGE_CHECK_MS: u64 = 200;
+const USUAL_PAUSE_US: u64 = 1_000;
 
 #[derive(Args, Debug)]
 pub(super) struct Arguments {
@@ -120,7 +121,7 @@ impl Tap {
         stop: &Stop,
         bridge_runs: impl Fn() -> bool,
     ) -> io::Result<bool> {
-        let mut interval = PollInterval::default();
+        let mut pause_us = USUAL_PAUSE_US;
         let mut check_at = clock::monotonic().plus_ms(BRIDGE_CHECK_MS);
         while !stop.is_requested() {
             let mut taken = 0;
@@ -152,8 +153,9 @@ impl Tap {
                 }
                 check_at = now.plus_ms(BRIDGE_CHECK_MS);
             }
+            pause_us = pause_after(pause_us, taken);
             #[allow(clippy::disallowed_methods, reason = "a subcommand handles no samples of the bridge")]
-            std::thread::sleep(interval.after(taken));
+            std::thread::sleep(Duration::from_micros(pause_us));
         }
         self.finish()
     }
@@ -261,30 +263,14 @@ fn write_frame(output: &mut impl Write, encapsulation: Encapsulation, payload: &
     output.write_all(payload)
 }
 
-/// The time between two polls of a tap: 1 ms while samples arrive, down to 0.1 ms when a poll takes several,
-/// because the queue has room for four, and doubled up to 20 ms while none arrive.
-struct PollInterval {
-    pause_us: u64,
-}
-
-impl Default for PollInterval {
-    fn default() -> Self {
-        Self { pause_us: Self::USUAL_US }
-    }
-}
-
-impl PollInterval {
-    const SHORTEST_US: u64 = 100;
-    const USUAL_US: u64 = 1_000;
-    const LONGEST_US: u64 = 20_000;
-
-    fn after(&mut self, taken: usize) -> Duration {
-        self.pause_us = match taken {
-            0 => (self.pause_us * 2).min(Self::LONGEST_US),
-            1 => self.pause_us.min(Self::USUAL_US),
-            _ => (self.pause_us / 2).clamp(Self::SHORTEST_US, Self::USUAL_US),
-        };
-        Duration::from_micros(self.pause_us)
+/// The time between two polls of a tap, after one that took so many samples: 1 ms while samples arrive, down
+/// to 0.1 ms when a poll takes several, because the queue has room for four, and doubled up to 20 ms while
+/// none arrive.
+fn pause_after(pause_us: u64, taken: usize) -> u64 {
+    match taken {
+        0 => (pause_us * 2).min(20_000),
+        1 => pause_us.min(USUAL_PAUSE_US),
+        _ => (pause_us / 2).clamp(100, USUAL_PAUSE_US),
     }
 }
 
@@ -302,17 +288,12 @@ mod tests {
 
     #[test]
     fn a_tap_polls_more_often_while_samples_arrive() {
-        let mut interval = PollInterval::default();
-        for _ in 0..10 {
-            interval.after(0);
-        }
-        assert_eq!(interval.after(0), Duration::from_millis(20));
-        assert_eq!(interval.after(1), Duration::from_millis(1));
-        for _ in 0..10 {
-            interval.after(4);
-        }
-        assert_eq!(interval.after(2), Duration::from_micros(100));
-        assert_eq!(interval.after(1), Duration::from_micros(100));
+        let pause_us = (0..11).fold(USUAL_PAUSE_US, |pause_us, _| pause_after(pause_us, 0));
+        assert_eq!(pause_us, 20_000);
+        assert_eq!(pause_after(pause_us, 1), 1_000);
+        let pause_us = (0..11).fold(1_000, |pause_us, _| pause_after(pause_us, 4));
+        assert_eq!(pause_us, 100);
+        assert_eq!((pause_after(pause_us, 2), pause_after(pause_us, 1)), (100, 100));
     }
 
     #[test]

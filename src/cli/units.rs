@@ -1,7 +1,6 @@
 //! `units`: prints or writes the systemd drop-ins that a configuration needs beside the installed units.
 
 use std::collections::BTreeMap;
-use std::fmt::Write;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -141,21 +140,15 @@ impl DropIns {
     }
 
     fn print(&self, folder: &Path) -> String {
-        let mut text = String::new();
-        for (unit, drop_in) in &self.0 {
-            // Writing to a String cannot fail.
-            let _ = writeln!(text, "# {}\n{drop_in}", path(folder, unit).display());
-        }
-        text
+        let text = |(unit, drop_in): (&String, _)| format!("# {}\n{drop_in}\n", path(folder, unit).display());
+        self.0.iter().map(text).collect()
     }
 
     /// Writes the drop-ins and removes obsolete ones; returns a report of it with the command to run next.
     fn write(&self, folder: &Path) -> Result<String, String> {
         let at = |path: &Path, error: io::Error| format!("{}: {error}", path.display());
         let mut text = String::new();
-        let mut done = |what: &str, path: &Path| {
-            let _ = writeln!(text, "{what} {}", path.display());
-        };
+        let mut done = |what: &str, path: &Path| text += &format!("{what} {}\n", path.display());
         for path in self.obsolete(folder).map_err(|error| at(folder, error))? {
             fs::remove_file(&path).map_err(|error| at(&path, error))?;
             // Fails while the folder has drop-ins of the administrator.

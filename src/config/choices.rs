@@ -10,7 +10,6 @@ pub(super) trait Choice: Copy + PartialEq + 'static {
     const WORDS: Words<Self>;
 }
 
-/// The words of a choice.
 pub(super) fn words<T: Choice>() -> Vec<&'static str> {
     T::WORDS.iter().map(|(word, _)| *word).collect()
 }

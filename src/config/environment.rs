@@ -64,13 +64,8 @@ impl Environment {
     pub fn read(env: &dyn Fn(&str) -> Option<String>, problems: &Problems) -> Self {
         let variable = |name: &str| env(name).filter(|value| !value.is_empty());
         let refuse = |name: &str, value: &str, allowed: &str| {
-            problems.report(Problem {
-                place: Place::Environment,
-                key: name.to_owned(),
-                value: Some(shown(value)),
-                allowed: allowed.to_owned(),
-                hint: None,
-            });
+            let problem = Problem::new(Place::Environment, name, allowed.to_owned());
+            problems.report(Problem { value: Some(shown(value)), ..problem });
         };
 
         let mut domain_id = 0;

@@ -97,8 +97,7 @@ fn find(
 }
 
 fn failure(file: &str, place: Place, allowed: String) -> ConfigError {
-    let problem = Problem { place, key: String::new(), value: None, allowed, hint: None };
-    ConfigError::new(file, Vec::new(), vec![problem])
+    ConfigError::new(file, Vec::new(), vec![Problem::new(place, "", allowed)])
 }
 
 /// Parses the settings from the content of a file; `file_name` is for messages. It has no side effects except

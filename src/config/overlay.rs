@@ -52,13 +52,9 @@ fn put_into_topic(root: &mut Node, name: &str, value: Node, problems: &Problems)
         found.max_by_key(|(_, id)| id.len()).and_then(|(index, id)| Some((index, key_after(id)?)))
     else {
         let first = name.split('.').next().unwrap_or_default();
-        problems.report(Problem {
-            place: Place::of(value.line),
-            key: joined(TOPICS, name),
-            value: None,
-            allowed: "must begin with `topics.` and the id of a topic in the configuration file".to_owned(),
-            hint: problems.hint(first, &ids),
-        });
+        let allowed = "must begin with `topics.` and the id of a topic in the configuration file".to_owned();
+        let problem = Problem::new(Place::of(value.line), &joined(TOPICS, name), allowed);
+        problems.report(Problem { hint: problems.hint(first, &ids), ..problem });
         return;
     };
     let item = Rc::make_mut(&mut items[index]);
@@ -126,13 +122,10 @@ fn merge(into: &mut Node, from: Node, path: &str, problems: &Problems) {
                 merge(Rc::make_mut(&mut own.value), Rc::unwrap_or_clone(entry.value), &path, problems);
             }
         }
-        (_, Content::Map(_)) if !is_null => problems.report(Problem {
-            place: Place::of(from.line),
-            key: path.to_owned(),
-            value: None,
-            allowed: "must be set as a whole: in the configuration file it is no mapping".to_owned(),
-            hint: None,
-        }),
+        (_, Content::Map(_)) if !is_null => {
+            let allowed = "must be set as a whole: in the configuration file it is no mapping".to_owned();
+            problems.report(Problem::new(Place::of(from.line), path, allowed));
+        }
         (own, new) => {
             *own = new;
             into.line = from.line;

@@ -151,12 +151,8 @@ pub(super) fn read(parameters: &[Parameters]) -> Result<Values, Problem> {
     node.push(renamed("ros.node_name").unwrap_or(DEFAULT_NAME));
     let mut values = Values::default();
     for (source, parameter) in parameters.iter().enumerate() {
-        let problem = |key: &str, line: usize, allowed: String| Problem {
-            place: Place::Parameter { source, line },
-            key: key.to_owned(),
-            value: None,
-            allowed,
-            hint: None,
+        let problem = |key: &str, line: usize, allowed: String| {
+            Problem::new(Place::Parameter { source, line }, key, allowed)
         };
         let parse = |key: &str, bytes: &[u8]| {
             let node = yaml::parse(bytes);

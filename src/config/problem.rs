@@ -66,6 +66,13 @@ pub struct Problem {
     pub hint: Option<String>,
 }
 
+impl Problem {
+    /// A problem without a value and without a hint.
+    pub(super) fn new(place: Place, key: &str, allowed: String) -> Self {
+        Self { place, key: key.to_owned(), value: None, allowed, hint: None }
+    }
+}
+
 /// Every problem of a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigError {

@@ -27,7 +27,7 @@ pub struct Endpoint {
     pub location: Location,
 }
 
-/// A change of a remote reader, writer or participant, or of its match with a local endpoint.
+/// A change of a remote reader, writer or participant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Discovery {
     /// A writer was discovered, or has changed.
@@ -46,13 +46,6 @@ pub enum Discovery {
         /// The time for which nothing was received from it, if its lease has expired; `None` if it announced
         /// that it leaves.
         silent_ms: Option<u64>,
-    },
-    /// A local and a remote endpoint do not match: the reader requests a stronger QoS than the writer offers.
-    Incompatible {
-        /// The local endpoint.
-        local: Guid,
-        /// The remote endpoint.
-        remote: Guid,
     },
 }
 
@@ -76,10 +69,6 @@ pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery
                 }
             };
             Some(Discovery::ParticipantGone { prefix: id.as_ref().try_into().ok()?, silent_ms })
-        }
-        Event::RemoteReaderQosIncompatible { local_writer: local, remote_reader: remote, .. }
-        | Event::RemoteWriterQosIncompatible { local_reader: local, remote_writer: remote, .. } => {
-            Some(Discovery::Incompatible { local: Guid(local.to_bytes()), remote: Guid(remote.to_bytes()) })
         }
         _ => None,
     }

@@ -64,11 +64,9 @@ pub struct Participant {
 /// The QoS of the graph entries, as in `rmw_dds_common`: the last entry is delivered reliably, also to late
 /// joiners.
 const GRAPH_QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
     history: History::KeepLast { depth: 1 },
     durability: Durability::TransientLocal,
-    lifespan_ms: None,
-    deadline_ms: None,
+    ..QosProfile::CRITICAL
 };
 
 /// The QoS for reading the last entry of each participant. The topic has no key, so all participants share

@@ -51,16 +51,13 @@ pub struct MemoryNeed {
 
 impl MemoryNeed {
     /// The need of a process with so many participants, without its samples.
-    const fn of_participants(participants: u64) -> Self {
+    fn of_participants(participants: u64) -> Self {
         Self {
             program_bytes: PROGRAM_BYTES,
             discovery_bytes: participants * DISCOVERY_BYTES,
             sockets_bytes: participants * SOCKETS_BYTES,
-            fragments_bytes: 0,
-            waiting_bytes: 0,
-            history_bytes: 0,
-            requests_bytes: 0,
             shared_memory_bytes: OTHER_SHARED_BYTES,
+            ..Self::default()
         }
     }
 
@@ -110,7 +107,7 @@ impl MemoryNeeds {
     }
 
     /// The need of a responder, which has no settings.
-    pub const fn of_responder() -> MemoryNeed {
+    pub fn of_responder() -> MemoryNeed {
         MemoryNeed { requests_bytes: REQUESTS_BYTES, ..MemoryNeed::of_participants(1) }
     }
 }

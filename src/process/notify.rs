@@ -1,7 +1,7 @@
 //! Notifications to the service manager (sd_notify(3)): readiness, status line, watchdog, reload and
 //! shutdown. Without a service manager all of this does nothing.
 
-use std::fmt::{Display, Write};
+use std::fmt::Display;
 use std::time::Duration;
 
 use sd_notify::NotifyState;
@@ -132,8 +132,7 @@ pub(super) fn write_drops<'a>(line: &mut String, counts: impl Iterator<Item = &'
 pub(super) fn write_list(line: &mut String, heading: &str, items: impl Iterator<Item = impl Display>) {
     let mut before = heading;
     for item in items {
-        // Writing to a String cannot fail.
-        let _ = write!(line, "{before} {item}");
+        *line += &format!("{before} {item}");
         before = ",";
     }
 }

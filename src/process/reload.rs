@@ -32,9 +32,8 @@ use crate::telemetry;
 
 /// The source of reload requests of a process. To be created before anything else: without its handler,
 /// SIGHUP ends the process.
-#[derive(Default)]
 pub struct ReloadRequests {
-    request: Option<Request>,
+    request: Request,
     in_force: Option<InForce>,
 }
 
@@ -56,17 +55,12 @@ impl ReloadRequests {
         let signals = Signals::new([SIGHUP])?;
         unblock()?;
         let request = Request { signals, load: Arc::new(load), terminal: Terminal::detect() };
-        Ok(Self { request: Some(request), in_force: None })
+        Ok(Self { request, in_force: None })
     }
 
     /// Sets the configuration in force, which the process applies and where it stores each reload.
     pub fn kept_in(self, in_force: InForce) -> Self {
         Self { in_force: Some(in_force), ..self }
-    }
-
-    /// A source that never requests a reload.
-    pub fn never() -> Self {
-        Self::default()
     }
 }
 
@@ -158,20 +152,14 @@ impl Reloads {
             Some(InForce { configuration, share }) => (configuration, Some(share)),
             None => (settings.clone().into(), None),
         };
-        let file = share.as_ref().map(InForceShare::file);
-        let parameters = requests.request.as_ref().zip(file.clone());
-        let parameters =
-            parameters.map(|(request, file)| ParameterStore::new(Arc::clone(&request.load), file));
-        let outcomes = requests.request.map(|request| {
-            // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
-            let (sender, outcomes) = sync_channel(0);
-            let reloader = Reloader { current: in_force.clone(), file };
-            std::thread::Builder::new()
-                .name("reload".to_owned())
-                .spawn(move || serve(request, reloader, &sender, &note))
-                .map(|_| outcomes)
-        });
-        Ok(Self { in_force, refused: 0, outcomes: outcomes.transpose()?, parameters, _share: share })
+        let (request, file) = (requests.request, share.as_ref().map(InForceShare::file));
+        let parameters = file.clone().map(|file| ParameterStore::new(Arc::clone(&request.load), file));
+        // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
+        let (sender, outcomes) = sync_channel(0);
+        let reloader = Reloader { current: in_force.clone(), file };
+        let thread = std::thread::Builder::new().name("reload".to_owned());
+        thread.spawn(move || serve(request, reloader, &sender, &note))?;
+        Ok(Self { in_force, refused: 0, outcomes: Some(outcomes), parameters, _share: share })
     }
 
     /// Takes the outcome of a request, puts its configuration in force, and returns whether the file was

@@ -3,7 +3,6 @@
 //! It needs no bridge and no shared memory on its host. Any message from the network is cheap to handle: the
 //! responder checks each request once, and counts the ones that it refuses.
 
-use std::fmt::Write;
 use std::time::Duration;
 
 use tracing::{debug, info, warn};
@@ -209,8 +208,7 @@ impl Responder {
         let (handler, answered) = (&self.handler, &mut self.answered);
         self.notifier.status(now, |line| {
             let per_s = answered.per_s(handler.answered, now);
-            // Writing to a String cannot fail.
-            let _ = write!(line, "{per_s:.1} probes answered per s; {} refused", handler.refused.total());
+            *line += &format!("{per_s:.1} probes answered per s; {} refused", handler.refused.total());
         });
         self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
     }

@@ -47,7 +47,6 @@ pub enum RoleError {
     Os(#[from] std::io::Error),
 }
 
-/// The index of the lane called `name`.
 pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleError> {
     settings.lanes.iter().position(|lane| lane.name.as_str() == name).ok_or_else(|| RoleError::NoSuchLane {
         name: name.to_owned(),
@@ -196,7 +195,6 @@ impl Drop for Role {
     }
 }
 
-/// The options of the participant of a process.
 pub(super) fn participant_options<'a>(
     settings: &Settings,
     network: &'a DdsNetwork,

@@ -5,7 +5,6 @@
 //! supervisor: each asks the kernel for SIGTERM when its parent dies, whatever the parent dies of.
 
 use std::ffi::OsString;
-use std::fmt::Write as _;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -220,8 +219,7 @@ impl<'a> ManagerReport<'a> {
         let report = next.report_since(self.last.as_ref().unwrap_or(&next));
         self.notifier.status(now, |line| {
             let running = children.iter().filter(|child| child.state == State::Running).count();
-            // Writing to a String cannot fail.
-            let _ = write!(line, "{running} of {} processes; in", children.len());
+            *line += &format!("{running} of {} processes; in", children.len());
             let rate = |hz: Option<f64>| hz.unwrap_or_default();
             let routes = report.routes.iter();
             write_list(line, "", routes.map(|route| format!("{} {:.1}/s", route.id, rate(route.rate_hz))));

@@ -26,7 +26,6 @@ pub(super) const LENT_SLOTS: usize = 2;
 /// The most slots that ingress holds before it publishes them: one that it copies into, and those in which
 /// the DDS library assembles samples.
 pub(super) const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
-/// The queue of a tap.
 pub(super) const TAP: QueueLimits = QueueLimits { queue_depth: 4, max_borrowed: 2 };
 /// The most publishers of a route: ingress, and one for a future standby.
 const PUBLISHERS: usize = 2;
@@ -74,8 +73,6 @@ pub struct RouteChannel {
 pub struct PoolSize {
     /// The number of slots.
     pub slots: usize,
-    /// Bytes of one slot, headers included.
-    pub slot_bytes: usize,
     /// Bytes of shared memory for the pool.
     pub bytes: u64,
 }
@@ -113,7 +110,7 @@ impl RouteChannel {
         let slot_bytes = (headers + self.max_sample_bytes).next_multiple_of(align);
         // In addition, a free list of 4 bytes for each slot, and the description of the segment.
         let bytes = (slots * (slot_bytes + 4) + 1024).next_multiple_of(4096) as u64;
-        PoolSize { slots, slot_bytes, bytes }
+        PoolSize { slots, bytes }
     }
 
     /// The depth of a queue, with room for the retained samples that a new subscriber receives first.

@@ -33,7 +33,7 @@ pub use board::{
 };
 pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
-pub use header::{HEADER_BYTES, HeaderError, decode_header};
+pub use header::HeaderError;
 pub use in_force::{BridgeAddress, InForceFile, InForceShare};
 pub use node::{CleanUp, ShmNode};
 pub use publisher::{LentSlot, LoanError, PublishError, SamplePublisher, Slot};

@@ -140,7 +140,6 @@ fn limit_iceoryx_log() {
     set_log_level(if debug { LogLevel::Debug } else { LogLevel::Warn });
 }
 
-/// The configuration of iceoryx2 for an instance.
 fn config_of(dir: &InstanceDir) -> Result<Config, ShmError> {
     let path = iceoryx2::prelude::Path::new(dir.path.as_os_str().as_encoded_bytes())
         .map_err(|error| ShmError::failed("to use the folder's path", &dir.path, format!("{error:?}")))?;

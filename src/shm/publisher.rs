@@ -37,13 +37,10 @@ pub enum LoanError {
     Failed(&'static str),
 }
 
-/// Why a sample could not be published.
+/// iceoryx2 failed; the sample was delivered to some of the subscribers or to none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum PublishError {
-    /// iceoryx2 failed; the sample was delivered to some of the subscribers or to none.
-    #[error("not published to all subscribers: {0}")]
-    Failed(&'static str),
-}
+#[error("not published to all subscribers: a connection of iceoryx2 is broken")]
+pub struct PublishError;
 
 /// The publisher of a route's channel, which ingress holds.
 #[derive(Debug)]
@@ -162,7 +159,7 @@ impl Slot {
     /// queue drops its oldest sample.
     pub fn publish(mut self, header: SampleHeader) -> Result<usize, PublishError> {
         *self.sample.user_header_mut() = WireHeader(header);
-        self.sample.send().map_err(|_| PublishError::Failed("a connection of iceoryx2 is broken"))
+        self.sample.send().map_err(|_| PublishError)
     }
 }
 

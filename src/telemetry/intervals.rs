@@ -4,17 +4,16 @@ use std::collections::VecDeque;
 
 use crate::model::{MonotonicNs, SampleHeader};
 
-/// The default window in samples, the same as that of `ros2 topic hz`.
-pub const WINDOW_SAMPLES: usize = 10_000;
+/// The window in samples, the same as that of `ros2 topic hz`.
+const WINDOW_SAMPLES: usize = 10_000;
 
 /// The arrivals of the last samples of a route.
 ///
 /// An arrival is the time at which ingress took the sample. It is in the sample's header, so a delay of the
 /// tap does not change the statistics. The rate counts sequence numbers, so samples that the tap itself
 /// missed do not lower it.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Intervals {
-    window_samples: usize,
     arrivals: VecDeque<(u64, MonotonicNs)>,
 }
 
@@ -33,25 +32,14 @@ pub struct IntervalStatistics {
     pub samples: usize,
 }
 
-impl Default for Intervals {
-    fn default() -> Self {
-        Self::new(WINDOW_SAMPLES)
-    }
-}
-
 impl Intervals {
-    /// Creates an empty window of `window_samples` samples, at least 2.
-    pub fn new(window_samples: usize) -> Self {
-        Self { window_samples: window_samples.max(2), arrivals: VecDeque::new() }
-    }
-
     /// Adds a sample. A sequence number that is not above the last one comes from a restarted bridge: the
     /// window is cleared first.
     pub fn record(&mut self, header: &SampleHeader) {
         if self.arrivals.back().is_some_and(|&(sequence, _)| sequence >= header.sequence) {
             self.arrivals.clear();
         }
-        if self.arrivals.len() == self.window_samples {
+        if self.arrivals.len() == WINDOW_SAMPLES {
             self.arrivals.pop_front();
         }
         self.arrivals.push_back((header.sequence, header.taken_at));
@@ -103,8 +91,8 @@ mod tests {
         }
     }
 
-    fn statistics_of(samples: &[(u64, u64)], window: usize) -> Option<IntervalStatistics> {
-        let mut intervals = Intervals::new(window);
+    fn statistics_of(samples: &[(u64, u64)]) -> Option<IntervalStatistics> {
+        let mut intervals = Intervals::default();
         for &(sequence, at_ms) in samples {
             intervals.record(&sample(sequence, at_ms));
         }
@@ -113,7 +101,7 @@ mod tests {
 
     #[test]
     fn rate_and_spread_are_those_of_the_arrivals() {
-        let found = statistics_of(&[(1, 0), (2, 8), (3, 20), (4, 28), (5, 40)], 10).unwrap();
+        let found = statistics_of(&[(1, 0), (2, 8), (3, 20), (4, 28), (5, 40)]).unwrap();
         assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 8.0, 12.0));
         assert!((found.std_ms - 2.0).abs() < 1e-9, "{found:?}");
         assert_eq!(found.samples, 5);
@@ -121,26 +109,27 @@ mod tests {
 
     #[test]
     fn missed_samples_do_not_lower_the_rate_and_add_no_interval() {
-        let found = statistics_of(&[(1, 0), (2, 10), (7, 60), (8, 70)], 10).unwrap();
+        let found = statistics_of(&[(1, 0), (2, 10), (7, 60), (8, 70)]).unwrap();
         assert_eq!((found.rate_hz, found.min_ms, found.max_ms), (100.0, 10.0, 10.0));
     }
 
     #[test]
     fn only_the_window_counts() {
-        let found = statistics_of(&[(1, 0), (2, 1_000), (3, 1_010), (4, 1_020)], 3).unwrap();
-        assert_eq!((found.rate_hz, found.samples), (100.0, 3));
+        let within = (0..WINDOW_SAMPLES as u64).map(|number| (2 + number, 1_000 + 10 * number));
+        let found = statistics_of(&[(1, 0)].into_iter().chain(within).collect::<Vec<_>>()).unwrap();
+        assert_eq!((found.rate_hz, found.samples), (100.0, WINDOW_SAMPLES));
     }
 
     #[test]
     fn a_sequence_number_that_goes_back_clears_the_window() {
-        let found = statistics_of(&[(900, 0), (901, 1), (1, 5_000), (2, 5_010)], 10).unwrap();
+        let found = statistics_of(&[(900, 0), (901, 1), (1, 5_000), (2, 5_010)]).unwrap();
         assert_eq!((found.rate_hz, found.samples), (100.0, 2));
     }
 
     #[test]
     fn one_sample_has_no_rate() {
-        assert_eq!(statistics_of(&[], 10), None);
-        assert_eq!(statistics_of(&[(1, 5)], 10), None);
-        assert_eq!(statistics_of(&[(1, 5), (3, 6)], 10), None);
+        assert_eq!(statistics_of(&[]), None);
+        assert_eq!(statistics_of(&[(1, 5)]), None);
+        assert_eq!(statistics_of(&[(1, 5), (3, 6)]), None);
     }
 }

@@ -4,7 +4,7 @@
 //! it. The fields are also appended to the message, for readers who do not filter by field.
 
 use std::ffi::OsString;
-use std::fmt::{Debug, Write};
+use std::fmt::Debug;
 use std::io;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixDatagram;
@@ -57,7 +57,6 @@ impl<S: Subscriber> Layer<S> for Journal {
     }
 }
 
-/// One entry of the journal.
 struct Entry {
     priority: u8,
     target: String,
@@ -79,8 +78,7 @@ impl Entry {
         };
         event.record(&mut entry);
         for (name, value) in &entry.fields {
-            // Writing to a String does not fail.
-            let _ = write!(entry.message, " {}={value}", name[PREFIX.len()..].to_ascii_lowercase());
+            entry.message += &format!(" {}={value}", name[PREFIX.len()..].to_ascii_lowercase());
         }
         entry
     }

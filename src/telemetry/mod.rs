@@ -19,7 +19,7 @@ mod text;
 mod threads;
 
 pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
-pub use intervals::{IntervalStatistics, Intervals, WINDOW_SAMPLES};
+pub use intervals::{IntervalStatistics, Intervals};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, cdr, diagnostics_json, string_message};
 pub use liveness::ProcessState;
 pub use log_limit::log_left_out;
@@ -28,7 +28,7 @@ pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problem::{Level, Problem};
 pub use report::{Report, SubscriberReport};
 pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
-pub use text::{bytes_text, wrapped};
+pub use text::{bytes_text, shortened, wrapped};
 pub use threads::Threads;
 
 impl Snapshot {

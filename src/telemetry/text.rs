@@ -1,14 +1,12 @@
 //! Text helpers. Names come from the network, so they are made safe for terminals and logs.
 
-use std::fmt::Write;
-
 /// Replaces each control character, so that the text cannot control a terminal or end a line or a string.
 pub(super) fn printable(text: &str) -> String {
     text.chars().map(|char| if char.is_control() { char::REPLACEMENT_CHARACTER } else { char }).collect()
 }
 
 /// Cuts the text to at most `max_bytes`; an ellipsis marks the cut.
-pub(super) fn shortened(text: &str, max_bytes: usize) -> String {
+pub fn shortened(text: &str, max_bytes: usize) -> String {
     const ELLIPSIS: &str = "…";
     if text.len() <= max_bytes {
         return text.to_owned();
@@ -49,7 +47,8 @@ pub fn wrapped<'a>(
     for part in parts {
         let length = line.chars().count() + between.len() + part.trim_end().chars().count();
         if !empty && length > columns {
-            let _ = writeln!(text, "{}", line.trim_end());
+            text += line.trim_end();
+            text.push('\n');
             line = next.to_owned();
         } else if !empty {
             line.push_str(between);
@@ -57,8 +56,7 @@ pub fn wrapped<'a>(
         line.push_str(part);
         empty = false;
     }
-    let _ = writeln!(text, "{}", line.trim_end());
-    text
+    text + line.trim_end() + "\n"
 }
 
 #[cfg(test)]

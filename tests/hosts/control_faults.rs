@@ -545,23 +545,23 @@ fn forged_responses_change_nothing_in_trust_mode_default_deny() {
                     }
                     ProbeRefusal::Unsolicited => {
                         response.seq += 1_000;
-                        genuine.sign(&mut response);
+                        response.signature = genuine.sign(&response);
                         attacker.send(response.encode());
                     }
                     ProbeRefusal::Unsigned => {
                         attacker.send(response.encode());
                     }
                     ProbeRefusal::BadSignature => {
-                        wrong_key.sign(&mut response);
+                        response.signature = wrong_key.sign(&response);
                         attacker.send(response.encode());
                         // A genuine signature of a different message.
-                        genuine.sign(&mut response);
+                        response.signature = genuine.sign(&response);
                         response.responder_id.push('x');
                         attacker.send(response.encode());
                     }
                     ProbeRefusal::Expired => {
                         response.response_send_time = WallNs(clock::wall().0 - 3_600_000_000_000);
-                        genuine.sign(&mut response);
+                        response.signature = genuine.sign(&response);
                         attacker.send(response.encode());
                     }
                     // A replay of a genuine response.
@@ -588,7 +588,7 @@ fn forged_responses_change_nothing_in_trust_mode_default_deny() {
             let name = attacker.new_name();
             let unsigned = attacker.response(&name);
             let mut forged = unsigned.clone();
-            wrong_key.sign(&mut forged);
+            forged.signature = wrong_key.sign(&forged);
             let replayed = attacker.receive_response();
             for payload in [unsigned.encode(), forged.encode(), replayed.into(), cdr(&name).into()] {
                 sent += u64::from(attacker.send(payload));

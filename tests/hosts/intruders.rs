@@ -12,9 +12,7 @@ use adaptive_bridge::dds::{
     host_addresses,
 };
 use adaptive_bridge::model::{Durability, Guid, Reliability, TopicName};
-use adaptive_bridge::policy::{
-    Guarded, GuardedTopic, IntruderCounts, IntruderEvent, IntruderWatch, Locality,
-};
+use adaptive_bridge::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Locality};
 use nix::sys::signal::Signal;
 
 use support::netns::{Host, Net};
@@ -242,7 +240,7 @@ fn an_intruder_is_reported_with_host_and_node_until_it_leaves() {
         peer.wait();
         assert!(matches!(turn.next("its end"), IntruderEvent::Left(gone) if gone.reader == intruder.reader));
     }
-    assert_eq!(turn.watch.counts(), IntruderCounts { present: 0, reported, unreported: 0 });
+    assert_eq!((turn.watch.present().count(), turn.watch.reported, turn.watch.unreported), (0, reported, 0));
     let _: Received = local.end();
 }
 
@@ -260,7 +258,7 @@ fn an_intruder_whose_link_fails_for_a_while_causes_one_warning() {
     laptop.set_link(true);
     let IntruderEvent::Returned(intruder) = turn.next("its return") else { panic!("{:?}", turn.events) };
     assert_eq!((intruder.reader, intruder.node.as_deref()), (reader.guid(), Some("/fleet/rviz")));
-    assert_eq!(turn.watch.counts(), IntruderCounts { present: 1, reported: 1, unreported: 0 });
+    assert_eq!((turn.watch.present().count(), turn.watch.reported, turn.watch.unreported), (1, 1, 0));
 }
 
 #[test]

@@ -271,7 +271,7 @@ fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
     let mut forger = trust(&wrong);
     let mut good = Asker::join(net.host("bridge"), "good");
     let (request, response) = good.ask(|mut request| {
-        bridge.sign(&mut request);
+        request.signature = bridge.sign(&request);
         request
     });
     assert_eq!(bridge.check(&response, clock::wall()), Ok(None));
@@ -283,10 +283,10 @@ fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
             let mut request = bad.request();
             match name {
                 "unsigned" => {}
-                "bad_signature" => forger.sign(&mut request),
+                "bad_signature" => request.signature = forger.sign(&request),
                 "expired" => {
                     request.send_time = WallNs(request.send_time.0 - 60_000_000_000);
-                    bridge.sign(&mut request);
+                    request.signature = bridge.sign(&request);
                 }
                 _ => {}
             }
@@ -303,12 +303,12 @@ fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
     for round in 0..20 {
         for _ in 0..500 {
             let mut request = bad.request();
-            forger.sign(&mut request);
+            request.signature = forger.sign(&request);
             bad.send_payload(request.encode());
             bad.send_payload(recorded.clone());
         }
         good.ask(|mut request| {
-            bridge.sign(&mut request);
+            request.signature = bridge.sign(&request);
             request
         });
         assert!(responder.is_running(), "round {round}");
@@ -320,12 +320,12 @@ fn with_a_secret_only_signed_requests_are_answered_also_during_a_flood() {
     let began = Instant::now();
     for _ in 0..500 {
         let mut request = greedy.request();
-        bridge.sign(&mut request);
+        request.signature = bridge.sign(&request);
         greedy.send_payload(request.encode());
         std::thread::sleep(Duration::from_millis(2));
     }
     good.ask(|mut request| {
-        bridge.sign(&mut request);
+        request.signature = bridge.sign(&request);
         request
     });
     let answers = greedy.decoded().iter().filter(|it| it.probe_id.to_string().starts_with("greedy")).count();

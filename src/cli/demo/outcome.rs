@@ -1,7 +1,5 @@
 //! The comparison of both phases, as text and as JSON.
 
-use std::fmt::Write;
-
 use serde::Serialize;
 
 use super::scan::SCAN_BYTES;
@@ -55,8 +53,7 @@ impl Outcome {
         let (without, with) = (&self.without_bridge, &self.with_bridge);
         let mut text = String::new();
         let mut row = |label: &str, without: &str, with: &str| {
-            // Writing to a string cannot fail.
-            let _ = writeln!(text, "  {label:<37}{without:>18}{with:>18}");
+            text += &format!("  {label:<37}{without:>18}{with:>18}\n");
         };
         row("", "without bridge", "with bridge");
         let rows: [Row; 10] = [
@@ -89,11 +86,10 @@ impl Outcome {
                 }
             }
             if drops.noncritical.contains_key(DropReason::Superseded.label()) {
-                let _ = writeln!(text, "\n{}", wrapped(SUPERSEDED));
+                text += &format!("\n{}\n", wrapped(SUPERSEDED));
             }
         }
-        let _ = write!(text, "\n{}", wrapped(&self.summary));
-        text
+        text + "\n" + &wrapped(&self.summary)
     }
 }
 

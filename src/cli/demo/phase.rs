@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::children::{Children, Role};
 use super::sandbox::Sandbox;
 use super::screen::Screen;
-use super::tally::{BridgeDrops, Figures, Tally, Window, scans_in_s};
-use super::{DemoError, INPUT_TOPIC, Setup, first_due_after};
+use super::tally::{BridgeDrops, Figures, Tally, Window};
+use super::{DemoError, INPUT_TOPIC, RATE_HZ, Setup, first_due_after};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{DropCounts, MonotonicNs};
@@ -99,7 +99,7 @@ impl Phase<'_> {
                 (None, Some(began_at)) => {
                     // A tenth of a second later, so that the first scan of the window is not published yet.
                     let first = first_due_after(began_at, now.plus_ms(100));
-                    return Ok(Window { began_at, numbers: first..first + scans_in_s(seconds) });
+                    return Ok(Window { began_at, numbers: first..first + seconds * RATE_HZ });
                 }
                 (late, _) if now >= deadline => {
                     let role = late.map_or(Role::Publisher, |(role, _)| *role);

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::children::Role;
 use super::report::Report;
-use super::{RATE_HZ, STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, due_at};
+use super::{STALL_AFTER_MS, STALL_EVERY_MS, STALL_MS, due_at};
 use crate::model::{DropCounts, MonotonicNs};
 
 /// What the picture shows of a phase, in times from the start of the measurement.
@@ -268,10 +268,6 @@ impl BridgeDrops {
 
 fn ms(ns: u64) -> f64 {
     ns as f64 / 1e6
-}
-
-pub(super) const fn scans_in_s(seconds: u64) -> u64 {
-    seconds * RATE_HZ
 }
 
 #[cfg(test)]

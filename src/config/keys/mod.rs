@@ -158,16 +158,9 @@ fn walk(node: &Node, key: Option<&Key>, path: &str, problems: &Problems) {
             for entry in entries {
                 let path = joined(path, &shown_key(path, &entry.key));
                 if let Some(first_line) = first_lines.get(entry.key.as_str()) {
-                    problems.report(Problem {
-                        place: Place::of(entry.line),
-                        key: path.clone(),
-                        value: None,
-                        allowed: format!(
-                            "must be given only once; {} already has it",
-                            Place::noun(*first_line)
-                        ),
-                        hint: None,
-                    });
+                    let first = Place::noun(*first_line);
+                    let allowed = format!("must be given only once; {first} already has it");
+                    problems.report(Problem::new(Place::of(entry.line), &path, allowed));
                 }
                 first_lines.entry(&entry.key).or_insert(entry.line);
                 let below = key.and_then(|key| key.get(&entry.key));

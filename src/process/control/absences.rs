@@ -49,7 +49,6 @@ impl Absences {
             Discovery::ParticipantGone { prefix, silent_ms } => {
                 return self.watch.participant_lost(network, *prefix, *silent_ms, now);
             }
-            Discovery::Incompatible { .. } => return,
         };
         let is_remote = endpoint.location.locality(own_addresses) == Locality::Remote;
         if participant.owns(endpoint.guid) || !is_remote || !is_bridge_topic(&endpoint.topic, publishes) {

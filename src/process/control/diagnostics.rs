@@ -15,20 +15,12 @@ use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter};
-use crate::model::{
-    Durability, Encapsulation, History, MonotonicNs, QosProfile, Reliability, SourceTimestamp,
-};
+use crate::model::{Encapsulation, History, MonotonicNs, QosProfile, SourceTimestamp};
 use crate::shm::Boards;
 use crate::telemetry::{self, Decision, MetricsServer, Report, Snapshot};
 
 /// The QoS with which ROS 2 nodes publish diagnostics and `diagnostic_aggregator` subscribes to them.
-const QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
-    history: History::KeepLast { depth: 10 },
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+const QOS: QosProfile = QosProfile { history: History::KeepLast { depth: 10 }, ..QosProfile::CRITICAL };
 
 /// Unacknowledged messages that a writer retains; older ones are evicted, and a slow reader misses them.
 const WINDOW_SAMPLES: usize = 64;
@@ -60,11 +52,12 @@ impl Diagnostics {
         participant: &mut Participant,
     ) -> Result<Self, RoleError> {
         // Creates all writers even while diagnostics are off: a reload may switch them on.
-        let mut writer =
-            |topic: &str, dds_type| participant.create_writer(topic, dds_type, &QOS, WINDOW_SAMPLES);
-        let decisions = writer(&dds_topic(telemetry::DECISION_TOPIC), telemetry::STRING_TYPE)?;
-        let array = writer(&dds_topic(telemetry::DIAGNOSTICS_TOPIC), telemetry::DIAGNOSTIC_ARRAY_TYPE)?;
-        let json = writer(&settings.diagnostics.topic.to_dds(), telemetry::STRING_TYPE)?;
+        let mut writer = |topic: &str, dds_type| {
+            participant.create_writer(&format!("rt{topic}"), dds_type, &QOS, WINDOW_SAMPLES)
+        };
+        let decisions = writer(telemetry::DECISION_TOPIC, telemetry::STRING_TYPE)?;
+        let array = writer(telemetry::DIAGNOSTICS_TOPIC, telemetry::DIAGNOSTIC_ARRAY_TYPE)?;
+        let json = writer(settings.diagnostics.topic.as_str(), telemetry::STRING_TYPE)?;
         // A failed metrics page does not stop the bridge.
         let metrics = settings.diagnostics.metrics.as_ref().and_then(|listener| {
             MetricsServer::start(listener).inspect_err(|error| error!(%error, "metrics are not served")).ok()
@@ -163,9 +156,4 @@ fn write(writer: &RawWriter, payload: Bytes) {
     {
         debug!(%error, "cannot publish a diagnostics message");
     }
-}
-
-fn dds_topic(topic: &str) -> String {
-    // The DDS name of a ROS 2 topic (design.ros2.org, "Topic and Service name mapping to DDS").
-    format!("rt{topic}")
 }

@@ -132,8 +132,7 @@ impl EndpointMonitor {
 
     /// The number of intruders seen since control started.
     pub fn intruders_seen(&self) -> u64 {
-        let counts = self.networks.iter().map(|network| network.watch.counts());
-        counts.map(|counts| counts.reported + counts.unreported).sum()
+        self.networks.iter().map(|network| network.watch.reported + network.watch.unreported).sum()
     }
 
     /// Handles discovery and logs new intruders; each second updates node names, absences and overruns.

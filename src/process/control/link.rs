@@ -100,7 +100,7 @@ impl Link {
             probe_id: probe.id.clone(),
             signature: None,
         };
-        trust.sign(&mut request);
+        request.signature = trust.sign(&request);
         self.writer.write(request.encode(), Encapsulation::CDR_LE, SourceTimestamp::NONE).ok()?;
         self.next_seq += 1;
         if self.probes.len() == REMEMBERED_PROBES {

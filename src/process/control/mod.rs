@@ -13,7 +13,6 @@ mod parameters;
 mod safety;
 mod subscribers;
 
-use std::fmt::Write;
 use std::time::Duration;
 
 use tracing::{error, info};
@@ -336,8 +335,7 @@ impl Control {
         self.role.notifier.ready();
         self.role.status(now, |line| {
             let record = self.record.get();
-            // Writing to a String cannot fail.
-            let _ = write!(line, "safety mode {}; {} subscribers", record.safety(), record.subscribers);
+            *line += &format!("safety mode {}; {} subscribers", record.safety(), record.subscribers);
             let lanes = self.settings.lanes.iter().zip(&self.decisions);
             write_list(line, "; lanes:", lanes.map(|(lane, decision)| format!("{} {decision}", lane.name)));
         });

@@ -16,7 +16,6 @@ mod output;
 mod overrun;
 mod unsent;
 
-use std::fmt::Write;
 use std::time::Duration;
 
 use tracing::{info, warn};
@@ -280,9 +279,7 @@ impl Egress {
             let offered_per_s = self.offered.per_s(counters().map(LaneCounters::received).sum(), now);
             let forwarded_per_s = self.forwarded.per_s(counters().map(|one| one.forwarded).sum(), now);
             let mode = self.policy.mode;
-            // Writing to a String cannot fail.
-            let _ =
-                write!(line, "mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
+            *line += &format!("mode {mode}; forwarding {forwarded_per_s:.1} of {offered_per_s:.1} samples/s");
             write_drops(line, counters().map(|one| &one.drops));
             let without = self.outputs.iter().filter(|output| output.writer.is_none());
             write_list(line, "; type not known yet for route", without.map(|output| &output.id));

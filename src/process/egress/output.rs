@@ -234,10 +234,7 @@ impl Output {
             bytes: bytes as u64,
             by_reference,
             caught_up: header.published_at < self.started_at,
-            sequence: header.sequence,
             written_at: began_at,
-            writer: header.writer_guid,
-            writer_sequence: header.writer_sequence,
         };
         let sent_through = writer.sent_through();
         let (unsent, queued) = (&mut self.unsent, self.queued);
@@ -573,10 +570,7 @@ fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
     counters.forwarded_bytes += sample.bytes;
     counters.by_reference += u64::from(sample.by_reference);
     counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_sequence = sample.sequence;
     counters.last_forwarded_at = sample.written_at;
-    counters.last_writer_guid = sample.writer;
-    counters.last_writer_sequence = sample.writer_sequence;
 }
 
 /// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use crate::model::{Guid, MonotonicNs};
+use crate::model::MonotonicNs;
 
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,10 +61,7 @@ pub(super) struct Forwarded {
     pub bytes: u64,
     pub by_reference: bool,
     pub caught_up: bool,
-    pub sequence: u64,
     pub written_at: MonotonicNs,
-    pub writer: Guid,
-    pub writer_sequence: i64,
 }
 
 #[cfg(test)]

@@ -177,7 +177,7 @@ impl Input {
             age_basis,
         };
         if let Err(error) = slot.publish(header) {
-            error!(route = self.id, ?error, "sample not published; the lanes will count it as missing");
+            error!(route = self.id, %error, "sample not published; the lanes will count it as missing");
         }
         Step::Published
     }

@@ -12,11 +12,10 @@ mod publishers;
 mod receiving;
 mod source;
 
-use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tracing::{debug, info};
+use tracing::info;
 
 use super::HOUSEKEEPING_MS;
 use super::memory_limit;
@@ -151,9 +150,6 @@ impl Ingress {
                 Discovery::ParticipantGone { prefix, .. } => {
                     self.for_each_input(|input, _| input.participant_gone(prefix));
                 }
-                Discovery::Incompatible { local, remote } => {
-                    debug!(?local, ?remote, "endpoints are not compatible");
-                }
                 _ => {}
             }
         }
@@ -225,8 +221,7 @@ fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now:
         }
     });
     let per_s = received.per_s(total, now);
-    // Writing to a String cannot fail.
-    let _ = write!(line, "reading {connected} of {routes} routes, {per_s:.1} samples/s");
+    *line += &format!("reading {connected} of {routes} routes, {per_s:.1} samples/s");
     write_drops(line, drops.iter());
     write_list(line, "; no publisher found yet for", without.iter());
     ring
@@ -240,9 +235,8 @@ mod tests {
     fn urgent(routes: &[(&str, u8)]) -> Vec<usize> {
         let mut text = "topics:\n".to_owned();
         for (index, (lanes, priority)) in routes.iter().enumerate() {
-            let _ = writeln!(
-                text,
-                "- {{id: r{index}, input_topic: /r{index}, lanes: {lanes}, priority: {priority}}}"
+            text += &format!(
+                "- {{id: r{index}, input_topic: /r{index}, lanes: {lanes}, priority: {priority}}}\n"
             );
         }
         urgent_routes(&parse(&text, "f.yaml", &|_| None).unwrap()).collect()

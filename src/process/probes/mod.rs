@@ -18,13 +18,8 @@ const PROBE_DEPTH: u32 = 64;
 
 /// QoS of the writers of both topics: RELIABLE, so that the RELIABLE subscriptions of the original Python
 /// package match. A writer with KEEP_LAST never waits for a reader.
-pub const PROBE_WRITER_QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
-    history: History::KeepLast { depth: 1 },
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+pub const PROBE_WRITER_QOS: QosProfile =
+    QosProfile { history: History::KeepLast { depth: 1 }, ..QosProfile::CRITICAL };
 
 /// QoS of the readers of both topics: BEST_EFFORT, because a repaired message would hide the loss that the
 /// probes measure. Such a reader matches writers of both reliabilities.

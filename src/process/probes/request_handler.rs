@@ -84,7 +84,7 @@ impl RequestHandler {
             responder_id: self.responder_id.clone(),
             signature: None,
         };
-        self.trust.sign(&mut response);
+        response.signature = self.trust.sign(&response);
         self.answered += 1;
         response
     }
@@ -178,7 +178,7 @@ mod tests {
         std::fs::write(&path, "a secret of the bridge's own").unwrap();
         let (mut handler, mut bridge) = responder_and_bridge(Some(&path), TrustMode::DefaultDeny);
         let mut first = request("robot", 0);
-        bridge.sign(&mut first);
+        first.signature = bridge.sign(&first);
         assert!(handler.accepts(&first));
         for seq in 1..1_000 {
             assert!(!handler.accepts(&first));
@@ -186,7 +186,7 @@ mod tests {
             let forged = ProbeRequest { signature: first.signature, ..request("robot", seq) };
             assert!(!handler.accepts(&forged));
             let mut good = request("robot", seq);
-            bridge.sign(&mut good);
+            good.signature = bridge.sign(&good);
             assert!(handler.accepts(&good), "{seq}");
         }
         for reason in [ProbeRefusal::Replayed, ProbeRefusal::Unsigned, ProbeRefusal::BadSignature] {

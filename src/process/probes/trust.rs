@@ -21,9 +21,6 @@ pub trait Signed {
 
     /// The signature of the message.
     fn signature(&self) -> Option<Signature>;
-
-    /// Adds a signature to the message.
-    fn set_signature(&mut self, signature: Signature);
 }
 
 impl Signed for ProbeRequest {
@@ -45,10 +42,6 @@ impl Signed for ProbeRequest {
 
     fn signature(&self) -> Option<Signature> {
         self.signature
-    }
-
-    fn set_signature(&mut self, signature: Signature) {
-        self.signature = Some(signature);
     }
 }
 
@@ -73,10 +66,6 @@ impl Signed for ProbeResponse {
 
     fn signature(&self) -> Option<Signature> {
         self.signature
-    }
-
-    fn set_signature(&mut self, signature: Signature) {
-        self.signature = Some(signature);
     }
 }
 
@@ -126,18 +115,11 @@ impl Trust {
         self.secret.is_some()
     }
 
-    /// How unauthenticated messages are handled; [`TrustMode::Off`] also if messages are not signed.
-    pub fn mode(&self) -> TrustMode {
-        self.mode
-    }
-
-    /// Signs a message if a secret is configured. The message must not be changed afterwards.
-    pub fn sign(&mut self, message: &mut impl Signed) {
-        if let Some(secret) = &self.secret {
-            let nonce = self.nonces.next();
-            let hmac = secret.sign(&message.signed_text(&nonce));
-            message.set_signature(Signature { nonce, hmac });
-        }
+    /// The signature of a message if a secret is configured. The message must not be changed afterwards.
+    pub fn sign(&mut self, message: &impl Signed) -> Option<Signature> {
+        let secret = self.secret.as_ref()?;
+        let nonce = self.nonces.next();
+        Some(Signature { nonce, hmac: secret.sign(&message.signed_text(&nonce)) })
     }
 
     /// Checks whether a message is accepted. `Ok` with a reason means that the message is not authentic and
@@ -239,7 +221,7 @@ mod tests {
     }
 
     fn signed(secret: &str, mut message: ProbeRequest) -> ProbeRequest {
-        trust(secret, TrustMode::Off).sign(&mut message);
+        message.signature = trust(secret, TrustMode::Off).sign(&message);
         message
     }
 
@@ -291,7 +273,7 @@ mod tests {
         assert_eq!(trust.check(&message, NOW), Err(ProbeRefusal::Replayed));
         assert_eq!(trust.check(&signed("swordfish", request()), NOW), Ok(None));
         let mut answer = response();
-        trust.sign(&mut answer);
+        answer.signature = trust.sign(&answer);
         assert_eq!(trust.check(&answer, NOW), Ok(None));
     }
 
@@ -344,7 +326,7 @@ mod tests {
         for mut trust in [trust("swordfish", TrustMode::Off), trust("", TrustMode::DefaultDeny)] {
             assert_eq!(trust.check(&request(), NOW), Ok(None));
             assert_eq!(trust.check(&signed("trout", request()), WallNs(0)), Ok(None));
-            assert_eq!(trust.mode(), TrustMode::Off);
+            assert_eq!(trust.mode, TrustMode::Off);
         }
     }
 
@@ -362,7 +344,7 @@ mod tests {
         let load = |security: Security| Trust::load(&security, None);
         // The defaults of the original package.
         let unsigned = load(security(false, None, TrustMode::DefaultDeny)).unwrap();
-        assert!(!unsigned.signs() && unsigned.mode() == TrustMode::Off);
+        assert!(!unsigned.signs() && unsigned.mode == TrustMode::Off);
         assert!(!load(security(false, missing(), TrustMode::DefaultDeny)).unwrap().signs());
         assert!(!load(security(true, None, TrustMode::Off)).unwrap().signs());
         for mode in [TrustMode::DefaultDeny, TrustMode::Permissive] {

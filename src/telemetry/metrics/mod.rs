@@ -27,7 +27,7 @@ pub fn metrics_page(report: &Report) -> String {
     outputs(&mut page, report);
     control(&mut page, report);
     subscribers(&mut page, report);
-    page.into_text()
+    page.text
 }
 
 fn bridge(page: &mut Page, report: &Report) {

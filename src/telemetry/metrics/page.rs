@@ -14,7 +14,7 @@ pub(super) type Labels<'a> = &'a [(&'static str, &'a str)];
 /// A page that is being written.
 #[derive(Debug, Default)]
 pub(super) struct Page {
-    text: String,
+    pub(super) text: String,
     /// The head of the current family until its first sample is written. A family without samples is omitted.
     head: Option<String>,
     /// The prefix of the names of all families.
@@ -79,10 +79,6 @@ impl Page {
         self.put("_count", labels, None, total.count);
     }
 
-    pub(super) fn into_text(self) -> String {
-        self.text
-    }
-
     /// Adds a line; `last` is the label after the others.
     fn put(&mut self, suffix: &str, labels: Labels<'_>, last: Option<(&str, &str)>, value: impl Display) {
         self.text.push_str(&self.head.take().unwrap_or_default());
@@ -113,7 +109,7 @@ mod tests {
         let expected = "# HELP a_total What a is.\n# TYPE a_total counter\n\
                         a_total{route=\"scan\"} 18446744073709551615\na_total 0.5\n\
                         # HELP c States.\n# TYPE c gauge\nc{lane=\"x\",mode=\"on\"} 0\nc{lane=\"x\",mode=\"off\"} 1\n";
-        assert_eq!(page.into_text(), expected);
+        assert_eq!(page.text, expected);
     }
 
     #[test]
@@ -121,7 +117,7 @@ mod tests {
         let mut page = Page::default();
         page.family("a", Kind::Gauge, "A.");
         page.sample(&[("id", "x\"} 1\nb{c=\"\\")], Some(f64::NAN));
-        let line = page.into_text().lines().last().unwrap().to_owned();
+        let line = page.text.lines().last().unwrap();
         assert_eq!(line, r#"a{id="x\"} 1\nb{c=\"\\"} NaN"#);
     }
 
@@ -132,7 +128,7 @@ mod tests {
         let mut page = Page::default();
         page.family("h_seconds", Kind::Histogram, "H.");
         page.histogram(&[("lane", "x")], &total);
-        let text = page.into_text();
+        let text = page.text;
         assert_eq!(text.matches("h_seconds_bucket").count(), 22);
         let first = "\nh_seconds_bucket{lane=\"x\",le=\"0.000016384\"} 0\n";
         assert!(text.contains(first), "{text}");

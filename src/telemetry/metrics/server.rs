@@ -45,7 +45,6 @@ const MAX_REQUEST_BYTES: usize = 8 * 1024;
 /// The pause before a retry when the system lacks resources.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 
-/// The report that is served.
 type Latest = Arc<Mutex<Option<Arc<Report>>>>;
 
 /// The reason why the metrics page cannot be served.

@@ -6,37 +6,28 @@ use super::modes::TrafficClass;
 reasons! {
     /// Why a sample was dropped. Code that drops samples for a new reason adds that reason here.
     DropReason:
-    /// Ingress: larger than the route's `max_sample_bytes`.
+    // Of ingress.
     TooLarge = "too_large", "larger than the route's max_sample_bytes; raise it",
-    /// Ingress: no free slot in the route's shared-memory pool.
     PoolExhausted = "pool_exhausted", "no free slot in shared memory; raise queue_depth",
-    /// Ingress: an encapsulation that DDS does not define, or a payload the DDS library could not decode.
     Malformed = "malformed", "an encapsulation that DDS does not define, or an undecodable payload",
-    /// Lane: a gap in the route's sequence numbers, left by an ingress process that died between numbering a
+    // Of each lane.
+    /// A gap in the route's sequence numbers, left by an ingress process that died between numbering a
     /// sample and publishing it.
     IngressDied = "ingress_died", "an ingress process died before it published them",
-    /// Lane: overwritten in the lane's shared-memory queue before the lane took it.
+    /// Overwritten in the lane's shared-memory queue before the lane took it.
     QueueOverflow = "queue_overflow", "the lane took them too slowly; raise its queue_depth",
-    /// Lane: published while no process served the lane, or held by a process that was killed.
     LaneDown = "lane_down", "published while no process served the lane, or held by one that was killed",
-    /// Lane: there is no DDS writer because the message type of the route is not known yet.
     NoWriter = "no_writer", "the message type is not known yet",
-    /// Lane: written while no reader was matched, or, after a restart of the lane, while a reader that had
-    /// been matched before was not matched again.
     NoReader = "no_reader", "no subscriber was matched, or not again yet after a restart of the lane",
-    /// Lane: the DDS library refused the sample for another reason.
     WriteFailed = "write_failed", "the DDS library refused them",
-    /// Noncritical lane: older than the stale threshold.
+    // Of noncritical lanes.
     Stale = "stale", "older than stale_threshold_ms; are the clocks synchronized?",
-    /// Noncritical lane: a newer sample was waiting when the rate allowed the next one.
+    /// A newer sample was waiting when the rate allowed the next one.
     Superseded = "superseded", "a newer one replaced them",
-    /// Noncritical lane: the lane's queue was full.
     QueueFull = "queue_full", "the lane's queue was full",
-    /// Noncritical lane: the lane is suspended.
     Suspended = "suspended", "the lane is suspended",
-    /// Any lane: forwarding is stopped (emergency).
+    // Of each lane.
     Stopped = "stopped", "forwarding is stopped",
-    /// Any lane: still waiting when the process shut down.
     Shutdown = "shutdown", "still waiting when the lane shut down",
 }
 

@@ -147,18 +147,9 @@ pub struct LaneCounters {
     pub drops: DropCounts,
     /// Samples waiting in the lane at present.
     pub waiting: u64,
-    /// The sequence number of the last forwarded sample.
-    #[serde(skip)]
-    pub last_forwarded_sequence: u64,
-    /// When that sample was written to DDS.
+    /// When the last forwarded sample was written to DDS.
     #[serde(skip)]
     pub last_forwarded_at: MonotonicNs,
-    /// The publisher's DDS writer of the last forwarded sample, from which a standby can resume.
-    #[serde(skip)]
-    pub last_writer_guid: Guid,
-    /// The sequence number that this writer gave the sample.
-    #[serde(skip)]
-    pub last_writer_sequence: i64,
     /// Readers matched at present.
     pub readers: u64,
     /// Overruns summed over all readers ever matched: samples that left the writer's history before one

@@ -128,18 +128,6 @@ impl AgeBasis {
             code => Some((code as u64 - 1) * 1_000),
         }
     }
-
-    /// The encoding in shared memory.
-    #[inline]
-    pub const fn bits(self) -> u32 {
-        self.0
-    }
-
-    /// The basis with this encoding in shared memory.
-    #[inline]
-    pub const fn from_bits(bits: u32) -> Self {
-        Self(bits)
-    }
 }
 
 #[cfg(test)]
@@ -161,12 +149,11 @@ mod tests {
         for (late_ns, kept_ns) in [(0, 0), (999, 0), (1_000, 1_000), (2_345_678, 2_345_000)] {
             let basis = AgeBasis::arrival(late_ns);
             assert_eq!(basis.late_ns(), Some(kept_ns), "{late_ns}");
-            assert_eq!(AgeBasis::from_bits(basis.bits()), basis);
         }
         assert_eq!(AgeBasis::arrival(u64::MAX).late_ns(), Some(u64::from(u32::MAX - 1) * 1_000));
         let largest = u64::from(u32::MAX - 2) * 1_000;
         assert_eq!(AgeBasis::arrival(largest).late_ns(), Some(largest));
-        assert_eq!((AgeBasis::SOURCE.late_ns(), AgeBasis::SOURCE.bits()), (None, 0));
+        assert_eq!((AgeBasis::SOURCE.late_ns(), AgeBasis::SOURCE), (None, AgeBasis(0)));
     }
 
     #[test]

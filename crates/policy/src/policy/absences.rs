@@ -98,6 +98,10 @@ struct Interface {
 }
 
 impl Interface {
+    fn new(name: String, is_configured: bool, address: Option<Ipv4Addr>) -> Self {
+        Self { name, is_configured, address, detail: "", span: None }
+    }
+
     fn absence(&self) -> Option<Absence> {
         let Span { since, back_at } = self.span?;
         Some(Absence {
@@ -165,13 +169,7 @@ impl AbsenceWatch {
         let mut watch = Self::default();
         for name in configured {
             if !watch.interfaces.iter().any(|known| known.name == name) {
-                watch.interfaces.push(Interface {
-                    name,
-                    is_configured: true,
-                    address: None,
-                    detail: "",
-                    span: None,
-                });
+                watch.interfaces.push(Interface::new(name, true, None));
             }
         }
         watch
@@ -225,13 +223,7 @@ impl AbsenceWatch {
                 continue;
             }
             if self.peers.iter().any(|peer| !is_away(peer.span) && found.reaches(peer.host)) {
-                self.interfaces.push(Interface {
-                    name: found.name.clone(),
-                    is_configured: false,
-                    address: Some(address),
-                    detail: "",
-                    span: None,
-                });
+                self.interfaces.push(Interface::new(found.name.clone(), false, Some(address)));
             }
         }
     }

@@ -111,18 +111,6 @@ pub enum IntruderEvent {
     Returned(Intruder),
 }
 
-/// Counts of intruders.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct IntruderCounts {
-    /// Intruders present, of those that were reported.
-    pub present: u64,
-    /// Intruders reported so far.
-    pub reported: u64,
-    /// Discoveries of further readers while [`MAX_REMEMBERED_INTRUDERS`] were remembered; a reader that is
-    /// announced again counts again.
-    pub unreported: u64,
-}
-
 /// Watches for remote readers of guarded topics, and returns each event once. Memory is bounded by
 /// [`MAX_REMEMBERED_INTRUDERS`].
 #[derive(Clone, Debug)]
@@ -132,8 +120,11 @@ pub struct IntruderWatch {
     dds_names: Vec<String>,
     tracked: Vec<Tracked>,
     events: VecDeque<IntruderEvent>,
-    reported: u64,
-    unreported: u64,
+    /// Intruders reported so far.
+    pub reported: u64,
+    /// Discoveries of further readers while [`MAX_REMEMBERED_INTRUDERS`] were remembered; a reader that is
+    /// announced again counts again.
+    pub unreported: u64,
 }
 
 #[derive(Clone, Debug)]
@@ -239,12 +230,6 @@ impl IntruderWatch {
         present.map(|tracked| &tracked.intruder)
     }
 
-    /// Counts of intruders.
-    pub fn counts(&self) -> IntruderCounts {
-        let present = self.present().count() as u64;
-        IntruderCounts { present, reported: self.reported, unreported: self.unreported }
-    }
-
     fn gone_where(&mut self, is_gone: impl Fn(Guid) -> bool, now: MonotonicNs) {
         let events = &mut self.events;
         self.tracked.retain_mut(|tracked| {
@@ -334,6 +319,11 @@ mod tests {
         None
     }
 
+    /// The intruders that are present, reported and not reported.
+    fn counts(watch: &IntruderWatch) -> (usize, u64, u64) {
+        (watch.present().count(), watch.reported, watch.unreported)
+    }
+
     /// All pending events as text; `node` is the node of every reader.
     fn events(watch: &mut IntruderWatch, now: MonotonicNs, node: Option<&str>) -> Vec<String> {
         let mut texts = Vec::new();
@@ -368,7 +358,7 @@ mod tests {
         // Discovery reports the same reader repeatedly.
         find(&mut watch, guid(1, 1), START.plus_ms(10));
         assert_eq!(events(&mut watch, START.plus_ms(10), Some("/rviz")), [""; 0]);
-        assert_eq!(watch.counts(), IntruderCounts { present: 2, reported: 2, unreported: 0 });
+        assert_eq!(counts(&watch), (2, 2, 0));
     }
 
     #[test]
@@ -385,7 +375,7 @@ mod tests {
             START,
         );
         assert_eq!(events(&mut watch, START.plus_ms(60_000), None), [""; 0]);
-        assert_eq!(watch.counts(), IntruderCounts::default());
+        assert_eq!(counts(&watch), (0, 0, 0));
     }
 
     #[test]
@@ -415,7 +405,7 @@ mod tests {
         assert_eq!(events(&mut watch, START, None), ["left: 1"]);
         watch.participant_lost(guid(1, 0).prefix(), START);
         assert_eq!(events(&mut watch, START, None), ["left: 2"]);
-        assert_eq!(watch.counts().present, 0);
+        assert_eq!(watch.present().count(), 0);
         find(&mut watch, guid(1, 2), START.plus_ms(REMEMBER_MS - 1));
         assert_eq!(events(&mut watch, START.plus_ms(REMEMBER_MS - 1), None), ["returned: 2"]);
         find(&mut watch, guid(1, 1), START.plus_ms(REMEMBER_MS));
@@ -424,7 +414,7 @@ mod tests {
             1,
             "no longer remembered"
         );
-        assert_eq!(watch.counts(), IntruderCounts { present: 2, reported: 3, unreported: 0 });
+        assert_eq!(counts(&watch), (2, 3, 0));
     }
 
     #[test]
@@ -484,7 +474,6 @@ mod tests {
         }
         // Each of those reported appeared and left.
         assert_eq!(count, 2 * MAX_REMEMBERED_INTRUDERS);
-        let counts = watch.counts();
-        assert_eq!(counts.reported + counts.unreported, 100_000);
+        assert_eq!(watch.reported + watch.unreported, 100_000);
     }
 }

@@ -28,7 +28,7 @@ pub use classifier::{
 };
 pub use clock_offset::ClockOffset;
 pub use intruders::{
-    Guarded, GuardedTopic, Intruder, IntruderCounts, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
+    Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
     NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
 pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, mode_and_source};

@@ -119,7 +119,6 @@ pub struct SenderLimits<K> {
     senders: Vec<Sender<K>>,
     /// Shared by the senders that are not in the table.
     others: TokenBucket,
-    refused: u64,
 }
 
 #[derive(Clone, Debug)]
@@ -140,7 +139,7 @@ impl<K: PartialEq> SenderLimits<K> {
     pub fn with_burst(rate_hz: f64, burst_s: f64, capacity: usize, now: MonotonicNs) -> Self {
         let others = TokenBucket::new(rate_hz, burst_for(rate_hz), now);
         let senders = Vec::with_capacity(capacity);
-        let mut limits = Self { rate_hz, burst_s, capacity, senders, others, refused: 0 };
+        let mut limits = Self { rate_hz, burst_s, capacity, senders, others };
         limits.others = limits.bucket(now);
         limits
     }
@@ -176,14 +175,7 @@ impl<K: PartialEq> SenderLimits<K> {
             }
             None => &mut self.others,
         };
-        let allowed = bucket.try_take(now);
-        self.refused = self.refused.saturating_add(u64::from(!allowed));
-        allowed
-    }
-
-    /// Messages refused so far.
-    pub const fn refused(&self) -> u64 {
-        self.refused
+        bucket.try_take(now)
     }
 
     /// Senders in the table.

@@ -95,13 +95,8 @@ const READER_QOS: ReaderQos = ReaderQos {
     deadline_ms: None,
 };
 
-const WRITER_QOS: QosProfile = QosProfile {
-    reliability: Reliability::Reliable,
-    history: History::KeepLast { depth: WINDOW_SAMPLES as u32 },
-    durability: Durability::Volatile,
-    lifespan_ms: None,
-    deadline_ms: None,
-};
+const WRITER_QOS: QosProfile =
+    QosProfile { history: History::KeepLast { depth: WINDOW_SAMPLES as u32 }, ..QosProfile::CRITICAL };
 
 #[derive(Clone, Copy, Debug)]
 enum Service {

@@ -14,6 +14,7 @@ use crate::config::{ConfigError, Listed, Row, SetParameters, Settings};
 use crate::model::Guid;
 use crate::policy::TokenBucket;
 use crate::shm::{RoleHolder, root_of};
+use crate::telemetry::shortened;
 
 /// The most parameters of one request: each takes the time of reading the file.
 const MAX_IN_REQUEST: usize = 8;
@@ -271,7 +272,6 @@ fn drop_equal_to_file(store: &ParameterStore, accepted: &mut SetParameters, para
     }
 }
 
-/// The problems in one line.
 fn listed(error: &ConfigError) -> String {
     let problems: Vec<String> = error.problems.iter().map(ToString::to_string).collect();
     problems.join("; ")
@@ -281,18 +281,9 @@ fn listed(error: &ConfigError) -> String {
 pub(super) fn set_results(results: Vec<Result<(), String>>) -> Vec<SetResult> {
     let result = |result: Result<(), String>| SetResult {
         successful: result.is_ok(),
-        reason: result.err().map(shortened).unwrap_or_default(),
+        reason: result.err().map(|why| shortened(&why, MAX_REASON_BYTES)).unwrap_or_default(),
     };
     results.into_iter().map(result).collect()
-}
-
-fn shortened(mut reason: String) -> String {
-    if reason.len() > MAX_REASON_BYTES {
-        let end = (0..=MAX_REASON_BYTES).rev().find(|end| reason.is_char_boundary(*end));
-        reason.truncate(end.unwrap_or(0));
-        reason.push('…');
-    }
-    reason
 }
 
 #[cfg(test)]
