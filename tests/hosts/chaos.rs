@@ -182,8 +182,8 @@ mod long {
         subscriber.wait_received(forwarded);
         let received: Received = subscriber.end();
         assert_eq!((received.bad, received.duplicates), (0, 0), "{received:?}");
-        // What a restarted lane writes before it has matched its subscribers counts as `no_reader`; this one may
-        // have received it.
+        // What a restarted lane writes before it has matched its subscribers counts as `no_reader`; this one
+        // may have received it.
         let possible = forwarded..=forwarded + number(&critical["drops"]["no_reader"]);
         assert!(possible.contains(&received.received), "{received:?} of {critical}");
         println!(

@@ -334,7 +334,8 @@ mod long {
         for role in ["ingress", "egress-critical", "egress-noncritical"] {
             assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
         }
-        // The samples that the lane retains, 32 MiB at most, and as much again for samples that are being sent.
+        // The samples that the lane retains, 32 MiB at most, and as much again for samples that are being
+        // sent.
         assert!(after < before + (64 << 20), "{before} to {after} bytes resident");
         bed.end();
     }

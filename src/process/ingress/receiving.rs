@@ -23,8 +23,8 @@ const LEFT_BYTES: usize = 64 << 10;
 /// Turns within which the missing fragments must arrive: one for each datagram, and the smallest fragments
 /// that publishers choose by default have 1.3 KB.
 const TURNS: u64 = 64;
-/// Turns within which a whole sample must be taken, besides its own: the next one, if the main thread had locked
-/// the route.
+/// Turns within which a whole sample must be taken, besides its own: the next one, if the main thread had
+/// locked the route.
 const TURNS_WHOLE: u64 = 1;
 /// The datagrams of urgent topics that the DDS library receives before each other one, each with a turn:
 /// `URGENT_DATAGRAMS_AHEAD` in `dp_event_loop.rs`.
