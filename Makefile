@@ -14,7 +14,7 @@ peers:
 	$(MAKE) --no-print-directory -C tests/peers
 	cargo build --locked --workspace --bins --example rust_peer
 
-# Sets up, builds and runs lints, unit, property and integration tests, in 35 minutes on two CPUs.
+# Sets up, builds and runs lints, unit, property and integration tests, in 30 minutes on two CPUs.
 test:
 	scripts/test.sh
 
