@@ -22,8 +22,8 @@ pub(super) struct FormerReaders {
 }
 
 impl FormerReaders {
-    /// The former readers by what the predecessor of this process, which starts `now`, left on the board:
-    /// those that it was matched with, and those that it was not matched with yet.
+    /// The former readers by what the former process left on the board when this one starts, `now`: those
+    /// that it was matched with, and those that it was not matched with yet.
     pub fn of(board: &OutputReaders, now: MonotonicNs) -> Self {
         let mut missing: Vec<Guid> = board.iter().map(|record| record.reader).collect();
         // A full table may lack readers.
