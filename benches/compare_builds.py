@@ -77,21 +77,26 @@ def summary(process):
     return next(event for event in events if event["event"] == "summary")
 
 
-def measure(build, rate_hz, size, seconds):
+def start_peer(arguments, cpu):
+    """Starts a peer that runs on one CPU, or on any if it is None."""
+    command = ["taskset", "--cpu-list", str(cpu)] if cpu is not None else []
+    return subprocess.Popen([*command, PEER, *arguments], stdout=subprocess.PIPE, text=True)
+
+
+def measure(build, rate_hz, size, seconds, cpus):
     """Returns the median latency in us, the CPU time per sample in us, and the number of missing samples.
 
     Without a build it measures the direct flow.
     """
     domain = build.domain if build else DIRECT_DOMAIN
     common = ["--domain", str(domain), "--size", str(size), "--summary", "--history", "1000"]
-    subscriber = subprocess.Popen(
-        [PEER, "--role", "sub", "--topic", OUTPUT if build else INPUT, *common], stdout=subprocess.PIPE, text=True)
+    subscriber = start_peer(["--role", "sub", "--topic", OUTPUT if build else INPUT, *common], cpus[1])
     # Time for the endpoints to match on both sides.
     time.sleep(1.0)
     before_s = build.cpu_s() if build else 0
-    publisher = subprocess.Popen(
-        [PEER, "--role", "pub", "--topic", INPUT, "--wait-match", "1", "--rate", str(rate_hz),
-         "--count", str(int(rate_hz * seconds)), *common], stdout=subprocess.PIPE, text=True)
+    publisher = start_peer(
+        ["--role", "pub", "--topic", INPUT, "--wait-match", "1", "--rate", str(rate_hz),
+         "--count", str(int(rate_hz * seconds)), *common], cpus[0])
     sent = summary(publisher)
     time.sleep(0.3)
     cpu_s = build.cpu_s() - before_s if build else 0
@@ -134,6 +139,8 @@ def main():
     parser.add_argument("--case", choices=CASES, action="append", help="repeatable; default: all cases")
     parser.add_argument("--cpus", type=int, nargs=2, default=(None, None), metavar=("INGRESS", "LANE"),
                         help="give ingress and the critical lane a CPU each")
+    parser.add_argument("--peer-cpus", type=int, nargs=2, default=(None, None), metavar=("PUBLISHER", "SUBSCRIBER"),
+                        help="run the programs on these CPUs; with --cpus the rounds differ less")
     parser.add_argument("--json", help="also write every round to this file")
     options = parser.parse_args()
     if not PEER.exists():
@@ -154,7 +161,7 @@ def main():
                     row = {}
                     for build in flows[turn:] + flows[:turn]:
                         name = build.name if build else "direct"
-                        row[name] = measure(build, rate_hz, size, options.seconds)
+                        row[name] = measure(build, rate_hz, size, options.seconds, options.peer_cpus)
                     rounds[case].append(row)
         finally:
             for build in builds:

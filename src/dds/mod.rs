@@ -5,6 +5,7 @@
 //! another DDS library could replace RustDDS, except the two traits by which that borrows memory from the
 //! bridge.
 
+mod arrivals;
 mod discovery;
 mod error;
 mod graph;
@@ -16,6 +17,7 @@ mod qos;
 mod reader;
 mod writer;
 
+pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
 pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};

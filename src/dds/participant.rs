@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::arrivals::Arrivals;
 use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
@@ -207,6 +208,16 @@ impl Participant {
         refusals.add(NetworkRefusal::EvictedParticipant, counts.participants_evicted);
         refusals.add(NetworkRefusal::TooManyEndpoints, counts.endpoints_refused);
         refusals
+    }
+
+    /// Returns a watch of the sockets on which samples arrive, for a thread that peeks at datagrams before
+    /// they are received. Drop it before the participant, because it keeps the participant's ports bound.
+    ///
+    /// # Errors
+    /// The process has no file descriptor left, the participant is not from
+    /// [`open_receiving`](Self::open_receiving), or this was called before.
+    pub fn arrivals(&self) -> Result<Arrivals, DdsError> {
+        Arrivals::new(self.participant.sockets_to_peek())
     }
 
     /// Announces that a participant whose process died has left. Remote participants then drop its readers

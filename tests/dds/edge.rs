@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    ArrivalFlag, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader, RawWriter,
-    ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError, WriterEvent,
+    Arrival, ArrivalFlag, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader,
+    RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
     Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
@@ -188,6 +188,61 @@ impl Drop for Lent {
     fn drop(&mut self) {
         self.lent.fetch_sub(1, Ordering::AcqRel);
     }
+}
+
+#[test]
+fn a_watch_of_arrivals_sees_samples_and_takes_none() {
+    let network = DdsNetwork::of_domain(66);
+    // Holds up the receiving thread, so that the watching thread peeks first.
+    let hold = Arc::new(Mutex::new(()));
+    let on_received = support::waits_for(&hold);
+    let mut there =
+        Participant::open_receiving(&options("there", &network), [], |_, _, _| {}, on_received).unwrap();
+    let mut here = participant("here", 66);
+    // BEST_EFFORT: a RELIABLE reader would receive a sample again that the watching thread had taken.
+    let reader = there
+        .create_reader("rt/blob", TYPE, &reader_qos(Reliability::BestEffort, Durability::Volatile))
+        .unwrap();
+    let writer = here.create_writer("rt/blob", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    wait_for_writer(&reader);
+    let arrivals = there.arrivals().unwrap();
+    let closer = arrivals.closer();
+    let (sender, seen) = std::sync::mpsc::channel();
+    let watching = std::thread::spawn(move || {
+        loop {
+            match arrivals.wait() {
+                Arrival::Closed => return,
+                arrival => sender.send(arrival).unwrap(),
+            }
+        }
+    });
+    let mut sequence = 0;
+    let is_seen = |sequence| {
+        let expected = Arrival::Sample { writer: writer.guid(), sequence, left_bytes: 0 };
+        let give_up = Instant::now() + Duration::from_secs(1);
+        while let Ok(arrival) = seen.recv_timeout(give_up - Instant::now()) {
+            if arrival == expected {
+                return true;
+            }
+        }
+        false
+    };
+    // The watch peeks only at the first of several waiting datagrams, which may be a heartbeat.
+    let times = (0..20).filter(|_| {
+        let held = hold.lock().unwrap();
+        there.ring();
+        std::thread::sleep(Duration::from_millis(50));
+        writer.write(Bytes::from(vec![7; 2_948]), Encapsulation([0, 1, 0, 0]), SourceTimestamp(1)).unwrap();
+        sequence += 1;
+        let seen = is_seen(sequence);
+        drop(held);
+        assert_eq!(take_one(&reader).expect("the watch took it").0.len(), 2_948);
+        seen
+    });
+    assert!(times.count() > 10, "seen too seldom");
+    closer.close();
+    watching.join().unwrap();
 }
 
 #[test]

@@ -309,7 +309,11 @@ impl Control {
     fn housekeeping(&mut self, now: MonotonicNs) {
         if let Some(Configuration { settings, inline_secret }) = self.role.reload() {
             self.settings = settings.clone();
-            self.trust = load_trust(settings, inline_secret.as_ref());
+            let trust = load_trust(settings, inline_secret.as_ref());
+            self.trust = match (trust, self.trust.take()) {
+                (Some(trust), Some(former)) => Some(trust.continuing(former)),
+                (trust, _) => trust,
+            };
             self.subscribers.apply(&self.settings, &self.link_of_lane, now);
             self.links.iter_mut().for_each(|link| link.apply(&self.settings, now));
             // At once, together with the resulting modes, instead of at the next evaluation.

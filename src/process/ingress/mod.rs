@@ -2,8 +2,9 @@
 //!
 //! Ingress never waits for a lane: a full queue overwrites its oldest sample, and waking a lane does not
 //! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
-//! does the housekeeping.
+//! does the housekeeping; a third thread wakes critical lanes early ([`early_waker`]).
 
+mod early_waker;
 mod input;
 pub(super) mod memory;
 mod pool;
@@ -27,6 +28,7 @@ use crate::config::Settings;
 use crate::dds::{ArrivalFlag, Discovery, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::ProcessRole;
+use early_waker::EarlyWaker;
 use input::Input;
 use receiving::{Receiving, ServedLane};
 
@@ -69,6 +71,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
 
 struct Ingress {
     /// Declared before the participant, so that it is dropped first: it watches the participant's sockets.
+    _early_waker: Option<EarlyWaker>,
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
@@ -114,8 +117,10 @@ impl Ingress {
         let urgent_topics = urgent.into_iter().map(|route| settings.routes[route].input_topic.to_dds());
         let participant = role.join_receiving(&options, urgent_topics, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
+        let early_waker = EarlyWaker::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
+            _early_waker: early_waker,
             receiving,
             participant,
             role,

@@ -110,6 +110,15 @@ impl Trust {
         Self { secret, mode, replays: ReplayGuard::new(replay_window_ms, capacity), nonces }
     }
 
+    /// This trust, which a reload has brought, with the memory of the former one: what that has accepted is
+    /// not accepted again.
+    pub fn continuing(self, former: Self) -> Self {
+        if TrustMode::Off == self.mode || TrustMode::Off == former.mode {
+            return self;
+        }
+        Self { replays: self.replays.remembering(former.replays), ..self }
+    }
+
     /// Whether messages are signed.
     pub fn signs(&self) -> bool {
         self.secret.is_some()
@@ -319,6 +328,20 @@ mod tests {
         let good = signed("swordfish", request());
         assert_eq!(trust.check(&good, NOW), Ok(None));
         assert_eq!(trust.check(&good, NOW), Ok(Some(ProbeRefusal::Replayed)));
+    }
+
+    #[test]
+    fn what_was_accepted_before_a_reload_is_not_accepted_again() {
+        let mut former = trust("swordfish", TrustMode::DefaultDeny);
+        let good = signed("swordfish", request());
+        assert_eq!(former.check(&good, NOW), Ok(None));
+        let mut reloaded = trust("swordfish", TrustMode::DefaultDeny).continuing(former);
+        assert_eq!(reloaded.check(&good, NOW), Err(ProbeRefusal::Replayed));
+        assert_eq!(reloaded.check(&signed("swordfish", request()), NOW), Ok(None));
+        // A former trust that checked nothing has no memory to continue with.
+        let mut checked = trust("swordfish", TrustMode::DefaultDeny).continuing(trust("", TrustMode::Off));
+        assert_eq!(checked.check(&good, NOW), Ok(None));
+        assert_eq!(checked.replays.len(), 1);
     }
 
     #[test]

@@ -28,6 +28,17 @@ fn a_message_is_admitted_once_and_within_the_window_only() {
 }
 
 #[test]
+fn a_guard_with_the_memory_of_another_admits_nothing_twice_in_a_wider_window() {
+    let mut former = ReplayGuard::new(1_000, 100);
+    assert_eq!(former.admit(nonce(1), wall(0), wall(0)), Admission::Fresh);
+    assert_eq!(former.admit(nonce(2), wall(1_500), wall(1_500)), Admission::Fresh);
+    let mut guard = ReplayGuard::new(30_000, 100).remembering(former);
+    assert_eq!(guard.admit(nonce(2), wall(1_500), wall(2_000)), Admission::Replayed);
+    assert_eq!(guard.admit(nonce(1), wall(0), wall(2_000)), Admission::Forgotten);
+    assert_eq!(guard.admit(nonce(3), wall(1_000), wall(20_000)), Admission::Fresh);
+}
+
+#[test]
 fn messages_may_overtake_each_other() {
     let mut guard = ReplayGuard::new(30_000, 100);
     for (number, sent_ms) in [(1, 40), (2, 20), (3, 30), (4, 10)] {

@@ -76,6 +76,15 @@ fn every_relative_link_leads_to_a_file() {
 }
 
 #[test]
+fn the_pages_to_read_first_are_short() {
+    let limits = [("README.md", 150), ("docs/ARCHITECTURE.md", 200), ("docs/performance.md", 150)];
+    for (page, max_lines) in limits {
+        let lines = std::fs::read_to_string(root().join(page)).unwrap().lines().count();
+        assert!(lines <= max_lines, "{page}: {lines} lines, at most {max_lines}");
+    }
+}
+
+#[test]
 fn no_page_has_the_markers_of_an_unresolved_merge() {
     let is_marker = |line: &str| line.starts_with("<<<<<<< ") || line.starts_with(">>>>>>> ");
     assert!(is_marker("<<<<<<< HEAD") && is_marker(">>>>>>> main") && !is_marker("# Merge"));

@@ -52,6 +52,11 @@ impl ReplayGuard {
         }
     }
 
+    /// This guard with the memory of a former one, which had another window perhaps.
+    pub fn remembering(self, former: Self) -> Self {
+        Self { window_ns: self.window_ns, ..former }
+    }
+
     /// Messages remembered.
     pub fn len(&self) -> usize {
         self.seen.len()

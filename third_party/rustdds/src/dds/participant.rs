@@ -664,6 +664,23 @@ impl DomainParticipant {
     discovery_db_read(&self.discovery_db()).counters()
   }
 
+  /// The sockets that user traffic comes to, for a thread of the application that
+  /// the kernel wakes together with the event loop. It may look at datagrams
+  /// (`peek`, and [`sample_arriving`](crate::sample_arriving)) and must take none,
+  /// nor change anything of the sockets, which do not block. For a participant with
+  /// the hook [`DomainParticipantBuilder::on_sample_arriving`], once; an error
+  /// otherwise, or if there were no descriptors. The ports stay bound as long as they
+  /// are open.
+  #[cfg(unix)]
+  pub fn sockets_to_peek(&self) -> io::Result<Vec<std::net::UdpSocket>> {
+    let sockets = match self.dpi.lock() {
+      Ok(mut dpi) => dpi.dpi.sockets_to_peek.take(),
+      Err(_) => None,
+    };
+    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets to peek")))
+  }
+
+
   /// Gets all DiscoveredTopics from DDS network
   ///
   /// # Examples
@@ -1387,6 +1404,9 @@ pub(crate) struct DomainParticipantInner {
 
   only_networks: Option<Arc<[NetworkSelector]>>,
 
+  /// See `DomainParticipant::sockets_to_peek`.
+  #[cfg(unix)]
+  sockets_to_peek: Option<io::Result<Vec<std::net::UdpSocket>>>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1544,6 +1564,19 @@ impl DomainParticipantInner {
       }
     }
 
+    #[cfg(unix)]
+    let sockets_to_peek = hooks.on_sample_arriving.is_some().then(|| {
+      [
+        USER_TRAFFIC_LISTENER_TOKEN,
+        USER_TRAFFIC_MUL_LISTENER_TOKEN,
+        URGENT_TRAFFIC_LISTENER_TOKEN,
+      ]
+      .iter()
+      .filter_map(|token| listeners.get(token))
+      .map(UDPListener::socket_to_peek)
+      .collect()
+    });
+
     // construct our own Locators
     let listener_kinds = listeners
       .iter()
@@ -1690,6 +1723,8 @@ impl DomainParticipantInner {
       listener_kinds,
       security_plugins_handle,
       only_networks,
+      #[cfg(unix)]
+      sockets_to_peek,
     })
   }
 

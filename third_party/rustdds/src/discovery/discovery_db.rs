@@ -136,7 +136,11 @@ fn announced_bytes(endpoint: &impl PlCdrSerialize, locators: usize) -> usize {
   serialized.map_or(usize::MAX, |bytes| bytes.len().saturating_sub(28 * locators))
 }
 
+// If there are too many, those of transports that are not UDP, which are not used here, go first.
 fn keep_first_locators(locators: &mut Vec<Locator>) {
+  if locators.len() > MAX_LOCATORS_PER_READER {
+    locators.sort_by_key(|locator| !locator.is_udp());
+  }
   locators.truncate(MAX_LOCATORS_PER_READER);
   locators.shrink_to_fit();
 }
@@ -1315,8 +1319,19 @@ mod tests {
     let mut many = named(3, 256);
     let locator = Locator::UdpV4("192.0.2.1:7411".parse().unwrap());
     many.reader_proxy.unicast_locator_list = vec![locator; 2_000];
+    // Those of another transport do not count.
+    let shared_memory = Locator::Other {
+      kind: 16,
+      port: 7411,
+      address: [0; 16],
+    };
+    let others = std::iter::repeat_n(shared_memory, 2 * MAX_LOCATORS_PER_READER);
+    many.reader_proxy.unicast_locator_list.splice(0..0, others);
     let known = db.update_subscription(&many).unwrap();
-    assert_eq!(known.reader_proxy.unicast_locator_list.len(), MAX_LOCATORS_PER_READER);
+    assert_eq!(
+      known.reader_proxy.unicast_locator_list,
+      vec![locator; MAX_LOCATORS_PER_READER]
+    );
     let mut participant = new_participant();
     participant.default_unicast_locators = vec![locator; 2_000];
     db.update_participant(&participant);

@@ -277,6 +277,13 @@ impl UDPListener {
     Ok(listener)
   }
 
+  /// A duplicate of the socket, for a thread that peeks at datagrams and receives none.
+  #[cfg(unix)]
+  pub fn socket_to_peek(&self) -> io::Result<std::net::UdpSocket> {
+    use std::os::fd::AsFd;
+    Ok(self.socket.as_fd().try_clone_to_owned()?.into())
+  }
+
   pub fn mio_socket(&mut self) -> &mut mio1::net::UdpSocket {
     &mut self.socket
   }
