@@ -8,6 +8,7 @@ use std::process::Command;
 use std::time::SystemTime;
 
 use adaptive_bridge_measure::hop::{Quantiles, Summary, figures, readme};
+use serde_json::Value;
 
 use super::link::Record;
 use super::options::Options;
@@ -124,14 +125,27 @@ impl Output {
 
 fn write_to(folder: &Path, summary: &Summary, raw: &[u8], files: &[(String, String)]) -> Result<(), String> {
     fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-    let json = serde_json::to_string(summary).map_err(|error| error.to_string())?;
-    write(&folder.join("summary.json"), (json + "\n").as_bytes())?;
+    let mut json = serde_json::to_value(summary).map_err(|error| error.to_string())?;
+    drop_nulls(&mut json);
+    write(&folder.join("summary.json"), format!("{json}\n").as_bytes())?;
     write(&folder.join("raw.csv"), raw)?;
     write(&folder.join("README.md"), readme(summary).as_bytes())?;
     for (name, text) in figures(summary).iter().chain(files) {
         write(&folder.join(name), text.as_bytes())?;
     }
     Ok(())
+}
+
+/// Leaves out the figures that were not measured, which are a fifth of a summary.
+fn drop_nulls(json: &mut Value) {
+    match json {
+        Value::Object(fields) => {
+            fields.values_mut().for_each(drop_nulls);
+            fields.retain(|_, value| !value.is_null());
+        }
+        Value::Array(values) => values.iter_mut().for_each(drop_nulls),
+        _ => {}
+    }
 }
 
 /// Replaces a file by a compressed one, with the `xz` command; without the command the file stays as it is.
