@@ -526,8 +526,11 @@ impl RtpsReaderProxy {
 
   fn discovered_or_default(drd: &[Locator], default: &[Locator]) -> Vec<Locator> {
     let announced = if drd.is_empty() { default } else { drd };
-    announced
-      .iter()
+    // Other transports are not used here.
+    let (udp, others): (Vec<_>, Vec<_>) = announced.iter().partition(|locator| locator.is_udp());
+    udp
+      .into_iter()
+      .chain(others)
       .take(MAX_LOCATORS_PER_READER)
       .copied()
       .collect()
