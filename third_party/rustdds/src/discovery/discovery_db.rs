@@ -137,7 +137,7 @@ fn announced_bytes(endpoint: &impl PlCdrSerialize, locators: usize) -> usize {
 }
 
 // If there are too many, those of transports that are not UDP, which are not used here, go first.
-fn keep_first_locators(locators: &mut Vec<Locator>) {
+pub(crate) fn keep_first_locators(locators: &mut Vec<Locator>) {
   if locators.len() > MAX_LOCATORS_PER_READER {
     locators.sort_by_key(|locator| !locator.is_udp());
   }

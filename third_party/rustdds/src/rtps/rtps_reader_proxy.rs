@@ -12,7 +12,7 @@ use mio1::Token;
 
 use crate::{
   dds::{participant::DomainParticipant, qos::QosPolicies},
-  discovery::sedp_messages::DiscoveredReaderData,
+  discovery::{discovery_db::keep_first_locators, sedp_messages::DiscoveredReaderData},
   messages::submessages::{ack_nack::AckNack, submessage::AckSubmessage},
   network::util::{path_mtu_payload_for_peer, IfAddr},
   rtps::{
@@ -526,14 +526,9 @@ impl RtpsReaderProxy {
 
   fn discovered_or_default(drd: &[Locator], default: &[Locator]) -> Vec<Locator> {
     let announced = if drd.is_empty() { default } else { drd };
-    // Other transports are not used here.
-    let (udp, others): (Vec<_>, Vec<_>) = announced.iter().partition(|locator| locator.is_udp());
-    udp
-      .into_iter()
-      .chain(others)
-      .take(MAX_LOCATORS_PER_READER)
-      .copied()
-      .collect()
+    let mut locators = announced.to_vec();
+    keep_first_locators(&mut locators);
+    locators
   }
 
   // OpenDDS (and RustDDS itself) advertise the loopback address as a Locator,
