@@ -144,7 +144,7 @@ mod tests {
         // BEST_EFFORT readers are promised nothing.
         (readers.records[1].reliable, readers.records[2].reliable) = (0, 0);
         assert_eq!(readers.unconfirmed(&counters), 0);
-        // A lane that was told to end, and of which all has been acknowledged.
+        // A process that ended on SIGTERM, after every reader had acknowledged every sample.
         readers.forwarded = counters.forwarded;
         readers.records[1] = ReaderRecord { unacknowledged: 0, reliable: 1, ..readers.records[1] };
         assert_eq!(readers.unconfirmed(&counters), 0);
