@@ -129,7 +129,9 @@ void set_qos(Qos& qos, const Options& options) {
   if (options.keys > 0) limits.max_samples *= std::max(1, limits.max_instances);
   limits.allocated_samples = std::min(limits.allocated_samples, limits.max_samples);
   // Sizes vary from a few bytes to megabytes: take the memory that each sample needs.
-  qos.endpoint().history_memory_policy = rtps::DYNAMIC_REUSABLE_MEMORY_MODE;
+  // Fast DDS 2.9 has no room there for a sample without payload, as a disposed key is one.
+  qos.endpoint().history_memory_policy =
+      options.keys > 0 ? rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE : rtps::DYNAMIC_REUSABLE_MEMORY_MODE;
   if (!options.shared_memory) qos.data_sharing().off();
 }
 
