@@ -59,7 +59,7 @@ plain! {
     NamedEndpoint: 2 + 2 * 16,
     PublisherAccount: 9,
     LanePolicy: 5,
-    RouteInfo: 2 * (16 + 4) + 3,
+    RouteInfo: 2 * (16 + 4) + 4,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 5,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,

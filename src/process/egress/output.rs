@@ -7,12 +7,13 @@ use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::former_readers::FormerReaders;
+use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
 use super::overrun::{Overrun, log_left};
-use super::unsent::{Forwarded, Unsent, UnsentSamples};
+use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
 use crate::clock;
-use crate::config::{self, DropPolicy, Forwarding, Settings};
+use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
@@ -47,6 +48,8 @@ pub(super) struct Output {
     pub writer: Option<RawWriter>,
     /// The hash that the writer announces.
     type_hash: TypeHash,
+    /// Whether the writer is one of a type with keys.
+    has_keys: bool,
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
@@ -125,6 +128,7 @@ impl Output {
             subscriber,
             writer: None,
             type_hash: TypeHash::UNKNOWN,
+            has_keys: false,
             queued: 0,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             drop_log: DropLog::new(former.drops),
@@ -147,7 +151,8 @@ impl Output {
                 let known = opened.boards.route_info(output.route).unwrap_or_default();
                 opened.durability.set(known.durability());
                 opened.follow_durability(participant);
-                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash };
+                let has_keys = known.has_keys != 0;
+                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash, has_keys };
                 opened.make_writer(participant, dds_type)?;
             }
             None => opened.announce_type(participant),
@@ -199,14 +204,17 @@ impl Output {
         if let Some(reason) = critical_drop(self.mode) {
             return self.drop_sample(&sample, reason);
         }
-        if self.writer.is_none() || (self.is_to_latch() && self.counters.get().readers == 0) {
+        let other_kind = sample.header().key.is_keyed() != self.has_keys;
+        if self.writer.is_none() || other_kind || (self.is_to_latch() && self.counters.get().readers == 0) {
             self.announce_type(participant);
         }
         if !self.former_readers.is_empty() {
             // Former readers may have matched since the last housekeeping.
             self.follow_matching(clock::monotonic());
         }
-        let Some(writer) = &self.writer else {
+        // A writer of the other kind would send what its readers take for something else.
+        let Some(writer) = self.writer.as_ref().filter(|_| sample.header().key.is_keyed() == self.has_keys)
+        else {
             self.drop_sample(&sample, DropReason::NoWriter);
             return;
         };
@@ -227,7 +235,8 @@ impl Output {
         };
         let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
-        let outcome = writer.write_from(publisher, payload, header.encapsulation, header.source_timestamp);
+        let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+        let outcome = writer.write_from(publisher, payload, encapsulation, timestamp, header.key);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
@@ -277,6 +286,11 @@ impl Output {
             record_sequence(counters, &self.tracker);
             counters.drops.add(reason, 1);
         });
+    }
+
+    /// Whether the writer is one of a type with keys.
+    pub const fn has_keys(&self) -> bool {
+        self.has_keys
     }
 
     /// Applies another mode of the lane. A noncritical lane that forwards nothing takes samples only at
@@ -459,19 +473,33 @@ impl Output {
             return;
         }
         let Some(latched) = self.latched_offer.take() else { return };
-        if let Some(volatile) = self.writer.take() {
-            self.unmatched.clear();
-            self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
-            self.counters.update(|counters| counters.readers = 0);
-            self.overrun.count(&volatile, &mut self.counters);
-            self.overrun = Overrun::default();
-            let guid = volatile.guid();
-            drop(volatile);
-            participant.remove_endpoint(guid);
-        }
+        self.remove_writer(participant);
         self.history = latched.history();
         self.unsent = UnsentSamples::new(latched.most_unsent());
         self.offer = latched;
+    }
+
+    /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
+    /// match no such publisher either, so nothing that they could get is lost; what is not sent yet is sent
+    /// first.
+    fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
+        if self.writer.is_some() && has_keys != self.has_keys && !self.count_sent() {
+            self.remove_writer(participant);
+            self.history = self.offer.history();
+        }
+    }
+
+    fn remove_writer(&mut self, participant: &mut Participant) {
+        if let Some(former) = self.writer.take() {
+            self.unmatched.clear();
+            self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
+            self.counters.update(|counters| counters.readers = 0);
+            self.overrun.count(&former, &mut self.counters);
+            self.overrun = Overrun::default();
+            let guid = former.guid();
+            drop(former);
+            participant.remove_endpoint(guid);
+        }
     }
 
     /// Creates the writer if ingress has published the type by now, and lets it announce the type's hash.
@@ -482,6 +510,7 @@ impl Output {
         let Some(dds_type) = info.announced_type() else { return };
         self.durability.set(info.durability());
         self.follow_durability(participant);
+        self.follow_kind(participant, dds_type.has_keys);
         match &self.writer {
             None => {
                 if let Err(failure) = self.make_writer(participant, dds_type) {
@@ -505,6 +534,7 @@ impl Output {
             lane = self.lane,
             topic = self.dds_topic,
             dds_type = dds_type.name,
+            has_keys = dds_type.has_keys,
             reliability = ?qos.reliability,
             durability = ?qos.durability,
             "DDS writer created"
@@ -514,6 +544,10 @@ impl Output {
         }
         self.writer = Some(writer);
         self.type_hash = dds_type.hash;
+        if self.has_keys != dds_type.has_keys {
+            self.has_keys = dds_type.has_keys;
+            self.durability.set_changed();
+        }
         Ok(())
     }
 
@@ -547,9 +581,10 @@ impl Output {
         let kept = history.kept(&payload, header);
         if kept.is_none()
             && let Some(writer) = &self.writer
+            && header.key.is_keyed() == self.has_keys
         {
-            let written =
-                writer.write_from(Some(publisher), payload, header.encapsulation, header.source_timestamp);
+            let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+            let written = writer.write_from(Some(publisher), payload, encapsulation, timestamp, header.key);
             if let Err(failure) = written {
                 warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
             }
@@ -562,26 +597,4 @@ impl Output {
 fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.first_sequence = tracker.first();
     counters.last_sequence = tracker.last();
-}
-
-/// Counts a sample that was sent.
-fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
-    counters.forwarded += 1;
-    counters.forwarded_bytes += sample.bytes;
-    counters.by_reference += u64::from(sample.by_reference);
-    counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_at = sample.written_at;
-}
-
-/// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too
-/// slow. A noncritical one sleeps until it has a token, and the drop policy decides which samples are lost
-/// meanwhile.
-const fn overwrite_reason(forwarding: &Forwarding) -> DropReason {
-    match forwarding {
-        Forwarding::Everything => DropReason::QueueOverflow,
-        Forwarding::Limited(rates) => match rates.normal.drop_policy {
-            DropPolicy::DropOldest => DropReason::Superseded,
-            _ => DropReason::QueueFull,
-        },
-    }
 }
