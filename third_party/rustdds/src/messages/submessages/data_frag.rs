@@ -287,8 +287,12 @@ impl DataFrag {
   }
 }
 
-impl<C: Context> Writable<C> for DataFrag {
-  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
+impl DataFrag {
+  /// Writes what comes before the fragments.
+  pub(crate) fn write_head<C: Context, T: ?Sized + Writer<C>>(
+    &self,
+    writer: &mut T,
+  ) -> Result<(), C::Error> {
     writer.write_u16(0)?; // extraflags
     writer.write_u16(28)?; // See calculation of this value in deserialization above.
                            // We always write constant 28 here, because this implementation does not (yet)
@@ -306,10 +310,22 @@ impl<C: Context> Writable<C> for DataFrag {
     if let Some(inline_qos) = self.inline_qos.as_ref() {
       writer.write_value(inline_qos)?;
     }
+    Ok(())
+  }
+
+  /// The bytes after the fragments, which are zero.
+  pub(crate) fn padding_len(&self) -> usize {
+    padding_needed_for_alignment_4(self.serialized_payload.len())
+  }
+}
+
+impl<C: Context> Writable<C> for DataFrag {
+  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
+    self.write_head(writer)?;
     writer.write_bytes(&self.serialized_payload)?;
     // Whole words (RTPS spec v2.5 Section 9.4.1): Cyclone DDS discards another
     // length as malformed. The receiver knows the length of the last fragment.
-    for _ in 0..padding_needed_for_alignment_4(self.serialized_payload.len()) {
+    for _ in 0..self.padding_len() {
       writer.write_u8(0)?;
     }
     Ok(())
