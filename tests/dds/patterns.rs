@@ -122,7 +122,9 @@ fn forged_topics_displace_no_topic_with_samples_and_are_counted() {
         let pattern = &status["patterns"][0];
         pattern["forgotten"].as_u64() > Some(20) && pattern["routes"] == PLACES
     });
-    assert_eq!(count(&status["patterns"][0]["waiting"]), MAX_WAITING_TOPICS as u64, "{status}");
+    // A place that has just got its topic may have made room for one more.
+    let waiting = count(&status["patterns"][0]["waiting"]) as usize;
+    assert!((MAX_WAITING_TOPICS - PLACES..=MAX_WAITING_TOPICS).contains(&waiting), "{status}");
     let problems = status["problems"].to_string();
     assert!(problems.contains("max_routes") && problems.contains("/camera/forged_"), "{problems}");
 

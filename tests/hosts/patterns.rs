@@ -75,6 +75,8 @@ fn topics_that_match_are_carried_as_they_appear() {
     support::wait_until("a restart", || bed.pids("ingress").len() == 2);
     let received = left_critical.received();
     left_critical.wait_received(received + 100);
+    let bound = |log: &str| log.matches("topic found for a place").count();
+    assert_eq!(bound(&bed.up.log()), 2, "the new process gave a place anew");
     let mut sent: Vec<(&str, Sent)> = Vec::new();
     for (topic, publisher) in [("/camera/front/image", front), ("/camera/left/image", left)] {
         sent.push((topic, publisher.end()));
