@@ -11,8 +11,8 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed, print};
-use crate::config::{self, ConfigError, Place, Problem, Route, Row, Settings};
-use crate::model::{InstanceName, LaneName, RouteId, TopicName, TypeName};
+use crate::config::{self, ConfigError, InputTopic, OutputTopic, Place, Problem, Route, Row, Settings};
+use crate::model::{InstanceName, LaneName, RouteId, TopicPattern, TypeName};
 use crate::process::{InForce, MemoryNeed, MemoryNeeds};
 use crate::shm::RouteChannel;
 use crate::telemetry::bytes_text;
@@ -148,7 +148,11 @@ impl ProcessMemory {
 #[derive(Serialize)]
 struct RouteSummary<'a> {
     id: &'a RouteId,
-    input_topic: &'a TopicName,
+    #[serde(serialize_with = "as_text")]
+    input_topic: &'a InputTopic,
+    /// Of a pattern: the topics that are left out, and the number of its places.
+    exclude: Option<&'a [TopicPattern]>,
+    max_routes: Option<usize>,
     message_type: Option<&'a TypeName>,
     outputs: Vec<OutputSummary<'a>>,
     max_sample_bytes: usize,
@@ -159,7 +163,12 @@ struct RouteSummary<'a> {
 #[derive(Serialize)]
 struct OutputSummary<'a> {
     lane: &'a LaneName,
-    topic: &'a TopicName,
+    #[serde(serialize_with = "as_text")]
+    topic: &'a OutputTopic,
+}
+
+fn as_text<S: serde::Serializer>(shown: &impl fmt::Display, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(shown)
 }
 
 impl<'a> Summary<'a> {
@@ -170,17 +179,25 @@ impl<'a> Summary<'a> {
                 let output = lane.outputs.iter().find(|output| output.route == index)?;
                 Some(OutputSummary { lane: &lane.name, topic: &output.topic })
             });
+            let pattern = settings.patterns.iter().find(|pattern| pattern.entry == route.entry);
+            let places = pattern.map_or(1, |pattern| pattern.max_routes);
             RouteSummary {
-                id: &route.id,
+                id: &route.entry,
                 input_topic: &route.input_topic,
+                exclude: pattern.map(|pattern| &pattern.exclude[..]),
+                max_routes: pattern.map(|pattern| pattern.max_routes),
                 message_type: route.message_type.as_ref(),
                 outputs: outputs.collect(),
                 max_sample_bytes: route.max_sample_bytes,
                 slots: pool.slots,
-                shared_memory_bytes: pool.bytes,
+                shared_memory_bytes: places as u64 * pool.bytes,
             }
         };
-        let routes: Vec<_> = settings.routes.iter().enumerate().map(summary).collect();
+        // The places of a pattern are equal: one entry of the file has one summary.
+        let is_first =
+            |index: usize| index == 0 || settings.routes[index - 1].entry != settings.routes[index].entry;
+        let routes = settings.routes.iter().enumerate().filter(|(index, _)| is_first(*index));
+        let routes: Vec<_> = routes.map(summary).collect();
         Self {
             instance: &settings.instance,
             lanes: settings.lanes.iter().map(|lane| &lane.name).collect(),
@@ -201,9 +218,17 @@ impl fmt::Display for Summary<'_> {
             for output in &route.outputs {
                 writeln!(f, "  {} -> {}", output.lane, output.topic)?;
             }
+            let mut places = String::new();
+            if let Some(max_routes) = route.max_routes {
+                let excluded: Vec<String> =
+                    route.exclude.unwrap_or_default().iter().map(ToString::to_string).collect();
+                let excluded = if excluded.is_empty() { "none".to_owned() } else { excluded.join(", ") };
+                writeln!(f, "  a pattern: at most {max_routes} topics at once; excluded: {excluded}")?;
+                places = format!("{max_routes} times ");
+            }
             writeln!(
                 f,
-                "  shared memory: {} slots for samples of up to {}: {}",
+                "  shared memory: {places}{} slots for samples of up to {}: {}",
                 route.slots,
                 bytes_text(route.max_sample_bytes as f64),
                 bytes_text(route.shared_memory_bytes as f64)

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::control::memory::{REQUESTS_BYTES, networks, node_bytes};
 use super::egress::memory::{COPIES_BYTES, output_bytes};
-use super::ingress::memory::{fragment_bytes, waiting_bytes};
+use super::ingress::memory::{PATTERN_BYTES, fragment_bytes, waiting_bytes};
 use crate::config::{Lane, Settings};
 use crate::dds::{DISCOVERY_BYTES, SOCKETS_BYTES};
 use crate::shm::{OTHER_SHARED_BYTES, RouteChannel};
@@ -114,6 +114,7 @@ impl MemoryNeeds {
 
 fn of_ingress(settings: &Settings) -> MemoryNeed {
     let mut need = MemoryNeed::of_participants(1);
+    need.discovery_bytes += settings.patterns.len() as u64 * PATTERN_BYTES;
     for (index, route) in settings.routes.iter().enumerate() {
         add(&mut need.fragments_bytes, fragment_bytes(route));
         add(&mut need.waiting_bytes, waiting_bytes(route));

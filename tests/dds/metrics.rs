@@ -5,17 +5,16 @@ use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::time::Duration;
 
-use adaptive_bridge::config::MetricsListener;
-use adaptive_bridge::config::SetParameters;
+use adaptive_bridge::config::{MetricsListener, RoutePattern, SetParameters};
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, RouteInfo,
-    SubscriberRecord, SubscriberState, TopicName, TrafficClass, WallNs,
+    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, PatternRecord, ProbeRefusal, ProcessHealth,
+    RouteId, RouteInfo, SubscriberRecord, SubscriberState, TopicName, TopicPattern, TrafficClass, WallNs,
 };
 use adaptive_bridge::shm::ProcessRole;
 use adaptive_bridge::telemetry::{
-    LaneReading, MetricsServer, OutputReading, ProcessReading, ProcessState, Report, RouteReading, Snapshot,
-    SubscriberReading,
+    LaneReading, MetricsServer, OutputReading, PatternReading, ProcessReading, ProcessState, Report,
+    RouteReading, Snapshot, SubscriberReading,
 };
 use serde_json::Value;
 use support::prometheus::{parse, python};
@@ -103,9 +102,20 @@ fn report() -> Report {
             is_used: true,
             health,
         }],
+        patterns: vec![PatternReading {
+            settings: RoutePattern {
+                entry: RouteId::try_from("camera").unwrap(),
+                input_topic: TopicPattern::try_from("/camera/**").unwrap(),
+                exclude: Vec::new(),
+                first_route: 1,
+                max_routes: 2,
+            },
+            record: PatternRecord { waiting: 45, ..PatternRecord::default() },
+        }],
         routes: vec![RouteReading {
             id: RouteId::try_from("scan").unwrap(),
             input_topic: TopicName::try_from("/scan").unwrap(),
+            pattern: None,
             message_type: None,
             info: RouteInfo::default(),
             counters: ingress,
@@ -190,6 +200,7 @@ fn the_parser_of_prometheus_reads_the_page() {
         ("route_lost_upstream_samples_total", 42.0),
         ("route_repeated_samples_total", 43.0),
         ("route_unmarked_samples_total", 44.0),
+        ("pattern_waiting_topics", 45.0),
         ("lane_subscribers", 2.0),
         ("lane_reader_overrun_samples_total", 23.0),
         ("lane_unconfirmed_samples_total", 24.0),

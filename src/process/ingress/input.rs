@@ -17,7 +17,7 @@ use crate::dds::{
 };
 use crate::model::{
     AgeBasis, DdsType, DropReason, Durability, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
-    Reliability, RouteInfo, SampleHeader,
+    Reliability, RouteInfo, SampleHeader, TopicName,
 };
 use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
 
@@ -27,6 +27,7 @@ const REMIND_MS: u64 = 30_000;
 /// The input of one route: takes samples from its DDS readers and publishes them to shared memory.
 pub(super) struct Input {
     id: String,
+    /// The input topic; empty for a place without a topic.
     dds_topic: String,
     configured_type: Option<String>,
     pub route: Route,
@@ -73,9 +74,11 @@ impl Input {
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
         let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
+        let info = role.boards.route_info_writer(index);
+        let topic = route.input_topic.resolve(info.get());
         Ok(Self {
             id: route.id.to_string(),
-            dds_topic: route.input_topic.to_dds(),
+            dds_topic: topic.map_or_else(String::new, |topic| topic.to_dds()),
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
             inbox: Inbox::with_flag(Arc::clone(flag)),
@@ -85,7 +88,7 @@ impl Input {
             pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
             drop_log: DropLog::new(counters.get().drops),
             counters,
-            info: role.boards.route_info_writer(index),
+            info,
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             publishers,
             remind_at: MonotonicNs(0),
@@ -96,6 +99,42 @@ impl Input {
     /// Whether there is a reader for at least one publisher.
     pub fn is_connected(&self) -> bool {
         self.readers.values().any(|reader| !reader.idle)
+    }
+
+    /// The topic of a place, and the samples received of it; `None` while it has none, and for other routes.
+    pub fn bound(&self) -> Option<(TopicName, u64)> {
+        let topic = self.info.get().topic().filter(|_| self.route.input_topic.is_place())?;
+        Some((topic, self.counters.get().published.saturating_sub(self.info.get().bound_after)))
+    }
+
+    /// Whether the route has an input topic.
+    pub fn has_topic(&self) -> bool {
+        !self.dds_topic.is_empty()
+    }
+
+    /// Gives a place to a topic, in place of the present one. The samples that are numbered from now on are
+    /// of this topic: the lanes learn of the topic, and of the number, before there is a reader.
+    pub fn bind(&mut self, participant: &mut Participant, topic: &TopicName) {
+        for reliability in [Reliability::Reliable, Reliability::BestEffort] {
+            self.remove_reader(participant, reliability);
+        }
+        if self.has_topic() {
+            participant.forget_topic(&self.dds_topic);
+        }
+        self.source = Source::default();
+        self.source_changed = true;
+        self.settled_type = None;
+        self.publishers.mark_gone(|_| true, true);
+        self.dds_topic = topic.to_dds();
+        let bound_after = self.counters.get().published;
+        let bound_count = self.info.get().bound_count.saturating_add(1);
+        // The type of the former topic goes with it, so that no lane announces this one with that type.
+        self.info.set(RouteInfo {
+            bound_topic: FixedText::new(topic.as_str()),
+            bound_after,
+            bound_count,
+            ..RouteInfo::default()
+        });
     }
 
     /// Takes one sample and publishes it to the lanes, which the caller has to wake then.
@@ -184,7 +223,7 @@ impl Input {
 
     /// Handles a discovered writer. Ignores writers of other topics.
     pub fn writer_found(&mut self, writer: &Endpoint) {
-        if writer.topic != self.dds_topic {
+        if writer.topic != self.dds_topic || !self.has_topic() {
             return;
         }
         self.source_changed = true;
@@ -229,7 +268,7 @@ impl Input {
 
     /// Creates the readers that the discovered publishers need, and removes the others.
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
-        if self.is_connected() && !std::mem::take(&mut self.source_changed) {
+        if !self.has_topic() || (self.is_connected() && !std::mem::take(&mut self.source_changed)) {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
@@ -273,7 +312,8 @@ impl Input {
     /// (`is_settled`), and names a publisher that announces another one.
     fn update_info(&mut self, dds_type: &str, is_settled: bool) {
         let type_hash = self.source.type_hash(dds_type, self.info.get().type_hash);
-        let mut info = RouteInfo { type_hash, ..RouteInfo::default() };
+        let RouteInfo { bound_topic, bound_after, bound_count, .. } = *self.info.get();
+        let mut info = RouteInfo { type_hash, bound_topic, bound_after, bound_count, ..RouteInfo::default() };
         let durability = self.source.durability(dds_type, self.info.get().durability());
         info.transient_local = u64::from(durability == Durability::TransientLocal);
         if is_settled {

@@ -129,6 +129,10 @@ fn routes(page: &mut Page, report: &Report) {
     for route in &report.routes {
         page.histogram(&[("route", &route.id)], &route.dds_in.total);
     }
+    page.family("pattern_waiting_topics", Gauge, "Topics that match a pattern and have no route.");
+    for pattern in &report.patterns {
+        page.sample(&[("pattern", &pattern.id)], Some(pattern.waiting));
+    }
 }
 
 fn outputs(page: &mut Page, report: &Report) {

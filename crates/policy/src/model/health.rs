@@ -4,6 +4,7 @@
 use serde::Serialize;
 
 use super::drops::DropCounts;
+use super::names::TopicName;
 use super::network::NetworkRefusals;
 use super::qos::Durability;
 use super::sample::Guid;
@@ -308,12 +309,24 @@ pub struct RouteInfo {
     pub other_hash: TypeHash,
     /// 1 if all present publishers offer TRANSIENT_LOCAL, or the last ones did, else 0.
     pub transient_local: u64,
+    /// The input topic of a route that has its topic by a pattern; empty while it has none.
+    pub bound_topic: FixedText,
+    /// The last sequence number of the route before it got this topic. What is numbered up to it is of
+    /// another topic.
+    pub bound_after: u64,
+    /// How many topics the route has had by its pattern.
+    pub bound_count: u64,
 }
 
 impl RouteInfo {
     /// What the publishers offer: it applies to outputs for which the configuration gives no DURABILITY.
     pub fn durability(&self) -> Durability {
         if self.transient_local == 0 { Durability::Volatile } else { Durability::TransientLocal }
+    }
+
+    /// The topic that the route has by a pattern; `None` while it has none.
+    pub fn topic(&self) -> Option<TopicName> {
+        TopicName::try_from(self.bound_topic.as_str()).ok()
     }
 
     /// The type that the outputs of the route announce; `None` while it is unknown.

@@ -14,6 +14,7 @@ mod probe_window;
 mod publisher_places;
 mod replay_guard;
 mod restart;
+mod route_places;
 mod safety;
 mod sequence;
 mod staleness;
@@ -28,8 +29,8 @@ pub use classifier::{
 };
 pub use clock_offset::ClockOffset;
 pub use intruders::{
-    Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
-    NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
+    Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_GUARDED_TOPICS,
+    MAX_REMEMBERED_INTRUDERS, NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
 pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, mode_and_source};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
@@ -42,6 +43,7 @@ pub use restart::{
     ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, HangWatch, MAX_BACKOFF_MS, RestartBackoff,
     RestartDecision,
 };
+pub use route_places::{AWAY_MS, Binding, MAX_TOPIC_WRITERS, MAX_WAITING_TOPICS, RoutePlaces, TRIAL_MS};
 pub use safety::{
     ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetySupervisor,
     SafetyTrouble, SourceLag,
