@@ -60,7 +60,7 @@ plain! {
     PublisherAccount: 9,
     LanePolicy: 5,
     RouteInfo: 2 * (16 + 4) + 3,
-    IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
+    IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 5,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
