@@ -5,7 +5,7 @@ use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
     ParametersReport, ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport,
-    SafetyReport, SubscriberReport, UnmatchedReport,
+    SafetyReport, SharedMemoryReport, SubscriberReport, UnmatchedReport,
 };
 use super::snapshot::ProcessReading;
 use crate::model::{
@@ -95,6 +95,7 @@ pub(super) fn wide_report() -> Report {
             applied_mode: Some("degraded"),
             applied_policy_epoch: 1,
         }],
+        shared_memory: SharedMemoryReport { budget_bytes: 1 << 40, used_bytes: 1 << 40, peak_bytes: 1 << 40 },
         routes: vec![RouteReport {
             id: "scan".into(),
             input_topic: topic,

@@ -209,9 +209,7 @@ mod tests {
         let mut demands = critical(3);
         demands[1].is_critical = false;
         demands[2].most_bytes = demands[2].first_bytes;
-        for route in 0..3 {
-            demands[route].first_bytes = 0;
-        }
+        demands.iter_mut().for_each(|one| one.first_bytes = 0);
         demands[2].most_bytes = 0;
         let mut budget = MemoryBudget::new(64 * MIB, &demands);
         let mut others = budget.clone();
