@@ -14,7 +14,7 @@ use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed,
 use crate::config::{self, ConfigError, InputTopic, OutputTopic, Place, Problem, Route, Row, Settings};
 use crate::model::{InstanceName, LaneName, RouteId, TopicPattern, TypeName};
 use crate::process::{InForce, MemoryNeed, MemoryNeeds};
-use crate::shm::RouteChannel;
+use crate::shm::{RouteChannel, budget_bytes};
 use crate::telemetry::bytes_text;
 
 #[derive(Args, Debug)]
@@ -120,6 +120,11 @@ struct Summary<'a> {
     instance: &'a InstanceName,
     lanes: Vec<&'a LaneName>,
     routes: Vec<RouteSummary<'a>>,
+    /// `shared_memory.budget_bytes`, or its default on this machine.
+    budget_bytes: u64,
+    /// What all pools take at the start.
+    first_bytes: u64,
+    /// The most that they take.
     shared_memory_bytes: u64,
     memory: Vec<ProcessMemory>,
 }
@@ -157,6 +162,9 @@ struct RouteSummary<'a> {
     outputs: Vec<OutputSummary<'a>>,
     max_sample_bytes: usize,
     slots: usize,
+    /// What the pool takes at the start.
+    first_bytes: u64,
+    /// What it takes if each slot has the largest sample, within the budget.
     shared_memory_bytes: u64,
 }
 
@@ -173,6 +181,7 @@ fn as_text<S: serde::Serializer>(shown: &impl fmt::Display, serializer: S) -> Re
 
 impl<'a> Summary<'a> {
     fn of(settings: &'a Settings) -> Self {
+        let budget_bytes = budget_bytes(settings);
         let summary = |(index, route): (usize, &'a Route)| {
             let pool = RouteChannel::of(settings, index).pool_size();
             let outputs = settings.lanes.iter().filter_map(|lane| {
@@ -190,7 +199,9 @@ impl<'a> Summary<'a> {
                 outputs: outputs.collect(),
                 max_sample_bytes: route.max_sample_bytes,
                 slots: pool.slots,
-                shared_memory_bytes: places as u64 * pool.bytes,
+                first_bytes: places as u64 * pool.first_bytes,
+                shared_memory_bytes: (places as u64 * pool.bytes)
+                    .min(budget_bytes.max(places as u64 * pool.first_bytes)),
             }
         };
         // The places of a pattern are equal: one entry of the file has one summary.
@@ -201,7 +212,9 @@ impl<'a> Summary<'a> {
         Self {
             instance: &settings.instance,
             lanes: settings.lanes.iter().map(|lane| &lane.name).collect(),
-            shared_memory_bytes: routes.iter().map(|route| route.shared_memory_bytes).sum(),
+            budget_bytes,
+            first_bytes: routes.iter().map(|route| route.first_bytes).sum(),
+            shared_memory_bytes: budget_bytes.min(routes.iter().map(|route| route.shared_memory_bytes).sum()),
             routes,
             memory: ProcessMemory::all(settings),
         }
@@ -228,13 +241,27 @@ impl fmt::Display for Summary<'_> {
             }
             writeln!(
                 f,
-                "  shared memory: {places}{} slots for samples of up to {}: {}",
+                "  shared memory: {places}{} slots for samples of up to {}: {} at the start, at most {}",
                 route.slots,
                 bytes_text(route.max_sample_bytes as f64),
+                bytes_text(route.first_bytes as f64),
                 bytes_text(route.shared_memory_bytes as f64)
             )?;
         }
-        writeln!(f, "\ntotal shared memory: {}", bytes_text(self.shared_memory_bytes as f64))?;
+        writeln!(
+            f,
+            "\ntotal shared memory: {} at the start, at most {} of a budget of {}",
+            bytes_text(self.first_bytes as f64),
+            bytes_text(self.shared_memory_bytes as f64),
+            bytes_text(self.budget_bytes as f64)
+        )?;
+        if self.first_bytes > self.budget_bytes {
+            writeln!(
+                f,
+                "ingress cannot start: raise shared_memory.budget_bytes, or lower max_sample_bytes of routes with \
+                 small samples, queue_depth or max_taps"
+            )?;
+        }
         writeln!(f, "\nmost memory of each process, the limit that `adaptive-bridge units` sets:")?;
         for memory in &self.memory {
             let parts = memory.parts.parts();

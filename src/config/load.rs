@@ -193,6 +193,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let shared_memory = SharedMemory {
         root_path: memory.get("root_path").parsed("an absolute path", control::absolute_path),
         max_taps: memory.get("max_taps").count_or_default(),
+        budget_bytes: memory.get("budget_bytes").count(),
     };
     let (routes, patterns, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 

@@ -167,7 +167,9 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
     d.add("ros.namespace", &old.node_namespace, &new.node_namespace);
     d.add("ros.node_name", &old.node_name, &new.node_name);
     d.add("ros.graph_gid_bytes", &old.graph_gid_bytes, &new.graph_gid_bytes);
-    compare!(d, "shared_memory", old.shared_memory, new.shared_memory, SharedMemory { root_path, max_taps; });
+    compare!(d, "shared_memory", old.shared_memory, new.shared_memory, SharedMemory {
+        root_path, max_taps, budget_bytes;
+    });
     d.add("policy_hold_s", &seconds(old.policy_hold_ms), &seconds(new.policy_hold_ms));
     compare_scheduling(d, "processes.ingress", &old.ingress_scheduling, &new.ingress_scheduling);
     compare_scheduling(d, "processes.control", &old.control_scheduling, &new.control_scheduling);

@@ -357,6 +357,8 @@ pub struct SharedMemory {
     pub root_path: Option<PathBuf>,
     /// The most local programs that tap a route at once.
     pub max_taps: usize,
+    /// The most bytes that the pools of all routes take together; `None` for a default by the machine.
+    pub budget_bytes: Option<u64>,
 }
 
 /// How the operating system schedules a process.

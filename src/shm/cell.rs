@@ -61,7 +61,7 @@ plain! {
     LanePolicy: 5,
     RouteInfo: 3 * 16 + 2 * 4 + 5,
     PatternRecord: 4 + 16,
-    IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 3 + 2,
+    IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 5,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),

@@ -5,7 +5,7 @@ use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
     ParametersReport, PatternReport, ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report,
-    RouteReport, SafetyReport, SubscriberReport, UnmatchedReport,
+    RouteReport, SafetyReport, SharedMemoryReport, SubscriberReport, UnmatchedReport,
 };
 use super::snapshot::ProcessReading;
 use crate::model::{
@@ -106,6 +106,7 @@ pub(super) fn wide_report() -> Report {
             refused: u64::MAX,
             forgotten: u64::MAX,
         }],
+        shared_memory: SharedMemoryReport { budget_bytes: 1 << 40, used_bytes: 1 << 40, peak_bytes: 1 << 40 },
         routes: vec![RouteReport {
             id: "scan".into(),
             input_topic: topic,

@@ -44,6 +44,11 @@ fn report() -> Report {
         repeated: 43,
         unmarked: 44,
         writers: 1,
+        pool_bytes: 45,
+        pool_peak_bytes: 46,
+        budget_bytes: 100,
+        budget_used_bytes: 47,
+        budget_peak_bytes: 48,
         ..Default::default()
     };
     ingress.drops.add(DropReason::TooLarge, 3);
@@ -197,6 +202,11 @@ fn the_parser_of_prometheus_reads_the_page() {
         ("route_received_bytes_total", 10_300.0),
         ("route_published_samples_total", 100.0),
         ("route_in_place_samples_total", 41.0),
+        ("route_pool_bytes", 45.0),
+        ("route_pool_peak_bytes", 46.0),
+        ("shared_memory_budget_bytes", 100.0),
+        ("shared_memory_used_bytes", 47.0),
+        ("shared_memory_peak_bytes", 48.0),
         ("route_lost_upstream_samples_total", 42.0),
         ("route_repeated_samples_total", 43.0),
         ("route_unmarked_samples_total", 44.0),

@@ -492,6 +492,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("lanes.noncritical.drop_policy", r#""drop_oldest""#, r#""drop_stale""#),
     ("lanes.noncritical.queue_samples", "5", "6"),
     ("shared_memory.root_path", "null", r#""/run/elsewhere""#),
+    ("shared_memory.budget_bytes", "268435456", "536870912"),
     ("shared_memory.max_taps", "2", "3"),
     ("processes.ingress.scheduling.nice", "0", "1"),
     ("processes.ingress.scheduling.cpus", "[]", "[1]"),

@@ -104,7 +104,7 @@ pub(super) const ROWS: &[Row] = &[
         ),
     restarts(&["topics[].max_sample_bytes"], SAMPLE, "`shared_memory.max_sample_bytes`").doc(
         "The largest serialized sample; ingress drops a larger one as `too_large`. Shared memory is \
-         reserved for samples of this size.",
+         taken for the samples that come, not for this size.",
     ),
     restarts(&["topics[].priority"], Whole(0, 99, ""), "0").doc(
         "Which routes go first: each lane sends waiting samples of a higher number first, and ingress \
@@ -245,4 +245,13 @@ pub(super) const ROWS: &[Row] = &[
         .doc("The largest sample of a topic without `max_sample_bytes` of its own."),
     restarts(&["shared_memory.max_taps"], Whole(0, 64, ""), "2")
         .doc("Local programs that may tap a route at once."),
+    restarts(
+        &["shared_memory.budget_bytes"],
+        Whole(1_048_576, 1_099_511_627_776, " bytes"),
+        "268435456, or an eighth of the machine's memory if that is less",
+    )
+    .doc(
+        "The most shared memory that the samples of all routes take together. A route takes what its samples \
+         need, and leaves the others room for theirs; ingress drops what does not fit as `over_budget`.",
+    ),
 ];

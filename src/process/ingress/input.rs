@@ -19,7 +19,7 @@ use crate::model::{
     AgeBasis, DdsType, DropReason, Durability, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
     Reliability, RouteInfo, SampleHeader, TopicName,
 };
-use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
+use crate::shm::{BoardWriter, HistogramWriter, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage};
 
 /// Interval at which a route without a publisher logs that it waits.
 const REMIND_MS: u64 = 30_000;
@@ -69,8 +69,10 @@ impl Input {
         settings: &Settings,
         index: usize,
         flag: &Arc<ArrivalFlag>,
+        budget: &Arc<PoolBudget>,
     ) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
+        let channel = RouteChannel::of(settings, index);
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
         let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
@@ -85,7 +87,7 @@ impl Input {
             readers: BTreeMap::new(),
             settled_type: None,
             source_changed: true,
-            pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
+            pool: PoolOwner::new(SamplePublisher::create_within(&role.node, &channel, budget, index)?),
             drop_log: DropLog::new(counters.get().drops),
             counters,
             info,
@@ -171,6 +173,7 @@ impl Input {
         let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
+            Err(LoanError::NoMemory(_)) => Some(DropReason::OverBudget),
             Err(_) => Some(DropReason::PoolExhausted),
         };
         let count = |counters: &mut IngressCounters| {
@@ -260,6 +263,12 @@ impl Input {
         self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();
+        let memory = self.pool.memory();
+        counters.pool_bytes = memory.used_bytes;
+        counters.pool_peak_bytes = memory.peak_bytes;
+        counters.budget_bytes = memory.budget_bytes;
+        counters.budget_used_bytes = memory.budget_used_bytes;
+        counters.budget_peak_bytes = memory.budget_peak_bytes;
         self.publishers.report_clocks(&self.id, &mut counters, now);
         self.counters.set(counters);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, "ingress", |_| false, now);

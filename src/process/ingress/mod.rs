@@ -28,7 +28,7 @@ use crate::clock;
 use crate::config::{InputTopic, Route, Settings};
 use crate::dds::{ArrivalFlag, Discovery, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::ProcessRole;
+use crate::shm::{PoolBudget, ProcessRole};
 use early_waker::EarlyWaker;
 use input::Input;
 use patterns::Patterns;
@@ -100,9 +100,10 @@ impl Ingress {
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
         memory_limit::check(settings, ProcessRole::Ingress);
         let mut inputs = Vec::with_capacity(settings.routes.len());
+        let budget = PoolBudget::of(settings);
         for route in 0..settings.routes.len() {
             let flag = ArrivalFlag::passive();
-            inputs.push((Input::open(&role, settings, route, &flag)?, flag));
+            inputs.push((Input::open(&role, settings, route, &flag, &budget)?, flag));
         }
         let mut lanes = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {

@@ -32,6 +32,7 @@ pub struct Report {
     pub(crate) lanes: Vec<LaneReport>,
     pub(crate) routes: Vec<RouteReport>,
     pub(crate) patterns: Vec<PatternReport>,
+    pub(crate) shared_memory: SharedMemoryReport,
     pub(crate) probes: ProbesReport,
     pub(crate) parameters: ParametersReport,
     /// The subscribers that control tracks.
@@ -41,6 +42,17 @@ pub struct Report {
     pub(crate) intruders_seen: u64,
     /// The network interfaces and peers that are away, or came back within the last 15 minutes.
     pub(crate) absences: Vec<AbsenceReport>,
+}
+
+/// The shared memory of the pools of all routes, as ingress last reported it.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct SharedMemoryReport {
+    /// The most that they may take.
+    pub(crate) budget_bytes: u64,
+    /// What they have.
+    pub(crate) used_bytes: u64,
+    /// The most that they have had since ingress started.
+    pub(crate) peak_bytes: u64,
 }
 
 /// The state of one process.
@@ -220,12 +232,26 @@ impl Snapshot {
                 .iter()
                 .map(|route| self.route_report(route, earlier.route(route), window_ms))
                 .collect(),
+            shared_memory: self.shared_memory_report(),
             probes: self.probes_report(earlier),
             parameters: self.parameters_report(),
             subscribers: self.subscribers.iter().map(|one| self.subscriber_report(one)).collect(),
             intruders: self.intruders.iter().map(|one| self.intruder_report(one)).collect(),
             intruders_seen: self.control.intruders_seen,
             absences: self.absences.iter().map(|one| self.absence_report(one)).collect(),
+        }
+    }
+
+    /// Each route has the same numbers, of the moment at which ingress wrote its board; the largest are the
+    /// latest, but for a pool that has just given memory back.
+    fn shared_memory_report(&self) -> SharedMemoryReport {
+        let most = |of: fn(&IngressCounters) -> u64| {
+            self.routes.iter().map(|route| of(&route.counters)).max().unwrap_or(0)
+        };
+        SharedMemoryReport {
+            budget_bytes: most(|counters| counters.budget_bytes),
+            used_bytes: most(|counters| counters.budget_used_bytes),
+            peak_bytes: most(|counters| counters.budget_peak_bytes),
         }
     }
 

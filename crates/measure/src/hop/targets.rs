@@ -276,12 +276,7 @@ pub enum Trend {
 /// A slope with its 95 % interval.
 pub fn slope(growth: Option<Growth>) -> String {
     let Some(growth) = growth else { return number(None) };
-    format!(
-        "{} ({} to {})",
-        number(Some(growth.slope)),
-        number(Some(growth.low)),
-        number(Some(growth.high))
-    )
+    format!("{} ({} to {})", number(Some(growth.slope)), number(Some(growth.low)), number(Some(growth.high)))
 }
 
 /// The trend of the memory, and its slope in KiB per hour.

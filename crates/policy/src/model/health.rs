@@ -105,6 +105,19 @@ pub struct IngressCounters {
     pub changed_account: PublisherAccount,
     /// Writers matched at present.
     pub writers: u64,
+    /// Shared memory of the pool, in bytes.
+    pub pool_bytes: u64,
+    /// The most shared memory that the pool has had since ingress started, in bytes.
+    pub pool_peak_bytes: u64,
+    /// The budget of the pools of all routes, in bytes; the same for each route, as the next two.
+    #[serde(skip)]
+    pub budget_bytes: u64,
+    /// Shared memory of the pools of all routes, in bytes.
+    #[serde(skip)]
+    pub budget_used_bytes: u64,
+    /// The most that they have had together since ingress started, in bytes.
+    #[serde(skip)]
+    pub budget_peak_bytes: u64,
     /// When the last sample was taken.
     #[serde(skip)]
     pub last_received_at: MonotonicNs,

@@ -10,6 +10,7 @@ mod lane;
 mod lane_mode;
 mod lane_queue;
 mod locality;
+mod memory_budget;
 mod probe_window;
 mod publisher_places;
 mod replay_guard;
@@ -36,6 +37,7 @@ pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, mode_and_source}
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
 pub use locality::{Locality, Location};
+pub use memory_budget::{BudgetRefusal, MemoryBudget, PoolDemand};
 pub use probe_window::{LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, ResponseOutcome, STOPPED_NS};
 pub use publisher_places::{PUBLISHER_SILENT_MS, publisher_place};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};

@@ -51,7 +51,6 @@ use crate::{
   structure::{
     cache_change::{CacheChange, ChangeKind},
     dds_cache::TopicCache,
-    duration::Duration,
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
     locator::Locator,
