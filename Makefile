@@ -49,6 +49,10 @@ test-arm64:
 	cargo clippy --locked --test arm64 -- -D warnings
 	cargo test --locked --test arm64 -- --nocapture
 
+# Builds the image of docker/Dockerfile whole, and runs it. Needs root, Docker and crates.io.
+test-image: peers
+	cargo test --locked --test root -- --nocapture docker::long::
+
 # Measures the latency and CPU time that the bridge adds. Takes an hour and saves the run in benches/runs. Shorter:
 # cargo bench -- --quick, or cargo bench -- --only isolation (benches/README.md).
 bench:
@@ -73,4 +77,4 @@ clean:
 	cargo clean
 	$(MAKE) --no-print-directory -C tests/peers clean
 
-.PHONY: build setup peers test test-long test-arm64 quick lint demo package bench fuzz soak clean
+.PHONY: build setup peers test test-long test-arm64 test-image quick lint demo package bench fuzz soak clean

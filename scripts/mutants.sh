@@ -44,7 +44,7 @@ config)
 accounting)
     # The counters of both processes, and the boards on which they are. tests/dds and tests/shm run the bridge.
     set -- --package adaptive-bridge --file src/shm/board.rs --file 'src/process/egress/{output,unsent}.rs' \
-        --file 'src/process/ingress/{input,publishers,writer_sequences}.rs' "$@" -- \
+        --file 'src/process/ingress/{input,publishers}.rs' "$@" -- \
         --lib --test shm --test dds
     ;;
 *)

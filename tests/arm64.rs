@@ -119,11 +119,7 @@ fn the_package_has_what_that_of_this_machine_has_and_its_program_runs() {
     let demo = output(on_arm64([&program]).args(["demo", "--seconds", "6", "--json"])).unwrap();
     let demo: Value = serde_json::from_str(&demo).unwrap();
     println!("demo: {}", demo["summary"]);
-    let bridge = &demo["with_bridge"];
-    assert!(bridge["publisher"]["written"].as_u64().unwrap() > 0, "{demo:#}");
-    assert_eq!(bridge["critical"]["lost"], 0, "{demo:#}");
-    assert_eq!(bridge["critical"]["received"], bridge["publisher"]["written"], "{demo:#}");
-    assert!(bridge["remote"]["received"].as_u64().unwrap() > 0, "{demo:#}");
+    support::bridge::assert_demo_lost_nothing(&demo);
 }
 
 /// Runs a test program, and returns how many of its tests passed.

@@ -195,10 +195,20 @@ pub struct BridgeRun {
     pub noncritical_forwarded: u64,
 }
 
+/// How a program ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// It leaves DDS, because its commands end.
+    Normal,
+    /// SIGKILL.
+    Killed,
+}
+
 /// A process of this binary that reads commands from its stdin and answers on its stdout.
 pub struct Program {
     child: Child,
-    commands: ChildStdin,
+    /// `None` once the program is to end.
+    commands: Option<ChildStdin>,
     answers: BufReader<ChildStdout>,
 }
 
@@ -210,7 +220,7 @@ impl Program {
         command.arg(role).arg(domain.to_string()).arg(place.to_argument()).args(more);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = spawn(&mut command)?;
-        let (Some(commands), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
+        let (commands, Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
             return Err(format!("{role} has no pipes"));
         };
         Ok(Self { child, commands, answers: BufReader::new(answers) })
@@ -229,9 +239,18 @@ impl Program {
         let _ = kill(Pid::from_raw(self.child.id().cast_signed()), signal);
     }
 
+    /// Ends the program, and waits for its end.
+    fn end(&mut self, ending: Ending) -> Result<(), String> {
+        match ending {
+            Ending::Normal => self.commands = None,
+            Ending::Killed => self.signal(Signal::SIGKILL),
+        }
+        self.child.wait().map(drop).map_err(|error| error.to_string())
+    }
+
     fn send(&mut self, command: &str) -> Result<(), String> {
-        writeln!(self.commands, "{command}")
-            .map_err(|error| format!("a program of the bench exited: {error}"))
+        let commands = self.commands.as_mut().ok_or("a program of the bench has ended")?;
+        writeln!(commands, "{command}").map_err(|error| format!("a program of the bench exited: {error}"))
     }
 
     fn answer(&mut self) -> Result<String, String> {
@@ -289,10 +308,36 @@ fn spawn(command: &mut Command) -> Result<Child, String> {
     command.spawn().map_err(|error| format!("{:?}: {error}", command.get_program()))
 }
 
+/// What the publisher and the subscriber of a bed are started with.
+struct Peers {
+    domain: u16,
+    routes: String,
+    /// The prefix of the topics that the subscriber reads.
+    prefix: &'static str,
+    /// The configuration of the bridge, from whose boards the subscriber reads.
+    config: Option<String>,
+    publisher_place: Place,
+    subscriber_place: Place,
+}
+
+impl Peers {
+    fn start(&self) -> Result<(Program, Program), String> {
+        let mut more = vec![self.routes.as_str(), self.prefix];
+        more.extend(self.config.as_deref());
+        let mut subscriber = Program::start("__subscriber", self.domain, self.subscriber_place, &more)?;
+        subscriber.numbers("ready")?;
+        let mut publisher =
+            Program::start("__publisher", self.domain, self.publisher_place, &[&self.routes])?;
+        publisher.numbers("ready")?;
+        Ok((publisher, subscriber))
+    }
+}
+
 /// A running bed: publisher, subscriber, and the relay or bridge between them.
 pub struct Bed {
     kind: Kind,
     routes: usize,
+    peers: Peers,
     publisher: Program,
     subscriber: Program,
     /// The subscriber of the noncritical lanes.
@@ -504,18 +549,29 @@ impl Bed {
             program.numbers("ready")?;
             drain = Some(program);
         }
-        let prefix = if kind == Kind::Direct { INPUT } else { OUTPUT };
-        let mut more = vec![routes.as_str(), prefix];
-        more.extend(config.as_deref());
-        let mut subscriber = Program::start("__subscriber", domain, place(stages - 1), &more)?;
-        subscriber.numbers("ready")?;
-        let mut publisher = Program::start("__publisher", domain, place(0), &[&routes])?;
-        publisher.numbers("ready")?;
+        let peers = Peers {
+            domain,
+            routes,
+            prefix: if kind == Kind::Direct { INPUT } else { OUTPUT },
+            config,
+            publisher_place: place(0),
+            subscriber_place: place(stages - 1),
+        };
+        let (publisher, subscriber) = peers.start()?;
         let routes = all.len();
         let mut bed =
-            Self { kind, routes, publisher, subscriber, _drain: drain, relay, bridge, next_number: 0 };
+            Self { kind, routes, peers, publisher, subscriber, _drain: drain, relay, bridge, next_number: 0 };
         bed.warm_up()?;
         Ok(bed)
+    }
+
+    /// Ends publisher and subscriber, and starts others.
+    pub fn restart_peers(&mut self, ending: Ending) -> Result<(), String> {
+        for peer in [&mut self.publisher, &mut self.subscriber] {
+            peer.end(ending)?;
+        }
+        (self.publisher, self.subscriber) = self.peers.start()?;
+        self.warm_up()
     }
 
     /// Starts another subscriber of the bridge's critical lane.

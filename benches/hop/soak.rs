@@ -6,16 +6,17 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge_measure::hop::{Lossy, Soak, SoakSeries};
 
-use super::beds::{Beds, Plan, add_up};
+use super::beds::{Beds, Ending, Plan, add_up};
 use super::cpu_delay::CpuDelayMonitor;
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
 use super::system::{Usage, descriptors};
 
-/// The part of each turn in which scans are sent.
-const SCANS_S: f64 = 4.0;
+/// The part of each turn in which scans are sent. With the rest of the turn a minute, the time after which
+/// publisher and subscriber are restarted.
+const SCANS_S: f64 = 30.0;
 /// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
-const CLOUDS_S: f64 = 1.0;
+const CLOUDS_S: f64 = 25.0;
 
 /// The highest number of points of a series in the summary.
 const MAX_POINTS: usize = 400;
@@ -24,9 +25,14 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
     let scheduling = options.first_scheduling();
     let mut beds = Beds::start(&[Plan::whole(scheduling, &[4096, 2 << 20])], options)?;
     let bed = &mut beds.0[0];
-    let (scans, clouds) = (Case::lasting(1_000, SCAN, SCANS_S, 0), Case::lasting(30, 1 << 20, CLOUDS_S, 1));
+    let (scans, clouds) = (Case::lasting(1_000, SCAN, SCANS_S, 0), Case::lasting(100, 1 << 20, CLOUDS_S, 1));
     let mut soak = Soak {
-        load: format!("{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn", scans.name(), clouds.name()),
+        load: format!(
+            "{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn; publisher and subscriber are restarted after \
+             each turn, one time in two by SIGKILL",
+            scans.name(),
+            clouds.name()
+        ),
         ..Soak::default()
     };
     let cpu_delays = CpuDelayMonitor::start();
@@ -70,6 +76,7 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
         add_point("shared memory".to_owned(), "KiB", shared_kib(&bed.middle_processes()));
         eprintln!("soak: {:.0} of {} s, {} missing", at_s, duration.as_secs(), soak.missing);
         turn += 1;
+        bed.restart_peers(if turn % 2 == 0 { Ending::Killed } else { Ending::Normal })?;
     }
     soak.seconds = began.elapsed().as_secs_f64();
     for series in &mut soak.series {

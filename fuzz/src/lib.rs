@@ -51,7 +51,7 @@ pub fn config(bytes: &[u8]) {
             assert!(!settings.routes.is_empty() && settings.lanes.len() >= 2);
             let outputs = settings.lanes.iter().flat_map(|lane| &lane.outputs);
             assert!(outputs.clone().all(|output| output.route < settings.routes.len()));
-            assert!(outputs.map(|output| output.topic.to_dds().len()).max() <= Some(255));
+            assert!(outputs.map(|output| format!("rt{}", output.topic).len()).max() <= Some(255));
             let shape = BridgeShape::of(&settings);
             assert_eq!(
                 (shape.lanes.len(), shape.routes.len()),

@@ -11,10 +11,10 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed, print};
-use crate::config::{self, ConfigError, Place, Problem, Route, Row, Settings};
-use crate::model::{InstanceName, LaneName, RouteId, TopicName, TypeName};
+use crate::config::{self, ConfigError, InputTopic, OutputTopic, Place, Problem, Route, Row, Settings};
+use crate::model::{InstanceName, LaneName, RouteId, TopicPattern, TypeName};
 use crate::process::{InForce, MemoryNeed, MemoryNeeds};
-use crate::shm::RouteChannel;
+use crate::shm::{RouteChannel, budget_bytes};
 use crate::telemetry::bytes_text;
 
 #[derive(Args, Debug)]
@@ -120,6 +120,11 @@ struct Summary<'a> {
     instance: &'a InstanceName,
     lanes: Vec<&'a LaneName>,
     routes: Vec<RouteSummary<'a>>,
+    /// `shared_memory.budget_bytes`, or its default on this machine.
+    budget_bytes: u64,
+    /// What all pools take at the start.
+    first_bytes: u64,
+    /// The most that they take.
     shared_memory_bytes: u64,
     memory: Vec<ProcessMemory>,
 }
@@ -148,43 +153,68 @@ impl ProcessMemory {
 #[derive(Serialize)]
 struct RouteSummary<'a> {
     id: &'a RouteId,
-    input_topic: &'a TopicName,
+    #[serde(serialize_with = "as_text")]
+    input_topic: &'a InputTopic,
+    /// Of a pattern: the topics that are left out, and the number of its places.
+    exclude: Option<&'a [TopicPattern]>,
+    max_routes: Option<usize>,
     message_type: Option<&'a TypeName>,
     outputs: Vec<OutputSummary<'a>>,
     max_sample_bytes: usize,
     slots: usize,
+    /// What the pool takes at the start.
+    first_bytes: u64,
+    /// What it takes if each slot has the largest sample, within the budget.
     shared_memory_bytes: u64,
 }
 
 #[derive(Serialize)]
 struct OutputSummary<'a> {
     lane: &'a LaneName,
-    topic: &'a TopicName,
+    #[serde(serialize_with = "as_text")]
+    topic: &'a OutputTopic,
+}
+
+fn as_text<S: serde::Serializer>(shown: &impl fmt::Display, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(shown)
 }
 
 impl<'a> Summary<'a> {
     fn of(settings: &'a Settings) -> Self {
+        let budget_bytes = budget_bytes(settings);
         let summary = |(index, route): (usize, &'a Route)| {
             let pool = RouteChannel::of(settings, index).pool_size();
             let outputs = settings.lanes.iter().filter_map(|lane| {
                 let output = lane.outputs.iter().find(|output| output.route == index)?;
                 Some(OutputSummary { lane: &lane.name, topic: &output.topic })
             });
+            let pattern = settings.patterns.iter().find(|pattern| pattern.entry == route.entry);
+            let places = pattern.map_or(1, |pattern| pattern.max_routes);
             RouteSummary {
-                id: &route.id,
+                id: &route.entry,
                 input_topic: &route.input_topic,
+                exclude: pattern.map(|pattern| &pattern.exclude[..]),
+                max_routes: pattern.map(|pattern| pattern.max_routes),
                 message_type: route.message_type.as_ref(),
                 outputs: outputs.collect(),
                 max_sample_bytes: route.max_sample_bytes,
                 slots: pool.slots,
-                shared_memory_bytes: pool.bytes,
+                first_bytes: places as u64 * pool.first_bytes,
+                shared_memory_bytes: (places as u64 * pool.bytes)
+                    .min(budget_bytes.max(places as u64 * pool.first_bytes)),
             }
         };
-        let routes: Vec<_> = settings.routes.iter().enumerate().map(summary).collect();
+        // The places of a pattern are equal: one entry of the file has one summary.
+        let is_first =
+            |index: usize| index == 0 || settings.routes[index - 1].entry != settings.routes[index].entry;
+        let routes = settings.routes.iter().enumerate().filter(|(index, _)| is_first(*index));
+        let routes: Vec<_> = routes.map(summary).collect();
         Self {
             instance: &settings.instance,
             lanes: settings.lanes.iter().map(|lane| &lane.name).collect(),
-            shared_memory_bytes: routes.iter().map(|route| route.shared_memory_bytes).sum(),
+            budget_bytes,
+            first_bytes: routes.iter().map(|route| route.first_bytes).sum(),
+            shared_memory_bytes: budget_bytes.min(routes.iter().map(|route| route.shared_memory_bytes).sum()),
             routes,
             memory: ProcessMemory::all(settings),
         }
@@ -201,15 +231,37 @@ impl fmt::Display for Summary<'_> {
             for output in &route.outputs {
                 writeln!(f, "  {} -> {}", output.lane, output.topic)?;
             }
+            let mut places = String::new();
+            if let Some(max_routes) = route.max_routes {
+                let excluded: Vec<String> =
+                    route.exclude.unwrap_or_default().iter().map(ToString::to_string).collect();
+                let excluded = if excluded.is_empty() { "none".to_owned() } else { excluded.join(", ") };
+                writeln!(f, "  a pattern: at most {max_routes} topics at once; excluded: {excluded}")?;
+                places = format!("{max_routes} times ");
+            }
             writeln!(
                 f,
-                "  shared memory: {} slots for samples of up to {}: {}",
+                "  shared memory: {places}{} slots for samples of up to {}: {} at the start, at most {}",
                 route.slots,
                 bytes_text(route.max_sample_bytes as f64),
+                bytes_text(route.first_bytes as f64),
                 bytes_text(route.shared_memory_bytes as f64)
             )?;
         }
-        writeln!(f, "\ntotal shared memory: {}", bytes_text(self.shared_memory_bytes as f64))?;
+        writeln!(
+            f,
+            "\ntotal shared memory: {} at the start, at most {} of a budget of {}",
+            bytes_text(self.first_bytes as f64),
+            bytes_text(self.shared_memory_bytes as f64),
+            bytes_text(self.budget_bytes as f64)
+        )?;
+        if self.first_bytes > self.budget_bytes {
+            writeln!(
+                f,
+                "ingress cannot start: raise shared_memory.budget_bytes, or lower max_sample_bytes of routes with \
+                 small samples, queue_depth or max_taps"
+            )?;
+        }
         writeln!(f, "\nmost memory of each process, the limit that `adaptive-bridge units` sets:")?;
         for memory in &self.memory {
             let parts = memory.parts.parts();

@@ -13,10 +13,13 @@ use clap::Args;
 use super::{ConfigArguments, failed, output_ended, read_bridge, running_bridge};
 use crate::clock;
 use crate::config::Settings;
-use crate::model::{Encapsulation, MonotonicNs};
+use crate::model::{Encapsulation, MonotonicNs, RouteInfo};
 use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::process::Stop;
-use crate::shm::{RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError, root_of};
+use crate::shm::{
+    Boards, BridgeShape, RouteChannel, SampleSubscriber, ShmNode, ShmSample, SubscriberRole, TakeError,
+    root_of,
+};
 use crate::telemetry::Intervals;
 
 /// The period of the lines of `--hz`.
@@ -49,29 +52,39 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     let settings = arguments.config.in_force()?;
-    let Some(route) = find_route(&settings, &arguments.topic) else {
+    let root = root_of(&settings);
+    let boards = Boards::find(&root, &settings.instance, &BridgeShape::of(&settings));
+    // A route without a pattern needs no board to be found.
+    let boards = boards.ok().flatten();
+    let info = |route: usize| boards.as_ref().and_then(|boards| boards.route_info(route)).unwrap_or_default();
+    let Some(route) = find_route(&settings, &arguments.topic, info) else {
         return Err(failed(&unknown_topic(&settings, &arguments.topic)));
     };
     // Checked first, because opening a node would create the shared memory of a bridge that does not run.
-    let root = root_of(&settings);
     running_bridge(&root, &settings)?;
+    let bound = info(route);
     let stop = Stop::on_signals().map_err(|error| failed(&error))?;
     let opened = ShmNode::open(&root, &settings.instance, "tap").and_then(|node| {
         let channel = RouteChannel::of(&settings, route);
         SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, arguments.retained)
     });
     let subscriber = opened.map_err(|error| failed(&error))?;
-    let bridge_runs = || matches!(read_bridge(&root, &settings), Ok(Some(_)));
-    match Tap::new(arguments).follow(&subscriber, &stop, bridge_runs) {
+    let has_same_topic = || info(route).bound_count == bound.bound_count;
+    let goes_on = || has_same_topic() && matches!(read_bridge(&root, &settings), Ok(Some(_)));
+    match Tap::new(arguments, bound.bound_after).follow(&subscriber, &stop, goes_on) {
         Ok(true) => Ok(ExitCode::SUCCESS),
+        Ok(false) if !has_same_topic() => Err(failed(&"the route has got another topic")),
         Ok(false) => Err(failed(&"the bridge has ended")),
         Err(error) => Err(output_ended(&error)),
     }
 }
 
-fn find_route(settings: &Settings, topic: &str) -> Option<usize> {
+fn find_route(settings: &Settings, topic: &str, info: impl Fn(usize) -> RouteInfo) -> Option<usize> {
     let absolute = format!("/{}", topic.trim_start_matches('/'));
-    let by_topic = settings.routes.iter().position(|route| route.input_topic.as_str() == absolute);
+    let mut routes = settings.routes.iter().enumerate();
+    let by_topic = routes.position(|(index, route)| {
+        route.input_topic.resolve(&info(index)).is_some_and(|topic| topic.as_str() == absolute)
+    });
     by_topic.or_else(|| settings.routes.iter().position(|route| route.id.as_str() == topic))
 }
 
@@ -92,11 +105,13 @@ struct Tap {
     /// Samples to show until the end; `None` without a limit.
     left: Option<u64>,
     tracker: SequenceTracker,
+    /// The last sequence number before the route got its topic.
+    bound_after: u64,
     output: BufWriter<StdoutLock<'static>>,
 }
 
 impl Tap {
-    fn new(arguments: &Arguments) -> Self {
+    fn new(arguments: &Arguments, bound_after: u64) -> Self {
         let format = if arguments.raw {
             Format::Raw
         } else if arguments.hz {
@@ -109,17 +124,18 @@ impl Tap {
             format,
             left: arguments.count,
             tracker: SequenceTracker::default(),
+            bound_after,
             output: BufWriter::new(io::stdout().lock()),
         }
     }
 
-    /// Shows samples until a stop is requested, the last wanted sample is shown, or the bridge ends: then
-    /// returns `false`.
+    /// Shows samples until a stop is requested, the last wanted sample is shown, or the bridge ends or gives
+    /// the route another topic: then returns `false`.
     fn follow(
         &mut self,
         subscriber: &SampleSubscriber,
         stop: &Stop,
-        bridge_runs: impl Fn() -> bool,
+        goes_on: impl Fn() -> bool,
     ) -> io::Result<bool> {
         let mut pause_us = USUAL_PAUSE_US;
         let mut check_at = clock::monotonic().plus_ms(BRIDGE_CHECK_MS);
@@ -148,7 +164,7 @@ impl Tap {
             self.report(now)?;
             self.output.flush()?;
             if now >= check_at {
-                if !bridge_runs() {
+                if !goes_on() {
                     return Ok(false);
                 }
                 check_at = now.plus_ms(BRIDGE_CHECK_MS);
@@ -162,6 +178,9 @@ impl Tap {
 
     fn show(&mut self, sample: &ShmSample) -> io::Result<()> {
         let header = sample.header();
+        if header.sequence <= self.bound_after {
+            return Ok(());
+        }
         self.left = self.left.map(|left| left.saturating_sub(1));
         let missed = match self.tracker.record(header.sequence) {
             SequenceOutcome::AfterGap(missed) => missed,

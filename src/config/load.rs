@@ -193,8 +193,9 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let shared_memory = SharedMemory {
         root_path: memory.get("root_path").parsed("an absolute path", control::absolute_path),
         max_taps: memory.get("max_taps").count_or_default(),
+        budget_bytes: memory.get("budget_bytes").count(),
     };
-    let (routes, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
+    let (routes, patterns, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
     let processes = root.section("processes");
     let process = |name: &str, class| {
@@ -220,6 +221,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         input,
         graph_gid_bytes: gid_bytes.map_or(environment.graph_gid_bytes, |bytes| bytes as usize),
         routes,
+        patterns,
         shared_memory,
         policy_hold_ms: (policy_hold_s * 1_000.0).round() as u64,
         ingress_scheduling: process("ingress", Some(TrafficClass::Critical)),

@@ -34,9 +34,9 @@ pub use parameters::Parameters;
 pub use problem::{ConfigError, Place, Problem};
 pub use reload::{Change, Reload};
 pub use settings::{
-    Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, Forwarding, InputQos, Lane,
-    LaneRates, MetricsListener, NetworkSelector, Output, Probes, RatePolicy, Route, Safety, SafetyRules,
-    Scheduling, SchedulingPolicy, SecretSource, Security, SetParameters, Settings, SharedMemory, TrustMode,
-    Verbosity,
+    Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, Forwarding, InputQos, InputTopic,
+    Lane, LaneRates, MetricsListener, NetworkSelector, Output, OutputTopic, Probes, RatePolicy, Route,
+    RoutePattern, Safety, SafetyRules, Scheduling, SchedulingPolicy, SecretSource, Security, SetParameters,
+    Settings, SharedMemory, TrustMode, Verbosity,
 };
 pub use shown::Value;

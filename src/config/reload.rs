@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::keys::joined;
 use super::settings::{
     Classifier, DdsNetwork, Diagnostics, Forwarding, InputQos, Lane, LaneRates, Output, Probes, RatePolicy,
-    Route, Safety, Scheduling, Security, Settings, SharedMemory,
+    Route, RoutePattern, Safety, Scheduling, Security, Settings, SharedMemory,
 };
 use super::shown::{Shown, Value};
 use crate::model::{ClassifierThresholds, LaneName, QosProfile, RouteId, SafetyRules, fnv1a};
@@ -67,6 +67,7 @@ impl Settings {
             node_name: old.node_name,
             graph_gid_bytes: old.graph_gid_bytes,
             routes: old.routes,
+            patterns: old.patterns,
             lanes: self.lanes.iter().map(|lane| reload_lane(lane, &new)).collect(),
             shared_memory: old.shared_memory,
             ingress_scheduling: old.ingress_scheduling,
@@ -158,15 +159,17 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
     }
     compare!(d, "", old, new, Settings {
         instance;
-        input, node_namespace, node_name, graph_gid_bytes, routes, lanes, shared_memory, policy_hold_ms,
-        ingress_scheduling, control_scheduling, classifier, probes, safety, security, diagnostics, overrides,
-        subscribers, set_parameters
+        input, node_namespace, node_name, graph_gid_bytes, routes, patterns, lanes, shared_memory,
+        policy_hold_ms, ingress_scheduling, control_scheduling, classifier, probes, safety, security,
+        diagnostics, overrides, subscribers, set_parameters
     });
     compare_network(d, "ros", &old.input, &new.input);
     d.add("ros.namespace", &old.node_namespace, &new.node_namespace);
     d.add("ros.node_name", &old.node_name, &new.node_name);
     d.add("ros.graph_gid_bytes", &old.graph_gid_bytes, &new.graph_gid_bytes);
-    compare!(d, "shared_memory", old.shared_memory, new.shared_memory, SharedMemory { root_path, max_taps; });
+    compare!(d, "shared_memory", old.shared_memory, new.shared_memory, SharedMemory {
+        root_path, max_taps, budget_bytes;
+    });
     d.add("policy_hold_s", &seconds(old.policy_hold_ms), &seconds(new.policy_hold_ms));
     compare_scheduling(d, "processes.ingress", &old.ingress_scheduling, &new.ingress_scheduling);
     compare_scheduling(d, "processes.control", &old.control_scheduling, &new.control_scheduling);
@@ -192,25 +195,41 @@ fn compare_scheduling(d: &mut Differences, of: &str, old: &Scheduling, new: &Sch
 }
 
 fn routes(d: &mut Differences, old: &Settings, new: &Settings) {
-    let ids = |of: &Settings| -> Vec<_> { of.routes.iter().map(|route| route.id.to_string()).collect() };
-    d.add("topics", &ids(old), &ids(new));
+    // The places of a pattern are equal, so the first one stands for all.
+    let entries = |of: &Settings| -> Vec<_> {
+        let mut entries: Vec<_> = of.routes.iter().map(|route| route.entry.to_string()).collect();
+        entries.dedup();
+        entries
+    };
+    d.add("topics", &entries(old), &entries(new));
     for (index, route) in old.routes.iter().enumerate() {
-        let Some(other_index) = new.routes.iter().position(|other| other.id == route.id) else { continue };
+        if index > 0 && old.routes[index - 1].entry == route.entry {
+            continue;
+        }
+        let Some(other_index) = new.routes.iter().position(|other| other.entry == route.entry) else {
+            continue;
+        };
+        let pattern_of = |of: &Settings| of.patterns.iter().find(|one| one.entry == route.entry).cloned();
+        if let (Some(pattern), Some(other)) = (pattern_of(old), pattern_of(new)) {
+            let RoutePattern { entry: _, input_topic: _, exclude, first_route: _, max_routes } = &pattern;
+            d.add(&format!("topics[{}].exclude", route.entry), exclude, &other.exclude);
+            d.add(&format!("topics[{}].max_routes", route.entry), max_routes, &other.max_routes);
+        }
         compare_route(d, route, &new.routes[other_index]);
         for lane in &old.lanes {
             if let Some(other) = new.lane(&lane.name) {
                 let [output, other] = [(lane, index), (other, other_index)]
                     .map(|(lane, route)| lane.outputs.iter().find(|output| output.route == route));
-                compare_output(d, &route.id, &lane.name, output, other);
+                compare_output(d, &route.entry, &lane.name, output, other);
             }
         }
     }
 }
 
 fn compare_route(d: &mut Differences, old: &Route, new: &Route) {
-    let of = &format!("topics[{}]", old.id);
+    let of = &format!("topics[{}]", old.entry);
     compare!(d, of, old, new, Route {
-        input_topic, message_type, max_sample_bytes, priority, retained_samples; id, input_qos
+        input_topic, message_type, max_sample_bytes, priority, retained_samples; id, entry, input_qos
     });
     let of = &format!("{of}.qos_overrides.input");
     compare!(d, of, old.input_qos, new.input_qos, InputQos {

@@ -9,11 +9,15 @@ use super::field::Field;
 use super::lanes::{self, LaneDraft};
 use super::problem::Place;
 use super::qos::{PartialQos, Profiles};
-use super::settings::{DdsNetwork, Lane, Output, Route};
-use crate::model::{Durability, QosProfile, RouteId, TopicName, TypeName};
+use super::settings::{DdsNetwork, InputTopic, Lane, Output, OutputTopic, Route, RoutePattern};
+use crate::model::{Durability, QosProfile, RouteId, TopicName, TopicPattern, TopicPrefix, TypeName};
 
-/// The most routes. Each has a pool in shared memory, a reader, and a writer on each of its lanes.
+/// The most routes, with the places of patterns. Each has a pool in shared memory, a reader, and a writer on
+/// each of its lanes.
 const MAX_ROUTES: usize = 1_024;
+
+/// The most patterns in `exclude`. Each is compared with each topic that discovery reports.
+const MAX_EXCLUDED: usize = 64;
 
 /// Samples retained for a restarted lane when no output is configured TRANSIENT_LOCAL.
 const RETAINED_SAMPLES: usize = 8;
@@ -33,7 +37,7 @@ pub(super) fn read(
     input: &DdsNetwork,
     drafts: Vec<LaneDraft>,
     max_sample_bytes: usize,
-) -> (Vec<Route>, Vec<Lane>) {
+) -> (Vec<Route>, Vec<RoutePattern>, Vec<Lane>) {
     let topics = root.get("topics");
     let mut items = topics.items().unwrap_or_default();
     if items.is_empty() && !topics.was_reported() {
@@ -49,36 +53,47 @@ pub(super) fn read(
     let read: Vec<RouteDraft<'_>> = items.iter().map(|item| reader.read(item)).collect();
     reader.check_topic_qos(&read);
     check_topics(&read, input, &drafts);
+    check_places(&topics, &read);
 
     // A route without an id or topic can be left out, because the settings are discarded if there are
     // problems.
-    let mut routes = Vec::new();
+    let (mut routes, mut patterns) = (Vec::new(), Vec::new());
     let mut lanes: Vec<Lane> = drafts.into_iter().map(|draft| draft.lane).collect();
     for draft in read {
         let Some(route) = draft.route else { continue };
-        for OutputDraft { lane, topic, qos, latched_qos, .. } in draft.outputs {
-            lanes[lane].outputs.push(Output { route: routes.len(), topic, qos, latched_qos });
+        if let Some(pattern) = draft.pattern {
+            patterns.push(RoutePattern { first_route: routes.len(), ..pattern });
         }
-        routes.push(route);
+        for id in draft.route_ids {
+            for OutputDraft { lane, topic, qos, latched_qos, .. } in &draft.outputs {
+                let (topic, qos, latched_qos) = (topic.clone(), *qos, *latched_qos);
+                lanes[*lane].outputs.push(Output { route: routes.len(), topic, qos, latched_qos });
+            }
+            routes.push(Route { id, ..route.clone() });
+        }
     }
     for lane in &mut lanes {
         lane.outputs.sort_by_key(|output| Reverse(routes[output.route].priority));
     }
-    (routes, lanes)
+    (routes, patterns, lanes)
 }
 
 /// One entry of `topics`, with the parts that are valid.
 struct RouteDraft<'a> {
     field: Field<'a>,
     id: Option<RouteId>,
-    input: Option<(TopicName, Field<'a>)>,
+    input: Option<(InputTopic, Field<'a>)>,
+    /// Its first route, with the id of the entry.
     route: Option<Route>,
+    /// The ids of its routes: its own, or those of the pattern's places.
+    route_ids: Vec<RouteId>,
+    pattern: Option<RoutePattern>,
     outputs: Vec<OutputDraft<'a>>,
 }
 
 struct OutputDraft<'a> {
     lane: usize,
-    topic: TopicName,
+    topic: OutputTopic,
     /// The field of the topic in the file, whose value may be missing.
     field: Field<'a>,
     qos: QosProfile,
@@ -97,12 +112,27 @@ impl<'f> RouteReader<'_, 'f> {
         field.entries();
         if field.was_reported() {
             // It is no mapping, so its missing keys are not reported.
-            let outputs = Vec::new();
-            return RouteDraft { field: field.clone(), id: None, input: None, route: None, outputs };
+            return RouteDraft {
+                field: field.clone(),
+                id: None,
+                input: None,
+                route: None,
+                route_ids: Vec::new(),
+                pattern: None,
+                outputs: Vec::new(),
+            };
         }
         let id = required(&field.get("id"), RouteId::ALLOWED, |text| RouteId::try_from(text).ok());
         let input = field.get("input_topic");
-        let input_topic = required(&input, TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+        let input_topic = input_topic(&input);
+        let (exclude, max_routes) = (exclude(field), field.get("max_routes"));
+        let places: usize = max_routes.count_or_default();
+        let is_pattern = input_topic.as_ref().is_some_and(InputTopic::is_place);
+        if input_topic.is_some() && !is_pattern {
+            for only in [&max_routes, &field.get("exclude")].into_iter().filter(|only| only.is_given()) {
+                only.report_key("must be given only with a pattern as input_topic, such as /camera/**");
+            }
+        }
         let message_type =
             field.get("message_type").parsed(TypeName::ALLOWED, |text| TypeName::try_from(text).ok());
         let max_sample_bytes = field.get("max_sample_bytes").count();
@@ -117,6 +147,7 @@ impl<'f> RouteReader<'_, 'f> {
         let route = match (&id, &input_topic) {
             (Some(id), Some(input_topic)) => Some(Route {
                 id: id.clone(),
+                entry: id.clone(),
                 input_topic: input_topic.clone(),
                 message_type,
                 input_qos,
@@ -126,8 +157,22 @@ impl<'f> RouteReader<'_, 'f> {
             }),
             _ => None,
         };
+        let pattern = match (&id, &input_topic) {
+            (Some(id), Some(InputTopic::Pattern(pattern))) => Some(RoutePattern {
+                entry: id.clone(),
+                input_topic: pattern.clone(),
+                exclude,
+                first_route: 0,
+                max_routes: places,
+            }),
+            _ => None,
+        };
+        let route_ids = match &id {
+            Some(id) if is_pattern => place_ids(id, places, field),
+            _ => id.clone().into_iter().collect(),
+        };
         let input = input_topic.map(|topic| (topic, input));
-        RouteDraft { field: field.clone(), id, input, route, outputs }
+        RouteDraft { field: field.clone(), id, input, route, route_ids, pattern, outputs }
     }
 
     /// One output for each lane that serves the route.
@@ -135,7 +180,7 @@ impl<'f> RouteReader<'_, 'f> {
         &self,
         field: &Field<'f>,
         id: Option<&RouteId>,
-        input: Option<&TopicName>,
+        input: Option<&InputTopic>,
         overrides: &Field<'f>,
     ) -> Vec<OutputDraft<'f>> {
         let section = field.section("outputs");
@@ -155,19 +200,34 @@ impl<'f> RouteReader<'_, 'f> {
                 }
             }
             // Values of lanes that do not serve the route are checked too.
-            let topic = given.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+            let topic = match input {
+                Some(InputTopic::Pattern(_)) => {
+                    given.parsed(TopicPrefix::ALLOWED, TopicPrefix::parse).map(OutputTopic::Prefix)
+                }
+                _ => {
+                    let topic = given.parsed(TopicName::ALLOWED, |text| TopicName::try_from(text).ok());
+                    topic.map(OutputTopic::Topic)
+                }
+            };
             let override_qos = PartialQos::read(&overrides.get(name));
             let profile = topic_qos.as_ref().and_then(|section| self.profiles.named(&section.get(name)));
             if !serving[index] {
                 continue;
             }
             let default = || {
-                let default = format!("/adaptive_bridge/{name}{}", input.filter(|_| !given.is_given())?);
+                let input = match input.filter(|_| !given.is_given())? {
+                    InputTopic::Topic(topic) => topic,
+                    InputTopic::Pattern(_) => {
+                        return TopicPrefix::parse(&format!("/adaptive_bridge/{name}/**"))
+                            .map(OutputTopic::Prefix);
+                    }
+                };
+                let default = format!("/adaptive_bridge/{name}{input}");
                 let topic = TopicName::try_from(default.as_str()).ok();
                 if topic.is_none() {
                     given.report_value(&default, format!("must be {}", TopicName::ALLOWED));
                 }
-                topic
+                topic.map(OutputTopic::Topic)
             };
             let Some(topic) = topic.or_else(default) else { continue };
             let given_qos = override_qos.over(profile.unwrap_or(*lane_qos));
@@ -248,11 +308,58 @@ fn required<T>(field: &Field<'_>, allowed: &str, parse: impl FnOnce(&str) -> Opt
     field.parsed(allowed, parse)
 }
 
+/// A topic, or a pattern if the text has a wild card.
+fn input_topic(field: &Field<'_>) -> Option<InputTopic> {
+    if field.text().is_some_and(|text| text.contains('*')) {
+        let pattern = field.parsed(TopicPattern::ALLOWED, |text| TopicPattern::try_from(text).ok());
+        return pattern.map(InputTopic::Pattern);
+    }
+    required(field, TopicName::ALLOWED, |text| TopicName::try_from(text).ok()).map(InputTopic::Topic)
+}
+
+/// The patterns in `exclude`.
+fn exclude(field: &Field<'_>) -> Vec<TopicPattern> {
+    let mut items = field.get("exclude").items().unwrap_or_default();
+    if items.len() > MAX_EXCLUDED {
+        field.get("exclude").report_key(&format!("must be at most {MAX_EXCLUDED} patterns"));
+        items.truncate(MAX_EXCLUDED);
+    }
+    let pattern =
+        |item: &Field<'_>| item.parsed(TopicPattern::ALLOWED, |text| TopicPattern::try_from(text).ok());
+    items.iter().filter_map(pattern).collect()
+}
+
+/// The ids of a pattern's places: `camera.1`, `camera.2`, …
+fn place_ids(id: &RouteId, places: usize, field: &Field<'_>) -> Vec<RouteId> {
+    let ids: Vec<_> =
+        (1..=places).filter_map(|place| RouteId::try_from(format!("{id}.{place}").as_str()).ok()).collect();
+    if ids.len() < places {
+        field.get("id").report::<()>("must be short enough for .1, .2, … after it: 61 characters at most");
+    }
+    ids
+}
+
+/// Checks the number of routes, and that no other entry has the id of a place.
+fn check_places(topics: &Field<'_>, routes: &[RouteDraft<'_>]) {
+    if routes.iter().map(|route| route.route_ids.len()).sum::<usize>() > MAX_ROUTES {
+        topics.report_key(&format!("must be at most {MAX_ROUTES} topics, with max_routes of each pattern"));
+    }
+    let patterns = routes.iter().filter(|route| route.pattern.is_some());
+    let places: HashMap<_, _> =
+        patterns.flat_map(|route| route.route_ids.iter().map(move |id| (id, &route.field))).collect();
+    for route in routes {
+        if let Some(first) = route.id.as_ref().and_then(|id| places.get(id)) {
+            let allowed = format!("must not be the id of a route of the pattern {}", at(&first.get("id")));
+            route.field.get("id").report::<()>(&allowed);
+        }
+    }
+}
+
 /// Checks that ids are unique, and that each topic of a domain is only one input or one output. A topic that
 /// is both would be a loop.
 fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraft]) {
     let mut ids = HashMap::new();
-    let mut inputs = HashMap::new();
+    let mut inputs: HashMap<String, &Field<'_>> = HashMap::new();
     for route in routes {
         if let Some(id) = &route.id
             && let Some(first) = first_of(&mut ids, id.as_str(), &route.field)
@@ -261,23 +368,29 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
             route.field.get("id").report::<()>(&allowed);
         }
         if let Some((topic, field)) = &route.input
-            && let Some(first) = first_of(&mut inputs, topic.as_str(), field)
+            && let Some(first) = first_of(&mut inputs, topic.to_string(), field)
         {
             field.report::<()>(&format!("must be listed once; {} is the same topic", at(first)));
         }
     }
     let mut outputs = HashMap::new();
-    for output in routes.iter().flat_map(|route| &route.outputs) {
+    for (index, output) in routes.iter().enumerate().flat_map(|(index, route)| {
+        // Two patterns may have the same prefix: a topic has one route, and so an output of its own.
+        let index = route.pattern.as_ref().map(|_| index);
+        route.outputs.iter().map(move |output| (index, output))
+    }) {
         let domain_id = lanes[output.lane].lane.network.domain_id;
-        let topic = output.topic.as_str();
-        let loops = if domain_id == input.domain_id { inputs.get(topic) } else { None };
-        if let Some(field) = loops {
+        let topic = output.topic.to_string();
+        let loops = if domain_id == input.domain_id { inputs.get(&topic) } else { None };
+        if let Some(field) = loops
+            && index.is_none()
+        {
             let allowed = format!("must not be an input topic in the same domain ({}): a loop", at(field));
-            output.field.report_value(topic, allowed);
+            output.field.report_value(&topic, allowed);
         }
-        if let Some(first) = first_of(&mut outputs, (domain_id, topic), &output.field) {
+        if let Some(first) = first_of(&mut outputs, (index, domain_id, topic.clone()), &output.field) {
             let allowed = format!("must not be another output in the same domain ({})", at(first));
-            output.field.report_value(topic, allowed);
+            output.field.report_value(&topic, allowed);
         }
     }
 }

@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 
 pub use crate::model::{ClassifierThresholds, DropPolicy, LaneRates, RatePolicy, SafetyRules};
 use crate::model::{
-    Durability, History, InstanceName, LaneName, NodeName, QosProfile, Reliability, RouteId, SubscriberState,
-    TopicName, TrafficClass, TypeName,
+    Durability, History, InstanceName, LaneName, NodeName, QosProfile, Reliability, RouteId, RouteInfo,
+    SubscriberState, TopicName, TopicPattern, TopicPrefix, TrafficClass, TypeName,
 };
 
 /// The whole configuration.
@@ -31,6 +31,8 @@ pub struct Settings {
     pub graph_gid_bytes: usize,
     /// The routes, in the order of the file.
     pub routes: Vec<Route>,
+    /// The patterns among the entries of `topics`, in the order of the file.
+    pub patterns: Vec<RoutePattern>,
     /// The lanes: `critical`, `noncritical`, then the user's, in the order of the file.
     pub lanes: Vec<Lane>,
     /// Shared memory.
@@ -135,8 +137,11 @@ impl NetworkSelector {
 pub struct Route {
     /// The user's name for it.
     pub id: RouteId,
+    /// The id of its entry in `topics`: another one than `id` if the entry is a pattern, which has several
+    /// routes.
+    pub entry: RouteId,
     /// The topic that ingress subscribes to.
-    pub input_topic: TopicName,
+    pub input_topic: InputTopic,
     /// The message type; `None` to discover it.
     pub message_type: Option<TypeName>,
     /// The QoS that ingress requests from the publisher.
@@ -148,6 +153,94 @@ pub struct Route {
     /// Samples kept in shared memory for a restarted lane: those that it catches up with, and those that a
     /// `TRANSIENT_LOCAL` lane offers to late joiners.
     pub retained_samples: usize,
+}
+
+/// What determines the input topic of a route.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum InputTopic {
+    /// It is this topic.
+    Topic(TopicName),
+    /// It is a topic that matches, which ingress chooses when it discovers one: the route is a place.
+    Pattern(TopicPattern),
+}
+
+impl InputTopic {
+    /// The topic of a route with this record of ingress; `None` while it has none.
+    pub fn resolve(&self, info: &RouteInfo) -> Option<TopicName> {
+        match self {
+            Self::Topic(topic) => Some(topic.clone()),
+            Self::Pattern(_) => info.topic(),
+        }
+    }
+
+    /// Whether the route is a place of a pattern.
+    pub const fn is_place(&self) -> bool {
+        matches!(self, Self::Pattern(_))
+    }
+}
+
+impl fmt::Display for InputTopic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Topic(topic) => topic.fmt(f),
+            Self::Pattern(pattern) => pattern.fmt(f),
+        }
+    }
+}
+
+/// What determines the topic of an output.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum OutputTopic {
+    /// It is this topic.
+    Topic(TopicName),
+    /// It is the input topic with this before it: the output of a place.
+    Prefix(TopicPrefix),
+}
+
+impl OutputTopic {
+    /// The topic of an output whose route has this input topic; `None` while that has none.
+    pub fn resolve(&self, input: Option<&TopicName>) -> Option<TopicName> {
+        match self {
+            Self::Topic(topic) => Some(topic.clone()),
+            Self::Prefix(prefix) => prefix.output_of(input?),
+        }
+    }
+}
+
+impl fmt::Display for OutputTopic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Topic(topic) => topic.fmt(f),
+            Self::Prefix(prefix) => prefix.fmt(f),
+        }
+    }
+}
+
+/// An entry of `topics` whose input topic is a pattern. Its places are consecutive routes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RoutePattern {
+    /// The id of the entry.
+    pub entry: RouteId,
+    /// The pattern.
+    pub input_topic: TopicPattern,
+    /// Topics that are left out although they match.
+    pub exclude: Vec<TopicPattern>,
+    /// The first of its places, as an index into [`Settings::routes`].
+    pub first_route: usize,
+    /// The number of its places.
+    pub max_routes: usize,
+}
+
+impl RoutePattern {
+    /// Whether the pattern is for a topic: it matches and is not excluded.
+    pub fn is_for(&self, topic: &str) -> bool {
+        self.input_topic.matches(topic) && !self.exclude.iter().any(|excluded| excluded.matches(topic))
+    }
+
+    /// Its places, as indices into [`Settings::routes`].
+    pub fn places(&self) -> std::ops::Range<usize> {
+        self.first_route..self.first_route + self.max_routes
+    }
 }
 
 /// The QoS that the ingress reader requests. A policy that is `None` follows the publisher's offer.
@@ -249,7 +342,7 @@ pub struct Output {
     /// Index into [`Settings::routes`].
     pub route: usize,
     /// The topic that the lane publishes to.
-    pub topic: TopicName,
+    pub topic: OutputTopic,
     /// The QoS of its writer.
     pub qos: QosProfile,
     /// The QoS of its writer once the publishers offer TRANSIENT_LOCAL; `None` if the configuration gives the
@@ -264,6 +357,8 @@ pub struct SharedMemory {
     pub root_path: Option<PathBuf>,
     /// The most local programs that tap a route at once.
     pub max_taps: usize,
+    /// The most bytes that the pools of all routes take together; `None` for a default by the machine.
+    pub budget_bytes: Option<u64>,
 }
 
 /// How the operating system schedules a process.

@@ -5,8 +5,8 @@ use std::net::Ipv4Addr;
 use std::path::PathBuf;
 
 use super::choices::Choice;
-use super::settings::{MetricsListener, NetworkSelector, SecretSource};
-use crate::model::{History, InstanceName, LaneName, NodeName, TopicName, TypeName};
+use super::settings::{InputTopic, MetricsListener, NetworkSelector, OutputTopic, SecretSource};
+use crate::model::{History, InstanceName, LaneName, NodeName, TopicName, TopicPattern, TypeName};
 
 /// A value as in the file. It is displayed as text for operators.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,6 +68,7 @@ macro_rules! shown_as_displayed {
 
 shown_as!(bool: Flag, u8: Whole, u16: Whole, u32: Whole, u64: Whole, f64: Decimal);
 shown_as_displayed!(String, Ipv4Addr, InstanceName, LaneName, NodeName, TopicName, TypeName, NetworkSelector);
+shown_as_displayed!(InputTopic, OutputTopic, TopicPattern);
 
 impl Shown for usize {
     fn value(&self) -> Value {

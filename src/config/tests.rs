@@ -50,9 +50,9 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
     let [critical, noncritical] = settings.lanes.as_slice() else { panic!("{:?}", settings.lanes) };
     assert_eq!((critical.name.as_str(), critical.queue_depth), ("critical", 64));
     assert_eq!((noncritical.name.as_str(), noncritical.queue_depth), ("noncritical", 16));
-    assert_eq!(critical.outputs[0].topic.as_str(), "/adaptive_bridge/critical/scan");
+    assert_eq!(critical.outputs[0].topic.to_string(), "/adaptive_bridge/critical/scan");
     assert_eq!(critical.outputs[0].qos, QosProfile::CRITICAL);
-    assert_eq!(noncritical.outputs[0].topic.as_str(), "/adaptive_bridge/noncritical/scan");
+    assert_eq!(noncritical.outputs[0].topic.to_string(), "/adaptive_bridge/noncritical/scan");
     assert_eq!(noncritical.outputs[0].qos, QosProfile::NONCRITICAL_RELIABLE);
     let normal = RatePolicy {
         max_rate_hz: 10.0,
@@ -343,7 +343,7 @@ fn an_output_in_another_domain_may_have_the_name_of_its_input() {
     let settings = settings(
         "topics: [{id: a, input_topic: /a, noncritical_output: /a}]\nlanes: {noncritical: {domain_id: 1}}\n",
     );
-    assert_eq!(settings.lanes[1].outputs[0].topic.as_str(), "/a");
+    assert_eq!(settings.lanes[1].outputs[0].topic.to_string(), "/a");
 }
 
 #[test]

@@ -380,6 +380,12 @@ impl Participant {
         self.publish_graph_entry();
     }
 
+    /// Forgets a topic, a DDS topic name, of which all readers and writers have been dropped: else the
+    /// library keeps its last samples as long as the participant.
+    pub fn forget_topic(&self, topic: &str) {
+        self.participant.forget_topic(topic);
+    }
+
     /// Returns the next change that discovery reports, if there is one.
     pub fn poll_discovery(&self) -> Option<Discovery> {
         loop {

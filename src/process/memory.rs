@@ -7,10 +7,10 @@ use serde::Serialize;
 
 use super::control::memory::{REQUESTS_BYTES, networks, node_bytes};
 use super::egress::memory::{COPIES_BYTES, output_bytes};
-use super::ingress::memory::{fragment_bytes, waiting_bytes};
+use super::ingress::memory::{PATTERN_BYTES, fragment_bytes, waiting_bytes};
 use crate::config::{Lane, Settings};
 use crate::dds::{DISCOVERY_BYTES, SOCKETS_BYTES};
-use crate::shm::{OTHER_SHARED_BYTES, RouteChannel};
+use crate::shm::{DEFAULT_BUDGET_BYTES, OTHER_SHARED_BYTES, RouteChannel};
 
 const MIB: u64 = 1 << 20;
 
@@ -114,12 +114,19 @@ impl MemoryNeeds {
 
 fn of_ingress(settings: &Settings) -> MemoryNeed {
     let mut need = MemoryNeed::of_participants(1);
+    need.discovery_bytes += settings.patterns.len() as u64 * PATTERN_BYTES;
+    let (mut first_bytes, mut most_bytes) = (0, 0);
     for (index, route) in settings.routes.iter().enumerate() {
         add(&mut need.fragments_bytes, fragment_bytes(route));
         add(&mut need.waiting_bytes, waiting_bytes(route));
-        // Twice: the pool of a killed ingress remains until the lanes have taken what is in it.
-        add(&mut need.shared_memory_bytes, 2 * RouteChannel::of(settings, index).pool_size().bytes);
+        let pool = RouteChannel::of(settings, index).pool_size();
+        add(&mut first_bytes, pool.first_bytes);
+        add(&mut most_bytes, pool.bytes);
     }
+    // Without a budget in the file, the largest that the default may be on any machine.
+    let budget_bytes = settings.shared_memory.budget_bytes.unwrap_or(DEFAULT_BUDGET_BYTES);
+    // Twice: the pool of a killed ingress remains until the lanes have taken what is in it.
+    add(&mut need.shared_memory_bytes, 2 * most_bytes.min(budget_bytes.max(first_bytes)));
     need
 }
 

@@ -64,13 +64,21 @@ pub(super) fn apply(scheduling: &Scheduling) {
         }
     }
     if scheduling.lock_memory {
-        match mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE) {
+        match lock_memory() {
             Ok(()) => info!("memory locked"),
             Err(error) => {
                 warn!(%error, "memory not locked: the process needs CAP_IPC_LOCK or a larger RLIMIT_MEMLOCK");
             }
         }
     }
+}
+
+/// Locks the present memory of the process, and what it maps later as soon as that is touched. Without
+/// `MCL_ONFAULT` the kernel would allocate each pool completely, for samples of the largest size.
+fn lock_memory() -> nix::Result<()> {
+    mlockall(MlockAllFlags::MCL_CURRENT)?;
+    let on_fault = MlockAllFlags::from_bits_retain(libc::MCL_ONFAULT);
+    mlockall(MlockAllFlags::MCL_FUTURE | on_fault)
 }
 
 /// Applies the scheduling of the early waker thread, which only wakes lanes and runs on their CPUs. With a

@@ -22,8 +22,8 @@ use crate::config::Settings;
 use crate::model::{
     AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName,
     LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
-    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth, PublisherAccount, RouteId,
-    RouteInfo, SubscriberRecord, fnv1a,
+    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PatternRecord, ProcessHealth,
+    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, fnv1a,
 };
 
 /// The lanes and routes for which the boards have room. It must be the same in all processes of an instance.
@@ -77,7 +77,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 8;
+const LAYOUT_VERSION: u32 = 9;
 /// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
@@ -96,6 +96,7 @@ struct Layout {
     named_endpoint: usize,
     absence: usize,
     route_info: usize,
+    pattern: usize,
     ingress: usize,
     publisher: usize,
     lane: usize,
@@ -125,6 +126,7 @@ impl Layout {
             named_endpoint: next(MAX_NAMED_ENDPOINTS * Cell::<NamedEndpoint>::WORDS),
             absence: next(MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS),
             route_info: next(routes * Cell::<RouteInfo>::WORDS),
+            pattern: next(routes * Cell::<PatternRecord>::WORDS),
             ingress: next(routes * Cell::<IngressCounters>::WORDS),
             publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
             lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
@@ -227,6 +229,8 @@ boards! {
     absence, absence_writer(index: usize): AbsenceRecord = |layout| within(index, MAX_ABSENCES);
     /// What ingress has discovered about a route.
     route_info, route_info_writer(route: usize): RouteInfo = |layout| layout.check_route(route);
+    /// The state of the pattern whose first place is this route, from ingress.
+    pattern, pattern_writer(route: usize): PatternRecord = |layout| layout.check_route(route);
     /// The counters of ingress for a route.
     ingress, ingress_writer(route: usize): IngressCounters = |layout| layout.check_route(route);
     /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
@@ -448,6 +452,7 @@ mod tests {
         found.extend((0..MAX_ABSENCES).map(|index| place(layout.absence(index))));
         for route in 0..routes {
             found.push(place(layout.route_info(route)));
+            found.push(place(layout.pattern(route)));
             found.push(place(layout.ingress(route)));
             found.extend((0..MAX_PUBLISHERS).map(|index| place(layout.publisher(route, index))));
             let mut stages = vec![Stage::DdsIn];

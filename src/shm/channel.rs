@@ -1,4 +1,4 @@
-//! The channel of a route: one publisher (ingress), the lanes and taps as subscribers, a pool of fixed size.
+//! The channel of a route: one publisher (ingress), the lanes and taps as subscribers, a pool of slots.
 
 use std::thread;
 use std::time::Duration;
@@ -68,12 +68,33 @@ pub struct RouteChannel {
     pub retained_samples: usize,
 }
 
+/// The unit in which the kernel allocates a file in shared memory.
+pub(super) const PAGE_BYTES: u64 = 4096;
+
+/// The layout of a slot in iceoryx2: its header, the bridge's header, the payload, each aligned, and the slot
+/// aligned to the largest of them.
+const SLOT_ALIGN: usize = if align_of::<IceoryxHeader>() > align_of::<WireHeader>() {
+    align_of::<IceoryxHeader>()
+} else {
+    align_of::<WireHeader>()
+};
+
+/// The bytes before the payload of a slot.
+pub(super) const SLOT_HEADER_BYTES: usize =
+    size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>()) + size_of::<WireHeader>();
+
 /// The size of the pool of a route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PoolSize {
     /// The number of slots.
     pub slots: usize,
-    /// Bytes of shared memory for the pool.
+    /// The bytes from one slot to the next.
+    pub stride_bytes: u64,
+    /// Whether the payloads of the slots are allocated when samples need them, not at the start.
+    pub is_sparse: bool,
+    /// Bytes of shared memory for the pool when it is created.
+    pub first_bytes: u64,
+    /// Bytes of shared memory for the pool if each slot has the largest sample.
     pub bytes: u64,
 }
 
@@ -94,7 +115,8 @@ impl RouteChannel {
         }
     }
 
-    /// The size of the pool. Ingress allocates the whole pool when it starts.
+    /// The size of the pool. At the start, ingress allocates the header of each slot. Slots of at most
+    /// a page are allocated completely: each needs that page anyway.
     ///
     /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. So
     /// the sum of these limits is enough, whatever the lanes do.
@@ -102,15 +124,16 @@ impl RouteChannel {
         let share = |queue: QueueLimits| self.depth(queue) + queue.max_borrowed.max(1);
         let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
         let slots = lanes + self.max_taps * share(TAP) + self.retained_samples + LOANED_SLOTS;
-        // The layout of iceoryx2: its header, the bridge's header, the payload, each aligned, and the slot
-        // aligned to the largest of them.
-        let align = align_of::<IceoryxHeader>().max(align_of::<WireHeader>());
-        let headers =
-            size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>()) + size_of::<WireHeader>();
-        let slot_bytes = (headers + self.max_sample_bytes).next_multiple_of(align);
+        let stride = (SLOT_HEADER_BYTES + self.max_sample_bytes).next_multiple_of(SLOT_ALIGN) as u64;
+        let is_sparse = stride > PAGE_BYTES;
+        // Each slot begins at the same place of a page, so that its header is on one page.
+        let stride_bytes = if is_sparse { stride.next_multiple_of(PAGE_BYTES) } else { stride };
         // In addition, a free list of 4 bytes for each slot, and the description of the segment.
-        let bytes = (slots * (slot_bytes + 4) + 1024).next_multiple_of(4096) as u64;
-        PoolSize { slots, bytes }
+        let of_slots =
+            |slot_bytes: u64| (slots as u64 * (slot_bytes + 4) + 1024).next_multiple_of(PAGE_BYTES);
+        let bytes = of_slots(stride_bytes);
+        let first_bytes = if is_sparse { of_slots(PAGE_BYTES) } else { bytes };
+        PoolSize { slots, stride_bytes, is_sparse, first_bytes, bytes }
     }
 
     /// The depth of a queue, with room for the retained samples that a new subscriber receives first.

@@ -73,6 +73,17 @@ pub enum ShmError {
         /// The file system.
         path: PathBuf,
     },
+    /// The pools take more at the start than the budget allows.
+    #[error(
+        "the pools need {needed_bytes} bytes of shared memory at the start, and shared_memory.budget_bytes is \
+         {budget_bytes}; raise it, or lower max_sample_bytes of routes with small samples, queue_depth or max_taps"
+    )]
+    BudgetTooSmall {
+        /// What all pools need.
+        needed_bytes: u64,
+        /// The budget.
+        budget_bytes: u64,
+    },
     /// The operating system refused access.
     #[error("not permitted {what} ({path}); all processes of a bridge must run as the same user")]
     Permission {

@@ -2,7 +2,8 @@
 //!
 //! - [`ShmNode`]: the membership of a process in a bridge instance; cleans up after dead processes.
 //! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of
-//!   fixed size (iceoryx2 publish-subscribe).
+//!   slots (iceoryx2 publish-subscribe).
+//! - [`PoolBudget`]: the shared memory that the pools of all routes may take.
 //! - [`LaneWaker`], [`LaneSleeper`]: ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
 //! - [`RoleLock`]: lets at most one process serve a role; [`RoleHolder`]: names that process.
@@ -12,6 +13,7 @@
 //! moment; `docs/decisions/0004-shared-memory.md` describes how each primitive tolerates that.
 
 mod board;
+mod budget;
 mod cell;
 mod channel;
 mod error;
@@ -31,6 +33,7 @@ mod wake;
 pub use board::{
     BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
 };
+pub use budget::{DEFAULT_BUDGET_BYTES, NoMemory, PoolBudget, PoolUse, budget_bytes};
 pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::HeaderError;

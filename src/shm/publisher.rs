@@ -1,6 +1,7 @@
 //! The publisher of a route's channel, and the slots of its pool that ingress loans: it writes a payload,
 //! then publishes the slot.
 
+use std::mem::MaybeUninit;
 use std::ptr::NonNull;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -9,8 +10,10 @@ use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::{LoanError as IceoryxLoanError, update_connections::UpdateConnections};
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy};
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::sample_mut_uninit::SampleMutUninit;
 
-use super::channel::{LENT_SLOTS, LOANED_SLOTS, RouteChannel};
+use super::budget::{NoMemory, PoolBudget, PoolUse, SlotMemory};
+use super::channel::{LENT_SLOTS, LOANED_SLOTS, RouteChannel, SLOT_HEADER_BYTES};
 use super::error::ShmError;
 use super::header::WireHeader;
 use super::node::{NodeShared, ShmNode, StartLock};
@@ -32,6 +35,9 @@ pub enum LoanError {
     /// No slot is free: a process holds more slots than its limit.
     #[error("no free slot in the route's pool")]
     PoolExhausted,
+    /// There is no shared memory for a payload of this size.
+    #[error("no shared memory for the sample: {0}")]
+    NoMemory(NoMemory),
     /// iceoryx2 failed.
     #[error("cannot get a slot: {0}")]
     Failed(&'static str),
@@ -48,23 +54,36 @@ pub struct SamplePublisher {
     // Declared first, so that the port is dropped before the membership that it needs.
     port: Publisher<Service, [u8], WireHeader>,
     max_sample_bytes: usize,
+    slots: SlotMemory,
     lent: Arc<AtomicUsize>,
     node: Arc<NodeShared>,
 }
 
 impl SamplePublisher {
-    /// Allocates the whole pool and connects to the present subscribers.
+    /// Creates a pool with a budget of its own, which allows every slot the largest sample.
     pub fn create(node: &ShmNode, channel: &RouteChannel) -> Result<Self, ShmError> {
+        let budget = PoolBudget::of_channels(std::slice::from_ref(channel), u64::MAX);
+        Self::create_within(node, channel, &budget, 0)
+    }
+
+    /// Creates the pool of a route, whose samples get shared memory within the budget, and connects to the
+    /// present subscribers. `route` is the number of the route in the budget.
+    pub fn create_within(
+        node: &ShmNode,
+        channel: &RouteChannel,
+        budget: &Arc<PoolBudget>,
+        route: usize,
+    ) -> Result<Self, ShmError> {
         let shared = node.shared();
         let pool = channel.pool_size();
         let what = format!("the sample pool of route {} ({} slots)", channel.route, pool.slots);
         let start = StartLock::take(shared.dir())?;
         let factory = channel.open(shared, &start)?;
-        shared.require_free(pool.bytes, &what)?;
+        shared.require_free(pool.first_bytes, &what)?;
         let create = || {
             factory
                 .publisher_builder()
-                .initial_max_slice_len(channel.max_sample_bytes)
+                .initial_max_slice_len(pool.stride_bytes as usize - SLOT_HEADER_BYTES)
                 .allocation_strategy(AllocationStrategy::Static)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
                 .max_loaned_samples(LOANED_SLOTS)
@@ -81,11 +100,15 @@ impl SamplePublisher {
             other => other,
         };
         let port = port.map_err(|error| match error {
-            PublisherCreateError::UnableToCreateDataSegment => no_room(&what, pool.bytes, free_bytes()),
+            PublisherCreateError::UnableToCreateDataSegment => no_room(&what, pool.first_bytes, free_bytes()),
             other => ShmError::failed(format!("to create {what}"), shared.folder(), other),
         })?;
         shared.commit(&what)?;
+        let first = address_of_first_slot(&port).ok_or_else(|| {
+            ShmError::failed(format!("to use {what}"), shared.folder(), "it has no free slot")
+        })?;
         Ok(Self {
+            slots: SlotMemory::find(first, pool, budget, route, &what)?,
             port,
             max_sample_bytes: channel.max_sample_bytes,
             lent: Arc::default(),
@@ -98,26 +121,38 @@ impl SamplePublisher {
         self.max_sample_bytes
     }
 
-    /// Copies a payload into a free slot, which is the only copy in ingress. Neither allocates nor waits.
-    pub fn copy_in(&self, payload: &[u8]) -> Result<Slot, LoanError> {
-        let too_large = LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes };
-        if payload.len() > self.max_sample_bytes {
-            return Err(too_large);
-        }
-        match self.port.loan_slice_uninit(payload.len()) {
-            Ok(slot) => Ok(Slot { sample: slot.write_from_slice(payload) }),
-            Err(IceoryxLoanError::OutOfMemory) => Err(LoanError::PoolExhausted),
-            Err(IceoryxLoanError::ExceedsMaxLoanSize) => Err(too_large),
-            Err(IceoryxLoanError::ExceedsMaxLoans) => {
-                Err(LoanError::Failed("ingress holds too many unpublished slots"))
-            }
-            Err(IceoryxLoanError::InternalFailure) => Err(LoanError::Failed("internal failure of iceoryx2")),
-        }
+    /// What the pool takes of the budget.
+    pub fn memory(&self) -> PoolUse {
+        self.slots.usage()
     }
 
-    /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot is free,
-    /// too many are lent, or the route does not allow that length. The slot contains bytes of an older
-    /// sample.
+    /// Copies a payload into a free slot, which is the only copy in ingress. Waits for nothing; the kernel
+    /// allocates memory while the slots in use have had no sample of that size.
+    pub fn copy_in(&self, payload: &[u8]) -> Result<Slot, LoanError> {
+        if payload.len() > self.max_sample_bytes {
+            return Err(LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes });
+        }
+        let slot = self.loan(payload.len())?;
+        Ok(Slot { sample: slot.write_from_slice(payload) })
+    }
+
+    /// Takes a free slot with the memory for a payload of that length.
+    fn loan(&self, len: usize) -> Result<SampleMutUninit<Service, [MaybeUninit<u8>], WireHeader>, LoanError> {
+        let mut slot = self.port.loan_slice_uninit(len).map_err(|error| match error {
+            IceoryxLoanError::OutOfMemory => LoanError::PoolExhausted,
+            IceoryxLoanError::ExceedsMaxLoanSize => LoanError::TooLarge { len, max: self.max_sample_bytes },
+            IceoryxLoanError::ExceedsMaxLoans => {
+                LoanError::Failed("ingress holds too many unpublished slots")
+            }
+            IceoryxLoanError::InternalFailure => LoanError::Failed("internal failure of iceoryx2"),
+        })?;
+        self.slots.ensure(slot.payload_mut().as_ptr().addr(), len).map_err(LoanError::NoMemory)?;
+        Ok(slot)
+    }
+
+    /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot or memory
+    /// is free, too many are lent, or the route does not allow that length. The slot contains bytes of an
+    /// older sample.
     ///
     /// May be called on any thread. It waits for no other process, but iceoryx2 takes a lock, so it waits for
     /// a thread of this process that is in [`connect_subscribers`](Self::connect_subscribers).
@@ -126,8 +161,8 @@ impl SamplePublisher {
             return None;
         }
         let permit = LentPermit::take(&self.lent)?;
-        let slot = self.port.loan_slice_uninit(len).ok()?;
-        // SAFETY: any byte is a valid `u8`, and the bytes of the pool, a mapped file with all its pages, are
+        let slot = self.loan(len).ok()?;
+        // SAFETY: any byte is a valid `u8`, and the bytes of the slot, pages of a mapped file, are
         // initialised: by the kernel with zeros, or by an older sample.
         let mut sample = unsafe { slot.assume_init() };
         // The address is stored, because iceoryx2 takes a lock for each access to the payload.
@@ -146,6 +181,13 @@ impl SamplePublisher {
         // iceoryx2 logs a failed connection to a subscriber, and still connects to the others.
         let _ = self.port.update_connections();
     }
+}
+
+/// The address of the payload in the slot that a new pool lends first.
+fn address_of_first_slot(port: &Publisher<Service, [u8], WireHeader>) -> Option<usize> {
+    // With a length, because an empty payload has no address of its own.
+    let mut slot = port.loan_slice_uninit(1).ok()?;
+    Some(slot.payload_mut().as_ptr().addr())
 }
 
 /// A slot with a complete payload that is not published yet. Dropping it frees the slot.

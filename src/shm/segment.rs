@@ -148,10 +148,14 @@ fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
     }
 }
 
-/// Allocates all pages of files in shared memory. iceoryx2 only sets the length of its segments; if the file
-/// system is full when a page is first touched, SIGBUS kills the process while it handles a sample.
+/// How the name of a pool ends, of which ingress allocates what it uses.
+const POOL_SUFFIX: &str = "data";
+
+/// Allocates all pages of files in shared memory, but not those of pools. iceoryx2 only sets the length of
+/// its segments; if the file system is full when a page is first touched, SIGBUS kills the process while it
+/// handles a sample.
 pub(super) fn commit_files(files: &[std::path::PathBuf], what: &str) -> Result<(), ShmError> {
-    for path in files {
+    for path in files.iter().filter(|path| path.extension().is_none_or(|suffix| suffix != POOL_SUFFIX)) {
         // A file that is missing or not readable yet belongs to a process that is starting or ending.
         let Ok(file) = OpenOptions::new().read(true).write(true).open(path) else { continue };
         let Ok(metadata) = file.metadata() else { continue };

@@ -27,7 +27,9 @@ pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};
 pub use problem::{Level, Problem};
 pub use report::{Report, SubscriberReport};
-pub use snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot, SubscriberReading};
+pub use snapshot::{
+    LaneReading, OutputReading, PatternReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
+};
 pub use text::{bytes_text, shortened, wrapped};
 pub use threads::Threads;
 

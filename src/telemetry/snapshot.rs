@@ -7,12 +7,13 @@ use std::time::Duration;
 
 use super::liveness::ProcessState;
 use crate::clock;
-use crate::config::{SetParameters, Settings};
+use crate::config::{RoutePattern, SetParameters, Settings};
 use crate::model::{
     AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
     LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
-    MAX_PUBLISHERS, MAX_SUBSCRIBERS, ModeReason, MonotonicNs, NamedEndpoint, OutputReaders, ProcessHealth,
-    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, TopicName, TrafficClass, TypeName, WallNs,
+    MAX_PUBLISHERS, MAX_SUBSCRIBERS, ModeReason, MonotonicNs, NamedEndpoint, OutputReaders, PatternRecord,
+    ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord, TopicName, TrafficClass, TypeName,
+    WallNs,
 };
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -37,8 +38,10 @@ pub struct Snapshot {
     pub processes: Vec<ProcessReading>,
     /// The lanes, in the order of the configuration.
     pub lanes: Vec<LaneReading>,
-    /// The routes, in the order of the configuration.
+    /// The routes that have a topic, in the order of the configuration.
     pub routes: Vec<RouteReading>,
+    /// The patterns, in the order of the configuration.
+    pub patterns: Vec<PatternReading>,
     /// Whether the configuration enables probes or classification, which only the control process does.
     pub needs_control: bool,
     /// The control process's record for the whole bridge.
@@ -100,6 +103,15 @@ pub struct LaneReading {
     pub is_used: bool,
 }
 
+/// The state of one pattern.
+#[derive(Clone, Debug)]
+pub struct PatternReading {
+    /// Its entry in the configuration.
+    pub settings: RoutePattern,
+    /// The record of ingress.
+    pub record: PatternRecord,
+}
+
 /// The counters and latencies of one route.
 #[derive(Clone, Debug)]
 pub struct RouteReading {
@@ -107,6 +119,8 @@ pub struct RouteReading {
     pub id: RouteId,
     /// The topic that ingress subscribes to.
     pub input_topic: TopicName,
+    /// The id of its entry in `topics` if that is a pattern.
+    pub pattern: Option<RouteId>,
     /// The message type if it is known; the ROS 2 name if it is a ROS 2 type.
     pub message_type: Option<String>,
     /// What the publishers announce of the type.
@@ -182,8 +196,13 @@ impl Snapshot {
             processes.extend(lane.is_used().then_some(egress));
         }
         let routes = (0..settings.routes.len())
-            .map(|route| read_route(boards, settings, route))
+            .filter_map(|route| read_route(boards, settings, route).transpose())
             .collect::<Result<_, _>>()?;
+        let pattern = |pattern: &RoutePattern| {
+            let record = consistent(boards.pattern(pattern.first_route))?;
+            Ok(PatternReading { settings: pattern.clone(), record })
+        };
+        let patterns = settings.patterns.iter().map(pattern).collect::<Result<_, ShmError>>()?;
         let control = consistent(boards.control())?;
         Ok(Self {
             instance: settings.instance.clone(),
@@ -191,6 +210,7 @@ impl Snapshot {
             at_wall: clock::wall(),
             processes,
             routes,
+            patterns,
             set_parameters: settings.set_parameters.clone(),
             needs_control: settings.probes.enabled || settings.classifier.enabled,
             subscribers: read_subscribers(boards, &control, lanes.len())?,
@@ -286,16 +306,19 @@ fn mode_of(
     (mode, reason, ends_at)
 }
 
-fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<RouteReading, ShmError> {
+/// Reads a route; `None` for a place of a pattern that has had no topic yet.
+fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<Option<RouteReading>, ShmError> {
     let route = &settings.routes[index];
     let info = consistent(boards.route_info(index))?;
+    let Some(input_topic) = route.input_topic.resolve(&info) else { return Ok(None) };
     let discovered_type = info.announced_type().map(|dds_type| type_name(dds_type.name));
     let mut outputs = Vec::new();
     for (lane, configured) in settings.lanes.iter().enumerate() {
         for output in configured.outputs.iter().filter(|output| output.route == index) {
+            let Some(topic) = output.topic.resolve(Some(&input_topic)) else { continue };
             outputs.push(OutputReading {
                 lane,
-                topic: output.topic.clone(),
+                topic,
                 counters: read_lane(boards, lane, index)?,
                 readers: consistent(boards.output_readers(lane, index))?,
                 shm: boards.histogram(Stage::Shm(lane), index),
@@ -305,16 +328,17 @@ fn read_route(boards: &Boards, settings: &Settings, index: usize) -> Result<Rout
         }
     }
     let counters = consistent(boards.ingress(index))?;
-    Ok(RouteReading {
+    Ok(Some(RouteReading {
         publishers: read_publishers(boards, index, &counters)?,
         counters,
         id: route.id.clone(),
-        input_topic: route.input_topic.clone(),
+        input_topic,
+        pattern: route.input_topic.is_place().then(|| route.entry.clone()),
         message_type: discovered_type.or_else(|| route.message_type.as_ref().map(ToString::to_string)),
         info,
         dds_in: boards.histogram(Stage::DdsIn, index),
         outputs,
-    })
+    }))
 }
 
 /// The name of a type; the ROS 2 name if it is a ROS 2 type.

@@ -46,6 +46,7 @@ impl fmt::Display for Report {
         }
         if let Some(ingress) = process("ingress") {
             write!(f, "\n{}", process_line("ingress", ingress))?;
+            f.write_str(&self.shared_memory_text())?;
         }
         let heads = ["TOPIC", "PUBS", "IN HZ", "", "BYTES/S", "DDS IN", "LOST UPSTREAM"];
         f.write_str(&table(1, TOPIC_TABLE, heads, self.routes.iter().map(route_row)))?;
@@ -64,6 +65,32 @@ impl fmt::Display for Report {
             f.write_str(&table(1, TOPIC_TABLE, heads, rows))?;
         }
         Ok(())
+    }
+}
+
+/// The most routes that the line about shared memory names.
+const MAX_NAMED_POOLS: usize = 3;
+
+impl Report {
+    /// What the pools have of the budget, and the routes that have the most.
+    fn shared_memory_text(&self) -> String {
+        let memory = &self.shared_memory;
+        if memory.budget_bytes == 0 {
+            return String::new();
+        }
+        let text = |bytes: u64| bytes_text(bytes as f64);
+        let mut pools: Vec<_> =
+            self.routes.iter().map(|route| (route.counters.pool_bytes, &route.id)).collect();
+        pools.sort_by_key(|&(bytes, _)| std::cmp::Reverse(bytes));
+        let named = pools.iter().take(MAX_NAMED_POOLS).map(|(bytes, id)| format!("{id} {}", text(*bytes)));
+        let line = format!(
+            "shared memory: {} of {}, at most {} so far; {}",
+            text(memory.used_bytes),
+            text(memory.budget_bytes),
+            text(memory.peak_bytes),
+            named.collect::<Vec<_>>().join(", ")
+        );
+        wrapped(COLUMNS, " ", "   ", line.split(' '), " ")
     }
 }
 

@@ -4,8 +4,8 @@ use super::liveness::ProcessState;
 use super::problem::{Level, Problem};
 use super::report::{
     AbsenceReport, EndpointOrigin, IntruderReport, LaneReport, Latency, LatencyTotal, OutputReport,
-    ParametersReport, ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report, RouteReport,
-    SafetyReport, SubscriberReport, UnmatchedReport,
+    ParametersReport, PatternReport, ProbesReport, ProcessReport, PublisherReport, ReaderReport, Report,
+    RouteReport, SafetyReport, SharedMemoryReport, SubscriberReport, UnmatchedReport,
 };
 use super::snapshot::ProcessReading;
 use crate::model::{
@@ -95,9 +95,22 @@ pub(super) fn wide_report() -> Report {
             applied_mode: Some("degraded"),
             applied_policy_epoch: 1,
         }],
+        patterns: vec![PatternReport {
+            id: "any".into(),
+            input_topic: "/**".into(),
+            max_routes: 64,
+            routes: 64,
+            waiting: 256,
+            first_waiting: Some(format!("/{}", "t".repeat(126))),
+            released: u64::MAX,
+            refused: u64::MAX,
+            forgotten: u64::MAX,
+        }],
+        shared_memory: SharedMemoryReport { budget_bytes: 1 << 40, used_bytes: 1 << 40, peak_bytes: 1 << 40 },
         routes: vec![RouteReport {
             id: "scan".into(),
             input_topic: topic,
+            pattern: None,
             message_type: None,
             type_hash: None,
             has_keys: false,

@@ -29,9 +29,14 @@ const ENCAPSULATIONS: [[u8; 4]; 4] = [[0, 1, 0, 0], [0, 0, 0, 3], [0, 7, 0, 2], 
 
 /// A bridge of one route, `/scan`, in a domain and with an instance of its own.
 fn bridge(domain_id: u16) -> Bridge {
+    bridge_with(domain_id, "")
+}
+
+/// Like [`bridge`], with more `topics`.
+fn bridge_with(domain_id: u16, topics: &str) -> Bridge {
     Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
-         topics:\n  - {{id: front_laser, input_topic: /scan, max_sample_bytes: 8192}}\n\
+         topics:\n  - {{id: front_laser, input_topic: /scan, max_sample_bytes: 8192}}\n{topics}\
          shared_memory: {{root_path: {{folder}}/root, max_taps: 1}}"
     ))
 }
@@ -302,7 +307,8 @@ fn keys(value: &Value, path: &str, found: &mut BTreeSet<String>) {
 
 #[test]
 fn every_key_of_the_json_is_documented_and_every_documented_key_is_there() {
-    let bridge = bridge(102);
+    let pattern = "  - {id: camera, input_topic: /camera/**, max_routes: 1, max_sample_bytes: 8192}\n";
+    let bridge = bridge_with(102, pattern);
     let _up = up(&bridge);
     let _subscriber = Subscriber::new(102, "critical");
     drop(Publisher::new(102));

@@ -9,5 +9,6 @@ mod cli;
 mod clocks;
 mod demo;
 mod metrics;
+mod patterns;
 mod priority;
 mod reload;

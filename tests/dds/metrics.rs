@@ -5,17 +5,16 @@ use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::time::Duration;
 
-use adaptive_bridge::config::MetricsListener;
-use adaptive_bridge::config::SetParameters;
+use adaptive_bridge::config::{MetricsListener, RoutePattern, SetParameters};
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
-    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, ProbeRefusal, ProcessHealth, RouteId, RouteInfo,
-    SubscriberRecord, SubscriberState, TopicName, TrafficClass, WallNs,
+    LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, PatternRecord, ProbeRefusal, ProcessHealth,
+    RouteId, RouteInfo, SubscriberRecord, SubscriberState, TopicName, TopicPattern, TrafficClass, WallNs,
 };
 use adaptive_bridge::shm::ProcessRole;
 use adaptive_bridge::telemetry::{
-    LaneReading, MetricsServer, OutputReading, ProcessReading, ProcessState, Report, RouteReading, Snapshot,
-    SubscriberReading,
+    LaneReading, MetricsServer, OutputReading, PatternReading, ProcessReading, ProcessState, Report,
+    RouteReading, Snapshot, SubscriberReading,
 };
 use serde_json::Value;
 use support::prometheus::{parse, python};
@@ -45,6 +44,11 @@ fn report() -> Report {
         repeated: 43,
         unmarked: 44,
         writers: 1,
+        pool_bytes: 45,
+        pool_peak_bytes: 46,
+        budget_bytes: 100,
+        budget_used_bytes: 47,
+        budget_peak_bytes: 48,
         ..Default::default()
     };
     ingress.drops.add(DropReason::TooLarge, 3);
@@ -103,9 +107,20 @@ fn report() -> Report {
             is_used: true,
             health,
         }],
+        patterns: vec![PatternReading {
+            settings: RoutePattern {
+                entry: RouteId::try_from("camera").unwrap(),
+                input_topic: TopicPattern::try_from("/camera/**").unwrap(),
+                exclude: Vec::new(),
+                first_route: 1,
+                max_routes: 2,
+            },
+            record: PatternRecord { waiting: 45, ..PatternRecord::default() },
+        }],
         routes: vec![RouteReading {
             id: RouteId::try_from("scan").unwrap(),
             input_topic: TopicName::try_from("/scan").unwrap(),
+            pattern: None,
             message_type: None,
             info: RouteInfo::default(),
             counters: ingress,
@@ -187,9 +202,15 @@ fn the_parser_of_prometheus_reads_the_page() {
         ("route_received_bytes_total", 10_300.0),
         ("route_published_samples_total", 100.0),
         ("route_in_place_samples_total", 41.0),
+        ("route_pool_bytes", 45.0),
+        ("route_pool_peak_bytes", 46.0),
+        ("shared_memory_budget_bytes", 100.0),
+        ("shared_memory_used_bytes", 47.0),
+        ("shared_memory_peak_bytes", 48.0),
         ("route_lost_upstream_samples_total", 42.0),
         ("route_repeated_samples_total", 43.0),
         ("route_unmarked_samples_total", 44.0),
+        ("pattern_waiting_topics", 45.0),
         ("lane_subscribers", 2.0),
         ("lane_reader_overrun_samples_total", 23.0),
         ("lane_unconfirmed_samples_total", 24.0),

@@ -439,14 +439,15 @@ fn a_second_egress_of_a_lane_is_refused_and_names_the_first() {
 }
 
 #[test]
-fn shared_memory_that_does_not_fit_is_an_error_with_the_needed_size() {
-    // Larger than /dev/shm of any machine: 64 MiB for each of more than 4,096 slots.
+fn pools_that_do_not_fit_are_an_error_with_the_needed_size() {
+    // More than 4,096 slots, of which the headers take 4 KiB each.
     let yaml = "instance: {instance}\nros: {domain_id: 121}\ntopics:\n  - {id: scan, input_topic: /scan, \
-                max_sample_bytes: 67108864}\nlanes:\n  critical: {queue_depth: 4096}\n";
+                max_sample_bytes: 67108864}\nlanes:\n  critical: {queue_depth: 4096}\n\
+                shared_memory: {budget_bytes: 1048576}\n";
     let bridge = Bridge::new(yaml);
     let (code, log) = wait_ended(bridge.start("ingress"));
     assert_eq!(code, Some(1), "{log}");
-    assert!(log.contains("/dev/shm") && log.contains("byte"), "{log}");
+    assert!(log.contains("shared_memory.budget_bytes is 1048576") && log.contains("need"), "{log}");
     assert_eq!(shared_memory_of(bridge.instance()), Vec::<String>::new());
 }
 

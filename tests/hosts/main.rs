@@ -22,6 +22,7 @@ mod networks;
 mod noncritical_readers;
 mod original_probes;
 mod parameters;
+mod patterns;
 mod qos_table;
 mod readers;
 mod responder;

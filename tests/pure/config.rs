@@ -41,13 +41,13 @@ fn the_default_file_and_the_minimal_file_give_the_same_settings() {
 /// What all three files of the original package have in common.
 fn check_common_original(settings: &Settings) {
     let [route] = settings.routes.as_slice() else { panic!("{:?}", settings.routes) };
-    assert_eq!((route.id.as_str(), route.input_topic.as_str()), ("scan_main", "/scan"));
+    assert_eq!((route.id.as_str(), &*route.input_topic.to_string()), ("scan_main", "/scan"));
     assert_eq!(route.message_type, Some(TypeName::try_from("sensor_msgs/msg/LaserScan").unwrap()));
     let [critical, noncritical] = settings.lanes.as_slice() else { panic!("{:?}", settings.lanes) };
     assert_eq!(critical.outputs.len() + noncritical.outputs.len(), 2);
-    assert_eq!(critical.outputs[0].topic, topic("/adaptive_bridge/critical/scan"));
+    assert_eq!(critical.outputs[0].topic.to_string(), "/adaptive_bridge/critical/scan");
     assert_eq!(critical.outputs[0].qos, QosProfile::CRITICAL);
-    assert_eq!(noncritical.outputs[0].topic, topic("/adaptive_bridge/noncritical/scan"));
+    assert_eq!(noncritical.outputs[0].topic.to_string(), "/adaptive_bridge/noncritical/scan");
     assert!(settings.overrides.is_empty() && settings.subscribers.is_empty());
 }
 
@@ -453,6 +453,9 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("ros.namespace", r#""/robot1""#, r#""/""#),
     ("ros.node_name", r#""front""#, r#""rear_2""#),
     ("topics.0.input_topic", r#""/scan""#, r#""/scan_2""#),
+    ("topics.1.input_topic", r#""/camera/**""#, r#""/camera/*""#),
+    ("topics.1.exclude", "[]", r#"["/camera/*/depth"]"#),
+    ("topics.1.max_routes", "2", "3"),
     ("topics.0.message_type", "null", r#""sensor_msgs/msg/LaserScan""#),
     ("topics.0.lanes", "null", r#"["critical", "noncritical"]"#),
     ("topics.0.outputs.critical", r#""/critical""#, r#""/critical_2""#),
@@ -489,6 +492,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("lanes.noncritical.drop_policy", r#""drop_oldest""#, r#""drop_stale""#),
     ("lanes.noncritical.queue_samples", "5", "6"),
     ("shared_memory.root_path", "null", r#""/run/elsewhere""#),
+    ("shared_memory.budget_bytes", "268435456", "536870912"),
     ("shared_memory.max_taps", "2", "3"),
     ("processes.ingress.scheduling.nice", "0", "1"),
     ("processes.ingress.scheduling.cpus", "[]", "[1]"),
@@ -544,7 +548,7 @@ const CHOICES: &[(&str, &str, &str)] = &[
 
 /// The settings in which each key has its first value, or its second where `second` is true.
 fn chosen(second: impl Fn(usize) -> bool) -> Settings {
-    let mut file = serde_json::json!({"topics": [{"id": "scan"}]});
+    let mut file = serde_json::json!({"topics": [{"id": "scan"}, {"id": "camera"}]});
     for (index, (key, first, other)) in CHOICES.iter().enumerate() {
         let place = key.split('.').fold(&mut file, |node, name| match name.parse::<usize>() {
             Ok(item) => &mut node[item],

@@ -5,6 +5,7 @@ mod config;
 mod control_policy;
 mod dumps;
 mod memory;
+mod patterns;
 mod policy;
 mod regressions;
 mod tidy;

@@ -205,14 +205,37 @@ fn the_median_lies_between_the_values_that_tables_of_the_sign_test_name() {
 
 #[test]
 fn growth_is_not_moved_by_outliers() {
-    let slope = |kib_per_second: f64| growth(&series("", kib_per_second, 3_600.0).points).unwrap();
+    let slope = |kib_per_second: f64| growth(&series("", kib_per_second, 3_600.0).points).unwrap().slope;
     assert!(slope(0.0).abs() < 1e-9);
     assert!((slope(0.5) - 0.5).abs() < 0.01, "{}", slope(0.5));
     assert!((slope(-2.0) + 2.0).abs() < 0.02);
     assert_eq!(growth(&[(0.0, 1.0), (1.0, 2.0)]), None);
     // More points than the estimate uses.
     let many: Vec<(f64, f64)> = (0..5_000).map(|at| (f64::from(at), 3.0 * f64::from(at))).collect();
-    assert_eq!(growth(&many), Some(3.0));
+    assert_eq!(growth(&many).map(|growth| growth.slope), Some(3.0));
+}
+
+#[test]
+fn the_interval_of_a_growth_is_that_of_sen() {
+    let points: Vec<(f64, f64)> = [0.0, 1.0, 4.0, 9.0, 16.0, 25.0, 36.0]
+        .into_iter()
+        .enumerate()
+        .map(|(at, value)| (at as f64, value))
+        .collect();
+    let growth_of_squares = growth(&points).unwrap();
+    // The slope between the points i and j of the squares is i + j. Kendall's statistic has the variance
+    // 7 * 6 * 19 / 18 = 44.3, so the ranks are (21 - 13.05) / 2 = 3 and (21 + 13.05) / 2 + 1 = 18.
+    let mut slopes: Vec<usize> = (0..7).flat_map(|one| (one + 1..7).map(move |other| one + other)).collect();
+    slopes.sort_unstable();
+    assert_eq!((growth_of_squares.low, growth_of_squares.high), (slopes[2] as f64, slopes[17] as f64));
+    assert_eq!(growth_of_squares.slope, slopes[10] as f64);
+    let of_noise = |slope: f64| {
+        let noise = (0..100).map(|at| (f64::from(at), f64::from(at * 7919 % 101) + slope * f64::from(at)));
+        growth(&noise.collect::<Vec<_>>()).unwrap()
+    };
+    let flat = of_noise(0.0);
+    assert!(flat.low < 0.0 && flat.high > 0.0, "{flat:?}");
+    assert!(of_noise(1.0).low > 0.0);
 }
 
 #[test]

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use adaptive_bridge::model::{DropReason, InstanceName, LaneMode, MonotonicNs};
+use adaptive_bridge::model::{DropReason, InstanceName, LaneMode, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
-    LoanError, ProcessRole, RoleLock, RouteChannel, SamplePublisher, SampleSubscriber, ShmNode, Stage,
-    SubscriberRole, TakeError, Woken,
+    LoanError, NoMemory, ProcessRole, RoleLock, RouteChannel, SamplePublisher, SampleSubscriber, ShmNode,
+    Stage, SubscriberRole, TakeError, Woken,
 };
 
 use crate::allocations;
@@ -236,9 +236,11 @@ impl Child {
     fn full(&self) {
         let node = self.node("ingress");
         let boards = node.boards(&shape()).unwrap();
-        let error = SamplePublisher::create(&node, &channel(1 << 20)).unwrap_err();
+        let error = SamplePublisher::create(&node, &deep_channel(1 << 20)).unwrap_err();
         println!("@ {error}");
-        let channel = channel(4096);
+        let large_channel = RouteChannel { route: RouteId::try_from("large").unwrap(), ..channel(1 << 20) };
+        let large = SamplePublisher::create(&node, &large_channel).unwrap();
+        let channel = channel(3_000);
         let publisher = SamplePublisher::create(&node, &channel).unwrap();
         let subscriber = SampleSubscriber::open(&node, &channel, SubscriberRole::Lane(LANE), false).unwrap();
         let mut counters = boards.ingress_writer(0);
@@ -247,19 +249,28 @@ impl Child {
         let mut filler = std::fs::File::create("/dev/shm/filler").unwrap();
         while filler.write_all(&[1; 4096]).is_ok() {}
         while filler.write_all(&[1]).is_ok() {}
+        let one_mib = vec![1; 1 << 20];
         for sequence in 1..=500 {
-            let slot = publisher.copy_in(&payload(sequence, 4096)).unwrap();
+            // What was allocated at the start can be used, and what was not is an error and not SIGBUS.
+            large.copy_in(&payload(sequence, 3_000)).unwrap().publish(header(sequence)).unwrap();
+            for length in [5_000, 1 << 20] {
+                let refused = large.copy_in(&one_mib[..length]).unwrap_err();
+                assert_eq!(refused, LoanError::NoMemory(NoMemory::FileSystem));
+                assert!(large.lend(length).is_none());
+            }
+            let slot = publisher.copy_in(&payload(sequence, 3_000)).unwrap();
             slot.publish(header(sequence)).unwrap();
             counters.update(|counters| counters.published += 1);
             boards.histogram_writer(Stage::DdsIn, 0).record(sequence << 12);
             let sample = subscriber.take().unwrap().unwrap();
-            assert_eq!(sample.payload(), payload(sequence, 4096));
+            assert_eq!(sample.payload(), payload(sequence, 3_000));
             assert!(matches!(subscriber.take(), Ok(None) | Err(TakeError::BorrowLimit)));
         }
         let error = SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, false).unwrap_err();
         println!("@ {error}");
         drop(filler);
         std::fs::remove_file("/dev/shm/filler").unwrap();
+        large.copy_in(&one_mib).unwrap().publish(header(501)).unwrap();
         SampleSubscriber::open(&node, &channel, SubscriberRole::Tap, false).unwrap();
         println!("@ done");
     }

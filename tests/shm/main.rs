@@ -17,9 +17,9 @@ use self::support::{
 };
 use adaptive_bridge::model::{InstanceName, LaneMode, LanePolicy, LatencyHistogram, MonotonicNs, RouteId};
 use adaptive_bridge::shm::{
-    Boards, BridgeShape, HeaderError, LoanError, ProcessRole, QueueLimits, RoleLock, RouteChannel,
-    SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole, TakeError, Woken,
-    this_cpu,
+    Boards, BridgeShape, HeaderError, LoanError, NoMemory, PoolBudget, ProcessRole, QueueLimits, RoleLock,
+    RouteChannel, SamplePublisher, SampleSubscriber, ShmError, ShmNode, ShmSample, Stage, SubscriberRole,
+    TakeError, Woken, this_cpu,
 };
 use nix::sys::signal::Signal;
 
@@ -107,8 +107,9 @@ fn a_slot_that_is_not_published_is_free_again() {
 }
 
 #[test]
-fn the_pool_has_the_computed_size_and_is_allocated_completely() {
-    for (bytes, retained_samples, max_taps) in [(2_948, 0, 0), (100, 3, 2), (1 << 20, 1, 1)] {
+fn the_pool_has_the_computed_size_and_its_headers_or_small_slots_are_allocated() {
+    for (bytes, retained_samples, max_taps) in [(2_948, 0, 0), (100, 3, 2), (1 << 20, 1, 1), (16 << 20, 0, 2)]
+    {
         let place = Place::new();
         let node = place.node();
         let channel = RouteChannel { max_taps, retained_samples, ..channel(bytes) };
@@ -126,9 +127,157 @@ fn the_pool_has_the_computed_size_and_is_allocated_completely() {
         assert_eq!(metadata.len().next_multiple_of(4096), pool.bytes);
         for path in place.shm_files() {
             let metadata = fs::metadata(&path).unwrap();
-            assert!(metadata.blocks() * 512 >= metadata.len(), "{path:?} lacks pages");
+            let least = if path == pools[0] { pool.first_bytes - 4096 } else { metadata.len() };
+            assert!(metadata.blocks() * 512 >= least, "{path:?} lacks pages");
+        }
+        assert!(metadata.blocks() * 512 <= pool.first_bytes + 2 * 4096, "{metadata:?}");
+        assert_eq!(pool.first_bytes == pool.bytes, bytes < 4_000, "small slots are allocated completely");
+    }
+}
+
+/// The bytes of the instance's files in /dev/shm that exist.
+fn allocated_bytes(place: &Place) -> u64 {
+    place.shm_files().iter().map(|path| fs::metadata(path).unwrap().blocks() * 512).sum()
+}
+
+/// A channel of a configured route with the default lanes and two taps.
+fn routed(route: &str) -> RouteChannel {
+    RouteChannel {
+        route: RouteId::try_from(route).unwrap(),
+        lanes: vec![QueueLimits { queue_depth: 32, max_borrowed: 8 }; 3],
+        retained_samples: 8,
+        ..channel(16 << 20)
+    }
+}
+
+fn no_memory(publisher: &SamplePublisher, length: usize) -> NoMemory {
+    match publisher.copy_in(&vec![1; length]) {
+        Err(LoanError::NoMemory(why)) => why,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn sixty_routes_of_scans_take_at_most_48_mib() {
+    let place = Place::new();
+    let node = place.node();
+    let channels: Vec<_> = (0..60).map(|number| routed(&format!("scan{number}"))).collect();
+    let budget = PoolBudget::of_channels(&channels, 256 << 20);
+    let routes: Vec<_> = (0..)
+        .zip(&channels)
+        .map(|(number, channel)| {
+            let publisher = SamplePublisher::create_within(&node, channel, &budget, number).unwrap();
+            (publisher, channel.lanes.iter().map(|_| lane(&node, channel)).collect::<Vec<_>>())
+        })
+        .collect();
+    for sequence in 1..=200 {
+        for (publisher, lanes) in &routes {
+            assert_eq!(publish(publisher, sequence, 2_948), 3);
+            for lane in lanes {
+                let sample = lane.take().unwrap().unwrap();
+                assert_eq!(sample.payload(), payload(sequence, 2_948));
+            }
         }
     }
+    let bytes = allocated_bytes(&place);
+    println!("60 routes of scans: {} KiB", bytes >> 10);
+    assert!(bytes <= 48 << 20, "{bytes}");
+}
+
+#[test]
+fn cameras_and_clouds_beside_sixty_scans_lose_nothing_within_512_mib() {
+    let place = Place::new();
+    let node = place.node();
+    let channels: Vec<_> = (0..66).map(|number| routed(&format!("route{number}"))).collect();
+    let budget = PoolBudget::of_channels(&channels, 512 << 20);
+    let routes: Vec<_> = (0..)
+        .zip(&channels)
+        .map(|(number, channel)| {
+            let publisher = SamplePublisher::create_within(&node, channel, &budget, number).unwrap();
+            (publisher, [lane(&node, channel), lane(&node, channel)])
+        })
+        .collect();
+    let bytes_of = |route| match route {
+        0..60 => 2_948,
+        60..64 => 6_220_800,
+        _ => 2_000_000,
+    };
+    // Two seconds: cameras at 30 Hz, scans and clouds at 10 Hz. The first lane takes each sample at once and
+    // holds the last one; the second one takes what has come every 100 ms.
+    let mut held: Vec<Option<ShmSample>> = routes.iter().map(|_| None).collect();
+    let mut grown = 0;
+    for frame in 1..=60_u64 {
+        for (route, (publisher, lanes)) in routes.iter().enumerate() {
+            if (60..64).contains(&route) || frame % 3 == 1 {
+                let mut slot = publisher.lend(bytes_of(route)).unwrap();
+                slot.payload_mut().fill(frame as u8);
+                assert_eq!(slot.into_slot().publish(header(frame)).unwrap(), 2);
+                held[route] = lanes[0].take().unwrap();
+            }
+            if frame % 3 == 0 {
+                while let Some(sample) = lanes[1].take().unwrap() {
+                    let bytes = sample.payload();
+                    let middle = bytes.len() / 2;
+                    assert_eq!(bytes.len(), bytes_of(route));
+                    for at in [0, middle, bytes.len() - 1] {
+                        assert_eq!(bytes[at], sample.header().sequence as u8);
+                    }
+                }
+            }
+        }
+        if frame == 30 {
+            grown = budget.usage(0).budget_used_bytes;
+        }
+    }
+    let usage = budget.usage(0);
+    println!("{usage:?}, allocated {} MiB", allocated_bytes(&place) >> 20);
+    assert_eq!(
+        usage.budget_used_bytes, grown,
+        "the pools of a steady flow do not grow after the first second"
+    );
+    assert!(allocated_bytes(&place) <= 512 << 20);
+}
+
+#[test]
+fn a_stopped_lane_of_a_camera_pins_at_most_its_quota_and_no_other_route_suffers() {
+    let place = Place::new();
+    let node = place.node();
+    let channels: Vec<_> = (0..8).map(|number| routed(&format!("route{number}"))).collect();
+    let budget = PoolBudget::of_channels(&channels, 128 << 20);
+    let create = |number| SamplePublisher::create_within(&node, &channels[number], &budget, number).unwrap();
+    let (camera, scan) = (create(0), create(1));
+    let stopped = lane(&node, &channels[0]);
+    let image = 6_220_800;
+    let mut published = 0;
+    while let Ok(slot) = camera.copy_in(&vec![7; image]) {
+        published += 1;
+        slot.publish(header(published)).unwrap();
+    }
+    assert_eq!(no_memory(&camera, image), NoMemory::Quota);
+    let usage = budget.usage(0);
+    assert!((50 << 20..=64 << 20).contains(&usage.used_bytes), "{usage:?}");
+    assert_eq!(usage.peak_bytes, usage.used_bytes);
+    for sequence in 1..=200 {
+        assert_eq!(publish(&scan, sequence, 2_948), 0);
+    }
+    // A smaller sample still finds a slot that has the memory, or takes it.
+    drop(camera.copy_in(&[1; 2_948]).unwrap());
+    // The lane continues, and has what was published before.
+    assert_eq!(sequences(&stopped), (1..=published).collect::<Vec<_>>());
+    for sequence in published + 1..published + 100 {
+        camera.copy_in(&vec![7; image]).unwrap().publish(header(sequence)).unwrap();
+        assert_eq!(sequences(&stopped), [sequence]);
+    }
+    assert_eq!(budget.usage(0).used_bytes, usage.used_bytes, "slots that are free are used again");
+}
+
+#[test]
+fn pools_that_do_not_fit_the_budget_at_the_start_are_an_error_that_names_the_key() {
+    let place = Place::new();
+    let budget = PoolBudget::of_channels(&[channel(1 << 20)], 4096);
+    let error = SamplePublisher::create_within(&place.node(), &channel(1 << 20), &budget, 0).unwrap_err();
+    assert!(matches!(error, ShmError::BudgetTooSmall { budget_bytes: 4096, .. }), "{error}");
+    assert!(error.to_string().contains("shared_memory.budget_bytes"), "{error}");
 }
 
 #[test]
@@ -1052,7 +1201,7 @@ fn a_full_shared_memory_is_an_error_at_the_start_and_never_later() {
     command.args(["-m", "sh", "-c", script]).arg(std::env::current_exe().unwrap());
     let child = Process::start_with(command, "full", &place, "");
     let error = child.next_line();
-    let needed = channel(1 << 20).pool_size().bytes;
+    let needed = deep_channel(1 << 20).pool_size().first_bytes;
     for part in [&format!("needs {}", needed + 512 * 1024), "/dev/shm", "scan", "remount", "max_sample_bytes"]
     {
         assert!(error.contains(part), "{part} is not in: {error}");

@@ -19,6 +19,15 @@ pub fn program() -> &'static Path {
     &PROGRAM
 }
 
+/// Asserts that a demo (`demo --json`) forwarded every critical sample, and some to the remote subscriber.
+pub fn assert_demo_lost_nothing(demo: &Value) {
+    let bridge = &demo["with_bridge"];
+    assert!(bridge["publisher"]["written"].as_u64().unwrap() > 0, "{demo:#}");
+    assert_eq!(bridge["critical"]["lost"], 0, "{demo:#}");
+    assert_eq!(bridge["critical"]["received"], bridge["publisher"]["written"], "{demo:#}");
+    assert!(bridge["remote"]["received"].as_u64().unwrap() > 0, "{demo:#}");
+}
+
 /// One bridge: an instance name and a folder with its configuration file.
 ///
 /// Declare it before its processes: dropping a process kills it and leaves its shared memory behind, which

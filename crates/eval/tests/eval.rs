@@ -322,7 +322,8 @@ fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
         run.assert_consistent();
         assert_eq!(run.manifest["bed"], "docker");
     }
-    for list in ["ps --all --format {{.Names}}", "network ls --format {{.Name}}"] {
+    let images = "images --format {{.Repository}}";
+    for list in ["ps --all --format {{.Names}}", "network ls --format {{.Name}}", images] {
         let left = String::from_utf8(docker(list).unwrap().stdout).unwrap();
         assert!(!left.contains(&format!("abe-{pid}-")), "{left}");
     }

@@ -70,13 +70,14 @@ struct Phase<'a> {
 impl Phase<'_> {
     fn start(&mut self, sandbox: &Sandbox, setup: Setup) -> Result<(), DemoError> {
         let Settings { lanes, input, .. } = &sandbox.settings;
-        let output = |lane: usize| lanes[lane].outputs[0].topic.as_str();
+        let [critical, noncritical] =
+            [CRITICAL, NONCRITICAL].map(|lane| lanes[lane].outputs[0].topic.to_string());
         let (critical, remote, remote_options) = match setup {
             Setup::Direct => (INPUT_TOPIC, INPUT_TOPIC, vec!["--name", "remote"]),
             Setup::Bridge => {
                 let config_file = sandbox.config_file();
                 self.children.start(Role::Bridge, &["up", "--config", &config_file.to_string_lossy()])?;
-                (output(CRITICAL), output(NONCRITICAL), vec!["--name", "remote", "--best-effort"])
+                (&*critical, &*noncritical, vec!["--name", "remote", "--best-effort"])
             }
         };
         let domain = input.domain_id.to_string();

@@ -8,7 +8,7 @@ use nix::unistd::geteuid;
 
 use super::{Finding, mib};
 use crate::config::Settings;
-use crate::shm::{OTHER_SHARED_BYTES, RoleHolder, RouteChannel, instance_files, root_of};
+use crate::shm::{OTHER_SHARED_BYTES, RoleHolder, RouteChannel, budget_bytes, instance_files, root_of};
 
 const SHM: &str = "/dev/shm";
 
@@ -16,8 +16,12 @@ const SHM: &str = "/dev/shm";
 const SYSTEM_UID_MAX: u32 = 999;
 
 pub(super) fn check(settings: &Settings) -> Vec<Finding> {
-    let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size().bytes);
-    let needed = pools.sum::<u64>() + OTHER_SHARED_BYTES;
+    let pools = || (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size());
+    let most: u64 = pools().map(|pool| pool.bytes).sum();
+    let needed = Needed {
+        at_start: pools().map(|pool| pool.first_bytes).sum::<u64>() + OTHER_SHARED_BYTES,
+        most: most.min(budget_bytes(settings)) + OTHER_SHARED_BYTES,
+    };
     let root = root_of(settings);
     let holders = RoleHolder::all(&root, &settings.instance).unwrap_or_default();
     let space = match statvfs(SHM) {
@@ -49,20 +53,35 @@ struct Space {
     is_allocated: bool,
 }
 
-fn free_space(needed: u64, space: &Space) -> Finding {
+/// What the bridge takes of /dev/shm, in bytes.
+#[derive(Clone, Copy)]
+struct Needed {
+    at_start: u64,
+    /// With the largest samples, up to the budget.
+    most: u64,
+}
+
+fn free_space(needed: Needed, space: &Space) -> Finding {
     let check = "shared memory";
-    let found =
-        format!("needs {} MiB; {SHM} has {} MiB, {} free", mib(needed), mib(space.size), mib(space.free));
-    let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(needed) + mib(space.size)).max(64));
+    let Needed { at_start, most } = needed;
+    let most = most.max(at_start);
+    let found = format!(
+        "needs {} MiB at the start, at most {} MiB; {SHM} has {} MiB, {} free",
+        mib(at_start),
+        mib(most),
+        mib(space.size),
+        mib(space.free)
+    );
+    let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(most) + mib(space.size)).max(64));
     if space.is_allocated {
-        Finding::ok(check, format!("{found}; the running bridge has already allocated it"))
-    } else if space.free < needed {
+        Finding::ok(check, format!("{found}; the running bridge has already a part of it"))
+    } else if space.free < at_start {
         Finding::error(check, found)
-            .means("The bridge does not start, because it allocates all its pools at the start.")
+            .means("The bridge does not start, because it allocates the headers of its samples at the start.")
             .with_command(command)
-    } else if space.free < needed + needed / 2 {
+    } else if space.free < most + most / 2 {
         Finding::warning(check, found)
-            .means("If another program uses the rest, the bridge cannot be restarted.")
+            .means("If /dev/shm is full, ingress drops the samples for which there is no room.")
             .with_command(command)
     } else {
         Finding::ok(check, found)
@@ -129,7 +148,10 @@ mod tests {
     #[test]
     fn shared_memory_must_be_free_unless_the_bridge_has_allocated_it() {
         let space = |free: u64, is_allocated| Space { size: 64 << 20, free: free << 20, is_allocated };
-        let needed = 40 << 20;
+        let needed = Needed { at_start: 40 << 20, most: 40 << 20 };
+        let growing = Needed { at_start: 4 << 20, most: 100 << 20 };
+        assert_eq!(free_space(growing, &space(64, false)).severity, Severity::Warning);
+        assert_eq!(free_space(growing, &space(3, false)).severity, Severity::Error);
         assert_eq!(free_space(needed, &space(64, false)).severity, Severity::Ok);
         assert_eq!(free_space(needed, &space(50, false)).severity, Severity::Warning);
         let too_small = free_space(needed, &space(39, false));

@@ -76,10 +76,19 @@ pub(super) const ROWS: &[Row] = &[
         .doc("Your name for the route; unique."),
     restarts(
         &["topics[].input_topic"],
-        Other("absolute topic name, at most 246 characters"),
+        Other("absolute topic name, or a pattern of such names, at most 246 characters"),
         "must be given",
     )
-    .doc("The topic that the bridge subscribes to."),
+    .doc(
+        "The topic that the bridge subscribes to. `*` in place of a token stands for any one token, `**` for \
+         any number of them: see [Routes by pattern](#routes-by-pattern).",
+    ),
+    restarts(&["topics[].exclude"], Other("list of at most 64 topic names or patterns"), "none")
+        .doc("Of a pattern: topics that match it and are not bridged."),
+    restarts(&["topics[].max_routes"], Whole(1, 64, " routes"), "8").doc(
+        "Of a pattern: the most topics that are bridged at once. Each has shared memory, and memory in each \
+         process, as a topic of its own has.",
+    ),
     restarts(&["topics[].message_type"], Other("a ROS 2 message type"), "found by discovery")
         .doc("Message type, `pkg/msg/Name` or `pkg/Name`."),
     restarts(&["topics[].lanes"], Other("list of lane names, at least one"), "all lanes")
@@ -89,10 +98,13 @@ pub(super) const ROWS: &[Row] = &[
     restarts(&["topics[].noncritical_output"], TOPIC, "`/adaptive_bridge/noncritical` and the input topic")
         .doc("The topic that the lane `noncritical` publishes."),
     restarts(&["topics[].outputs.<lane>"], TOPIC, "`/adaptive_bridge/<lane>` and the input topic")
-        .doc("The same for any lane. For `critical` and `noncritical` give this or the key above, not both."),
+        .doc(
+            "The same for any lane. For `critical` and `noncritical` give this or the key above, not both. Of a \
+         pattern it ends in `/**`, which stands for the input topic.",
+        ),
     restarts(&["topics[].max_sample_bytes"], SAMPLE, "`shared_memory.max_sample_bytes`").doc(
         "The largest serialized sample; ingress drops a larger one as `too_large`. Shared memory is \
-         reserved for samples of this size.",
+         taken for the samples that come, not for this size.",
     ),
     restarts(&["topics[].priority"], Whole(0, 99, ""), "0").doc(
         "Which routes go first: each lane sends waiting samples of a higher number first, and ingress \
@@ -233,4 +245,13 @@ pub(super) const ROWS: &[Row] = &[
         .doc("The largest sample of a topic without `max_sample_bytes` of its own."),
     restarts(&["shared_memory.max_taps"], Whole(0, 64, ""), "2")
         .doc("Local programs that may tap a route at once."),
+    restarts(
+        &["shared_memory.budget_bytes"],
+        Whole(1_048_576, 1_099_511_627_776, " bytes"),
+        "268435456, or an eighth of the machine's memory if that is less",
+    )
+    .doc(
+        "The most shared memory that the samples of all routes take together. A route takes what its samples \
+         need, and leaves the others room for theirs; ingress drops what does not fit as `over_budget`.",
+    ),
 ];

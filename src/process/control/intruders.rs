@@ -9,11 +9,11 @@ use tracing::{info, warn};
 use super::super::role::RoleError;
 use super::absences::Absences;
 use super::networks;
-use crate::config::{Lane, Settings};
+use crate::config::{InputTopic, Lane, OutputTopic, RoutePattern, Settings};
 use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
 use crate::model::{
     FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
-    ReaderRecord, TrafficClass,
+    ReaderRecord, TopicName, TopicPrefix, TrafficClass,
 };
 use crate::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Location};
 use crate::shm::{BoardWriter, Boards, write_rows};
@@ -30,8 +30,48 @@ struct WatchedNetwork {
     /// The DDS names of the outputs and of the inputs on this network.
     outputs: BTreeSet<String>,
     inputs: BTreeSet<String>,
+    /// The patterns whose topics are inputs or outputs on this network.
+    patterns: Vec<WatchedPattern>,
     /// The readers of the outputs and the writers of the inputs, with their locations.
     endpoints: Vec<(Guid, Location)>,
+}
+
+/// A pattern, as far as it concerns one network. Its topics are watched whether they have a place or not.
+struct WatchedPattern {
+    settings: RoutePattern,
+    /// Whether its inputs are on the network, and the prefixes of its outputs there, with their class.
+    has_inputs: bool,
+    outputs: Vec<(TopicPrefix, TrafficClass)>,
+    /// The prefix of the output that a reader on another host should read.
+    alternative: Option<TopicPrefix>,
+}
+
+impl WatchedPattern {
+    fn is_input(&self, dds_topic: &str) -> bool {
+        self.has_inputs && dds_topic.strip_prefix("rt").is_some_and(|topic| self.settings.is_for(topic))
+    }
+
+    /// The input topic of an output and the class of its lane; `None` for other topics.
+    fn output(&self, dds_topic: &str) -> Option<(TopicName, TrafficClass)> {
+        let topic = TopicName::try_from(dds_topic.strip_prefix("rt")?).ok()?;
+        self.outputs.iter().find_map(|(prefix, class)| {
+            let input = prefix.input_of(&topic).filter(|input| self.settings.is_for(input))?;
+            Some((TopicName::try_from(input).ok()?, *class))
+        })
+    }
+
+    /// The topic if hosts other than this one should not read it.
+    fn guarded(&self, dds_topic: &str) -> Option<GuardedTopic> {
+        let topic = TopicName::try_from(dds_topic.strip_prefix("rt")?).ok()?;
+        let (input, guarded) = match self.output(dds_topic) {
+            Some((input, TrafficClass::Critical)) => (input, Guarded::CriticalOutput),
+            Some((_, TrafficClass::Noncritical)) => return None,
+            None if self.is_input(dds_topic) => (topic.clone(), Guarded::Input),
+            None => return None,
+        };
+        let alternative = self.alternative.as_ref().and_then(|prefix| prefix.output_of(&input));
+        Some(GuardedTopic { topic, guarded, alternative })
+    }
 }
 
 /// Overrun samples of one reader that were already logged.
@@ -82,25 +122,43 @@ impl EndpointMonitor {
             let mut outputs = BTreeSet::new();
             let mut inputs = BTreeSet::new();
             if network == 0 {
-                inputs.extend(settings.routes.iter().map(|route| route.input_topic.to_dds()));
-                guarded.extend(settings.routes.iter().enumerate().map(|(route, route_settings)| {
-                    GuardedTopic {
-                        topic: route_settings.input_topic.clone(),
+                for (route, route_settings) in settings.routes.iter().enumerate() {
+                    let InputTopic::Topic(topic) = &route_settings.input_topic else { continue };
+                    inputs.insert(topic.to_dds());
+                    guarded.push(GuardedTopic {
+                        topic: topic.clone(),
                         guarded: Guarded::Input,
                         alternative: noncritical_output(settings, route),
-                    }
-                }));
+                    });
+                }
             }
+            let mut patterns: Vec<_> = settings
+                .patterns
+                .iter()
+                .map(|pattern| watched_pattern(settings, pattern, network == 0))
+                .collect();
             let lanes =
                 settings.lanes.iter().zip(&network_of_lane).filter(|(_, of_lane)| **of_lane == network);
             for (lane, _) in lanes {
-                outputs.extend(lane.outputs.iter().map(|output| output.topic.to_dds()));
-                if lane.class() == TrafficClass::Critical {
-                    guarded.extend(lane.outputs.iter().map(|output| GuardedTopic {
-                        topic: output.topic.clone(),
-                        guarded: Guarded::CriticalOutput,
-                        alternative: noncritical_output(settings, output.route),
-                    }));
+                for output in &lane.outputs {
+                    let topic = match &output.topic {
+                        OutputTopic::Topic(topic) => topic,
+                        OutputTopic::Prefix(prefix) => {
+                            let of = |one: &&mut WatchedPattern| one.settings.first_route == output.route;
+                            if let Some(pattern) = patterns.iter_mut().find(of) {
+                                pattern.outputs.push((prefix.clone(), lane.class()));
+                            }
+                            continue;
+                        }
+                    };
+                    outputs.insert(topic.to_dds());
+                    if lane.class() == TrafficClass::Critical {
+                        guarded.push(GuardedTopic {
+                            topic: topic.clone(),
+                            guarded: Guarded::CriticalOutput,
+                            alternative: noncritical_output(settings, output.route),
+                        });
+                    }
                 }
             }
             watched.push(WatchedNetwork {
@@ -108,6 +166,7 @@ impl EndpointMonitor {
                 graph: participant.watch_graph()?,
                 outputs,
                 inputs,
+                patterns,
                 endpoints: Vec::new(),
             });
         }
@@ -156,8 +215,7 @@ impl EndpointMonitor {
                     }
                 }
                 let is_bridge_topic = |topic: &str, publishes: bool| {
-                    let topics = if publishes { &network.inputs } else { &network.outputs };
-                    topics.contains(topic)
+                    if publishes { network.is_input(topic) } else { network.is_output(topic) }
                 };
                 if let Discovery::ParticipantGone { .. } = change {
                     // Before `network.handle` removes the participant's nodes from the graph.
@@ -231,7 +289,7 @@ impl EndpointMonitor {
                     warn!(
                         lane = configured.name.as_str(),
                         route = settings.routes[output.route].id.as_str(),
-                        topic = output.topic.as_str(),
+                        topic = %output.topic,
                         reader = reader.unwrap_or_else(|| record.reader.to_string()),
                         missed,
                         unacknowledged = record.unacknowledged,
@@ -246,6 +304,15 @@ impl EndpointMonitor {
 }
 
 impl WatchedNetwork {
+    fn is_input(&self, dds_topic: &str) -> bool {
+        self.inputs.contains(dds_topic) || self.patterns.iter().any(|pattern| pattern.is_input(dds_topic))
+    }
+
+    fn is_output(&self, dds_topic: &str) -> bool {
+        self.outputs.contains(dds_topic)
+            || self.patterns.iter().any(|pattern| pattern.output(dds_topic).is_some())
+    }
+
     fn handle(
         &mut self,
         change: Discovery,
@@ -255,8 +322,11 @@ impl WatchedNetwork {
     ) {
         match change {
             Discovery::Reader(reader) if !participant.owns(reader.guid) => {
-                if self.outputs.contains(&reader.topic) {
+                if self.is_output(&reader.topic) {
                     self.remember(&reader);
+                }
+                if let Some(guarded) = self.patterns.iter().find_map(|one| one.guarded(&reader.topic)) {
+                    self.watch.guard(guarded);
                 }
                 self.watch.endpoint_discovered(
                     reader.guid,
@@ -266,9 +336,7 @@ impl WatchedNetwork {
                     now,
                 );
             }
-            Discovery::Writer(writer)
-                if !participant.owns(writer.guid) && self.inputs.contains(&writer.topic) =>
-            {
+            Discovery::Writer(writer) if !participant.owns(writer.guid) && self.is_input(&writer.topic) => {
                 self.remember(&writer);
             }
             Discovery::WriterGone(guid) => self.endpoints.retain(|(writer, _)| *writer != guid),
@@ -313,10 +381,29 @@ impl WatchedNetwork {
     }
 }
 
-fn noncritical_output(settings: &Settings, route: usize) -> Option<crate::model::TopicName> {
+fn noncritical_output(settings: &Settings, route: usize) -> Option<TopicName> {
     let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
-    outputs.find(|output| output.route == route).map(|output| output.topic.clone())
+    match &outputs.find(|output| output.route == route)?.topic {
+        OutputTopic::Topic(topic) => Some(topic.clone()),
+        OutputTopic::Prefix(_) => None,
+    }
+}
+
+/// A pattern without its outputs.
+fn watched_pattern(settings: &Settings, pattern: &RoutePattern, has_inputs: bool) -> WatchedPattern {
+    let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
+    let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
+    let alternative = outputs.find(|output| output.route == pattern.first_route);
+    WatchedPattern {
+        settings: pattern.clone(),
+        has_inputs,
+        outputs: Vec::new(),
+        alternative: alternative.and_then(|output| match &output.topic {
+            OutputTopic::Prefix(prefix) => Some(prefix.clone()),
+            OutputTopic::Topic(_) => None,
+        }),
+    }
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@
 //! to send and when; [`output`] writes samples and accounts for them.
 
 mod arena;
+mod bound_topic;
 mod former_readers;
 mod gaps;
 mod history;

@@ -6,6 +6,7 @@ use crate::config::Lane;
 use crate::model::{Durability, QosProfile, Reliability};
 
 /// What the DDS writer of an output offers.
+#[derive(Clone, Copy)]
 pub(super) struct Offer {
     pub qos: QosProfile,
     pub window_samples: usize,

@@ -1,11 +1,14 @@
 //! One output: takes the samples of a route from shared memory, writes them to DDS, and accounts for them.
 
+mod announce;
+
 use bytes::Bytes;
 use tracing::{error, info, warn};
 
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
+use super::bound_topic::BoundTopic;
 use super::former_readers::FormerReaders;
 use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
@@ -31,7 +34,9 @@ pub(super) struct Output {
     lane: String,
     class: TrafficClass,
     route: usize,
-    dds_topic: String,
+    topic: BoundTopic,
+    /// What the configuration lets an output offer first, and once the publishers offer TRANSIENT_LOCAL.
+    configured: (Offer, Option<Offer>),
     offer: Offer,
     /// What the output offers once the publishers offer TRANSIENT_LOCAL and no reader is matched; `None` when
     /// it does, and where the configuration gives the DURABILITY.
@@ -115,7 +120,8 @@ impl Output {
             lane: lane.name.to_string(),
             class: lane.class(),
             route: output.route,
-            dds_topic: output.topic.to_dds(),
+            topic: BoundTopic::new(route, output),
+            configured: (offer, latched_offer),
             history: offer.history(),
             unsent: UnsentSamples::new(offer.most_unsent()),
             durability: RouteDurability::new(&offer, latched_offer.is_some()),
@@ -147,7 +153,8 @@ impl Output {
             boards,
         };
         match &route.message_type {
-            Some(message_type) => {
+            // The type of a place is known with its topic.
+            Some(message_type) if !opened.topic.is_place => {
                 let known = opened.boards.route_info(output.route).unwrap_or_default();
                 opened.durability.set(known.durability());
                 opened.follow_durability(participant);
@@ -155,7 +162,7 @@ impl Output {
                 let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash, has_keys };
                 opened.make_writer(participant, dds_type)?;
             }
-            None => opened.announce_type(participant),
+            _ => opened.announce_type(participant),
         }
         Ok(opened)
     }
@@ -203,6 +210,13 @@ impl Output {
         // A noncritical lane polls no sample in such a mode.
         if let Some(reason) = critical_drop(self.mode) {
             return self.drop_sample(&sample, reason);
+        }
+        if self.topic.is_place {
+            self.follow_topic(participant);
+            if self.topic.is_former(sample.header().sequence) {
+                // Of the former topic of the place, which has no writer any more.
+                return self.drop_sample(&sample, DropReason::NoWriter);
+            }
         }
         let other_kind = sample.header().key.is_keyed() != self.has_keys;
         if self.writer.is_none() || other_kind || (self.is_to_latch() && self.counters.get().readers == 0) {
@@ -415,7 +429,7 @@ impl Output {
                     warn!(
                         route = self.id,
                         lane = self.lane,
-                        topic = self.dds_topic,
+                        topic = self.topic.dds_topic,
                         ?reader,
                         %policy,
                         "a reader requests a stricter QoS than this lane offers and receives nothing: change \
@@ -455,102 +469,6 @@ impl Output {
         }
     }
 
-    /// Whether the publishers offer TRANSIENT_LOCAL and the output does not, though it follows them.
-    fn is_to_latch(&self) -> bool {
-        self.durability.get() == Durability::TransientLocal && self.latched_offer.is_some()
-    }
-
-    /// Offers TRANSIENT_LOCAL when the publishers do, unless the configuration gives the DURABILITY. A writer
-    /// cannot change it (DDS 1.4 clause 2.2.3), and a reader misses what is written until it has matched the
-    /// next writer, so the present one stays as long as it has a reader.
-    fn follow_durability(&mut self, participant: &mut Participant) {
-        if !self.is_to_latch() {
-            return;
-        }
-        if let Some(writer) = &self.writer
-            && (self.unsent.len() > 0 || writer.matched_readers().next().is_some())
-        {
-            return;
-        }
-        let Some(latched) = self.latched_offer.take() else { return };
-        self.remove_writer(participant);
-        self.history = latched.history();
-        self.unsent = UnsentSamples::new(latched.most_unsent());
-        self.offer = latched;
-    }
-
-    /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
-    /// match no such publisher either, so nothing that they could get is lost; what is not sent yet is sent
-    /// first.
-    fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
-        if self.writer.is_some() && has_keys != self.has_keys && !self.count_sent() {
-            self.remove_writer(participant);
-            self.history = self.offer.history();
-        }
-    }
-
-    fn remove_writer(&mut self, participant: &mut Participant) {
-        if let Some(former) = self.writer.take() {
-            self.unmatched.clear();
-            self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
-            self.counters.update(|counters| counters.readers = 0);
-            self.overrun.count(&former, &mut self.counters);
-            self.overrun = Overrun::default();
-            let guid = former.guid();
-            drop(former);
-            participant.remove_endpoint(guid);
-        }
-    }
-
-    /// Creates the writer if ingress has published the type by now, and lets it announce the type's hash.
-    fn announce_type(&mut self, participant: &mut Participant) {
-        let Some(info) = self.boards.route_info(self.route) else {
-            return;
-        };
-        let Some(dds_type) = info.announced_type() else { return };
-        self.durability.set(info.durability());
-        self.follow_durability(participant);
-        self.follow_kind(participant, dds_type.has_keys);
-        match &self.writer {
-            None => {
-                if let Err(failure) = self.make_writer(participant, dds_type) {
-                    let (route, lane, dds_type) = (&self.id, &self.lane, dds_type.name);
-                    error!(route, lane, dds_type, %failure, "cannot create the DDS writer");
-                }
-            }
-            Some(writer) if dds_type.hash != self.type_hash => {
-                writer.set_type_hash(dds_type.hash);
-                self.type_hash = dds_type.hash;
-            }
-            Some(_) => {}
-        }
-    }
-
-    fn make_writer(&mut self, participant: &mut Participant, dds_type: DdsType) -> Result<(), RoleError> {
-        let Offer { qos, window_samples, supersedes } = &self.offer;
-        let writer = participant.create_writer(&self.dds_topic, dds_type, qos, *window_samples)?;
-        info!(
-            route = self.id,
-            lane = self.lane,
-            topic = self.dds_topic,
-            dds_type = dds_type.name,
-            has_keys = dds_type.has_keys,
-            reliability = ?qos.reliability,
-            durability = ?qos.durability,
-            "DDS writer created"
-        );
-        if *supersedes {
-            writer.skip_evicted();
-        }
-        self.writer = Some(writer);
-        self.type_hash = dds_type.hash;
-        if self.has_keys != dds_type.has_keys {
-            self.has_keys = dds_type.has_keys;
-            self.durability.set_changed();
-        }
-        Ok(())
-    }
-
     /// Counts the samples missing before `next`, by the reason why the lane did not get them.
     fn count_missing(&mut self, missing: u64, next: &SampleHeader) {
         let restarted = self.boards.health(ProcessRole::Ingress).is_some_and(|health| {
@@ -575,6 +493,9 @@ impl Output {
 
     /// Writes a sample that was forwarded before a restart again, for late joiners.
     fn restore(&mut self, sample: &ShmSample) {
+        if self.topic.is_former(sample.header().sequence) {
+            return;
+        }
         let Some(history) = &mut self.history else { return };
         let (header, publisher) = (sample.header(), sample.header().writer_guid);
         let payload = Bytes::copy_from_slice(sample.payload());

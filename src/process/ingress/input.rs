@@ -17,9 +17,9 @@ use crate::dds::{
 };
 use crate::model::{
     AgeBasis, DdsType, DropReason, Durability, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
-    Reliability, RouteInfo, SampleHeader,
+    Reliability, RouteInfo, SampleHeader, TopicName,
 };
-use crate::shm::{BoardWriter, HistogramWriter, LoanError, RouteChannel, SamplePublisher, Stage};
+use crate::shm::{BoardWriter, HistogramWriter, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage};
 
 /// Interval at which a route without a publisher logs that it waits.
 const REMIND_MS: u64 = 30_000;
@@ -27,6 +27,7 @@ const REMIND_MS: u64 = 30_000;
 /// The input of one route: takes samples from its DDS readers and publishes them to shared memory.
 pub(super) struct Input {
     id: String,
+    /// The input topic; empty for a place without a topic.
     dds_topic: String,
     configured_type: Option<String>,
     pub route: Route,
@@ -69,24 +70,28 @@ impl Input {
         settings: &Settings,
         index: usize,
         flag: &Arc<ArrivalFlag>,
+        budget: &Arc<PoolBudget>,
     ) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
+        let channel = RouteChannel::of(settings, index);
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
         let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
+        let info = role.boards.route_info_writer(index);
+        let topic = route.input_topic.resolve(info.get());
         Ok(Self {
             id: route.id.to_string(),
-            dds_topic: route.input_topic.to_dds(),
+            dds_topic: topic.map_or_else(String::new, |topic| topic.to_dds()),
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
             source: Source::default(),
             inbox: Inbox::with_flag(Arc::clone(flag)),
             readers: BTreeMap::new(),
             settled_type: None,
             source_changed: true,
-            pool: PoolOwner::new(SamplePublisher::create(&role.node, &RouteChannel::of(settings, index))?),
+            pool: PoolOwner::new(SamplePublisher::create_within(&role.node, &channel, budget, index)?),
             drop_log: DropLog::new(counters.get().drops),
             counters,
-            info: role.boards.route_info_writer(index),
+            info,
             dds_in: role.boards.histogram_writer(Stage::DdsIn, index),
             publishers,
             remind_at: MonotonicNs(0),
@@ -97,6 +102,42 @@ impl Input {
     /// Whether there is a reader for at least one publisher.
     pub fn is_connected(&self) -> bool {
         self.readers.values().any(|reader| !reader.idle)
+    }
+
+    /// The topic of a place, and the samples received of it; `None` while it has none, and for other routes.
+    pub fn bound(&self) -> Option<(TopicName, u64)> {
+        let topic = self.info.get().topic().filter(|_| self.route.input_topic.is_place())?;
+        Some((topic, self.counters.get().published.saturating_sub(self.info.get().bound_after)))
+    }
+
+    /// Whether the route has an input topic.
+    pub fn has_topic(&self) -> bool {
+        !self.dds_topic.is_empty()
+    }
+
+    /// Gives a place to a topic, in place of the present one. The samples that are numbered from now on are
+    /// of this topic: the lanes learn of the topic, and of the number, before there is a reader.
+    pub fn bind(&mut self, participant: &mut Participant, topic: &TopicName) {
+        for reliability in [Reliability::Reliable, Reliability::BestEffort] {
+            self.remove_reader(participant, reliability);
+        }
+        if self.has_topic() {
+            participant.forget_topic(&self.dds_topic);
+        }
+        self.source = Source::default();
+        self.source_changed = true;
+        self.settled_type = None;
+        self.publishers.mark_gone(|_| true, true);
+        self.dds_topic = topic.to_dds();
+        let bound_after = self.counters.get().published;
+        let bound_count = self.info.get().bound_count.saturating_add(1);
+        // The type of the former topic goes with it, so that no lane announces this one with that type.
+        self.info.set(RouteInfo {
+            bound_topic: FixedText::new(topic.as_str()),
+            bound_after,
+            bound_count,
+            ..RouteInfo::default()
+        });
     }
 
     /// Takes one sample and publishes it to the lanes, which the caller has to wake then.
@@ -133,6 +174,7 @@ impl Input {
         let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
+            Err(LoanError::NoMemory(_)) => Some(DropReason::OverBudget),
             Err(_) => Some(DropReason::PoolExhausted),
         };
         let count = |counters: &mut IngressCounters| {
@@ -186,7 +228,7 @@ impl Input {
 
     /// Handles a discovered writer. Ignores writers of other topics.
     pub fn writer_found(&mut self, writer: &Endpoint) {
-        if writer.topic != self.dds_topic {
+        if writer.topic != self.dds_topic || !self.has_topic() {
             return;
         }
         self.source_changed = true;
@@ -223,6 +265,12 @@ impl Input {
         self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();
+        let memory = self.pool.memory();
+        counters.pool_bytes = memory.used_bytes;
+        counters.pool_peak_bytes = memory.peak_bytes;
+        counters.budget_bytes = memory.budget_bytes;
+        counters.budget_used_bytes = memory.budget_used_bytes;
+        counters.budget_peak_bytes = memory.budget_peak_bytes;
         self.publishers.report_clocks(&self.id, &mut counters, now);
         self.counters.set(counters);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, "ingress", |_| false, now);
@@ -231,7 +279,7 @@ impl Input {
 
     /// Creates the readers that the discovered publishers need, and removes the others.
     fn connect(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
-        if self.is_connected() && !std::mem::take(&mut self.source_changed) {
+        if !self.has_topic() || (self.is_connected() && !std::mem::take(&mut self.source_changed)) {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
@@ -278,7 +326,10 @@ impl Input {
         let type_hash = self.source.type_hash(dds_type, self.info.get().type_hash);
         let has_keys = self.source.has_keys(dds_type, self.info.get().has_keys != 0);
         let of_route = DdsType { name: dds_type, hash: type_hash, has_keys };
-        let mut info = RouteInfo { type_hash, has_keys: has_keys.into(), ..RouteInfo::default() };
+        let RouteInfo { bound_topic, bound_after, bound_count, .. } = *self.info.get();
+        let has_keys = has_keys.into();
+        let mut info =
+            RouteInfo { type_hash, has_keys, bound_topic, bound_after, bound_count, ..RouteInfo::default() };
         let durability = self.source.durability(of_route, self.info.get().durability());
         info.transient_local = u64::from(durability == Durability::TransientLocal);
         if is_settled {

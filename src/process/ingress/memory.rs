@@ -1,5 +1,6 @@
 //! The memory that the input of a route may take. Pure.
 
+pub(in crate::process) use super::patterns::PATTERN_BYTES;
 use super::pool::assembly_limits;
 use super::source::most_waiting_bytes;
 use crate::config::Route;

@@ -7,6 +7,7 @@
 mod early_waker;
 mod input;
 pub(super) mod memory;
+mod patterns;
 mod pool;
 mod publishers;
 mod receiving;
@@ -24,12 +25,13 @@ use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, participant_options};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::Settings;
+use crate::config::{InputTopic, Route, Settings};
 use crate::dds::{ArrivalFlag, Discovery, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::ProcessRole;
+use crate::shm::{PoolBudget, ProcessRole};
 use early_waker::EarlyWaker;
 use input::Input;
+use patterns::Patterns;
 use receiving::{Receiving, ServedLane};
 
 /// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
@@ -75,6 +77,7 @@ struct Ingress {
     receiving: Arc<Receiving>,
     participant: Participant,
     role: Role,
+    patterns: Patterns,
     /// Whether each publisher that wrote until the former process died has sent a sample to this process.
     has_resumed: bool,
     /// The latest time to dispose of the participant of a killed former process.
@@ -97,9 +100,10 @@ impl Ingress {
         let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
         memory_limit::check(settings, ProcessRole::Ingress);
         let mut inputs = Vec::with_capacity(settings.routes.len());
+        let budget = PoolBudget::of(settings);
         for route in 0..settings.routes.len() {
             let flag = ArrivalFlag::passive();
-            inputs.push((Input::open(&role, settings, route, &flag)?, flag));
+            inputs.push((Input::open(&role, settings, route, &flag, &budget)?, flag));
         }
         let mut lanes = Vec::with_capacity(settings.lanes.len());
         for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
@@ -114,9 +118,14 @@ impl Ingress {
         let receiving = Arc::new(Receiving::new(inputs, lanes, !urgent.is_empty()));
         let (on_arriving, on_received) = receiving.hooks();
         let options = participant_options(settings, &settings.input, "ingress");
-        let urgent_topics = urgent.into_iter().map(|route| settings.routes[route].input_topic.to_dds());
+        let urgent_topics =
+            urgent.into_iter().filter_map(|route| match &settings.routes[route].input_topic {
+                InputTopic::Topic(topic) => Some(topic.to_dds()),
+                InputTopic::Pattern(_) => None,
+            });
         let participant = role.join_receiving(&options, urgent_topics, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
+        let patterns = Patterns::open(settings, &role.boards);
         let early_waker = EarlyWaker::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
         let mut ingress = Self {
@@ -124,11 +133,13 @@ impl Ingress {
             receiving,
             participant,
             role,
+            patterns,
             has_resumed: false,
             resume_until,
             housekeeping_at,
             received: Meter::default(),
         };
+        ingress.resume_places(housekeeping_at);
         ingress.housekeeping(housekeeping_at)?;
         ingress.role.notifier.ready();
         Ok(ingress)
@@ -144,22 +155,28 @@ impl Ingress {
         while let Some(change) = self.participant.poll_discovery() {
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
+                    self.patterns.writer_found(&writer);
                     self.for_each_input(|input, _| input.writer_found(&writer));
                 }
-                Discovery::WriterGone(guid) => self.for_each_input(|input, _| input.writer_gone(guid)),
+                Discovery::WriterGone(guid) => {
+                    self.patterns.writers_gone(|writer| writer == guid);
+                    self.for_each_input(|input, _| input.writer_gone(guid));
+                }
                 Discovery::ParticipantGone { prefix, .. } => {
+                    self.patterns.writers_gone(|writer| writer.prefix() == prefix);
                     self.for_each_input(|input, _| input.participant_gone(prefix));
                 }
                 _ => {}
             }
         }
+        self.bind_places(now);
         let mut searching = false;
         let mut resumed = true;
         let mut outcome = Ok(());
         self.for_each_input(|input, participant| {
             let done = input.housekeeping(participant, now);
             outcome = std::mem::replace(&mut outcome, Ok(())).and(done);
-            searching |= !input.is_connected();
+            searching |= !input.is_connected() && !input.route.input_topic.is_place();
             resumed &= input.publishers.have_resumed();
         });
         // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
@@ -183,6 +200,30 @@ impl Ingress {
         outcome
     }
 
+    /// Returns the topics of the former process to their places.
+    fn resume_places(&mut self, now: MonotonicNs) {
+        for route in self.patterns.places() {
+            self.receiving.with_input(route, |input| self.patterns.resume(route, input.bound(), now));
+        }
+    }
+
+    /// Gives the places of patterns to the topics that discovery has reported.
+    fn bind_places(&mut self, now: MonotonicNs) {
+        for route in self.patterns.places() {
+            self.receiving.with_input(route, |input| self.patterns.samples_at(route, input.bound(), now));
+        }
+        while let Some((route, topic)) = self.patterns.poll(now) {
+            let ring = self.receiving.with_input(route, |input| {
+                input.bind(&mut self.participant, &topic);
+                self.patterns.writers_of(&topic).for_each(|writer| input.writer_found(writer));
+            });
+            if ring {
+                self.participant.ring();
+            }
+        }
+        self.patterns.housekeeping();
+    }
+
     /// Calls `work` with each input, which the receiving thread cannot use meanwhile.
     fn for_each_input(&mut self, mut work: impl FnMut(&mut Input, &mut Participant)) {
         if self.receiving.for_each_input(|input| work(input, &mut self.participant)) {
@@ -195,13 +236,15 @@ impl Ingress {
 /// lowest of all routes. A route on noncritical lanes alone never goes before a critical one.
 fn urgent_routes(settings: &Settings) -> impl Iterator<Item = usize> {
     let lowest = settings.routes.iter().map(|route| route.priority).min().unwrap_or(0);
+    // The ports are bound before a place has a topic.
+    let is_fixed = |route: &Route| !route.input_topic.is_place();
     let is_critical = |index| {
         let mut lanes = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Critical);
         lanes.any(|lane| lane.outputs.iter().any(|output| output.route == index))
     };
     let routes = settings.routes.iter().enumerate();
     routes
-        .filter(move |(index, route)| route.priority > lowest && is_critical(*index))
+        .filter(move |(index, route)| route.priority > lowest && is_fixed(route) && is_critical(*index))
         .map(|(index, _)| index)
 }
 
@@ -211,6 +254,9 @@ fn describe(receiving: &Receiving, received: &mut Meter, line: &mut String, now:
     let (mut routes, mut connected, mut total) = (0, 0, 0);
     let (mut drops, mut without) = (Vec::new(), Vec::new());
     let ring = receiving.for_each_input(|input| {
+        if !input.has_topic() {
+            return;
+        }
         routes += 1;
         total += input.counters.get().received;
         drops.push(input.counters.get().drops);

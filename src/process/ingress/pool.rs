@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dds::{AssemblyLimits, LentMemory, Payload, SampleMemory};
-use crate::shm::{LentSlot, LoanError, SamplePublisher, Slot};
+use crate::shm::{LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
 
 /// The pool, as the main thread and the DDS library share it.
 pub(super) struct Pool {
@@ -57,6 +57,11 @@ impl PoolOwner {
             drop(slot);
         }
         self.pool.publisher.connect_subscribers();
+    }
+
+    /// What the pool takes of the budget.
+    pub fn memory(&self) -> PoolUse {
+        self.pool.publisher.memory()
     }
 
     /// Returns the slot in which the DDS library assembled the payload, or copies the payload into a new one.

@@ -338,6 +338,32 @@ mod tests {
     }
 
     #[test]
+    fn a_publisher_is_expected_that_wrote_in_the_last_5_s() {
+        let fixture = Fixture::new("expected");
+        let mut former = fixture.open(at(0));
+        assert_eq!(take(&mut former, ONE, 1, at(1)), Some(0));
+        drop(former);
+        for (now_ms, is_expected) in [(5_000, true), (5_001, false)] {
+            assert_eq!(fixture.open(at(now_ms)).1.have_resumed(), !is_expected, "{now_ms} ms");
+        }
+    }
+
+    #[test]
+    fn the_account_has_the_reliability_that_its_publisher_offers() {
+        let fixture = Fixture::new("offered");
+        let mut route = fixture.open(at(0));
+        assert_eq!(take(&mut route, ONE, 1, at(1)), Some(0));
+        for (reliability, offered) in [
+            (Some(Reliability::Reliable), PublisherAccount::OFFERS_RELIABLE),
+            (Some(Reliability::BestEffort), PublisherAccount::OFFERS_BEST_EFFORT),
+            (None, PublisherAccount::OFFER_UNKNOWN),
+        ] {
+            route.1.set_reliabilities(|writer| reliability.filter(|_| writer == ONE));
+            assert_eq!(fixture.boards.publisher(0, 0).unwrap().offered_reliability, offered);
+        }
+    }
+
+    #[test]
     fn the_second_write_of_an_account_is_made_up_for_after_a_kill() {
         let fixture = Fixture::new("completed");
         let mut former = fixture.open(at(0));
@@ -404,7 +430,15 @@ mod tests {
         };
         let second = Guid(2_u128.to_ne_bytes());
         assert_eq!(furthest(&mut publishers, 3_000), (second, 5_000_000_000));
+        let logged = |publishers: &Publishers| (publishers.logged_clock, publishers.log_clock_at);
+        assert_eq!(logged(&publishers), (Some(second), at(33_000)));
+        assert_eq!(furthest(&mut publishers, 62_999), (second, 5_000_000_000));
+        assert_eq!(logged(&publishers), (Some(second), at(33_000)), "nothing has changed");
+        publishers.log_clock_at = at(63_001);
+        assert_eq!(furthest(&mut publishers, 63_000), (Guid::default(), 0), "silent");
+        assert_eq!(logged(&publishers), (Some(second), at(63_001)), "too soon after the last line");
         assert_eq!(furthest(&mut publishers, 63_001), (Guid::default(), 0), "silent");
+        assert_eq!(logged(&publishers), (None, at(93_001)));
         // A publisher that takes over an account does not inherit the offset.
         observe(&mut publishers, 2, 4_000, 5_000);
         assert_eq!(furthest(&mut publishers, 4_000), (second, 5_000_000_000));
@@ -422,7 +456,9 @@ mod tests {
         assert_eq!(marks.find(ONE), None, "a publisher without a mark");
         let vacant = marks.find(Guid([0; 16])).map(|(_, last)| last);
         assert_eq!(vacant, Some(i64::MAX), "no sample is above a vacant place");
+        let other_entity = Guid(std::array::from_fn(|byte| if byte < 8 { 1 } else { 2 }));
         marks.set(3, ONE, 10);
+        assert_eq!(marks.find(other_entity), None, "it differs in the second half");
         assert_eq!((marks.find(ONE), marks.find(TWO)), (Some((3, 10)), None));
         marks.set(3, TWO, 11);
         assert_eq!((marks.find(ONE), marks.find(TWO)), (None, Some((3, 11))));

@@ -95,6 +95,13 @@ impl Receiving {
         (on_arriving, move || received.turn(true))
     }
 
+    /// Like [`for_each_input`](Self::for_each_input), for one route.
+    pub fn with_input(&self, route: usize, work: impl FnOnce(&mut Input)) -> bool {
+        let Some(shared) = self.routes.get(route) else { return false };
+        work(&mut shared.lock());
+        shared.take_skipped() || shared.flag.is_raised()
+    }
+
     /// Wakes the critical lanes of a route early. A datagram has arrived that seems to hold a sample of
     /// `writer`, or a part of one of which `left_bytes` are missing, and `cpu` receives it. A sample that was
     /// received before wakes no lane: many publishers send each one to all addresses of this host. Returns

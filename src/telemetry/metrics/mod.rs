@@ -97,6 +97,13 @@ fn lanes(page: &mut Page, report: &Report) {
 }
 
 fn routes(page: &mut Page, report: &Report) {
+    let memory = &report.shared_memory;
+    page.family("shared_memory_budget_bytes", Gauge, "The most that the pools of all routes may take.");
+    page.sample(&[], Some(memory.budget_bytes));
+    page.family("shared_memory_used_bytes", Gauge, "Shared memory of the pools of all routes.");
+    page.sample(&[], Some(memory.used_bytes));
+    page.family("shared_memory_peak_bytes", Gauge, "The most that they have had since ingress started.");
+    page.sample(&[], Some(memory.peak_bytes));
     let mut each = |name, kind, help, value: fn(&RouteReport) -> u64| {
         page.family(name, kind, help);
         for route in &report.routes {
@@ -112,6 +119,10 @@ fn routes(page: &mut Page, report: &Report) {
     each("route_published_samples_total", Counter, help, |route| route.counters.published);
     let help = "Published samples that were assembled in shared memory, not copied there.";
     each("route_in_place_samples_total", Counter, help, |route| route.counters.in_place);
+    let help = "Shared memory of the route's pool.";
+    each("route_pool_bytes", Gauge, help, |route| route.counters.pool_bytes);
+    let help = "The most shared memory that the route's pool has had since ingress started.";
+    each("route_pool_peak_bytes", Gauge, help, |route| route.counters.pool_peak_bytes);
     let help = "Samples lost before ingress, by gaps in the publishers' sequence numbers.";
     each("route_lost_upstream_samples_total", Counter, help, |route| route.counters.lost_upstream);
     let help =
@@ -128,6 +139,10 @@ fn routes(page: &mut Page, report: &Report) {
     page.family("route_dds_in_latency_seconds", Histogram, help);
     for route in &report.routes {
         page.histogram(&[("route", &route.id)], &route.dds_in.total);
+    }
+    page.family("pattern_waiting_topics", Gauge, "Topics that match a pattern and have no route.");
+    for pattern in &report.patterns {
+        page.sample(&[("pattern", &pattern.id)], Some(pattern.waiting));
     }
 }
 

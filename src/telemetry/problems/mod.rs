@@ -59,6 +59,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems.extend(now.routes.iter().filter_map(|route| publishers::other_type(now, route)));
     problems.extend(now.routes.iter().filter_map(|route| publishers::unrepaired(now, route)));
     problems.extend(now.routes.iter().filter_map(publishers::no_publisher));
+    problems.extend(now.patterns.iter().filter_map(publishers::no_place));
     problems
 }
 
@@ -309,9 +310,11 @@ pub(super) mod tests {
                 lane(LaneName::critical(), TrafficClass::Critical),
                 lane(LaneName::noncritical(), TrafficClass::Noncritical),
             ],
+            patterns: Vec::new(),
             routes: vec![RouteReading {
                 id: RouteId::try_from("scan").unwrap(),
                 input_topic: TopicName::try_from("/scan").unwrap(),
+                pattern: None,
                 message_type: None,
                 info: RouteInfo::default(),
                 counters: IngressCounters {

@@ -1,6 +1,6 @@
 //! Problems of a route's publishers.
 
-use super::super::snapshot::{RouteReading, Snapshot, type_name};
+use super::super::snapshot::{PatternReading, RouteReading, Snapshot, type_name};
 use super::super::text::{counted, printable};
 use super::{Level, Problem};
 use crate::model::{DropReason, Guid, PublisherAccount};
@@ -134,9 +134,26 @@ pub(super) fn unrepaired(now: &Snapshot, route: &RouteReading) -> Option<Problem
     Some(Problem::new(format!("route {}", route.id), Level::Warn, text))
 }
 
-/// A route without a matched publisher.
+/// A pattern with more topics than places.
+pub(super) fn no_place(pattern: &PatternReading) -> Option<Problem> {
+    let PatternReading { settings, record } = pattern;
+    (record.waiting > 0).then(|| {
+        let text = format!(
+            "{} match the pattern {} of {} and are not bridged, {} first: all {} have a topic; raise max_routes of \
+             the topic, or exclude topics, and restart the bridge",
+            counted(record.waiting, "topic"),
+            settings.input_topic,
+            settings.entry,
+            printable(record.first_waiting.as_str()),
+            counted(settings.max_routes as u64, "place"),
+        );
+        Problem::new(format!("pattern {}", settings.entry), Level::Warn, text)
+    })
+}
+
+/// A route without a matched publisher. The topics of a pattern come and go.
 pub(super) fn no_publisher(route: &RouteReading) -> Option<Problem> {
-    (route.counters.writers == 0).then(|| {
+    (route.counters.writers == 0 && route.pattern.is_none()).then(|| {
         let text = match route.counters.received {
             0 => format!(
                 "route {}: waits for a publisher of {}; if one runs, check ROS_DOMAIN_ID and the network with \

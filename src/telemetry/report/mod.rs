@@ -11,7 +11,7 @@ pub use control::{
 pub use latency::{Latency, LatencyTotal};
 
 use super::problem::Problem;
-use super::snapshot::{LaneReading, OutputReading, ProcessReading, RouteReading, Snapshot};
+use super::snapshot::{LaneReading, OutputReading, PatternReading, ProcessReading, RouteReading, Snapshot};
 use super::text::printable;
 use crate::model::{
     DropCounts, Guid, IngressCounters, LaneCounters, LaneMode, MonotonicNs, PublisherAccount, ReaderRecord,
@@ -31,6 +31,8 @@ pub struct Report {
     pub(crate) processes: Vec<ProcessReport>,
     pub(crate) lanes: Vec<LaneReport>,
     pub(crate) routes: Vec<RouteReport>,
+    pub(crate) patterns: Vec<PatternReport>,
+    pub(crate) shared_memory: SharedMemoryReport,
     pub(crate) probes: ProbesReport,
     pub(crate) parameters: ParametersReport,
     /// The subscribers that control tracks.
@@ -40,6 +42,17 @@ pub struct Report {
     pub(crate) intruders_seen: u64,
     /// The network interfaces and peers that are away, or came back within the last 15 minutes.
     pub(crate) absences: Vec<AbsenceReport>,
+}
+
+/// The shared memory of the pools of all routes, as ingress last reported it.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct SharedMemoryReport {
+    /// The most that they may take.
+    pub(crate) budget_bytes: u64,
+    /// What they have.
+    pub(crate) used_bytes: u64,
+    /// The most that they have had since ingress started.
+    pub(crate) peak_bytes: u64,
 }
 
 /// The state of one process.
@@ -76,6 +89,8 @@ pub struct LaneReport {
 pub struct RouteReport {
     pub(crate) id: String,
     pub(crate) input_topic: String,
+    /// The id of its entry in `topics` if that is a pattern.
+    pub(crate) pattern: Option<String>,
     /// The message type; null until it is known.
     pub(crate) message_type: Option<String>,
     /// The hash of the message type's definition that the outputs announce; null while it is unknown.
@@ -99,6 +114,27 @@ pub struct RouteReport {
     pub(crate) dds_in: Latency,
     /// The outputs of the route, one for each lane that serves it.
     pub(crate) lanes: Vec<OutputReport>,
+}
+
+/// The places of one pattern.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct PatternReport {
+    /// The id of its entry in `topics`.
+    pub(crate) id: String,
+    pub(crate) input_topic: String,
+    pub(crate) max_routes: usize,
+    /// Places that have a topic.
+    pub(crate) routes: usize,
+    /// Topics that match and wait for a place.
+    pub(crate) waiting: u64,
+    /// The topic that has waited longest; null if none waits.
+    pub(crate) first_waiting: Option<String>,
+    /// Places that a topic has had to leave for another one, since ingress started.
+    pub(crate) released: u64,
+    /// Matching topics that have no valid output, each time one of their writers is discovered.
+    pub(crate) refused: u64,
+    /// Times that a waiting topic was forgotten because too many waited.
+    pub(crate) forgotten: u64,
 }
 
 /// The account of one publisher of a route, from the sequence numbers of its DDS writer.
@@ -192,11 +228,13 @@ impl Snapshot {
                 .filter(|(_, lane)| lane.is_used)
                 .map(|(number, lane)| self.lane_report(number, lane))
                 .collect(),
+            patterns: self.patterns.iter().map(|pattern| self.pattern_report(pattern)).collect(),
             routes: self
                 .routes
                 .iter()
                 .map(|route| self.route_report(route, earlier.route(route), window_ms))
                 .collect(),
+            shared_memory: self.shared_memory_report(),
             probes: self.probes_report(earlier),
             parameters: self.parameters_report(),
             subscribers: self.subscribers.iter().map(|one| self.subscriber_report(one)).collect(),
@@ -206,9 +244,39 @@ impl Snapshot {
         }
     }
 
-    /// The route with the same id in this snapshot.
+    /// Each route has the same numbers, of the moment at which ingress wrote its board; the largest are the
+    /// latest, but for a pool that has just given memory back.
+    fn shared_memory_report(&self) -> SharedMemoryReport {
+        let most = |of: fn(&IngressCounters) -> u64| {
+            self.routes.iter().map(|route| of(&route.counters)).max().unwrap_or(0)
+        };
+        SharedMemoryReport {
+            budget_bytes: most(|counters| counters.budget_bytes),
+            used_bytes: most(|counters| counters.budget_used_bytes),
+            peak_bytes: most(|counters| counters.budget_peak_bytes),
+        }
+    }
+
+    /// The route with the same id in this snapshot, unless it had another topic then.
     pub(super) fn route(&self, other: &RouteReading) -> Option<&RouteReading> {
-        self.routes.iter().find(|route| route.id == other.id)
+        self.routes.iter().find(|route| route.id == other.id && route.input_topic == other.input_topic)
+    }
+
+    fn pattern_report(&self, pattern: &PatternReading) -> PatternReport {
+        let PatternReading { settings, record } = pattern;
+        let first = printable(record.first_waiting.as_str());
+        let is_of = |route: &&RouteReading| route.pattern.as_ref() == Some(&settings.entry);
+        PatternReport {
+            id: settings.entry.to_string(),
+            input_topic: settings.input_topic.to_string(),
+            max_routes: settings.max_routes,
+            routes: self.routes.iter().filter(is_of).count(),
+            waiting: record.waiting,
+            first_waiting: Some(first).filter(|first| !first.is_empty()),
+            released: record.released,
+            refused: record.refused,
+            forgotten: record.forgotten,
+        }
     }
 
     fn lane_report(&self, number: usize, lane: &LaneReading) -> LaneReport {
@@ -232,6 +300,7 @@ impl Snapshot {
         RouteReport {
             id: now.id.to_string(),
             input_topic: now.input_topic.to_string(),
+            pattern: now.pattern.as_ref().map(ToString::to_string),
             message_type: now.message_type.as_deref().map(printable),
             type_hash: Some(now.info.type_hash).filter(TypeHash::is_known).map(|hash| hash.to_string()),
             has_keys: now.info.has_keys != 0,

@@ -1,4 +1,4 @@
-//! What the dependencies declare: the Rust version that they need.
+//! The Rust version: that which the dependencies need, and that of the image.
 
 use std::process::Command;
 
@@ -60,4 +60,50 @@ fn a_dependency_that_needs_a_later_rust_is_found() {
     assert_eq!(found("2.0").len(), 1);
     assert!(found("1.89.0").is_empty());
     assert!(found("1.9").is_empty());
+}
+
+/// The image that the Dockerfile gives to an argument: its Rust version, if it has one, and its Debian.
+fn image(dockerfile: &str, argument: &str) -> Option<(Option<[u32; 3]>, String)> {
+    let image = dockerfile.lines().find_map(|line| line.strip_prefix("ARG ")?.strip_prefix(argument))?;
+    let (name, tag) = image.strip_prefix('=')?.split_once(':')?;
+    match name {
+        "rust" => tag.split_once('-').map(|(rust, debian)| (Some(version(rust)), debian.to_owned())),
+        _ => Some((None, tag.strip_suffix("-slim").unwrap_or(tag).to_owned())),
+    }
+}
+
+#[test]
+fn the_image_is_built_by_a_given_rust_that_is_new_enough_on_the_debian_that_it_runs_on() {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/docker/Dockerfile");
+    let dockerfile = std::fs::read_to_string(file).unwrap();
+    let (rust, debian) = image(&dockerfile, "RUST_IMAGE").unwrap();
+    assert!(rust.unwrap() >= version(env!("CARGO_PKG_RUST_VERSION")), "{rust:?}");
+    assert!(rust.unwrap()[1] > 0, "rust:1 is another Rust with each release");
+    assert_eq!(image(&dockerfile, "BASE_IMAGE").unwrap(), (None, debian));
+}
+
+/// The packages of the workspace whose manifest the image's build, which lists what it copies, does not get.
+fn not_copied(dockerignore: &str, manifests: &[String]) -> Vec<String> {
+    let copied: Vec<&str> = dockerignore.lines().filter_map(|line| line.strip_prefix('!')).collect();
+    let is_copied = |manifest: &&String| {
+        copied.iter().any(|path| {
+            manifest.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+        })
+    };
+    manifests.iter().filter(|manifest| !is_copied(manifest)).cloned().collect()
+}
+
+#[test]
+fn the_image_is_built_with_the_manifest_of_each_package_of_the_workspace() {
+    let root = env!("CARGO_MANIFEST_DIR");
+    let local = |package: &Value| {
+        let manifest = package["manifest_path"].as_str()?.strip_prefix(root)?;
+        package["source"].is_null().then(|| manifest.trim_start_matches('/').to_owned())
+    };
+    let manifests: Vec<String> = packages().iter().filter_map(local).collect();
+    assert!(manifests.len() >= 5, "{manifests:?}");
+    let dockerignore = std::fs::read_to_string(format!("{root}/.dockerignore")).unwrap();
+    assert_eq!(not_copied(&dockerignore, &manifests), Vec::<String>::new());
+    let without = dockerignore.replace("!crates/measure/Cargo.toml", "");
+    assert_eq!(not_copied(&without, &manifests), ["crates/measure/Cargo.toml"]);
 }

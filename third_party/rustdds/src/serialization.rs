@@ -1,3 +1,8 @@
+use std::{cmp::min, io};
+
+use bytes::Bytes;
+use speedy::{Endianness, Readable};
+
 mod cdr_adapters;
 
 pub(crate) mod pl_cdr_adapters;
@@ -15,6 +20,22 @@ pub use cdr_adapters::{
   to_writer_with_rep_id, CDRDeserializerAdapter, CDRSerializerAdapter, CdrDeserializeSeedDecoder,
 };
 pub use representation_identifier::RepresentationIdentifier;
+
+/// Reads a value at the position of the cursor, which moves to its end.
+///
+/// A reader of speedy for streams allocates and clears a buffer for each value. This one
+/// reads from the buffer that is already there.
+pub(crate) fn read_at<'a, T: Readable<'a, Endianness>>(
+  cursor: &mut io::Cursor<&'a Bytes>,
+  endianness: Endianness,
+) -> io::Result<T> {
+  let buffer: &'a Bytes = cursor.get_ref();
+  let begin = min(cursor.position(), buffer.len() as u64);
+  let (value, len) =
+    T::read_with_length_from_buffer_with_ctx(endianness, &buffer[begin as usize..]);
+  cursor.set_position(begin + len as u64);
+  value.map_err(io::Error::other)
+}
 
 // Compute how much padding bytes are needed to
 // get the next multiple of 4

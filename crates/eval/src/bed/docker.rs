@@ -16,11 +16,12 @@ use crate::error::EvalError;
 use crate::impairment::system;
 use crate::scenario::Switch;
 
-/// The image of all hosts: empty folders to mount into, and symbolic links into `/usr`.
-const IMAGE: &str = "adaptive-bridge-eval:host";
+/// The image of all hosts: empty folders to mount into, and symbolic links into `/usr`. It is made for each
+/// bed and removed with it: an import under a name that exists would leave the former image without a name.
+const IMAGE: &str = "host-image";
 const FOLDERS: [&str; 8] = ["usr", "etc", "proc", "sys", "dev", "tmp", "run", "var"];
 const LINKS: [&str; 4] = ["bin", "sbin", "lib", "lib64"];
-/// Name of the docker network. Names of hosts have no dash.
+/// Name of the docker network. Names of hosts have no dash, unlike this one and that of the image.
 const NETWORK: &str = "bridge-network";
 /// Size of a container's /dev/shm: docker's default of 64 MiB is too small for ten routes.
 const SHM_SIZE: &str = "1g";
@@ -47,7 +48,7 @@ pub fn switch() -> Switch {
     if setting.trim() == "1" { Switch::Reassembling } else { Switch::Plain }
 }
 
-/// Removes containers and network of this process when it is dropped, even if the bed is incomplete.
+/// Removes containers, network and image of this process when it is dropped, even if the bed is incomplete.
 struct Remover;
 
 impl Drop for Remover {
@@ -59,8 +60,9 @@ impl Drop for Remover {
 
 /// Creates the network and a container for each host.
 pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError> {
-    make_image()?;
     let remover = Remover;
+    let image = stale::name(IMAGE);
+    make_image(&image)?;
     let network = stale::name(NETWORK);
     docker(&format!("network create {network}"))?;
     let mut hosts = Vec::with_capacity(names.len());
@@ -74,7 +76,7 @@ pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError>
             let folder = folder.display();
             words.extend(["--volume".to_owned(), format!("{folder}:{folder}")]);
         }
-        words.extend(system::words(&format!("{IMAGE} /usr/bin/sleep infinity")));
+        words.extend(system::words(&format!("{image} /usr/bin/sleep infinity")));
         system::run(&words)?;
         hosts.push(host(name, &container)?);
     }
@@ -82,8 +84,8 @@ pub(super) fn make(names: &[String], shared: &[&Path]) -> Result<Bed, EvalError>
     Ok(Bed { hosts, switch, _remover: Box::new(remover) })
 }
 
-/// Creates the image, also if it exists: that is fast, and the existing one may be of another version.
-fn make_image() -> Result<(), EvalError> {
+/// Creates the image of that name.
+fn make_image(name: &str) -> Result<(), EvalError> {
     let folder = stale::scratch("image");
     let root = folder.join("root");
     let created = FOLDERS.iter().try_for_each(|name| fs::create_dir_all(root.join(name)));
@@ -96,7 +98,7 @@ fn make_image() -> Result<(), EvalError> {
     let imported =
         system::run(&system::words(&format!("tar --create --file {archive} --directory {root} .")))
             .map_err(EvalError::from)
-            .and_then(|_| docker(&format!("import {archive} {IMAGE}")));
+            .and_then(|_| docker(&format!("import {archive} {name}")));
     let _ = fs::remove_dir_all(&folder);
     imported.map(|_| ())
 }
@@ -126,24 +128,31 @@ fn port(network: &Network) -> Result<Option<String>, EvalError> {
     Ok(found.and_then(|link| link["ifname"].as_str()).map(str::to_owned))
 }
 
-/// Removes containers and networks of harness processes that no longer run; returns a description of each.
+/// Removes containers, networks and images of harness processes that no longer run; returns a description of
+/// each.
 pub(super) fn remove_leftovers() -> Vec<String> {
     let leftovers = names().into_iter().filter(|name| stale::is_leftover(name));
-    let removed = leftovers.inspect(|name| remove(name)).map(|name| format!("container or network {name}"));
+    let removed =
+        leftovers.inspect(|name| remove(name)).map(|name| format!("container, network or image {name}"));
     removed.collect()
 }
 
-/// Lists containers and networks of all harness processes, including this one; empty without docker.
+/// Lists containers, networks and images of all harness processes, including this one; empty without docker.
 fn names() -> Vec<String> {
     let containers = docker("ps --all --filter name=^abe- --format {{.Names}}").unwrap_or_default();
     let networks = docker("network ls --filter name=^abe- --format {{.Name}}").unwrap_or_default();
-    // Containers first: a network that is in use can't be removed.
-    containers.lines().chain(networks.lines()).map(str::to_owned).collect()
+    let images = docker("images --filter reference=abe-* --format {{.Repository}}").unwrap_or_default();
+    // Containers first: a network or an image that is in use can't be removed.
+    containers.lines().chain(networks.lines()).chain(images.lines()).map(str::to_owned).collect()
 }
 
-/// Removes the container or network of that name.
+/// Removes the container, network or image of that name.
 fn remove(name: &str) {
-    let what = if name.ends_with(NETWORK) { "network rm" } else { "rm --force" };
+    let what = match name {
+        _ if name.ends_with(NETWORK) => "network rm",
+        _ if name.ends_with(IMAGE) => "image rm",
+        _ => "rm --force",
+    };
     let _ = docker(&format!("{what} {name}"));
 }
 

@@ -468,7 +468,7 @@ pub fn isolation(summary: &Summary) -> Option<String> {
 /// The load, the missing samples and the memory over time of a soak.
 pub fn soak(summary: &Summary) -> Option<String> {
     let soak = summary.soak.as_ref()?;
-    let mut table = Table::new(&["", "first", "last", "most", "unit", "per hour", ""]);
+    let mut table = Table::new(&["", "first", "last", "most", "unit", "per hour (95 % interval)", ""]);
     for series in &soak.series {
         let values = || series.points.iter().map(|point| point.1);
         let (trend, per_hour) = targets::trend(series);
@@ -479,7 +479,7 @@ pub fn soak(summary: &Summary) -> Option<String> {
             number(values().next_back()),
             number(values().reduce(f64::max)),
             series.unit.clone(),
-            number(per_hour),
+            targets::slope(per_hour),
             match trend {
                 _ if !is_memory => String::new(),
                 targets::Trend::Flat => "flat".to_owned(),

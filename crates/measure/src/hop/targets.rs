@@ -2,7 +2,7 @@
 
 use super::summary::{Isolation, Latency, SoakSeries, Summary};
 use crate::format::{number, payload};
-use crate::statistics::{growth, median, median_interval};
+use crate::statistics::{Growth, growth, median, median_interval};
 use crate::table::Table;
 
 /// A target for the bridge's hop at one rate and payload.
@@ -124,13 +124,13 @@ pub fn table(summary: &Summary) -> Option<String> {
         }
     }
     for series in summary.soak.iter().flat_map(|soak| &soak.series).filter(|series| series.unit == "KiB") {
-        let (trend, kib_per_hour) = trend(series);
+        let (trend, per_hour) = trend(series);
         targets.push(Target {
             what: format!("growth of the memory of {}", series.name),
             limit: format!("at most {} KiB/h", number(Some(MAX_KIB_PER_HOUR))),
             value: match trend {
                 Trend::TooShort => "too short to tell".to_owned(),
-                _ => number(kib_per_hour) + " KiB/h",
+                _ => slope(per_hour) + " KiB/h",
             },
             met: match trend {
                 Trend::Flat => Some(true),
@@ -273,20 +273,30 @@ pub enum Trend {
     TooShort,
 }
 
+/// A slope with its 95 % interval.
+pub fn slope(growth: Option<Growth>) -> String {
+    let Some(growth) = growth else { return number(None) };
+    format!("{} ({} to {})", number(Some(growth.slope)), number(Some(growth.low)), number(Some(growth.high)))
+}
+
 /// The trend of the memory, and its slope in KiB per hour.
-pub fn trend(series: &SoakSeries) -> (Trend, Option<f64>) {
+pub fn trend(series: &SoakSeries) -> (Trend, Option<Growth>) {
     let end = series.points.last().map_or(0.0, |point| point.0);
     let points: Vec<(f64, f64)> =
         series.points.iter().copied().filter(|point| point.0 >= end * WARM_UP).collect();
-    let Some(kib_per_second) = growth(&points) else { return (Trend::TooShort, None) };
+    let Some(per_second) = growth(&points) else { return (Trend::TooShort, None) };
     let seconds = end - points.first().map_or(0.0, |point| point.0);
-    let kib_per_hour = kib_per_second * 3_600.0;
-    let trend = if kib_per_second * seconds > ALLOCATION_STEP_KIB {
-        if kib_per_hour > MAX_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
+    let per_hour = Growth {
+        slope: per_second.slope * 3_600.0,
+        low: per_second.low * 3_600.0,
+        high: per_second.high * 3_600.0,
+    };
+    let trend = if per_second.slope * seconds > ALLOCATION_STEP_KIB {
+        if per_hour.slope > MAX_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
     } else if ALLOCATION_STEP_KIB / seconds * 3_600.0 > MAX_KIB_PER_HOUR {
         Trend::TooShort
     } else {
         Trend::Flat
     };
-    (trend, Some(kib_per_hour))
+    (trend, Some(per_hour))
 }

@@ -6,4 +6,4 @@ mod values;
 
 pub use distribution::Distribution;
 pub use repetitions::Estimate;
-pub use values::{growth, median, median_interval, quantile};
+pub use values::{Growth, growth, median, median_interval, quantile};

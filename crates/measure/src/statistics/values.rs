@@ -36,10 +36,20 @@ fn sorted(values: &[f64]) -> Vec<f64> {
     sorted
 }
 
-/// The growth of a value per unit of time: the median of the slopes between all pairs of points (Theil and
-/// Sen), which is robust against outliers. Uses at most 500 points, evenly chosen. `None` with fewer than
+/// The growth of a value per unit of time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Growth {
+    /// The median of the slopes between all pairs of points (Theil and Sen), which is robust against outliers.
+    pub slope: f64,
+    /// The lower end of the slope's 95 % confidence interval (Sen, 1968).
+    pub low: f64,
+    /// The upper end.
+    pub high: f64,
+}
+
+/// The growth of a value per unit of time. Uses at most 500 points, evenly chosen. `None` with fewer than
 /// three points.
-pub fn growth(points: &[(f64, f64)]) -> Option<f64> {
+pub fn growth(points: &[(f64, f64)]) -> Option<Growth> {
     const MAX_POINTS: usize = 500;
     let step = points.len().div_ceil(MAX_POINTS).max(1);
     let points: Vec<(f64, f64)> = points.iter().copied().step_by(step).collect();
@@ -53,5 +63,17 @@ pub fn growth(points: &[(f64, f64)]) -> Option<f64> {
         .filter(|(one, other)| other.0 > one.0)
         .map(|(one, other)| (other.1 - one.1) / (other.0 - one.0))
         .collect();
-    (!slopes.is_empty()).then(|| median(&slopes))
+    let slopes = sorted(&slopes);
+    let (first, last) = (*slopes.first()?, *slopes.last()?);
+    // Kendall's statistic of points without a trend has this variance; 1.96 standard deviations of it are the
+    // distance of the interval's ranks.
+    let count = points.len() as f64;
+    let distance = 1.96 * (count * (count - 1.0) * (2.0 * count + 5.0) / 18.0).sqrt();
+    let middle = slopes.len() as f64 / 2.0;
+    let at = |rank: f64| if rank < 0.0 { None } else { slopes.get(rank as usize).copied() };
+    Some(Growth {
+        slope: median(&slopes),
+        low: at((middle - distance / 2.0).floor() - 1.0).unwrap_or(first),
+        high: at((middle + distance / 2.0).floor()).unwrap_or(last),
+    })
 }

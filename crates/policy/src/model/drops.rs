@@ -9,6 +9,8 @@ reasons! {
     // Of ingress.
     TooLarge = "too_large", "larger than the route's max_sample_bytes; raise it",
     PoolExhausted = "pool_exhausted", "no free slot in shared memory; raise queue_depth",
+    OverBudget = "over_budget",
+        "no shared memory left for them; raise shared_memory.budget_bytes, or enlarge /dev/shm if it is full",
     Malformed = "malformed", "an encapsulation that DDS does not define, or an undecodable payload",
     // Of each lane.
     /// A gap in the route's sequence numbers, left by an ingress process that died between numbering a

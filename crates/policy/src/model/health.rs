@@ -4,6 +4,7 @@
 use serde::Serialize;
 
 use super::drops::DropCounts;
+use super::names::TopicName;
 use super::network::NetworkRefusals;
 use super::qos::Durability;
 use super::sample::Guid;
@@ -104,6 +105,19 @@ pub struct IngressCounters {
     pub changed_account: PublisherAccount,
     /// Writers matched at present.
     pub writers: u64,
+    /// Shared memory of the pool, in bytes.
+    pub pool_bytes: u64,
+    /// The most shared memory that the pool has had since ingress started, in bytes.
+    pub pool_peak_bytes: u64,
+    /// The budget of the pools of all routes, in bytes; the same for each route, as the next two.
+    #[serde(skip)]
+    pub budget_bytes: u64,
+    /// Shared memory of the pools of all routes, in bytes.
+    #[serde(skip)]
+    pub budget_used_bytes: u64,
+    /// The most that they have had together since ingress started, in bytes.
+    #[serde(skip)]
+    pub budget_peak_bytes: u64,
     /// When the last sample was taken.
     #[serde(skip)]
     pub last_received_at: MonotonicNs,
@@ -310,12 +324,24 @@ pub struct RouteInfo {
     pub transient_local: u64,
     /// 1 if the type has keys, as the publishers announce it, else 0. It is 0 before there was a publisher.
     pub has_keys: u64,
+    /// The input topic of a route that has its topic by a pattern; empty while it has none.
+    pub bound_topic: FixedText,
+    /// The last sequence number of the route before it got this topic. What is numbered up to it is of
+    /// another topic.
+    pub bound_after: u64,
+    /// How many topics the route has had by its pattern.
+    pub bound_count: u64,
 }
 
 impl RouteInfo {
     /// What the publishers offer: it applies to outputs for which the configuration gives no DURABILITY.
     pub fn durability(&self) -> Durability {
         if self.transient_local == 0 { Durability::Volatile } else { Durability::TransientLocal }
+    }
+
+    /// The topic that the route has by a pattern; `None` while it has none.
+    pub fn topic(&self) -> Option<TopicName> {
+        TopicName::try_from(self.bound_topic.as_str()).ok()
     }
 
     /// The type that the outputs of the route announce; `None` while it is unknown.

@@ -18,6 +18,7 @@ mod readers;
 mod sample;
 mod thresholds;
 mod time;
+mod topic_pattern;
 mod type_hash;
 
 pub use control::{
@@ -42,4 +43,5 @@ pub use readers::{MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, OutputReaders, Read
 pub use sample::{AgeBasis, Encapsulation, Guid, KeyedPayload, SampleHeader, SampleKey};
 pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
+pub use topic_pattern::{PatternRecord, TopicPattern, TopicPrefix};
 pub use type_hash::{DdsType, TypeHash};

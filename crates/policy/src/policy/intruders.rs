@@ -22,6 +22,9 @@ pub const NODE_NAME_TIMEOUT_MS: u64 = 2_000;
 /// only counted. More than are shown at once ([`MAX_INTRUDERS`](crate::model::MAX_INTRUDERS)).
 pub const MAX_REMEMBERED_INTRUDERS: usize = 64;
 
+/// The most topics that are guarded once discovery has reported them, with those of the configuration.
+pub const MAX_GUARDED_TOPICS: usize = 4_096;
+
 /// A reader that returns within this time after it left is the same intruder and causes no second warning: a
 /// laptop with bad Wi-Fi leaves and returns frequently. In this time at most [`MAX_REMEMBERED_INTRUDERS`] are
 /// reported, whatever the network announces.
@@ -153,6 +156,16 @@ impl IntruderWatch {
             events: VecDeque::new(),
             reported: 0,
             unreported: 0,
+        }
+    }
+
+    /// Guards a topic also, unless [`MAX_GUARDED_TOPICS`] others are guarded: for a topic that discovery has
+    /// reported, and that was not known before.
+    pub fn guard(&mut self, topic: GuardedTopic) {
+        let dds_name = topic.topic.to_dds();
+        if self.guarded.len() < MAX_GUARDED_TOPICS && !self.dds_names.contains(&dds_name) {
+            self.dds_names.push(dds_name);
+            self.guarded.push(topic);
         }
     }
 

@@ -10,10 +10,12 @@ mod lane;
 mod lane_mode;
 mod lane_queue;
 mod locality;
+mod memory_budget;
 mod probe_window;
 mod publisher_places;
 mod replay_guard;
 mod restart;
+mod route_places;
 mod safety;
 mod sequence;
 mod staleness;
@@ -28,13 +30,14 @@ pub use classifier::{
 };
 pub use clock_offset::ClockOffset;
 pub use intruders::{
-    Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_REMEMBERED_INTRUDERS,
-    NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
+    Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_GUARDED_TOPICS,
+    MAX_REMEMBERED_INTRUDERS, NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
 };
 pub use lane::{Decision, PollOrder, RouteShaper, critical_drop, mode_and_source};
 pub use lane_mode::{LaneDecision, LaneReason, lane_mode, safety_floor};
 pub use lane_queue::{Allowance, LaneQueue, SampleStamps};
 pub use locality::{Locality, Location};
+pub use memory_budget::{BudgetRefusal, MemoryBudget, PoolDemand};
 pub use probe_window::{LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, ResponseOutcome, STOPPED_NS};
 pub use publisher_places::{PUBLISHER_SILENT_MS, publisher_place};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};
@@ -42,6 +45,7 @@ pub use restart::{
     ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, HangWatch, MAX_BACKOFF_MS, RestartBackoff,
     RestartDecision,
 };
+pub use route_places::{AWAY_MS, Binding, MAX_TOPIC_WRITERS, MAX_WAITING_TOPICS, RoutePlaces, TRIAL_MS};
 pub use safety::{
     ErrorCounts, MAX_SOURCE_LAG_MS, ProcessLoad, SafetyCause, SafetyDecision, SafetySupervisor,
     SafetyTrouble, SourceLag,

@@ -800,6 +800,15 @@ impl DomainParticipant {
     Ok(())
   }
 
+  /// Drops what the participant keeps of a topic for later Readers of it, once the
+  /// application has dropped its Readers and Writers of the topic. Otherwise it is
+  /// kept as long as the participant.
+  pub fn forget_topic(&self, name: &str) {
+    if let Ok(mut cache) = self.dds_cache().write() {
+      cache.remove_topic(name);
+    }
+  }
+
   /// Get a `DomainDomainParticipantStatusListener` that can be used
   /// to get `DomainParticipantStatusEvent`s for this DomainParticipant.
   pub fn status_listener(&self) -> DomainParticipantStatusListener {
@@ -2089,6 +2098,23 @@ mod tests {
     let mut _data_writer = publisher
       .create_datawriter::<RandomData, CDRSerializerAdapter<RandomData, LittleEndian>>(&topic, None)
       .expect("Failed to create datawriter");
+  }
+
+  #[test]
+  fn a_topic_is_kept_until_it_is_forgotten() {
+    let participant = DomainParticipant::new(test_domain_id(0)).unwrap();
+    let topic = participant
+      .create_topic(
+        "Forgotten".to_string(),
+        "RandomData".to_string(),
+        &QosPolicies::qos_none(),
+        TopicKind::NoKey,
+      )
+      .unwrap();
+    participant.begin_now(&topic).unwrap();
+    participant.forget_topic("Forgotten");
+    participant.forget_topic("Forgotten");
+    participant.begin_now(&topic).unwrap_err();
   }
 
   #[test]

@@ -344,8 +344,10 @@ impl UDPListener {
     // Loop invariant. Note that capacity() may be large, but .len() == 0.
     assert_eq!(self.receive_buffer.len(), 0);
 
-    // Ensure that receive buffer has enough capacity for a message
-    if self.receive_buffer.capacity() < MAX_MESSAGE_SIZE {
+    // Ensure that receive buffer has enough capacity for a message. The chunk is used
+    // again if no datagram in it is kept, such as after fragments, which were copied
+    // elsewhere: a new chunk costs 64 page faults.
+    if !self.receive_buffer.try_reclaim(MAX_MESSAGE_SIZE) {
       self.receive_buffer = BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK);
       debug!("ensure_receive_buffer_capacity - reallocated receive_buffer");
     }
@@ -546,6 +548,27 @@ mod tests {
     assert_eq!(rec_data, data);
   }
 
+  // Sends a datagram to a listener, and receives it.
+  fn pass(
+    listener: &mut UDPListener,
+    socket: &std::net::UdpSocket,
+    port: u16,
+    datagram: &[u8],
+  ) -> Bytes {
+    socket.send_to(datagram, ("127.0.0.1", port)).unwrap();
+    let (received, _) = std::iter::repeat_with(|| listener.next_message())
+      .inspect(|message| {
+        if message.is_none() {
+          thread::sleep(time::Duration::from_millis(1));
+        }
+      })
+      .take(5_000)
+      .flatten()
+      .next()
+      .expect("a datagram");
+    received
+  }
+
   // What is kept of a small datagram does not keep the memory of large ones.
   #[test]
   fn small_datagrams_share_memory_with_small_ones_only() {
@@ -554,17 +577,7 @@ mod tests {
     let mut small = Vec::new();
     for number in 0..20_u8 {
       for len in [1_001, 60_000] {
-        socket.send_to(&vec![number; len], "127.0.0.1:10012").unwrap();
-        let (received, _) = std::iter::repeat_with(|| listener.next_message())
-          .inspect(|message| {
-            if message.is_none() {
-              thread::sleep(time::Duration::from_millis(1));
-            }
-          })
-          .take(5_000)
-          .flatten()
-          .next()
-          .expect("a datagram");
+        let received = pass(&mut listener, &socket, 10012, &vec![number; len]);
         assert_eq!(received, vec![number; len]);
         if len == 1_001 {
           small.push(received);
@@ -574,6 +587,23 @@ mod tests {
     let begin = small[0].as_ptr() as usize;
     for (index, datagram) in small.iter().enumerate() {
       assert_eq!(datagram.as_ptr() as usize, begin + index * 1_004);
+    }
+  }
+
+  #[test]
+  fn large_datagrams_that_are_not_kept_share_one_chunk() {
+    let mut listener = UDPListener::new_unicast("127.0.0.1", 10013).unwrap();
+    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut pass = |number: u8| pass(&mut listener, &socket, 10013, &[number; 60_000]);
+    let begin = pass(0).as_ptr() as usize;
+    for number in 1..20 {
+      let at = pass(number).as_ptr() as usize;
+      assert!((begin..begin + MESSAGE_BUFFER_ALLOCATION_CHUNK).contains(&at));
+    }
+    // One that is kept stays as it is.
+    let kept: Vec<Bytes> = (20..40).map(&mut pass).collect();
+    for (datagram, number) in kept.iter().zip(20..) {
+      assert_eq!(datagram, &[number; 60_000][..]);
     }
   }
 

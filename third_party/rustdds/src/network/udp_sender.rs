@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::HashMap,
-  io,
+  io::{self, IoSlice},
   net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket},
   rc::Rc,
   sync::Arc,
@@ -11,13 +11,13 @@ use std::os::unix::io::{AsRawFd, RawFd};
 
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
-use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+use socket2::{Domain, Protocol, SockAddr, SockRef, Socket, Type};
 
 use crate::{
   network::util::{get_local_multicast_ip_addrs_inner, IfAddr, NetworkSelector},
   rtps::{
     message::RTPS_MESSAGE_HEADER_SIZE,
-    outbound::{ControlQueue, Datagram, SendOutcome, SocketId, CONTROL_QUEUE_WARN_LEN},
+    outbound::{ControlQueue, Datagram, Gather, SendOutcome, SocketId, CONTROL_QUEUE_WARN_LEN},
     transmit::InterfaceSelector,
   },
   structure::locator::Locator,
@@ -205,7 +205,7 @@ impl UDPSender {
     if dscp == 0 {
       return Ok(());
     }
-    socket2::SockRef::from(&*self.unicast_socket).set_tos_v4(u32::from(dscp) << 2)
+    SockRef::from(&*self.unicast_socket).set_tos_v4(u32::from(dscp) << 2)
   }
 
   pub(crate) fn unicast_socket(&self) -> Arc<UdpSocket> {
@@ -260,24 +260,31 @@ impl UDPSender {
   }
 
   /// One non-blocking datagram send. Never blocks; classifies the result.
-  fn raw_send(&self, id: SocketId, addr: SocketAddr, buffer: &[u8]) -> SendOutcome {
+  fn raw_send(&self, id: SocketId, addr: SocketAddr, datagram: Gather<'_>) -> SendOutcome {
     if !self.socket_can_reach(id, addr) {
       trace!("raw_send: {id:?} cannot reach {addr} (address family mismatch), dropping");
       return SendOutcome::Dropped;
     }
+    let send = |socket: &UdpSocket| {
+      if datagram.fragments.is_empty() {
+        return socket.send_to(datagram.head, addr);
+      }
+      let pieces = datagram.pieces().map(IoSlice::new);
+      SockRef::from(socket).send_to_vectored(&pieces, &SockAddr::from(addr))
+    };
     let sent = match id {
-      SocketId::Unicast => self.unicast_socket.send_to(buffer, addr),
+      SocketId::Unicast => send(&self.unicast_socket),
       SocketId::Multicast(place) => match self.multicast_socket(place) {
-        Some((_, socket)) => socket.send_to(buffer, addr),
+        Some((_, socket)) => send(&socket),
         None => return SendOutcome::Dropped, // closed meanwhile
       },
     };
     match sent {
       Ok(bytes_sent) => {
-        if bytes_sent != buffer.len() {
+        if bytes_sent != datagram.len() {
           error!(
             "raw_send: {id:?} tried {} bytes, sent only {bytes_sent}",
-            buffer.len()
+            datagram.len()
           );
         }
         SendOutcome::Sent
@@ -298,7 +305,7 @@ impl UDPSender {
         SendOutcome::Dropped
       }
       Err(e) => {
-        warn!("raw_send: {id:?} to {addr} : {e:?} len={}", buffer.len());
+        warn!("raw_send: {id:?} to {addr} : {e:?} len={}", datagram.len());
         SendOutcome::Dropped
       }
     }
@@ -370,7 +377,7 @@ impl UDPSender {
     let mut queues = self.control_queues.borrow_mut();
     let queue = queues.entry(id).or_default();
     if queue.is_empty() {
-      match self.raw_send(id, addr, buffer) {
+      match self.raw_send(id, addr, Gather::whole(buffer)) {
         SendOutcome::Sent | SendOutcome::Dropped => {}
         SendOutcome::WouldBlock => queue.push_back(Datagram {
           addr,
@@ -401,7 +408,7 @@ impl UDPSender {
     };
     while let Some(front) = queue.front() {
       let addr = front.addr;
-      let outcome = self.raw_send(id, addr, &front.bytes);
+      let outcome = self.raw_send(id, addr, Gather::whole(&front.bytes));
       match outcome {
         SendOutcome::Sent | SendOutcome::Dropped => {
           queue.pop_front();
@@ -541,18 +548,22 @@ impl UDPSender {
   // One bulk datagram attempt to a socket. Control has strict priority: if the
   // socket still has queued control, report WouldBlock so the writer backs off
   // and resumes only after control has drained.
-  fn bulk_send_one(&self, id: SocketId, addr: SocketAddr, buffer: &[u8]) -> SendOutcome {
+  fn bulk_send_one(&self, id: SocketId, addr: SocketAddr, datagram: Gather<'_>) -> SendOutcome {
     if self.control_queue_nonempty(id) {
       return SendOutcome::WouldBlock;
     }
-    self.raw_send(id, addr, buffer)
+    self.raw_send(id, addr, datagram)
   }
 
   /// Bulk send to a locator. Returns the sockets that could not accept the
   /// datagram (WouldBlock), so the caller can stop and arm write readiness.
-  pub(crate) fn try_send_to_locator(&self, buffer: &[u8], locator: &Locator) -> Vec<SocketId> {
-    if buffer.len() > MAX_UDP_PAYLOAD {
-      warn!("try_send_to_locator: Message size = {}", buffer.len());
+  pub(crate) fn try_send_to_locator(
+    &self,
+    datagram: Gather<'_>,
+    locator: &Locator,
+  ) -> Vec<SocketId> {
+    if datagram.len() > MAX_UDP_PAYLOAD {
+      warn!("try_send_to_locator: Message size = {}", datagram.len());
     }
     let mut blocked = Vec::new();
     let Some(socket_address) = self.locator_socket_addr(locator, "try_send_to_locator") else {
@@ -560,11 +571,11 @@ impl UDPSender {
     };
     if socket_address.ip().is_multicast() {
       for id in self.multicast_ids() {
-        if self.bulk_send_one(id, socket_address, buffer) == SendOutcome::WouldBlock {
+        if self.bulk_send_one(id, socket_address, datagram) == SendOutcome::WouldBlock {
           blocked.push(id);
         }
       }
-    } else if self.bulk_send_one(SocketId::Unicast, socket_address, buffer)
+    } else if self.bulk_send_one(SocketId::Unicast, socket_address, datagram)
       == SendOutcome::WouldBlock
     {
       blocked.push(SocketId::Unicast);
@@ -576,14 +587,14 @@ impl UDPSender {
   /// sockets that could not accept the datagram (WouldBlock).
   pub(crate) fn try_send_to_multicast_locator_via(
     &self,
-    buffer: &[u8],
+    datagram: Gather<'_>,
     locator: &Locator,
     interface: &InterfaceSelector,
   ) -> Vec<SocketId> {
-    if buffer.len() > MAX_UDP_PAYLOAD {
+    if datagram.len() > MAX_UDP_PAYLOAD {
       warn!(
         "try_send_to_multicast_locator_via: Message size = {}",
-        buffer.len()
+        datagram.len()
       );
     }
     let mut blocked = Vec::new();
@@ -593,7 +604,8 @@ impl UDPSender {
       return blocked;
     };
     if !socket_address.ip().is_multicast() {
-      if self.bulk_send_one(SocketId::Unicast, socket_address, buffer) == SendOutcome::WouldBlock {
+      if self.bulk_send_one(SocketId::Unicast, socket_address, datagram) == SendOutcome::WouldBlock
+      {
         blocked.push(SocketId::Unicast);
       }
       return blocked;
@@ -603,7 +615,7 @@ impl UDPSender {
       None => self.multicast_ids(),
     };
     for id in ids {
-      if self.bulk_send_one(id, socket_address, buffer) == SendOutcome::WouldBlock {
+      if self.bulk_send_one(id, socket_address, datagram) == SendOutcome::WouldBlock {
         blocked.push(id);
       }
     }
@@ -761,7 +773,7 @@ mod tests {
     assert!(sender.socket_can_reach(SocketId::Unicast, v4_dest));
     assert!(!sender.socket_can_reach(SocketId::Unicast, v6_dest));
     assert_eq!(
-      sender.raw_send(SocketId::Unicast, v6_dest, &[0u8; 4]),
+      sender.raw_send(SocketId::Unicast, v6_dest, Gather::whole(&[0u8; 4])),
       SendOutcome::Dropped
     );
   }

@@ -2,6 +2,7 @@ use std::{
   cmp::min,
   collections::{btree_map::Entry, BTreeMap},
   fmt, iter,
+  time::{Duration, Instant},
 };
 
 use bit_vec::BitVec;
@@ -112,10 +113,8 @@ struct AssemblyBuffer {
 
   stated: StatedOnce,
 
-  #[allow(dead_code)] // TODO: Purpose is to use this later for e.g.
-  // garbage collection, in case some buffer is not completed within reasonable time.
-  created_time: Timestamp,
-  modified_time: Timestamp,
+  // Not of the system's clock, which may be set meanwhile.
+  modified_at: Instant,
 }
 
 impl AssemblyBuffer {
@@ -157,8 +156,6 @@ impl AssemblyBuffer {
       None => Memory::Own(BytesMut::zeroed(data_size)),
     };
 
-    let now = Timestamp::now();
-
     Some(Self {
       memory,
       data_size,
@@ -166,8 +163,7 @@ impl AssemblyBuffer {
       fragment_count,
       received_bitmap: BitVec::from_elem(fragment_count, false),
       stated: StatedOnce::default(),
-      created_time: now,
-      modified_time: now,
+      modified_at: Instant::now(),
     })
   }
 
@@ -236,7 +232,7 @@ impl AssemblyBuffer {
     for f in 0..frags_in_submessage {
       self.received_bitmap.set(start_frag_from_0 + f, true);
     }
-    self.modified_time = Timestamp::now();
+    self.modified_at = Instant::now();
     true
   }
 
@@ -403,10 +399,10 @@ impl FragmentAssembler {
     self.assembly_buffers.is_empty()
   }
 
-  pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
+  pub fn garbage_collect(&mut self, max_age: Duration) {
     let own_bytes = &mut self.own_bytes;
     self.assembly_buffers.retain(|sn, ab| {
-      let retain = ab.modified_time >= expire_before;
+      let retain = ab.modified_at.elapsed() < max_age;
       if !retain {
         info!("AssemblyBuffer dropping {sn:?}");
         *own_bytes -= ab.own_bytes();
@@ -508,10 +504,10 @@ impl FragmentAssemblers {
     self.own_bytes -= removed.map_or(0, |fa| fa.own_bytes);
   }
 
-  pub fn garbage_collect_before(&mut self, expire_before: Timestamp) {
+  pub fn garbage_collect(&mut self, max_age: Duration) {
     self.by_writer.retain(|writer, fa| {
       debug!("AssemblyBuffer GC writer {writer:?}");
-      fa.garbage_collect_before(expire_before);
+      fa.garbage_collect(max_age);
       // Also of Writers that are not matched and therefore never removed: those of
       // builtin topics, of which everything is accepted.
       !fa.is_empty()
@@ -522,7 +518,7 @@ impl FragmentAssemblers {
 
 #[cfg(test)]
 mod tests {
-  use std::sync::Arc;
+  use std::{sync::Arc, time::Duration};
 
   use bytes::Bytes;
   use enumflags2::BitFlags;
@@ -558,6 +554,28 @@ mod tests {
       Memory::Own(bytes) => bytes.to_vec(),
       Memory::Lent { .. } => panic!("lent"),
     }
+  }
+
+  #[test]
+  fn an_unfinished_sample_expires_when_no_fragment_came_for_too_long() {
+    let mut assemblers = FragmentAssemblers::default();
+    let writer = GUID::new(GuidPrefix::UNKNOWN, EntityId::MIN);
+    let first = DataFrag {
+      writer_sn: SequenceNumber::new(1),
+      ..datafrag(1, 1, 1024, 2048, vec![7; 1024])
+    };
+    let flags = BitFlags::<DATAFRAG_Flags>::empty();
+    let is_unfinished = |assemblers: &FragmentAssemblers| {
+      let assembler = assemblers.get(writer);
+      assembler.is_some_and(|assembler| assembler.is_partially_received(SequenceNumber::new(1)))
+    };
+    assemblers.new_datafrag(writer, true, &first, flags, StatedOnce::default(), Lender::default);
+    assemblers.garbage_collect(Duration::from_secs(10));
+    assert!(is_unfinished(&assemblers));
+    std::thread::sleep(Duration::from_millis(2));
+    assemblers.garbage_collect(Duration::from_millis(1));
+    assert!(!is_unfinished(&assemblers));
+    assert_eq!(assemblers.own_bytes, 0);
   }
 
   // A DATAFRAG that packs K > 1 fragments in one submessage must reassemble the

@@ -20,7 +20,7 @@ use crate::{
     validity_trait::Validity,
     vendor_id::VendorId,
   },
-  rtps::{Submessage, SubmessageBody},
+  rtps::{outbound::Pieces, Submessage, SubmessageBody},
   structure::{
     cache_change::CacheChange,
     guid::{EntityId, GuidPrefix, GUID},
@@ -36,6 +36,19 @@ use crate::{
 };
 #[cfg(not(feature = "security"))]
 use crate::no_security::SecurityPluginsHandle;
+
+// Fragments of fewer bytes are copied into the datagram: that takes less time than the
+// kernel needs for a second piece.
+const MIN_SEPARATE_BYTES: usize = 4_096;
+
+// What `DataFrag` writes before its fragments.
+struct FragmentsHead<'a>(&'a DataFrag);
+
+impl<C: Context> Writable<C> for FragmentsHead<'_> {
+  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
+    self.0.write_head(writer)
+  }
+}
 
 #[derive(Debug, Clone)]
 pub struct Message {
@@ -86,6 +99,36 @@ impl Message {
     }
     debug_assert_eq!(buf.len(), total);
     Ok(buf)
+  }
+
+  /// Serializes this message without copying the fragments with which it ends.
+  pub(crate) fn write_in_pieces(&self, endianness: Endianness) -> Result<Pieces, speedy::Error> {
+    let (last, others, fragments) = match self.submessages.split_last() {
+      Some((last, others)) => match &last.body {
+        SubmessageBody::Writer(WriterSubmessage::DataFrag(fragments, _))
+          if fragments.serialized_payload.len() >= MIN_SEPARATE_BYTES =>
+        {
+          (last, others, fragments)
+        }
+        _ => return self.write_to_vec_fast(endianness).map(Pieces::whole),
+      },
+      None => return self.write_to_vec_fast(endianness).map(Pieces::whole),
+    };
+    let mut head = Vec::with_capacity(256);
+    self.header.write_to_stream_with_ctx(endianness, &mut head)?;
+    for sm in others {
+      sm.header.write_to_stream_with_ctx(endianness, &mut head)?;
+      sm.body
+        .write_to_stream_with_ctx(endianness_flag(sm.header.flags), &mut head)?;
+    }
+    last.header.write_to_stream_with_ctx(endianness, &mut head)?;
+    FragmentsHead(fragments)
+      .write_to_stream_with_ctx(endianness_flag(last.header.flags), &mut head)?;
+    Ok(Pieces {
+      head,
+      fragments: fragments.serialized_payload.clone(),
+      padding_len: fragments.padding_len(),
+    })
   }
 
   #[cfg(test)]
@@ -505,17 +548,17 @@ impl MessageBuilder {
       sample_size_usize,
     );
 
-    let serialized_payload = Vec::from(
-      cache_change
-        .data_value
-        .bytes_slice(from_byte, up_to_before_byte),
-    );
+    // A part of the sample's own bytes, not a copy of it, but for the first fragment.
+    let serialized_payload = cache_change
+      .data_value
+      .bytes_slice(from_byte, up_to_before_byte);
 
     #[cfg(not(feature = "security"))]
     let encoded_payload = serialized_payload;
 
     #[cfg(feature = "security")]
     let encoded_payload = {
+      let serialized_payload = Vec::from(serialized_payload);
       let encode_result = match security_plugins.map(SecurityPluginsHandle::get_plugins) {
         Some(security_plugins) => {
           security_plugins
@@ -534,7 +577,7 @@ impl MessageBuilder {
       };
 
       match encode_result {
-        Ok(encoded_payload) => encoded_payload,
+        Ok(encoded_payload) => Bytes::from(encoded_payload),
         Err(e) => {
           error!("{e:?}");
           return self;
@@ -555,7 +598,7 @@ impl MessageBuilder {
       } else {
         None
       },
-      serialized_payload: Bytes::from(encoded_payload),
+      serialized_payload: encoded_payload,
     };
 
     let flags: BitFlags<DATAFRAG_Flags> =
@@ -1019,6 +1062,59 @@ mod tests {
       .unwrap();
     let fast_multi = multi.write_to_vec_fast(Endianness::LittleEndian).unwrap();
     assert_eq!(generic_multi, fast_multi);
+  }
+
+  #[test]
+  fn the_pieces_of_a_message_are_the_message() {
+    use crate::{
+      dds::{ddsdata::DDSData, with_key::datawriter::WriteOptions},
+      messages::submessages::elements::serialized_payload::SerializedPayload,
+      structure::{cache_change::CacheChange, guid::GUID},
+      RepresentationIdentifier,
+    };
+    let value: Vec<u8> = (0..30_001_u32).map(|at| at as u8).collect();
+    let sample = CacheChange::new(
+      GUID::default(),
+      SequenceNumber::new(1),
+      WriteOptions::default(),
+      DDSData::new(SerializedPayload::new(RepresentationIdentifier::CDR_LE, value)),
+    );
+    let message = |first: u32, count: u16| {
+      MessageBuilder::new()
+        .ts_msg(Endianness::LittleEndian, Some(Timestamp::now()))
+        .data_frag_msg(
+          &sample,
+          EntityId::UNKNOWN,
+          GUID::default(),
+          FragmentNumber::new(first),
+          count,
+          5_000,
+          30_005,
+          Endianness::LittleEndian,
+          None,
+        )
+        .add_header_and_build(GuidPrefix::UNKNOWN)
+    };
+    // The first fragments, of which the header of the payload is a part; some in the
+    // middle; the last ones, with three bytes of padding.
+    for (first, count) in [(1, 3), (4, 2), (6, 2)] {
+      let message = message(first, count);
+      let whole = message.write_to_vec_fast(Endianness::LittleEndian).unwrap();
+      let pieces = message.write_in_pieces(Endianness::LittleEndian).unwrap();
+      assert!(!pieces.fragments.is_empty());
+      assert_eq!(pieces.padding_len, if first == 6 { 3 } else { 0 });
+      assert_eq!(pieces.gather().pieces().concat(), whole);
+      assert_eq!(pieces.gather().len(), whole.len());
+    }
+    // A short last fragment, and a message without fragments, are one piece.
+    let without_fragments = MessageBuilder::new()
+      .ts_msg(Endianness::LittleEndian, None)
+      .add_header_and_build(GuidPrefix::UNKNOWN);
+    for message in [message(7, 1), without_fragments] {
+      let pieces = message.write_in_pieces(Endianness::LittleEndian).unwrap();
+      let whole = message.write_to_vec_fast(Endianness::LittleEndian).unwrap();
+      assert_eq!((pieces.head, pieces.fragments.len()), (whole, 0));
+    }
   }
 
   #[test]

@@ -7,6 +7,8 @@
 
 use std::{collections::VecDeque, net::SocketAddr};
 
+use bytes::Bytes;
+
 /// Identifies one physical sender socket owned by `UDPSender`.
 ///
 /// `Multicast(i)` indexes into `UDPSender::multicast_sockets` (one socket per
@@ -39,6 +41,62 @@ pub(crate) enum TrafficClass {
   /// Bulk user DATA/DATAFRAG: flow-controlled; on WouldBlock the producer stops
   /// and is resumed on write readiness (or, for repair, simply retried later).
   Bulk,
+}
+
+/// The bytes of a datagram, in pieces that the kernel gathers.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Gather<'a> {
+  pub head: &'a [u8],
+  pub fragments: &'a [u8],
+  /// At most 3 bytes of zero after the fragments.
+  pub padding_len: usize,
+}
+
+impl<'a> Gather<'a> {
+  pub fn whole(datagram: &'a [u8]) -> Self {
+    Self {
+      head: datagram,
+      fragments: &[],
+      padding_len: 0,
+    }
+  }
+
+  pub fn len(&self) -> usize {
+    self.head.len() + self.fragments.len() + self.padding_len
+  }
+
+  pub fn pieces(&self) -> [&'a [u8]; 3] {
+    [self.head, self.fragments, &[0; 3][..self.padding_len]]
+  }
+}
+
+/// A serialized message. Fragments with which it ends are not copied.
+#[derive(Debug)]
+pub(crate) struct Pieces {
+  /// What comes before the fragments; all of a message that does not end with any.
+  pub head: Vec<u8>,
+  /// The fragments, a part of the sample's own bytes.
+  pub fragments: Bytes,
+  /// The bytes after the fragments, which are zero; at most 3.
+  pub padding_len: usize,
+}
+
+impl Pieces {
+  pub fn whole(message: Vec<u8>) -> Self {
+    Self {
+      head: message,
+      fragments: Bytes::new(),
+      padding_len: 0,
+    }
+  }
+
+  pub fn gather(&self) -> Gather<'_> {
+    Gather {
+      head: &self.head,
+      fragments: &self.fragments,
+      padding_len: self.padding_len,
+    }
+  }
 }
 
 /// A queued outbound datagram. Used only for the never-dropped control queue;

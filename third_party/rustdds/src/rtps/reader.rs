@@ -6,7 +6,7 @@ use std::{
   rc::Rc,
   sync::{Arc, Mutex, MutexGuard},
   task::Waker,
-  time::Duration as StdDuration,
+  time::{Duration as StdDuration, Instant},
 };
 
 use mio1::Token;
@@ -53,7 +53,6 @@ use crate::{
   structure::{
     cache_change::{CacheChange, ChangeKind},
     dds_cache::TopicCache,
-    duration::Duration,
     entity::RTPSEntity,
     guid::{EntityId, GuidPrefix, GUID},
     locator::Locator,
@@ -140,7 +139,7 @@ pub(crate) struct Reader {
   received_heartbeat_count: i32,
 
   fragment_assemblers: FragmentAssemblers,
-  last_fragment_garbage_collect: Timestamp,
+  last_fragment_garbage_collect: Instant,
   matched_writers: BTreeMap<GUID, RtpsWriterProxy>,
   writer_match_count_total: i32, // total count, never decreases
 
@@ -228,9 +227,9 @@ const NACK_FRAGS_MAX: usize = 16;
 
 // If we are assembling a fragment, but it does not receive any updates
 // for this time, the AssemblyBuffer is just dropped.
-const FRAGMENT_ASSEMBLY_TIMEOUT: Duration = Duration::from_secs(10);
+const FRAGMENT_ASSEMBLY_TIMEOUT: StdDuration = StdDuration::from_secs(10);
 // minimum interval (max frequency) of AssemblyBuffer GC
-const MIN_FRAGMENT_GC_INTERVAL: Duration = Duration::from_secs(2);
+const MIN_FRAGMENT_GC_INTERVAL: StdDuration = StdDuration::from_secs(2);
 
 impl Reader {
   pub(crate) fn new(
@@ -274,7 +273,7 @@ impl Reader {
       heartbeat_suppression_duration: StdDuration::new(0, 0),
       received_heartbeat_count: 0,
       fragment_assemblers: FragmentAssemblers::default(),
-      last_fragment_garbage_collect: Timestamp::now(),
+      last_fragment_garbage_collect: Instant::now(),
       matched_writers: BTreeMap::new(),
       writer_match_count_total: 0,
       requested_deadline_missed_count: 0,
@@ -736,7 +735,6 @@ impl Reader {
   ) {
     let writer_guid = GUID::new_with_prefix_and_id(mr_state.source_guid_prefix, datafrag.writer_id);
     let seq_num = datafrag.writer_sn;
-    let receive_timestamp = Timestamp::now();
     //trace!("DATAFRAG received topic={:?}", self.topic_name);
 
     // Assemble only what will be delivered: not what a writer that we do not know
@@ -756,7 +754,7 @@ impl Reader {
     if let (Some(source_timestamp), Some(lifespan)) =
       (mr_state.source_timestamp, self.qos().lifespan)
     {
-      let elapsed = receive_timestamp.duration_since(source_timestamp);
+      let elapsed = Timestamp::now().duration_since(source_timestamp);
       if lifespan.duration < elapsed {
         info!(
           "DataFrag {:?} from {:?} lifespan exceeded. duration={:?} elapsed={:?}",
@@ -818,7 +816,7 @@ impl Reader {
       }
       self.process_received_data(
         dds_data,
-        receive_timestamp,
+        Timestamp::now(),
         write_options_b.build(),
         writer_guid,
         writer_seq_num,
@@ -841,15 +839,11 @@ impl Reader {
     // fragment assemblers and discard those assembly buffers whose
     // creation / modification timestamps look like it is no longer receiving
     // data and can therefore be discarded.
-    let now = Timestamp::now();
-    if now - self.last_fragment_garbage_collect > MIN_FRAGMENT_GC_INTERVAL {
-      self.last_fragment_garbage_collect = now;
-
-      let expire_before = now - FRAGMENT_ASSEMBLY_TIMEOUT;
-
+    if self.last_fragment_garbage_collect.elapsed() > MIN_FRAGMENT_GC_INTERVAL {
+      self.last_fragment_garbage_collect = Instant::now();
       self
         .fragment_assemblers
-        .garbage_collect_before(expire_before);
+        .garbage_collect(FRAGMENT_ASSEMBLY_TIMEOUT);
     } else {
       trace!("Not yet AssemblyBuffer GC time.");
     }

@@ -39,7 +39,7 @@ use crate::{
       REPAIR_INTERVAL_DEFAULT, REPAIR_INTERVAL_MAX, REPAIR_INTERVAL_MIN, REPAIR_RATE_FACTOR, WRITE_RATE_PERIOD,
     },
     direct_send::{Offer, Plan},
-    outbound::{SocketId, TrafficClass},
+    outbound::{Pieces, SocketId, TrafficClass},
     rtps_reader_proxy::{EvictedRequests, RtpsReaderProxy},
     timed_event::DpTimerEvent,
     transmit::{DefaultRouteSelector, InterfaceObservations, RouteKey},
@@ -2377,13 +2377,19 @@ impl Writer {
 
     match encoded {
       Ok(message) => {
-        let buffer = match message.write_to_vec_fast(self.endianness) {
-          Ok(b) => b,
+        let serialized = match class {
+          TrafficClass::Bulk => message.write_in_pieces(self.endianness),
+          // It may be queued, which takes one piece.
+          TrafficClass::Control => message.write_to_vec_fast(self.endianness).map(Pieces::whole),
+        };
+        let pieces = match serialized {
+          Ok(pieces) => pieces,
           Err(e) => {
             error!("Failed to serialize RTPS message for send: {e:?}");
             return blocked;
           }
         };
+        let (datagram, buffer) = (pieces.gather(), &pieces.head);
 
         // De-duplication of narrowed (interface-aware) sends across readers.
         let mut sent_routes: BTreeSet<RouteKey> = BTreeSet::new();
@@ -2396,11 +2402,11 @@ impl Writer {
               match class {
                 TrafficClass::Control => self
                   .udp_sender
-                  .send_to_multicast_locator_via(&buffer, &$mc, &$iface),
+                  .send_to_multicast_locator_via(buffer, &$mc, &$iface),
                 TrafficClass::Bulk => blocked.extend(
                   self
                     .udp_sender
-                    .try_send_to_multicast_locator_via(&buffer, &$mc, &$iface),
+                    .try_send_to_multicast_locator_via(datagram, &$mc, &$iface),
                 ),
               }
             } else {
@@ -2412,9 +2418,9 @@ impl Writer {
           ($uc:expr) => {
             if sent_routes.insert(RouteKey::Unicast($uc)) {
               match class {
-                TrafficClass::Control => self.udp_sender.send_to_locator(&buffer, &$uc),
+                TrafficClass::Control => self.udp_sender.send_to_locator(buffer, &$uc),
                 TrafficClass::Bulk => {
-                  blocked.extend(self.udp_sender.try_send_to_locator(&buffer, &$uc));
+                  blocked.extend(self.udp_sender.try_send_to_locator(datagram, &$uc));
                 }
               }
             } else {
@@ -2427,9 +2433,9 @@ impl Writer {
             for loc in $locs.iter() {
               if sent_legacy.insert(*loc) {
                 match class {
-                  TrafficClass::Control => self.udp_sender.send_to_locator(&buffer, loc),
+                  TrafficClass::Control => self.udp_sender.send_to_locator(buffer, loc),
                   TrafficClass::Bulk => {
-                    blocked.extend(self.udp_sender.try_send_to_locator(&buffer, loc));
+                    blocked.extend(self.udp_sender.try_send_to_locator(datagram, loc));
                   }
                 }
               } else {

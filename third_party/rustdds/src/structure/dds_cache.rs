@@ -91,9 +91,7 @@ impl DDSCache {
     }
   }
 
-  // TODO: Investigate why this is not used.
-  // When do RTPS Topics die? Never?
-  #[allow(dead_code)]
+  // Readers and Writers of the topic that still exist keep their handle.
   pub fn remove_topic(&mut self, topic_name: &str) {
     if self.topic_caches.contains_key(topic_name) {
       self.topic_caches.remove(topic_name);

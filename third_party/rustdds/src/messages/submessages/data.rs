@@ -1,12 +1,12 @@
 use std::io;
 
 use bytes::Bytes;
-use speedy::{Context, Error, Readable, Writable, Writer};
+use speedy::{Context, Writable, Writer};
 use enumflags2::BitFlags;
 
 use crate::{
   messages::submessages::{elements::parameter_list::ParameterList, submessages::*},
-  serialization::{padding_needed_for_alignment_4, round_up_to_4},
+  serialization::{padding_needed_for_alignment_4, read_at, round_up_to_4},
   structure::{guid::EntityId, sequence_number::SequenceNumber},
 };
 // use log::debug;
@@ -55,21 +55,14 @@ impl Data {
   /// requires info from submessage header. Required information is  expect_qos
   /// and expect_payload, which are told on submessage header flags.
   pub fn deserialize_data(buffer: &Bytes, flags: BitFlags<DATA_Flags>) -> io::Result<Self> {
-    let mut cursor = io::Cursor::new(&buffer);
+    let mut cursor = io::Cursor::new(buffer);
     let endianness = endianness_flag(flags.bits());
-    let map_speedy_err = |p: Error| io::Error::other(p);
 
-    let _extra_flags =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let octets_to_inline_qos =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let reader_id = EntityId::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-      .map_err(map_speedy_err)?;
-    let writer_id = EntityId::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-      .map_err(map_speedy_err)?;
-    let sequence_number =
-      SequenceNumber::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-        .map_err(map_speedy_err)?;
+    let _extra_flags = read_at::<u16>(&mut cursor, endianness)?;
+    let octets_to_inline_qos = read_at::<u16>(&mut cursor, endianness)?;
+    let reader_id = read_at::<EntityId>(&mut cursor, endianness)?;
+    let writer_id = read_at::<EntityId>(&mut cursor, endianness)?;
+    let sequence_number = read_at::<SequenceNumber>(&mut cursor, endianness)?;
 
     let expect_qos = flags.contains(DATA_Flags::InlineQos);
     let expect_data = flags.contains(DATA_Flags::Data) || flags.contains(DATA_Flags::Key);
@@ -117,10 +110,7 @@ impl Data {
 
     // read the inline Qos
     let parameter_list = if expect_qos {
-      Some(
-        ParameterList::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-          .map_err(map_speedy_err)?,
-      )
+      Some(read_at::<ParameterList>(&mut cursor, endianness)?)
     } else {
       None
     };

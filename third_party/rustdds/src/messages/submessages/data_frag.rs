@@ -2,13 +2,13 @@ use std::io;
 
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
-use speedy::{Context, Error, Readable, Writable, Writer};
+use speedy::{Context, Writable, Writer};
 use enumflags2::BitFlags;
 use bytes::Bytes;
 
 use crate::{
   messages::submessages::{elements::parameter_list::ParameterList, submessages::*},
-  serialization::{padding_needed_for_alignment_4, round_up_to_4},
+  serialization::{padding_needed_for_alignment_4, read_at, round_up_to_4},
   structure::{
     guid::EntityId,
     sequence_number::{FragmentNumber, SequenceNumber},
@@ -113,29 +113,18 @@ impl DataFrag {
   }
 
   pub fn deserialize(buffer: &Bytes, flags: BitFlags<DATAFRAG_Flags>) -> io::Result<Self> {
-    let mut cursor = io::Cursor::new(&buffer);
+    let mut cursor = io::Cursor::new(buffer);
     let endianness = endianness_flag(flags.bits());
-    let map_speedy_err = |p: Error| io::Error::other(p);
 
-    let _extra_flags =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let octets_to_inline_qos =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let reader_id = EntityId::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-      .map_err(map_speedy_err)?;
-    let writer_id = EntityId::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-      .map_err(map_speedy_err)?;
-    let writer_sn = SequenceNumber::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-      .map_err(map_speedy_err)?;
-    let fragment_starting_num =
-      FragmentNumber::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-        .map_err(map_speedy_err)?;
-    let fragments_in_submessage =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let fragment_size =
-      u16::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
-    let data_size =
-      u32::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor).map_err(map_speedy_err)?;
+    let _extra_flags = read_at::<u16>(&mut cursor, endianness)?;
+    let octets_to_inline_qos = read_at::<u16>(&mut cursor, endianness)?;
+    let reader_id = read_at::<EntityId>(&mut cursor, endianness)?;
+    let writer_id = read_at::<EntityId>(&mut cursor, endianness)?;
+    let writer_sn = read_at::<SequenceNumber>(&mut cursor, endianness)?;
+    let fragment_starting_num = read_at::<FragmentNumber>(&mut cursor, endianness)?;
+    let fragments_in_submessage = read_at::<u16>(&mut cursor, endianness)?;
+    let fragment_size = read_at::<u16>(&mut cursor, endianness)?;
+    let data_size = read_at::<u32>(&mut cursor, endianness)?;
 
     let expect_qos = flags.contains(DATAFRAG_Flags::InlineQos);
     // let expect_key = flags.contains(DATAFRAG_Flags::Key);
@@ -178,10 +167,7 @@ impl DataFrag {
     }
 
     let inline_qos = if expect_qos {
-      Some(
-        ParameterList::read_from_stream_unbuffered_with_ctx(endianness, &mut cursor)
-          .map_err(map_speedy_err)?,
-      )
+      Some(read_at::<ParameterList>(&mut cursor, endianness)?)
     } else {
       None
     };
@@ -287,8 +273,12 @@ impl DataFrag {
   }
 }
 
-impl<C: Context> Writable<C> for DataFrag {
-  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
+impl DataFrag {
+  /// Writes what comes before the fragments.
+  pub(crate) fn write_head<C: Context, T: ?Sized + Writer<C>>(
+    &self,
+    writer: &mut T,
+  ) -> Result<(), C::Error> {
     writer.write_u16(0)?; // extraflags
     writer.write_u16(28)?; // See calculation of this value in deserialization above.
                            // We always write constant 28 here, because this implementation does not (yet)
@@ -306,10 +296,22 @@ impl<C: Context> Writable<C> for DataFrag {
     if let Some(inline_qos) = self.inline_qos.as_ref() {
       writer.write_value(inline_qos)?;
     }
+    Ok(())
+  }
+
+  /// The bytes after the fragments, which are zero.
+  pub(crate) fn padding_len(&self) -> usize {
+    padding_needed_for_alignment_4(self.serialized_payload.len())
+  }
+}
+
+impl<C: Context> Writable<C> for DataFrag {
+  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
+    self.write_head(writer)?;
     writer.write_bytes(&self.serialized_payload)?;
     // Whole words (RTPS spec v2.5 Section 9.4.1): Cyclone DDS discards another
     // length as malformed. The receiver knows the length of the last fragment.
-    for _ in 0..padding_needed_for_alignment_4(self.serialized_payload.len()) {
+    for _ in 0..self.padding_len() {
       writer.write_u8(0)?;
     }
     Ok(())

@@ -1,0 +1,292 @@
+//! The shared memory that the pools of all routes may take, and the slots of one pool that have it.
+//!
+//! iceoryx2 maps a pool with slots of the largest sample, of which only the headers exist at the start.
+//! Before ingress writes a payload into a slot, it allocates the pages that the payload needs. So a page that
+//! does not exist is never touched: SIGBUS kills a process that touches one when the file system is full.
+
+use std::fs::{self, File, OpenOptions};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use nix::errno::Errno;
+use nix::fcntl::{FallocateFlags, fallocate};
+use nix::sys::sysinfo::sysinfo;
+
+use super::channel::{PAGE_BYTES, PoolSize, RouteChannel, SLOT_HEADER_BYTES};
+use super::error::ShmError;
+use super::root::SHM_DIR;
+use super::segment::{free_bytes, no_room};
+use crate::config::Settings;
+use crate::model::TrafficClass;
+use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
+
+/// The budget if the configuration sets none: this, or an eighth of the machine's memory if that is less.
+pub const DEFAULT_BUDGET_BYTES: u64 = 256 << 20;
+const DEFAULT_BUDGET_DIVISOR: u64 = 8;
+
+/// Why a slot gets no memory for its payload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NoMemory {
+    /// One route may hold no more.
+    #[error("the route holds as much of shared_memory.budget_bytes as one route may")]
+    Quota,
+    /// The budget is used up, or the rest is kept for other routes.
+    #[error("shared_memory.budget_bytes is used up, or the rest is kept for other routes")]
+    Budget,
+    /// The file system has no room.
+    #[error("/dev/shm is full")]
+    FileSystem,
+    /// The pool is not where it should be.
+    #[error("the slot is outside of its pool")]
+    NoSuchSlot,
+}
+
+/// What the pool of a route takes of the budget.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PoolUse {
+    /// What the pool has now.
+    pub used_bytes: u64,
+    /// The most that it ever had.
+    pub peak_bytes: u64,
+    /// The budget of all pools.
+    pub budget_bytes: u64,
+    /// What all pools have now.
+    pub budget_used_bytes: u64,
+    /// The most that all pools together ever had.
+    pub budget_peak_bytes: u64,
+}
+
+/// The shared memory of all pools of ingress.
+#[derive(Debug)]
+pub struct PoolBudget {
+    state: Mutex<MemoryBudget>,
+}
+
+impl PoolBudget {
+    /// The budget of the configured routes.
+    pub fn of(settings: &Settings) -> Arc<Self> {
+        let demand = |index| {
+            let is_critical = settings.lanes.iter().any(|lane| {
+                lane.class() == TrafficClass::Critical
+                    && lane.outputs.iter().any(|output| output.route == index)
+            });
+            demand_of(&RouteChannel::of(settings, index).pool_size(), is_critical)
+        };
+        let demands: Vec<_> = (0..settings.routes.len()).map(demand).collect();
+        Arc::new(Self { state: Mutex::new(MemoryBudget::new(budget_bytes(settings), &demands)) })
+    }
+
+    /// A budget for pools of the critical lane.
+    pub fn of_channels(channels: &[RouteChannel], bytes: u64) -> Arc<Self> {
+        let demand = |channel: &RouteChannel| demand_of(&channel.pool_size(), true);
+        let demands: Vec<_> = channels.iter().map(demand).collect();
+        Arc::new(Self { state: Mutex::new(MemoryBudget::new(bytes, &demands)) })
+    }
+
+    /// What the pool of a route takes.
+    pub fn usage(&self, route: usize) -> PoolUse {
+        let state = self.lock();
+        let (used_bytes, peak_bytes) = state.used_and_peak_of(route);
+        let (budget_used_bytes, budget_peak_bytes) = state.used_and_peak();
+        let budget_bytes = state.limit_bytes();
+        PoolUse { used_bytes, peak_bytes, budget_bytes, budget_used_bytes, budget_peak_bytes }
+    }
+
+    #[allow(clippy::disallowed_methods, reason = "held for a sum over the routes, when a slot grows")]
+    fn lock(&self) -> MutexGuard<'_, MemoryBudget> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn demand_of(pool: &PoolSize, is_critical: bool) -> PoolDemand {
+    PoolDemand { first_bytes: pool.first_bytes, most_bytes: pool.bytes, is_critical }
+}
+
+/// The budget of the configuration, or the default on this machine.
+pub fn budget_bytes(settings: &Settings) -> u64 {
+    settings.shared_memory.budget_bytes.unwrap_or_else(|| {
+        let machine = sysinfo().map_or(u64::MAX, |info| info.ram_total());
+        DEFAULT_BUDGET_BYTES.min(machine / DEFAULT_BUDGET_DIVISOR)
+    })
+}
+
+/// The slots of a pool, and how much of each exists.
+#[derive(Debug)]
+pub(super) struct SlotMemory {
+    file: File,
+    /// The address of the first slot, and its place in the file.
+    first_address: usize,
+    first_offset: u64,
+    pool: PoolSize,
+    /// The pages of each slot that exist, from its beginning. Only the thread that holds a slot changes them.
+    pages: Box<[AtomicU32]>,
+    budget: Arc<PoolBudget>,
+    route: usize,
+}
+
+impl SlotMemory {
+    /// Finds the file of a pool by the address of the payload in its first slot, and allocates what the pool
+    /// takes at the start.
+    ///
+    /// iceoryx2 has written the description of the pool before, so the page of the first header exists.
+    pub(super) fn find(
+        first_payload: usize,
+        pool: PoolSize,
+        budget: &Arc<PoolBudget>,
+        route: usize,
+        what: &str,
+    ) -> Result<Self, ShmError> {
+        let usage = budget.usage(route);
+        if usage.budget_used_bytes > usage.budget_bytes {
+            return Err(ShmError::BudgetTooSmall {
+                needed_bytes: usage.budget_used_bytes,
+                budget_bytes: usage.budget_bytes,
+            });
+        }
+        let failure =
+            |reason: String| ShmError::failed(format!("to find {what}"), Path::new(SHM_DIR), reason);
+        let first_address = first_payload - SLOT_HEADER_BYTES;
+        let mapping = Mapping::at(first_address).ok_or_else(|| failure("it is not mapped".to_owned()))?;
+        let file = OpenOptions::new().read(true).write(true).open(&mapping.path);
+        let file = file.map_err(|error| ShmError::os("to open a pool", &mapping.path, &error))?;
+        let length = file.metadata().map_err(|error| failure(error.to_string()))?.len();
+        let first_offset = (first_address - mapping.start) as u64 + mapping.offset;
+        let end = first_offset + pool.slots as u64 * pool.stride_bytes;
+        if first_offset + SLOT_HEADER_BYTES as u64 > PAGE_BYTES || end > length {
+            return Err(failure(format!("its first slot is at {first_offset}, it has {length} bytes")));
+        }
+        let pages = if pool.is_sparse { 1 } else { u32::MAX };
+        let pages = (0..pool.slots).map(|_| AtomicU32::new(pages)).collect();
+        let slots = Self { file, first_address, first_offset, pool, pages, budget: budget.clone(), route };
+        let no_room = |errno| match errno {
+            Errno::ENOSPC => no_room(what, pool.first_bytes, free_bytes()),
+            errno => ShmError::os("to reserve shared memory", Path::new(SHM_DIR), &errno.into()),
+        };
+        if pool.is_sparse {
+            for slot in 0..pool.slots {
+                slots.allocate(slot, 0, 1).map_err(no_room)?;
+            }
+            // The end of the last slot shares its page with the free list.
+            let tail = (end / PAGE_BYTES) * PAGE_BYTES;
+            allocate(&slots.file, tail, length - tail).map_err(no_room)?;
+        } else {
+            allocate(&slots.file, 0, length).map_err(no_room)?;
+        }
+        Ok(slots)
+    }
+
+    /// What the pool takes of the budget.
+    pub(super) fn usage(&self) -> PoolUse {
+        self.budget.usage(self.route)
+    }
+
+    /// Makes sure that the pages of a payload exist, in a slot that the caller holds.
+    pub(super) fn ensure(&self, payload: usize, len: usize) -> Result<(), NoMemory> {
+        if len == 0 || !self.pool.is_sparse {
+            return Ok(());
+        }
+        let from_first = payload.wrapping_sub(SLOT_HEADER_BYTES + self.first_address);
+        let slot = from_first / self.pool.stride_bytes as usize;
+        let (Some(pages), true) =
+            (self.pages.get(slot), from_first.is_multiple_of(self.pool.stride_bytes as usize))
+        else {
+            return Err(NoMemory::NoSuchSlot);
+        };
+        let present = pages.load(Ordering::Relaxed);
+        let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(PAGE_BYTES) as u32;
+        // What lies beyond the pages of this slot is on the first page of the next one, or of the free list.
+        let most = (self.pool.stride_bytes / PAGE_BYTES) as u32;
+        if needed.min(most) <= present {
+            return Ok(());
+        }
+        let wanted = size_class(needed).min(most);
+        let more = u64::from(wanted - present) * PAGE_BYTES;
+        self.budget.lock().take(self.route, more, u64::from(wanted) * PAGE_BYTES).map_err(|refusal| {
+            match refusal {
+                BudgetRefusal::Quota => NoMemory::Quota,
+                BudgetRefusal::Budget => NoMemory::Budget,
+            }
+        })?;
+        if self.allocate(slot, present, wanted).is_err() {
+            self.budget.lock().give_back(self.route, more);
+            return Err(NoMemory::FileSystem);
+        }
+        pages.store(wanted, Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn allocate(&self, slot: usize, from_page: u32, to_page: u32) -> nix::Result<()> {
+        let first = slot as u64 * self.pool.stride_bytes + u64::from(from_page) * PAGE_BYTES;
+        allocate(&self.file, first, u64::from(to_page - from_page) * PAGE_BYTES)
+    }
+}
+
+/// Rounds a number of pages up, so that samples whose size varies a little share a class: to at most a
+/// quarter more.
+fn size_class(pages: u32) -> u32 {
+    let step = (pages.next_power_of_two() / 8).max(1);
+    pages.next_multiple_of(step)
+}
+
+fn allocate(file: &File, offset: u64, bytes: u64) -> nix::Result<()> {
+    loop {
+        match fallocate(file, FallocateFlags::empty(), offset.cast_signed(), bytes.cast_signed()) {
+            Err(Errno::EINTR) => {}
+            result => return result,
+        }
+    }
+}
+
+/// A mapped file of this process.
+struct Mapping {
+    start: usize,
+    /// The place in the file that is mapped at `start`.
+    offset: u64,
+    path: PathBuf,
+}
+
+impl Mapping {
+    fn at(address: usize) -> Option<Self> {
+        let maps = fs::read_to_string("/proc/self/maps").ok()?;
+        maps.lines().find_map(|line| Self::of_line(line, address))
+    }
+
+    /// Reads a line such as `7f00-7f10 rw-s 00001000 00:19 42 /dev/shm/name`.
+    fn of_line(line: &str, address: usize) -> Option<Self> {
+        let (range, rest) = line.split_once(' ')?;
+        let (start, end) = range.split_once('-')?;
+        let number = |text| usize::from_str_radix(text, 16).ok();
+        let (start, end) = (number(start)?, number(end)?);
+        if !(start..end).contains(&address) {
+            return None;
+        }
+        let offset = number(rest.split_ascii_whitespace().nth(1)?)? as u64;
+        Some(Self { start, offset, path: rest.get(rest.find('/')?..)?.into() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_size_class_is_at_most_a_quarter_larger() {
+        for pages in 1..20_000 {
+            let class = size_class(pages);
+            assert!((pages..=pages + pages / 4).contains(&class), "{pages}: {class}");
+        }
+        assert_eq!([1, 8, 9, 1_500, 1_537].map(size_class), [1, 8, 10, 1_536, 1_792]);
+    }
+
+    #[test]
+    fn a_mapping_is_read_from_its_line() {
+        let line =
+            "7f0000000000-7f0000002000 rw-s 00001000 00:19 42                         /dev/shm/ab1_a b";
+        let mapping = Mapping::of_line(line, 0x7f00_0000_1fff).unwrap();
+        assert_eq!((mapping.start, mapping.offset), (0x7f00_0000_0000, 0x1000));
+        assert_eq!(mapping.path, Path::new("/dev/shm/ab1_a b"));
+        assert!(Mapping::of_line(line, 0x7f00_0000_2000).is_none());
+        assert!(Mapping::of_line("7f00-7f10 rw-p 00000000 00:00 0", 0x7f01).is_none());
+    }
+}
