@@ -432,7 +432,13 @@ fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
     };
     wait_for_writer(&reader);
     writer
-        .write_to(joined, Bytes::from_static(b"map again..."), Encapsulation::CDR_LE, SourceTimestamp(1))
+        .write_to(
+            joined,
+            Bytes::from_static(b"map again..."),
+            Encapsulation::CDR_LE,
+            SourceTimestamp(1),
+            SampleKey::default(),
+        )
         .unwrap();
     assert_eq!(take_one(&reader).unwrap().0, b"map again...");
 }

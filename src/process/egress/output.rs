@@ -213,14 +213,14 @@ impl Output {
         }
         if self.topic.is_place {
             self.follow_topic(participant);
-            if self.topic.is_former(sample.header().sequence) {
-                // Of the former topic of the place, which has no writer any more.
-                return self.drop_sample(&sample, DropReason::NoWriter);
-            }
         }
         let other_kind = sample.header().key.is_keyed() != self.has_keys;
         if self.writer.is_none() || other_kind || (self.is_to_latch() && self.counters.get().readers == 0) {
             self.announce_type(participant);
+        }
+        // After both calls, which follow the topic of a place: its former topic has no writer any more.
+        if self.topic.is_former(sample.header().sequence) {
+            return self.drop_sample(&sample, DropReason::NoWriter);
         }
         if !self.former_readers.is_empty() {
             // Former readers may have matched since the last housekeeping.

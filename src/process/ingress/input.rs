@@ -327,9 +327,14 @@ impl Input {
         let has_keys = self.source.has_keys(dds_type, self.info.get().has_keys != 0);
         let of_route = DdsType { name: dds_type, hash: type_hash, has_keys };
         let RouteInfo { bound_topic, bound_after, bound_count, .. } = *self.info.get();
-        let has_keys = has_keys.into();
-        let mut info =
-            RouteInfo { type_hash, has_keys, bound_topic, bound_after, bound_count, ..RouteInfo::default() };
+        let mut info = RouteInfo {
+            type_hash,
+            has_keys: has_keys.into(),
+            bound_topic,
+            bound_after,
+            bound_count,
+            ..RouteInfo::default()
+        };
         let durability = self.source.durability(of_route, self.info.get().durability());
         info.transient_local = u64::from(durability == Durability::TransientLocal);
         if is_settled {

@@ -3,6 +3,7 @@
 use tracing::{error, info};
 
 use super::super::super::role::RoleError;
+use super::super::former_readers::FormerReaders;
 use super::super::offer::Offer;
 use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
@@ -72,10 +73,14 @@ impl Output {
     pub(super) fn follow_topic(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else { return };
         let Some(topic) = self.topic.next(&info) else { return };
-        // The former topic has had no publisher for a while, so what is still unsent is in no reader's reach.
+        // The former topic has had no publisher for a while, but a reader that was out of reach may not have
+        // acknowledged its last samples.
+        self.count_sent();
+        let behind = self.readers.get().unconfirmed(self.counters.get());
         let unsent = self.unsent.clear() as u64;
         let queued = self.queued;
         self.counters.update(|counters| {
+            counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
             counters.drops.add(DropReason::NoWriter, unsent);
             counters.waiting = queued;
         });
@@ -83,6 +88,8 @@ impl Output {
             self.remove_writer(former, participant);
             participant.forget_topic(&self.topic.dds_topic);
         }
+        // They were readers of the former topic.
+        self.former_readers = FormerReaders::default();
         self.topic.set(&info, &topic);
         let (offer, latched_offer) = self.configured;
         self.start_offer(offer);
