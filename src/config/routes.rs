@@ -374,10 +374,11 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
         }
     }
     let mut outputs = HashMap::new();
-    for (index, output) in routes.iter().enumerate().flat_map(|(index, route)| {
+    for (index, pattern, output) in routes.iter().enumerate().flat_map(|(index, route)| {
         // Two patterns may have the same prefix: a topic has one route, and so an output of its own.
-        let index = route.pattern.as_ref().map(|_| index);
-        route.outputs.iter().map(move |output| (index, output))
+        let pattern = route.pattern.as_ref();
+        let index = pattern.map(|_| index);
+        route.outputs.iter().map(move |output| (index, pattern, output))
     }) {
         let domain_id = lanes[output.lane].lane.network.domain_id;
         let topic = output.topic.to_string();
@@ -386,6 +387,13 @@ fn check_topics(routes: &[RouteDraft<'_>], input: &DdsNetwork, lanes: &[LaneDraf
             && index.is_none()
         {
             let allowed = format!("must not be an input topic in the same domain ({}): a loop", at(field));
+            output.field.report_value(&topic, allowed);
+        }
+        if let (Some(pattern), OutputTopic::Prefix(prefix)) = (pattern, &output.topic)
+            && prefix.is_within(&format!("{}/topic", pattern.input_topic.literal_start()))
+        {
+            let allowed =
+                "must not be what all topics of the pattern begin with: each would be an output".to_owned();
             output.field.report_value(&topic, allowed);
         }
         if let Some(first) = first_of(&mut outputs, (index, domain_id, topic.clone()), &output.field) {

@@ -23,6 +23,7 @@ pub(super) const TOPIC: &str = "ros_discovery_info";
 pub(super) const TYPE: DdsType = DdsType {
     name: "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_",
     hash: TypeHash::from_hex(b"91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"),
+    has_keys: false,
 };
 
 /// `rmw_dds_common/msg/ParticipantEntitiesInfo`: the identifiers of the participant and, of each node, its

@@ -319,9 +319,9 @@ impl Participant {
         begin: impl FnOnce(&DomainParticipant, &Topic) -> CreateResult<()>,
     ) -> Result<RawReader, DdsError> {
         let policies = qos::of_reader(reader_qos).with_user_data(qos::user_data(dds_type.hash));
-        let made_topic = make_topic(&self.participant, topic, dds_type.name, &policies)?;
+        let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
         let inner = begin(&self.participant, &made_topic)
-            .and_then(|()| self.subscriber.create_simple_datareader_no_key(&made_topic, Some(policies)))
+            .and_then(|()| self.subscriber.create_simple_datareader_raw(&made_topic, Some(policies)))
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
         let guid = Guid(inner.guid().to_bytes());
         Ok(RawReader { inner, guid })
@@ -415,11 +415,12 @@ impl Participant {
 fn make_topic(
     participant: &DomainParticipant,
     name: &str,
-    dds_type: &str,
+    dds_type: DdsType<'_>,
     policies: &QosPolicies,
 ) -> Result<Topic, DdsError> {
+    let kind = if dds_type.has_keys { TopicKind::WithKey } else { TopicKind::NoKey };
     participant
-        .create_topic(name.to_owned(), dds_type.to_owned(), policies, TopicKind::NoKey)
+        .create_topic(name.to_owned(), dds_type.name.to_owned(), policies, kind)
         .map_err(|error| DdsError::library(format!("the topic {name}"), error))
 }
 
@@ -430,10 +431,10 @@ fn make_writer(
     dds_type: DdsType<'_>,
     policies: QosPolicies,
 ) -> Result<RawWriter, DdsError> {
-    let made_topic = make_topic(participant, topic, dds_type.name, &policies)?;
+    let made_topic = make_topic(participant, topic, dds_type, &policies)?;
     let policies = policies.with_user_data(qos::user_data(dds_type.hash));
     let inner = publisher
-        .create_datawriter_no_key(&made_topic, Some(policies))
+        .create_datawriter_raw(&made_topic, Some(policies))
         .map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
     let guid = Guid(inner.guid().to_bytes());
     Ok(RawWriter { inner, guid })

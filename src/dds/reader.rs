@@ -10,8 +10,8 @@ use std::thread::{self, Thread};
 use bytes::Bytes;
 
 use super::rustdds::no_key::{Decode, DeserializerAdapter, SimpleDataReader};
-use super::rustdds::{DataReaderStatus, RepresentationIdentifier, StatusEvented};
-use crate::model::{Encapsulation, Guid, SourceTimestamp};
+use super::rustdds::{DataReaderStatus, InstancePayload, RepresentationIdentifier, StatusEvented};
+use crate::model::{Encapsulation, Guid, KeyedPayload, SampleKey, SourceTimestamp};
 
 pub use super::rustdds::{AssemblyLimits, LentMemory, SampleMemory};
 
@@ -54,7 +54,7 @@ impl SampleMemory for SmallSamples {
     }
 }
 
-/// The writer of a sample, its sequence number there, and its source timestamp.
+/// The writer of a sample, its sequence number there, its source timestamp, and what it says of its key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleOrigin {
     /// The time at which the publisher wrote the sample, by the publisher's clock.
@@ -63,6 +63,9 @@ pub struct SampleOrigin {
     pub writer: Guid,
     /// The writer's sequence number of the sample.
     pub sequence: i64,
+    /// What it says of its key. A sample that disposes or unregisters a key has the key as its payload, or
+    /// none.
+    pub key: SampleKey,
 }
 
 /// The result of [`RawReader::take`].
@@ -177,6 +180,14 @@ impl RawReader {
                         .map_or(SourceTimestamp::NONE, |time| SourceTimestamp(time.to_ticks())),
                     writer: Guid(change.writer_guid.to_bytes()),
                     sequence: i64::from(change.sequence_number),
+                    key: change.write_options.instance_change().map_or(SampleKey::NONE, |change| {
+                        let payload = match change.payload {
+                            InstancePayload::Data => KeyedPayload::Data,
+                            InstancePayload::Key => KeyedPayload::Key,
+                            InstancePayload::Absent => KeyedPayload::Absent,
+                        };
+                        SampleKey::new(change.key_hash, change.status_info, payload)
+                    }),
                 };
                 let (payload, encapsulation) = change.sample;
                 TakePayload::Sample(origin, payload, encapsulation)

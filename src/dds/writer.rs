@@ -9,10 +9,12 @@ use super::qos;
 use super::reader::SampleOrigin;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
-    DataWriterStatus, GUID, RepresentationIdentifier, SampleIdentity, SequenceNumber, StatusEvented,
-    Timestamp, WriteOptionsBuilder, dds::result::WriteError as DdsWriteError,
+    DataWriterStatus, GUID, InstanceChange, InstancePayload, RepresentationIdentifier, SampleIdentity,
+    SequenceNumber, StatusEvented, Timestamp, WriteOptionsBuilder, dds::result::WriteError as DdsWriteError,
 };
-use crate::model::{Encapsulation, Guid, ReaderRecord, SourceTimestamp, TypeHash, UnmatchedPolicy};
+use crate::model::{
+    Encapsulation, Guid, KeyedPayload, ReaderRecord, SampleKey, SourceTimestamp, TypeHash, UnmatchedPolicy,
+};
 
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -96,12 +98,13 @@ impl RawWriter {
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
     ) -> Result<Written, WriteError> {
-        self.write_from(None, payload, encapsulation, timestamp)
+        self.write_from(None, payload, encapsulation, timestamp, SampleKey::NONE)
     }
 
     /// Like [`write`](Self::write), and with the publisher that the sample comes from: a RELIABLE,
     /// TRANSIENT_LOCAL writer keeps the last samples of each publisher for late joiners, as many as its
-    /// HISTORY has, until [`forget_history_of`](Self::forget_history_of).
+    /// HISTORY has, until [`forget_history_of`](Self::forget_history_of). Of a type with keys, `key` goes
+    /// with the sample, and the writer keeps as many of each key.
     ///
     /// # Errors
     /// As for [`write`](Self::write).
@@ -111,9 +114,10 @@ impl RawWriter {
         payload: Bytes,
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
+        key: SampleKey,
     ) -> Result<Written, WriteError> {
         let payload = RawPayload { bytes: payload, encapsulation };
-        let mut options = stamped(timestamp);
+        let mut options = with_key(stamped(timestamp), key);
         if let Some(publisher) = publisher {
             options = options.history_source(GUID::from_bytes(publisher.0));
         }
@@ -143,9 +147,10 @@ impl RawWriter {
         payload: Bytes,
         encapsulation: Encapsulation,
         timestamp: SourceTimestamp,
+        key: SampleKey,
     ) -> Result<(), WriteError> {
         let payload = RawPayload { bytes: payload, encapsulation };
-        let options = stamped(timestamp).to_single_reader(GUID::from_bytes(reader.0));
+        let options = with_key(stamped(timestamp), key).to_single_reader(GUID::from_bytes(reader.0));
         self.inner.write_counting_readers(payload, options.build())?;
         Ok(())
     }
@@ -269,4 +274,17 @@ fn stamped(timestamp: SourceTimestamp) -> WriteOptionsBuilder {
     } else {
         options.source_timestamp(Timestamp::from_ticks(timestamp.0))
     }
+}
+
+/// The options of a sample that says this of its key.
+fn with_key(options: WriteOptionsBuilder, key: SampleKey) -> WriteOptionsBuilder {
+    if !key.is_keyed() {
+        return options;
+    }
+    let payload = match key.payload() {
+        KeyedPayload::Data => InstancePayload::Data,
+        KeyedPayload::Key => InstancePayload::Key,
+        KeyedPayload::Absent => InstancePayload::Absent,
+    };
+    options.instance_change(InstanceChange { key_hash: key.hash(), status_info: key.status_info(), payload })
 }

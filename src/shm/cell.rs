@@ -59,7 +59,7 @@ plain! {
     NamedEndpoint: 2 + 2 * 16,
     PublisherAccount: 9,
     LanePolicy: 5,
-    RouteInfo: 3 * 16 + 2 * 4 + 5,
+    RouteInfo: 3 * 16 + 2 * 4 + 6,
     PatternRecord: 4 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 5,

@@ -21,14 +21,15 @@ pub enum HeaderError {
 pub(super) struct WireHeader(pub(super) SampleHeader);
 
 /// The header has no padding, so that every byte in shared memory is written.
-const _: () =
-    assert!(size_of::<SampleHeader>() == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 && align_of::<SampleHeader>() == 8);
+const _: () = assert!(
+    size_of::<SampleHeader>() == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 + 24 && align_of::<SampleHeader>() == 8
+);
 
 // SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle
 // of a process, no destructor, every bit pattern valid. The type name denotes exactly this layout, and the
 // name of the service contains the version.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
-        "ab1::SampleHeader"
+        "ab2::SampleHeader"
     }
 }

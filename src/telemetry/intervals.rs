@@ -76,7 +76,7 @@ impl Intervals {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{AgeBasis, Encapsulation, Guid, SourceTimestamp};
+    use crate::model::{AgeBasis, Encapsulation, Guid, SampleKey, SourceTimestamp};
 
     fn sample(sequence: u64, at_ms: u64) -> SampleHeader {
         SampleHeader {
@@ -88,6 +88,7 @@ mod tests {
             writer_guid: Guid::default(),
             encapsulation: Encapsulation::CDR_LE,
             age_basis: AgeBasis::SOURCE,
+            key: SampleKey::NONE,
         }
     }
 

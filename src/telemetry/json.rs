@@ -14,6 +14,7 @@ use crate::model::{DdsType, SubscriberState, TypeHash, WallNs};
 pub const STRING_TYPE: DdsType = DdsType {
     name: "std_msgs::msg::dds_::String_",
     hash: TypeHash::from_hex(b"df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+    has_keys: false,
 };
 
 /// The topic of the classifier's decisions, as in the original package.

@@ -113,6 +113,7 @@ pub(super) fn wide_report() -> Report {
             pattern: None,
             message_type: None,
             type_hash: None,
+            has_keys: false,
             counters: IngressCounters {
                 writers: 99_999,
                 lost_upstream: 9_999_999_999_999,

@@ -12,7 +12,8 @@ use adaptive_bridge::dds::{
     RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
-    Durability, Encapsulation, Guid, History, QosProfile, Reliability, SourceTimestamp,
+    DdsType, Durability, Encapsulation, Guid, History, KeyedPayload, QosProfile, Reliability, SampleKey,
+    SourceTimestamp,
 };
 use bytes::Bytes;
 
@@ -94,7 +95,7 @@ fn a_payload_arrives_bit_for_bit_with_its_encapsulation_and_timestamp() {
         writer.write(Bytes::from(payload.clone()), Encapsulation(kind), timestamp).unwrap();
         let (taken, encapsulation, taken_timestamp) = take_one(&reader).expect("nothing arrived");
         assert_eq!(taken.len(), payload.len());
-        assert!(taken == payload, "{length} bytes changed on the way");
+        assert!(taken == *payload, "{length} bytes changed on the way");
         assert_eq!(encapsulation, Encapsulation(kind));
         assert_eq!(taken_timestamp, timestamp);
     }
@@ -431,7 +432,13 @@ fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
     };
     wait_for_writer(&reader);
     writer
-        .write_to(joined, Bytes::from_static(b"map again..."), Encapsulation::CDR_LE, SourceTimestamp(1))
+        .write_to(
+            joined,
+            Bytes::from_static(b"map again..."),
+            Encapsulation::CDR_LE,
+            SourceTimestamp(1),
+            SampleKey::default(),
+        )
         .unwrap();
     assert_eq!(take_one(&reader).unwrap().0, b"map again...");
 }
@@ -610,4 +617,50 @@ fn a_process_that_was_stopped_and_continued_goes_on_receiving() {
         writer.write(payload, Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
         assert_eq!(take_one(&reader).expect("nothing arrived").0, vec![number; 100]);
     }
+}
+
+/// Takes a sample within 20 s, with its payload and what it says of its key.
+fn take_keyed(reader: &RawReader) -> (Vec<u8>, SampleKey) {
+    let give_up = Instant::now() + Duration::from_secs(20);
+    loop {
+        match reader.take_payload() {
+            TakePayload::Sample(origin, mut payload, _) => return (payload.bytes().to_vec(), origin.key),
+            TakePayload::Malformed => panic!("malformed"),
+            TakePayload::Empty => std::thread::sleep(Duration::from_millis(1)),
+        }
+        assert!(Instant::now() < give_up, "nothing arrived");
+    }
+}
+
+#[test]
+fn what_a_sample_says_of_its_key_passes_unchanged() {
+    let (mut here, mut there) = (participant("here", 83), participant("there", 83));
+    let keyed = DdsType { has_keys: true, ..TYPE.into() };
+    let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
+    let stock = there.create_reader("rt/keyed", TYPE, &qos).unwrap();
+    let reader = there.create_reader("rt/keyed", keyed, &qos).unwrap();
+    let writer = here.create_writer("rt/keyed", keyed, &QosProfile::CRITICAL, 64).unwrap();
+    wait_for_reader(&writer);
+    assert!(reader.guid().has_keys() && writer.guid().has_keys() && !stock.guid().has_keys());
+    let mut sent = Vec::new();
+    for hash in [None, Some([7; 16])] {
+        // Of one datagram, and of several.
+        for length in [12, 200_000] {
+            sent.push((vec![1; length], SampleKey::new(hash, 0, KeyedPayload::Data)));
+            sent.push((vec![2; length], SampleKey::new(hash, 1, KeyedPayload::Data)));
+            sent.push((vec![3; length], SampleKey::new(hash, 2, KeyedPayload::Key)));
+            sent.push((vec![4; length], SampleKey::new(hash, 3, KeyedPayload::Key)));
+        }
+    }
+    sent.push((Vec::new(), SampleKey::new(Some([9; 16]), 1, KeyedPayload::Absent)));
+    for (payload, key) in &sent {
+        let bytes = Bytes::from(payload.clone());
+        writer.write_from(None, bytes, Encapsulation::CDR_LE, SourceTimestamp(5), *key).unwrap();
+        let (taken, its_key) = take_keyed(&reader);
+        assert!(taken == *payload, "{key:?}");
+        assert_eq!(its_key, *key);
+    }
+    // A reader without keys does not match the writer.
+    assert_eq!(writer.matched_readers().count(), 1);
+    assert!(matches!(stock.take(&mut |_, _| {}), Take::Empty));
 }

@@ -14,6 +14,7 @@ mod hostile;
 mod hostile_readers;
 mod interop;
 mod intruders;
+mod keyed;
 mod kilted;
 mod large_samples;
 mod latched;

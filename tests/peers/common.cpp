@@ -192,6 +192,7 @@ Options parse_options(int argc, char** argv) {
     }
     else if (name == "--max-samples") options.max_samples = static_cast<int32_t>(number(name, value, 1e6));
     else if (name == "--max-blocking-ms") options.max_blocking_s = number(name, value, 1e6) / 1e3;
+    else if (name == "--keys") options.keys = static_cast<uint32_t>(number(name, value, 1e6));
     else if (name == "--interface") options.interface_ip = value == "none" ? "" : value;
     else if (name == "--rate") options.rate_hz = number(name, value, 1e6);
     else if (name == "--count") options.count = whole(name, value);
@@ -418,6 +419,30 @@ void Publisher::print_summary() {
        ",\"acknowledged\":" + (acknowledged_ ? "true" : "false") + ",\"hash\":\"" + hash_text(hash_) + "\"}");
 }
 
+uint32_t key_of(const Bytes& bytes, uint32_t keys) {
+  uint64_t seq = 0;
+  if (keys == 0 || bytes.size() < header_bytes + 8) return 0;
+  std::memcpy(&seq, bytes.data() + header_bytes, 8);
+  return static_cast<uint32_t>(seq % keys);
+}
+
+Bytes key_sample(uint32_t key) {
+  Bytes bytes{0, 1, 0, 0};
+  bytes.resize(header_bytes + 8, 0);
+  std::memcpy(bytes.data() + header_bytes, &key, sizeof key);
+  return bytes;
+}
+
+uint32_t key_of_hash(const uint8_t* hash) {
+  return static_cast<uint32_t>(hash[0]) << 24 | static_cast<uint32_t>(hash[1]) << 16 |
+         static_cast<uint32_t>(hash[2]) << 8 | hash[3];
+}
+
+void hash_of_key(uint32_t key, uint8_t* hash) {
+  std::memset(hash, 0, 16);
+  for (int at = 0; at < 4; ++at) hash[at] = static_cast<uint8_t>(key >> (24 - 8 * at));
+}
+
 Subscriber::Subscriber(const Options& options)
     : options_(options),
       record_(options.record_file, "seq,time_ns,latency_ns"),
@@ -507,6 +532,13 @@ void Subscriber::take(const uint8_t* bytes, size_t count, int64_t source_ns) {
   }
 }
 
+void Subscriber::state(uint32_t key, const std::string& state) {
+  std::string& known = states_[key];
+  if (known == state) return;
+  known = state;
+  emit("{\"event\":\"key\",\"key\":" + std::to_string(key) + ",\"state\":\"" + state + "\"}");
+}
+
 void Subscriber::housekeeping() {
   const int64_t now_ns = monotonic_ns();
   if (options_.summary && received_ != progress_received_ && now_ns - progress_ns_ >= progress_period_ns) {
@@ -547,12 +579,18 @@ void Subscriber::print_summary() {
     if (!headers.empty()) headers += ",";
     headers += "\"" + header + "\":" + std::to_string(count);
   }
+  std::string keys;
+  for (const auto& [key, state] : states_) {
+    if (!keys.empty()) keys += ",";
+    keys += "\"" + std::to_string(key) + "\":\"" + state + "\"";
+  }
   const bool any = received_ > 0;
   emit("{\"event\":\"summary\",\"role\":\"sub\",\"received\":" + std::to_string(received_) +
        ",\"unnumbered\":" + std::to_string(unnumbered_) +
        ",\"first\":" + (any_numbered_ ? std::to_string(sequences.front()) : "null") +
        ",\"last\":" + (any_numbered_ ? std::to_string(sequences.back()) : "null") + ",\"missing\":[" + missing +
-       "],\"missing_count\":" + std::to_string(missing_count) + ",\"duplicates\":" + std::to_string(duplicates_) +
+       "],\"keys\":{" + keys + "},\"missing_count\":" + std::to_string(missing_count) +
+       ",\"duplicates\":" + std::to_string(duplicates_) +
        ",\"out_of_order\":" + std::to_string(out_of_order_) + ",\"bad\":" + std::to_string(bad_) +
        ",\"padded\":" + std::to_string(padded_) + ",\"bytes\":" + std::to_string(payload_bytes_) +
        ",\"size_min\":" + std::to_string(any ? size_min_ : 0) + ",\"size_max\":" + std::to_string(size_max_) +

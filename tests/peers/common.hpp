@@ -4,6 +4,7 @@
 #include <csignal>
 #include <cstdint>
 #include <cstdio>
+#include <map>
 #include <string>
 #include <unordered_map>
 #include <unordered_set>
@@ -21,6 +22,7 @@ struct Options {
   int32_t history_depth = 10;  // 0 is KEEP_ALL
   int32_t max_samples = 0;     // 0 is the library's default
   double max_blocking_s = 0.1;
+  uint32_t keys = 0;           // 0 is a type without keys; else the key of sample `seq` is seq % keys
   std::string interface_ip;    // empty is every interface
   bool shared_memory = false;
 
@@ -166,6 +168,14 @@ class Publisher {
   bool acknowledged_ = false;
 };
 
+// The key of a sample, header included, by its sequence number; 0 if it has none.
+uint32_t key_of(const Bytes& bytes, uint32_t keys);
+// A sample of the last sequence with that key, of which a library reads nothing but the key.
+Bytes key_sample(uint32_t key);
+// A key by its hash: of a key of at most 16 bytes, its big-endian CDR.
+uint32_t key_of_hash(const uint8_t* hash);
+void hash_of_key(uint32_t key, uint8_t* hash);
+
 // What a subscriber has seen.
 class Subscriber {
  public:
@@ -173,6 +183,8 @@ class Subscriber {
 
   // One received sample, header included.
   void take(const uint8_t* bytes, size_t count, int64_t source_ns);
+  // The state of that key as the library shows it with a sample: alive, disposed or no_writers.
+  void state(uint32_t key, const std::string& state);
   // To be called about every 100 ms and after each batch: progress lines, and the sleep of --stall-every.
   void housekeeping();
   // Whether enough was received, the time is up, or a signal came.
@@ -206,6 +218,7 @@ class Subscriber {
   std::unordered_set<uint64_t> seen_;
   std::vector<int64_t> latencies_ns_;
   std::unordered_map<std::string, uint64_t> headers_;
+  std::map<uint32_t, std::string> states_;
   int64_t last_arrival_ns_ = 0;
   int64_t max_gap_ns_ = 0;
 };

@@ -70,6 +70,7 @@ void wait_for_readers(const Options& options, dds_entity_t writer) {
 
 int publish(const Options& options, dds_entity_t participant) {
   dds_qos_t* qos = qos_of(options);
+  dds_qset_writer_data_lifecycle(qos, false);  // unregistered is not disposed
   const dds_entity_t topic = raw_topic(participant, options.topic, options.type);
   const dds_entity_t writer = check("writer", dds_create_writer(participant, topic, qos, listener()));
   emit_ready("Cyclone DDS " DDS_VERSION);
@@ -81,6 +82,12 @@ int publish(const Options& options, dds_entity_t participant) {
   const auto acknowledged = [&](int64_t timeout_ns) { return dds_wait_for_acks(writer, timeout_ns) == DDS_RETCODE_OK; };
   publisher.begin(write, acknowledged);
   publisher.run(write);
+  if (options.keys > 2) {
+    const Bytes disposed = key_sample(1);
+    const Bytes unregistered = key_sample(2);
+    check("dispose", dds_dispose(writer, &disposed));
+    check("unregister", dds_unregister_instance(writer, &unregistered));
+  }
   publisher.linger(acknowledged);
   publisher.print_summary();
   return 0;
@@ -143,9 +150,16 @@ int subscribe(const Options& options, dds_entity_t participant) {
   Subscriber subscriber(options);
   while (!subscriber.done()) {
     dds_waitset_wait(waitset, nullptr, 0, DDS_MSECS(100));
-    drain(reader, [&](const uint8_t* bytes, size_t count, int64_t source_ns) {
+    const auto take = [&](const uint8_t* bytes, size_t count, int64_t source_ns) {
       subscriber.take(bytes, count, source_ns);
-    });
+    };
+    const auto state = [&](uint32_t key, dds_instance_state_t state) {
+      if (options.keys == 0) return;
+      subscriber.state(key, state == DDS_IST_ALIVE                ? "alive"
+                            : state == DDS_IST_NOT_ALIVE_DISPOSED ? "disposed"
+                                                                  : "no_writers");
+    };
+    drain(reader, take, state);
     subscriber.housekeeping();
   }
   subscriber.print_summary();
@@ -444,6 +458,7 @@ std::string configuration(const Options& options) {
 
 int main(int argc, char** argv) {
   const Options options = parse_options(argc, argv);
+  raw_keys = options.keys;
   handle_signals();
   setenv("CYCLONEDDS_URI", configuration(options).c_str(), 0);
   const dds_entity_t participant = check("participant", dds_create_participant(options.domain, nullptr, nullptr));

@@ -25,22 +25,45 @@ dds_entity_t check(const std::string& what, dds_entity_t entity) {
 }
 
 // A type whose samples are `Bytes` in memory and the very same bytes on the wire, encapsulation header included.
-// It is keyless, and carries no XTypes information, so that only its name has to match.
+// It has keys if `raw_keys` is not 0, and carries no XTypes information, so that only its name has to match.
 struct RawSample : ddsi_serdata {
   Bytes bytes;   // with up to three zeros after `count`: Cyclone sends whole words
   uint32_t count = 0;
+  uint32_t key = 0;
 
   RawSample(const ddsi_sertype* type, ddsi_serdata_kind kind, size_t count_) : bytes((count_ + 3) / 4 * 4, 0) {
     count = static_cast<uint32_t>(count_);
     ddsi_serdata_init(this, type, kind);
     hash = type->serdata_basehash;
   }
+
+  RawSample* with_key(uint32_t key_) {
+    key = key_;
+    hash ^= key * 0x9e3779b1u;
+    return this;
+  }
+
+  // The key of what was received: that of data by its sequence; a serialized key has 4 bytes, or 16 of Fast DDS,
+  // which sends the key hash.
+  RawSample* with_own_key();
 };
+
+// The keys of the type of all raw topics; 0 for none.
+uint32_t raw_keys = 0;
+
+RawSample* RawSample::with_own_key() {
+  if (raw_keys == 0) return this;
+  if (kind == SDK_DATA) return with_key(key_of(bytes, raw_keys));
+  if (count >= 20) return with_key(key_of_hash(bytes.data() + 4));
+  uint32_t own = 0;
+  if (count >= 8) std::memcpy(&own, bytes.data() + 4, sizeof own);
+  return with_key(own);
+}
 
 RawSample* raw(ddsi_serdata* sample) { return static_cast<RawSample*>(sample); }
 const RawSample* raw(const ddsi_serdata* sample) { return static_cast<const RawSample*>(sample); }
 
-bool same_key(const ddsi_serdata*, const ddsi_serdata*) { return true; }
+bool same_key(const ddsi_serdata* one, const ddsi_serdata* other) { return raw(one)->key == raw(other)->key; }
 
 uint32_t size_of(const ddsi_serdata* sample) { return raw(sample)->count; }
 
@@ -58,7 +81,7 @@ ddsi_serdata* from_fragments(const ddsi_sertype* type, ddsi_serdata_kind kind, c
       have = fragment->maxp1;
     }
   }
-  return sample;
+  return sample->with_own_key();
 }
 
 ddsi_serdata* from_pieces(const ddsi_sertype* type, ddsi_serdata_kind kind, ddsrt_msg_iovlen_t count,
@@ -70,16 +93,28 @@ ddsi_serdata* from_pieces(const ddsi_sertype* type, ddsi_serdata_kind kind, ddsr
     std::memcpy(sample->bytes.data() + have, pieces[at].iov_base, part);
     have += part;
   }
-  return sample;
+  return sample->with_own_key();
 }
 
-ddsi_serdata* from_keyhash(const ddsi_sertype* type, const ddsi_keyhash*) { return new RawSample(type, SDK_KEY, 0); }
+// A serialized key is a number of 4 bytes in little-endian CDR.
+RawSample* key_alone(const ddsi_sertype* type, uint32_t key) {
+  if (raw_keys == 0) return new RawSample(type, SDK_KEY, 0);
+  auto* sample = new RawSample(type, SDK_KEY, 8);
+  sample->bytes[1] = 1;
+  std::memcpy(sample->bytes.data() + 4, &key, sizeof key);
+  return sample->with_key(key);
+}
+
+ddsi_serdata* from_keyhash(const ddsi_sertype* type, const ddsi_keyhash* hash) {
+  return key_alone(type, key_of_hash(reinterpret_cast<const uint8_t*>(hash->value)));
+}
 
 ddsi_serdata* from_sample(const ddsi_sertype* type, ddsi_serdata_kind kind, const void* data) {
   const auto& bytes = *static_cast<const Bytes*>(data);
-  auto* sample = new RawSample(type, kind, kind == SDK_DATA ? bytes.size() : 0);
-  if (kind == SDK_DATA && !bytes.empty()) std::memcpy(sample->bytes.data(), bytes.data(), bytes.size());
-  return sample;
+  if (kind != SDK_DATA) return key_alone(type, key_of(bytes, raw_keys));
+  auto* sample = new RawSample(type, kind, bytes.size());
+  if (!bytes.empty()) std::memcpy(sample->bytes.data(), bytes.data(), bytes.size());
+  return sample->with_own_key();
 }
 
 void to_bytes(const ddsi_serdata* sample, size_t offset, size_t count, void* buffer) {
@@ -100,7 +135,7 @@ bool to_sample(const ddsi_serdata* sample, void* data, void**, void*) {
   return true;
 }
 
-ddsi_serdata* to_untyped(const ddsi_serdata* sample) { return new RawSample(sample->type, SDK_KEY, 0); }
+ddsi_serdata* to_untyped(const ddsi_serdata* sample) { return key_alone(sample->type, raw(sample)->key); }
 
 bool untyped_to_sample(const ddsi_sertype*, const ddsi_serdata*, void*, void**, void*) { return true; }
 
@@ -111,7 +146,9 @@ size_t print_sample(const ddsi_sertype*, const ddsi_serdata*, char* buffer, size
   return 0;
 }
 
-void keyhash_of(const ddsi_serdata*, ddsi_keyhash* keyhash, bool) { std::memset(keyhash, 0, sizeof *keyhash); }
+void keyhash_of(const ddsi_serdata* sample, ddsi_keyhash* keyhash, bool) {
+  hash_of_key(raw(sample)->key, reinterpret_cast<uint8_t*>(keyhash->value));
+}
 
 void free_type(ddsi_sertype* type) {
   ddsi_sertype_fini(type);
@@ -154,7 +191,7 @@ ddsi_sertype* raw_type(const std::string& name) {
   type_ops.equal = same_type;
   type_ops.hash = hash_of_type;
   auto* type = new ddsi_sertype{};
-  ddsi_sertype_init(type, name.c_str(), &type_ops, &sample_ops, true);
+  ddsi_sertype_init(type, name.c_str(), &type_ops, &sample_ops, raw_keys == 0);
   type->allowed_data_representation = DDS_DATA_REPRESENTATION_FLAG_XCDR1;
   return type;
 }
@@ -164,9 +201,10 @@ dds_entity_t raw_topic(dds_entity_t participant, const std::string& topic, const
   return check("topic", dds_create_topic_sertype(participant, topic.c_str(), &type, nullptr, nullptr, nullptr));
 }
 
-// Takes what a raw reader has: `take(bytes, count, source_ns)` for each sample.
-template <typename Take>
-void drain(dds_entity_t reader, Take take) {
+// Takes what a raw reader has: `take(bytes, count, source_ns)` for each sample with data, then
+// `state(key, instance_state)` for each.
+template <typename Take, typename State>
+void drain(dds_entity_t reader, Take take, State state) {
   constexpr size_t batch = 64;
   ddsi_serdata* samples[batch];
   dds_sample_info_t infos[batch];
@@ -178,10 +216,16 @@ void drain(dds_entity_t reader, Take take) {
         const RawSample* sample = raw(samples[at]);
         take(sample->bytes.data(), static_cast<size_t>(sample->count), infos[at].source_timestamp);
       }
+      state(raw(samples[at])->key, infos[at].instance_state);
       ddsi_serdata_unref(samples[at]);
     }
     if (taken < static_cast<dds_return_t>(batch)) return;
   }
+}
+
+template <typename Take>
+void drain(dds_entity_t reader, Take take) {
+  drain(reader, take, [](uint32_t, dds_instance_state_t) {});
 }
 
 }  // namespace

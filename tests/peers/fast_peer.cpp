@@ -1,4 +1,5 @@
 // A DDS peer on Fast DDS 2: publishes and subscribes serialized samples of any type.
+#include <fastdds/dds/core/LoanableSequence.hpp>
 #include <fastdds/dds/core/policy/QosPolicies.hpp>
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
@@ -41,10 +42,10 @@ uint32_t socket_buffer(const char* limit_file) {
 // Samples are `Bytes`, in memory and on the wire, encapsulation header included.
 class RawType : public fast::TopicDataType {
  public:
-  RawType(const std::string& name, uint32_t max_size) {
+  RawType(const std::string& name, uint32_t max_size, uint32_t keys) : keys_(keys) {
     setName(name.c_str());
     m_typeSize = max_size;
-    m_isGetKeyDefined = false;
+    m_isGetKeyDefined = keys > 0;
     auto_fill_type_object(false);
     auto_fill_type_information(false);
   }
@@ -69,7 +70,16 @@ class RawType : public fast::TopicDataType {
 
   void* createData() override { return new Bytes(); }
   void deleteData(void* data) override { delete static_cast<Bytes*>(data); }
-  bool getKey(void*, rtps::InstanceHandle_t*, bool) override { return false; }
+  bool getKey(void* data, rtps::InstanceHandle_t* handle, bool) override {
+    if (keys_ == 0) return false;
+    uint8_t hash[16];
+    hash_of_key(key_of(*static_cast<const Bytes*>(data), keys_), hash);
+    for (size_t at = 0; at < sizeof hash; ++at) handle->value[at] = hash[at];
+    return true;
+  }
+
+ private:
+  uint32_t keys_;
 };
 
 class Events : public fast::DataWriterListener, public fast::DataReaderListener {
@@ -116,9 +126,12 @@ void set_qos(Qos& qos, const Options& options) {
   if (options.max_samples > 0) limits.max_samples = options.max_samples;
   limits.max_samples = std::max(limits.max_samples, options.history_depth);
   limits.max_samples_per_instance = limits.max_samples;
+  if (options.keys > 0) limits.max_samples *= std::max(1, limits.max_instances);
   limits.allocated_samples = std::min(limits.allocated_samples, limits.max_samples);
   // Sizes vary from a few bytes to megabytes: take the memory that each sample needs.
-  qos.endpoint().history_memory_policy = rtps::DYNAMIC_REUSABLE_MEMORY_MODE;
+  // Fast DDS 2.9 has no room there for a sample without payload, as a disposed key is one.
+  qos.endpoint().history_memory_policy =
+      options.keys > 0 ? rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE : rtps::DYNAMIC_REUSABLE_MEMORY_MODE;
   if (!options.shared_memory) qos.data_sharing().off();
 }
 
@@ -128,6 +141,8 @@ int publish(const Options& options, fast::DomainParticipant* participant, fast::
   if (options.heartbeat_s > 0) {
     qos.reliable_writer_qos().times.heartbeatPeriod = Duration_t(static_cast<long double>(options.heartbeat_s));
   }
+  // Unregistered is not disposed.
+  qos.writer_data_lifecycle().autodispose_unregistered_instances = false;
   fast::Publisher* parent = participant->create_publisher(fast::PUBLISHER_QOS_DEFAULT);
   fast::DataWriter* writer = parent == nullptr ? nullptr : parent->create_datawriter(topic, qos, &events);
   if (writer == nullptr) {
@@ -151,9 +166,36 @@ int publish(const Options& options, fast::DomainParticipant* participant, fast::
   };
   publisher.begin(write, acknowledged);
   publisher.run(write);
+  if (options.keys > 2) {
+    Bytes disposed = key_sample(1);
+    Bytes unregistered = key_sample(2);
+    if (writer->dispose(&disposed, writer->lookup_instance(&disposed)) != ReturnCode_t::RETCODE_OK ||
+        writer->unregister_instance(&unregistered, writer->lookup_instance(&unregistered)) !=
+            ReturnCode_t::RETCODE_OK) {
+      emit_error("a key could not be disposed or unregistered");
+    }
+  }
   publisher.linger(acknowledged);
   publisher.print_summary();
   return 0;
+}
+
+// take_next_sample leaves out keys that are not alive.
+void take_with_keys(fast::DataReader* reader, Subscriber& subscriber) {
+  fast::LoanableSequence<Bytes> samples;
+  fast::SampleInfoSeq infos;
+  if (reader->take(samples, infos, 64) != ReturnCode_t::RETCODE_OK) return;
+  for (fast::LoanableCollection::size_type at = 0; at < infos.length(); ++at) {
+    const fast::SampleInfo& info = infos[at];
+    if (info.valid_data) subscriber.take(samples[at].data(), samples[at].size(), info.source_timestamp.to_ns());
+    uint8_t hash[16];
+    for (size_t byte = 0; byte < sizeof hash; ++byte) hash[byte] = info.instance_handle.value[byte];
+    subscriber.state(key_of_hash(hash), info.instance_state == fast::ALIVE_INSTANCE_STATE ? "alive"
+                                        : info.instance_state == fast::NOT_ALIVE_DISPOSED_INSTANCE_STATE
+                                            ? "disposed"
+                                            : "no_writers");
+  }
+  reader->return_loan(samples, infos);
 }
 
 int subscribe(const Options& options, fast::DomainParticipant* participant, fast::Topic* topic, Events& events) {
@@ -170,7 +212,10 @@ int subscribe(const Options& options, fast::DomainParticipant* participant, fast
   Bytes bytes;
   fast::SampleInfo info;
   while (!subscriber.done()) {
-    if (reader->wait_for_unread_message(Duration_t(0, 100'000'000))) {
+    const bool is_unread = reader->wait_for_unread_message(Duration_t(0, 100'000'000));
+    if (options.keys > 0) {
+      take_with_keys(reader, subscriber);
+    } else if (is_unread) {
       // At most so many in a row, so that housekeeping and signals get their turn in a flood.
       for (int taken = 0; taken < 64 && reader->take_next_sample(&bytes, &info) == ReturnCode_t::RETCODE_OK; ++taken) {
         if (info.valid_data) subscriber.take(bytes.data(), bytes.size(), info.source_timestamp.to_ns());
@@ -210,7 +255,7 @@ int main(int argc, char** argv) {
     return 1;
   }
   const uint32_t largest = options.sizes.empty() ? 0 : *std::max_element(options.sizes.begin(), options.sizes.end());
-  const fast::TypeSupport type(new RawType(options.type, largest + 64));
+  const fast::TypeSupport type(new RawType(options.type, largest + 64, options.keys));
   type.register_type(participant);
   fast::Topic* topic = participant->create_topic(options.topic, options.type, fast::TOPIC_QOS_DEFAULT);
   if (topic == nullptr) {

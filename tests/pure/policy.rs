@@ -6,8 +6,8 @@
 use std::collections::BTreeMap;
 
 use adaptive_bridge::model::{
-    DropPolicy, DropReason, LaneMode, LanePolicy, LaneRates, MonotonicNs, RatePolicy, SourceTimestamp,
-    TrafficClass, WallNs,
+    DropPolicy, DropReason, LaneMode, LanePolicy, LaneRates, MonotonicNs, RatePolicy, SampleKey,
+    SourceTimestamp, TrafficClass, WallNs,
 };
 use adaptive_bridge::policy::{
     Allowance, ByteBudget, Decision, LaneQueue, PollOrder, RouteShaper, SampleStamps, SequenceOutcome,
@@ -231,6 +231,7 @@ fn run(setup: &Setup, gate: &mut impl Gate) -> Outcome {
                 source_timestamp,
                 taken_at,
                 bytes: SAMPLE_BYTES,
+                key: SampleKey::NONE,
             };
             gate.offer(publisher.sequence, stamps);
             offered += 1;
@@ -600,6 +601,7 @@ fn aged(sequence: u64, now: MonotonicNs, age_ms: u64) -> SampleStamps {
         source_timestamp: SourceTimestamp::from_wall(wall(taken_at)),
         taken_at,
         bytes: 1,
+        key: SampleKey::NONE,
     }
 }
 
@@ -698,7 +700,8 @@ proptest! {
  SourceTimestamp::from_wall(WallNs(source_ns))
                     });
                     let sequence = ledger.offered;
-                    let stamps = SampleStamps { sequence, source_timestamp, taken_at: now, bytes };
+                    let key = SampleKey::NONE;
+                    let stamps = SampleStamps { sequence, source_timestamp, taken_at: now, bytes, key };
                     shaper.offer(ledger.offered, stamps, |item, _, reason| {
                         let expected = match (rate, mode) {
                             (None, LaneMode::Stopped) => DropReason::Stopped,

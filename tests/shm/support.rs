@@ -8,7 +8,7 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::model::{
-    AgeBasis, Encapsulation, Guid, InstanceName, LaneName, MonotonicNs, RouteId, SampleHeader,
+    AgeBasis, Encapsulation, Guid, InstanceName, LaneName, MonotonicNs, RouteId, SampleHeader, SampleKey,
     SourceTimestamp,
 };
 use adaptive_bridge::shm::{BridgeShape, QueueLimits, RouteChannel, ShmNode};
@@ -129,6 +129,7 @@ pub fn header(sequence: u64) -> SampleHeader {
         writer_guid: Guid([9; 16]),
         encapsulation: Encapsulation::CDR_LE,
         age_basis: AgeBasis::SOURCE,
+        key: SampleKey::NONE,
     }
 }
 

@@ -235,6 +235,12 @@ impl Peer {
         self.option("--first-seq", seq)
     }
 
+    /// Gives the type so many keys, which the samples have in turn. After the last sample, a publisher
+    /// disposes key 1 and unregisters key 2. Fast DDS and Cyclone DDS only.
+    pub fn keys(self, keys: u32) -> Peer {
+        self.option("--keys", keys)
+    }
+
     /// Sets the bytes of a sample after the encapsulation header. A subscriber with this option checks the
     /// size and the bytes.
     pub fn size(self, bytes: usize) -> Peer {
@@ -577,6 +583,9 @@ pub struct Received {
     pub size_min: u64,
     /// Bytes of the largest sample.
     pub size_max: u64,
+    /// The last state of each key: `alive`, `disposed` or `no_writers`; see [`Peer::keys`].
+    #[serde(default)]
+    pub keys: BTreeMap<u32, String>,
     /// The number of samples with each encapsulation header.
     pub headers: BTreeMap<String, u64>,
     /// Samples whose source timestamp differs from the publisher's by 10 ns at most.

@@ -3,13 +3,14 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::net::IpAddr;
+use std::rc::Rc;
 
 use tracing::{info, warn};
 
 use super::super::role::RoleError;
 use super::absences::Absences;
 use super::networks;
-use crate::config::{InputTopic, Lane, OutputTopic, RoutePattern, Settings};
+use crate::config::{InputTopic, Lane, NeverInputs, OutputTopic, RoutePattern, Settings};
 use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
 use crate::model::{
     FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
@@ -44,11 +45,15 @@ struct WatchedPattern {
     outputs: Vec<(TopicPrefix, TrafficClass)>,
     /// The prefix of the output that a reader on another host should read.
     alternative: Option<TopicPrefix>,
+    never_inputs: Rc<NeverInputs>,
 }
 
 impl WatchedPattern {
     fn is_input(&self, dds_topic: &str) -> bool {
-        self.has_inputs && dds_topic.strip_prefix("rt").is_some_and(|topic| self.settings.is_for(topic))
+        let topic =
+            dds_topic.strip_prefix("rt").filter(|topic| self.has_inputs && self.settings.is_for(topic));
+        let topic = topic.and_then(|topic| TopicName::try_from(topic).ok());
+        topic.is_some_and(|topic| !self.never_inputs.contains(&topic))
     }
 
     /// The input topic of an output and the class of its lane; `None` for other topics.
@@ -132,10 +137,11 @@ impl EndpointMonitor {
                     });
                 }
             }
+            let never_inputs = Rc::new(NeverInputs::of(settings));
             let mut patterns: Vec<_> = settings
                 .patterns
                 .iter()
-                .map(|pattern| watched_pattern(settings, pattern, network == 0))
+                .map(|pattern| watched_pattern(settings, pattern, &never_inputs, network == 0))
                 .collect();
             let lanes =
                 settings.lanes.iter().zip(&network_of_lane).filter(|(_, of_lane)| **of_lane == network);
@@ -391,7 +397,12 @@ fn noncritical_output(settings: &Settings, route: usize) -> Option<TopicName> {
 }
 
 /// A pattern without its outputs.
-fn watched_pattern(settings: &Settings, pattern: &RoutePattern, has_inputs: bool) -> WatchedPattern {
+fn watched_pattern(
+    settings: &Settings,
+    pattern: &RoutePattern,
+    never_inputs: &Rc<NeverInputs>,
+    has_inputs: bool,
+) -> WatchedPattern {
     let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
     let alternative = outputs.find(|output| output.route == pattern.first_route);
@@ -403,6 +414,7 @@ fn watched_pattern(settings: &Settings, pattern: &RoutePattern, has_inputs: bool
             OutputTopic::Prefix(prefix) => Some(prefix.clone()),
             OutputTopic::Topic(_) => None,
         }),
+        never_inputs: never_inputs.clone(),
     }
 }
 

@@ -13,7 +13,7 @@ use crate::model::{Guid, MonotonicNs, OutputReaders};
 const WAIT_MS: u64 = 5_000;
 
 /// The former readers of one output that are not matched again yet.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct FormerReaders {
     missing: Vec<Guid>,
     /// Whether there may be others, for which the board had no room.

@@ -70,8 +70,9 @@ impl History {
         if let Some(late_joiners) = &mut self.late_joiners {
             while let Some((reader, history)) = late_joiners.next_due(now) {
                 for kept in history {
+                    let payload = kept.payload.clone();
                     let written =
-                        writer.write_to(reader, kept.payload.clone(), kept.encapsulation, kept.timestamp);
+                        writer.write_to(reader, payload, kept.encapsulation, kept.timestamp, kept.key);
                     if let Err(failure) = written {
                         warn!(route, lane, ?reader, %failure, "cannot send the history to a late joiner");
                     }

@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 
 use bytes::Bytes;
 
-use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SampleKey, SourceTimestamp};
 
 /// How long the lane waits after a match before it sends the history. The writer matches a reader before the
 /// reader matches the writer, and samples sent in between are lost. Discovery of both directions takes some
@@ -22,6 +22,14 @@ const MAX_WAITING: usize = 4_096;
 /// `depth` samples are kept whatever their size.
 pub(super) const MAX_BYTES: usize = 32 << 20;
 
+/// The most samples of several publishers or keys, here and in the history of a RELIABLE writer.
+const MAX_SAMPLES: usize = 8_192;
+
+/// How many samples a publisher of a topic with keys has here if it sends no key hashes, so that its keys are
+/// not known: then a late joiner gets more than the last `depth` of each. As in the history of a RELIABLE
+/// writer.
+const DEPTH_OF_UNKNOWN_KEYS: usize = 1_024;
+
 /// A sample of the history, as it was written.
 #[derive(Clone, Debug)]
 pub(super) struct KeptSample {
@@ -29,6 +37,7 @@ pub(super) struct KeptSample {
     pub payload: Bytes,
     pub encapsulation: Encapsulation,
     pub timestamp: SourceTimestamp,
+    pub key: SampleKey,
 }
 
 impl KeptSample {
@@ -38,6 +47,7 @@ impl KeptSample {
             payload,
             encapsulation: header.encapsulation,
             timestamp: header.source_timestamp,
+            key: header.key,
         }
     }
 }
@@ -46,7 +56,8 @@ impl KeptSample {
 #[derive(Debug)]
 pub(super) struct LateJoiners {
     depth: usize,
-    /// The last `depth` samples of each publisher, in the order in which they were written.
+    /// The last `depth` samples of each publisher, and of each of its keys, in the order in which they were
+    /// written.
     history: VecDeque<KeptSample>,
     bytes: usize,
     evicted: u64,
@@ -64,19 +75,29 @@ impl LateJoiners {
         }
     }
 
-    /// Adds a written sample, and removes the oldest one of its publisher if that has `depth` others.
+    /// Adds a written sample, and removes the oldest one of its publisher and key if these have `depth`
+    /// others.
     pub fn keep(&mut self, sample: KeptSample) {
-        let mut of_publisher =
-            self.history.iter().enumerate().filter(|(_, kept)| kept.publisher == sample.publisher);
-        if let Some((oldest, _)) = of_publisher.next()
-            && of_publisher.count() + 1 >= self.depth
+        let key = sample.key.hash();
+        let depth = if sample.key.is_keyed() && key.is_none() {
+            self.depth.max(DEPTH_OF_UNKNOWN_KEYS)
+        } else {
+            self.depth
+        };
+        let mut like_it = self
+            .history
+            .iter()
+            .enumerate()
+            .filter(|(_, kept)| kept.publisher == sample.publisher && kept.key.hash() == key);
+        if let Some((oldest, _)) = like_it.next()
+            && like_it.count() + 1 >= depth
             && let Some(superseded) = self.history.remove(oldest)
         {
             self.bytes -= superseded.payload.len();
         }
         self.bytes += sample.payload.len();
         self.history.push_back(sample);
-        while self.bytes > MAX_BYTES
+        while (self.bytes > MAX_BYTES || self.history.len() > MAX_SAMPLES)
             && self.history.len() > self.depth
             && let Some(oldest) = self.history.pop_front()
         {
@@ -91,7 +112,7 @@ impl LateJoiners {
         self.bytes = self.history.iter().map(|kept| kept.payload.len()).sum();
     }
 
-    /// Samples that were removed because there were too many bytes.
+    /// Samples that were removed because there were too many, or too many bytes.
     pub fn evicted(&self) -> u64 {
         self.evicted
     }
@@ -125,6 +146,7 @@ impl LateJoiners {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::KeyedPayload;
 
     fn kept(byte: u8) -> KeptSample {
         KeptSample {
@@ -132,6 +154,7 @@ mod tests {
             payload: Bytes::from(vec![byte]),
             encapsulation: Encapsulation::CDR_LE,
             timestamp: SourceTimestamp(1),
+            key: SampleKey::NONE,
         }
     }
 
@@ -167,6 +190,29 @@ mod tests {
         late.forget(Guid([2; 16]));
         assert_eq!(history(&late), [0, 4, 5]);
         assert_eq!((late.bytes, late.evicted()), (3, 0));
+    }
+
+    #[test]
+    fn each_key_has_its_own_last_samples() {
+        let mut late = LateJoiners::new(2);
+        let of = |hash: Option<u8>, byte: u8| KeptSample {
+            key: SampleKey::new(hash.map(|hash| [hash; 16]), 0, KeyedPayload::Data),
+            ..kept(byte)
+        };
+        for (hash, byte) in [(1, 0), (2, 1), (2, 2), (2, 3), (1, 4)] {
+            late.keep(of(Some(hash), byte));
+        }
+        assert_eq!(history(&late), [0, 2, 3, 4]);
+        // Without a hash the keys are not known.
+        for byte in 0..2_000 {
+            late.keep(of(None, byte as u8));
+        }
+        assert_eq!(late.history.len(), 4 + DEPTH_OF_UNKNOWN_KEYS);
+        for hash in 0..2 * MAX_SAMPLES {
+            let hash = (hash as u128).to_le_bytes();
+            late.keep(KeptSample { key: SampleKey::new(Some(hash), 0, KeyedPayload::Data), ..kept(0) });
+        }
+        assert_eq!(late.history.len(), MAX_SAMPLES);
     }
 
     #[test]

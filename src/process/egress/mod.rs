@@ -8,6 +8,7 @@
 mod arena;
 mod bound_topic;
 mod former_readers;
+mod gaps;
 mod history;
 mod late_joiners;
 pub(super) mod memory;
@@ -266,7 +267,7 @@ impl Egress {
                 .iter_mut()
                 .fold(false, |changed, output| output.durability.take_change() | changed)
         {
-            lane.follow_durability(&mut self.outputs, now);
+            lane.follow_publishers(&mut self.outputs, now);
         }
         self.reload(now);
         // While a thread of the DDS library hangs, the lane forwards nothing. Without this report the

@@ -14,8 +14,7 @@ use crate::shm::ShmSample;
 
 pub(super) struct Noncritical {
     rates: LaneRates,
-    /// The samples of a latched topic that may wait, unless `queue_samples` is more.
-    latched_queue: usize,
+    queues: Queues,
     mode: LaneMode,
     budget: ByteBudget,
     /// The outputs of each priority, the highest first. Outputs of the same priority take turns.
@@ -33,11 +32,11 @@ impl Noncritical {
         rules: &SafetyRules,
         now: MonotonicNs,
     ) -> Self {
-        let latched_queue = latched_queue(rules);
+        let queues = Queues::of(rules, lane.max_borrowed_in_all());
         let shapers = lane
             .outputs
             .iter()
-            .map(|output| RouteShaper::new(rates_of(rates, latched_queue, output.qos.durability), now))
+            .map(|output| RouteShaper::new(queues.rates_of(rates, output.qos.durability, false), now))
             .collect();
         let turn_orders = more_urgent
             .chunk_by(|one, other| one == other)
@@ -49,7 +48,7 @@ impl Noncritical {
             .collect();
         Self {
             rates,
-            latched_queue,
+            queues,
             mode: LaneMode::Normal,
             budget: ByteBudget::new(rates.normal.max_bytes_per_s, now),
             turn_orders,
@@ -66,15 +65,15 @@ impl Noncritical {
         now: MonotonicNs,
     ) {
         self.rates = rates;
-        self.latched_queue = latched_queue(rules);
+        self.queues = Queues::of(rules, self.queues.max_borrowed);
         self.budget.set_mode(&rates, self.mode, now);
-        self.follow_durability(outputs, now);
+        self.follow_publishers(outputs, now);
     }
 
-    /// Applies the rates again after the durability of an output has changed.
-    pub fn follow_durability(&mut self, outputs: &mut [Output], now: MonotonicNs) {
+    /// Applies the rates again after the durability of an output or its kind of topic has changed.
+    pub fn follow_publishers(&mut self, outputs: &mut [Output], now: MonotonicNs) {
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            let rates = rates_of(self.rates, self.latched_queue, output.durability.get());
+            let rates = self.queues.rates_of(self.rates, output.durability.get(), output.has_keys());
             shaper.set_rates(rates, now, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(shaper.waiting());
         }
@@ -97,7 +96,7 @@ impl Noncritical {
             }
         }
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output, self.rates, self.latched_queue, now);
+            fill_queue(shaper, output, self.rates, self.queues, now);
         }
         let now = clock::monotonic();
         let now_wall = clock::wall();
@@ -121,8 +120,10 @@ impl Noncritical {
                         Decision::SleepUntil(at) => {
                             token_at = MonotonicNs(token_at.0.min(at.0));
                             // Samples wake the lane also without a token: several latched publishers may
-                            // send more samples at once than the channel has room for.
-                            waits_for_sample |= output.durability.get() == Durability::TransientLocal;
+                            // send more samples at once than the channel has room for. Of a topic with keys,
+                            // the channel would lose the end of a key.
+                            waits_for_sample |=
+                                output.durability.get() == Durability::TransientLocal || output.has_keys();
                             break;
                         }
                         Decision::WaitForSample => {
@@ -148,7 +149,7 @@ impl Noncritical {
     pub fn shut_down(&mut self, outputs: &mut [Output]) {
         let now = clock::monotonic();
         for (shaper, output) in self.shapers.iter_mut().zip(outputs.iter_mut()) {
-            fill_queue(shaper, output, self.rates, self.latched_queue, now);
+            fill_queue(shaper, output, self.rates, self.queues, now);
             shaper.clear(DropReason::Shutdown, |sample, _, reason| output.drop_sample(&sample, reason));
             output.set_queued(0);
         }
@@ -161,12 +162,12 @@ fn fill_queue(
     shaper: &mut RouteShaper<ShmSample>,
     output: &mut Output,
     rates: LaneRates,
-    latched_queue: usize,
+    queues: Queues,
     now: MonotonicNs,
 ) {
     while let Some(sample) = output.take() {
         if output.durability.take_change() {
-            let rates = rates_of(rates, latched_queue, output.durability.get());
+            let rates = queues.rates_of(rates, output.durability.get(), output.has_keys());
             shaper.set_rates(rates, now, |dropped, _, reason| output.drop_sample(&dropped, reason));
         }
         let stamps = SampleStamps::new(sample.header(), sample.payload().len() as u64);
@@ -174,23 +175,39 @@ fn fill_queue(
     }
 }
 
-/// The queue for a latched topic: room for a sample of each publisher, because all may be discovered at once,
-/// but not so much that the queue counts as overflowing. What it holds in shared memory is bounded by
-/// `max_borrowed`; more waits in the channel.
-fn latched_queue(rules: &SafetyRules) -> usize {
-    rules.max_noncritical_queue.min(MAX_PUBLISHERS)
+/// The samples of a topic that may wait, unless `queue_samples` is more.
+#[derive(Clone, Copy)]
+struct Queues {
+    /// Of a latched topic: room for a sample of each publisher, because all may be discovered at once, but
+    /// not so much that the queue counts as overflowing. What it holds in shared memory is bounded by
+    /// `max_borrowed`; more waits in the channel.
+    latched: usize,
+    /// Of a topic with keys, the freshest of each: not so many that more waits in the channel, which would
+    /// lose the end of a key. The lane holds two more: the next one and the one that it sends.
+    keyed: usize,
+    max_borrowed: usize,
 }
 
-/// The rates of an output. TRANSIENT_LOCAL publishers publish state (a map, static transforms): their samples
-/// do not become stale and do not supersede each other, so they are sent in order, at the lane's rate.
-fn rates_of(lane: LaneRates, latched_queue: usize, durability: Durability) -> LaneRates {
-    let mut rates = lane;
-    if durability == Durability::TransientLocal {
-        for rate in [&mut rates.normal, &mut rates.degraded] {
-            rate.stale_threshold_ms = 0;
-            rate.drop_policy = DropPolicy::DropStale;
-            rate.queue_samples = rate.queue_samples.max(latched_queue);
-        }
+impl Queues {
+    fn of(rules: &SafetyRules, max_borrowed: usize) -> Self {
+        let latched = rules.max_noncritical_queue.min(MAX_PUBLISHERS);
+        Self { latched, keyed: latched.min(max_borrowed.saturating_sub(2)), max_borrowed }
     }
-    rates
+
+    /// The rates of an output. TRANSIENT_LOCAL publishers publish state (a map, static transforms): their
+    /// samples do not become stale and do not supersede each other, so they are sent in order, at the lane's
+    /// rate.
+    fn rates_of(self, lane: LaneRates, durability: Durability, has_keys: bool) -> LaneRates {
+        let mut rates = lane;
+        for rate in [&mut rates.normal, &mut rates.degraded] {
+            if durability == Durability::TransientLocal {
+                rate.stale_threshold_ms = 0;
+                rate.drop_policy = DropPolicy::DropStale;
+                rate.queue_samples = rate.queue_samples.max(self.latched);
+            } else if has_keys && rate.drop_policy == DropPolicy::DropOldest {
+                rate.queue_samples = rate.queue_samples.max(self.keyed);
+            }
+        }
+        rates
+    }
 }

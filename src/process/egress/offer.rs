@@ -66,6 +66,11 @@ impl RouteDurability {
         }
     }
 
+    /// Makes [`take_change`](Self::take_change) return true: the topic has got keys, or lost them.
+    pub const fn set_changed(&mut self) {
+        self.changed = true;
+    }
+
     /// Returns whether it has changed since the last call.
     pub fn take_change(&mut self) -> bool {
         std::mem::take(&mut self.changed)

@@ -10,12 +10,13 @@ use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::bound_topic::BoundTopic;
 use super::former_readers::FormerReaders;
+use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
 use super::overrun::{Overrun, log_left};
-use super::unsent::{Forwarded, Unsent, UnsentSamples};
+use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
 use crate::clock;
-use crate::config::{self, DropPolicy, Forwarding, Settings};
+use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
@@ -52,6 +53,8 @@ pub(super) struct Output {
     pub writer: Option<RawWriter>,
     /// The hash that the writer announces.
     type_hash: TypeHash,
+    /// Whether the writer is one of a type with keys.
+    has_keys: bool,
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
@@ -131,6 +134,7 @@ impl Output {
             subscriber,
             writer: None,
             type_hash: TypeHash::UNKNOWN,
+            has_keys: false,
             queued: 0,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             drop_log: DropLog::new(former.drops),
@@ -154,7 +158,8 @@ impl Output {
                 let known = opened.boards.route_info(output.route).unwrap_or_default();
                 opened.durability.set(known.durability());
                 opened.follow_durability(participant);
-                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash };
+                let has_keys = known.has_keys != 0;
+                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash, has_keys };
                 opened.make_writer(participant, dds_type)?;
             }
             _ => opened.announce_type(participant),
@@ -208,19 +213,22 @@ impl Output {
         }
         if self.topic.is_place {
             self.follow_topic(participant);
-            if self.topic.is_former(sample.header().sequence) {
-                // Of the former topic of the place, which has no writer any more.
-                return self.drop_sample(&sample, DropReason::NoWriter);
-            }
         }
-        if self.writer.is_none() || (self.is_to_latch() && self.counters.get().readers == 0) {
+        let other_kind = sample.header().key.is_keyed() != self.has_keys;
+        if self.writer.is_none() || other_kind || (self.is_to_latch() && self.counters.get().readers == 0) {
             self.announce_type(participant);
+        }
+        // After both calls, which follow the topic of a place: its former topic has no writer any more.
+        if self.topic.is_former(sample.header().sequence) {
+            return self.drop_sample(&sample, DropReason::NoWriter);
         }
         if !self.former_readers.is_empty() {
             // Former readers may have matched since the last housekeeping.
             self.follow_matching(clock::monotonic());
         }
-        let Some(writer) = &self.writer else {
+        // A writer of the other kind would send what its readers take for something else.
+        let Some(writer) = self.writer.as_ref().filter(|_| sample.header().key.is_keyed() == self.has_keys)
+        else {
             self.drop_sample(&sample, DropReason::NoWriter);
             return;
         };
@@ -241,7 +249,8 @@ impl Output {
         };
         let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
-        let outcome = writer.write_from(publisher, payload, header.encapsulation, header.source_timestamp);
+        let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+        let outcome = writer.write_from(publisher, payload, encapsulation, timestamp, header.key);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
@@ -291,6 +300,11 @@ impl Output {
             record_sequence(counters, &self.tracker);
             counters.drops.add(reason, 1);
         });
+    }
+
+    /// Whether the writer is one of a type with keys.
+    pub const fn has_keys(&self) -> bool {
+        self.has_keys
     }
 
     /// Applies another mode of the lane. A noncritical lane that forwards nothing takes samples only at
@@ -488,9 +502,10 @@ impl Output {
         let kept = history.kept(&payload, header);
         if kept.is_none()
             && let Some(writer) = &self.writer
+            && header.key.is_keyed() == self.has_keys
         {
-            let written =
-                writer.write_from(Some(publisher), payload, header.encapsulation, header.source_timestamp);
+            let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+            let written = writer.write_from(Some(publisher), payload, encapsulation, timestamp, header.key);
             if let Err(failure) = written {
                 warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
             }
@@ -503,26 +518,4 @@ impl Output {
 fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.first_sequence = tracker.first();
     counters.last_sequence = tracker.last();
-}
-
-/// Counts a sample that was sent.
-fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
-    counters.forwarded += 1;
-    counters.forwarded_bytes += sample.bytes;
-    counters.by_reference += u64::from(sample.by_reference);
-    counters.caught_up += u64::from(sample.caught_up);
-    counters.last_forwarded_at = sample.written_at;
-}
-
-/// The drop reason of samples that were overwritten in the lane's channel queue. A critical lane was too
-/// slow. A noncritical one sleeps until it has a token, and the drop policy decides which samples are lost
-/// meanwhile.
-const fn overwrite_reason(forwarding: &Forwarding) -> DropReason {
-    match forwarding {
-        Forwarding::Everything => DropReason::QueueOverflow,
-        Forwarding::Limited(rates) => match rates.normal.drop_policy {
-            DropPolicy::DropOldest => DropReason::Superseded,
-            _ => DropReason::QueueFull,
-        },
-    }
 }

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use crate::model::MonotonicNs;
+use crate::model::{LaneCounters, MonotonicNs};
 
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,6 +62,15 @@ pub(super) struct Forwarded {
     pub by_reference: bool,
     pub caught_up: bool,
     pub written_at: MonotonicNs,
+}
+
+/// Counts a sample that was sent.
+pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
+    counters.forwarded += 1;
+    counters.forwarded_bytes += sample.bytes;
+    counters.by_reference += u64::from(sample.by_reference);
+    counters.caught_up += u64::from(sample.caught_up);
+    counters.last_forwarded_at = sample.written_at;
 }
 
 #[cfg(test)]

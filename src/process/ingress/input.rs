@@ -58,6 +58,7 @@ pub(super) enum Step {
 
 struct ActiveReader {
     guid: Guid,
+    has_keys: bool,
     qos: ReaderQos,
     writers: u64,
     idle: bool,
@@ -217,6 +218,7 @@ impl Input {
             writer_guid: origin.writer,
             encapsulation,
             age_basis,
+            key: origin.key,
         };
         if let Err(error) = slot.publish(header) {
             error!(route = self.id, %error, "sample not published; the lanes will count it as missing");
@@ -281,7 +283,8 @@ impl Input {
             return Ok(());
         }
         let known_type = self.settled_type.as_deref().or(self.configured_type.as_deref());
-        let plan = self.source.plan(known_type, &self.route.input_qos, self.route.max_sample_bytes);
+        let had_keys = self.info.get().has_keys != 0;
+        let plan = self.source.plan(known_type, had_keys, &self.route.input_qos, self.route.max_sample_bytes);
         match plan {
             ReaderPlan::Readers { dds_type, reliable, best_effort } => {
                 // Before the readers are created: a lane must be able to create its writer before it gets a
@@ -321,14 +324,23 @@ impl Input {
     /// (`is_settled`), and names a publisher that announces another one.
     fn update_info(&mut self, dds_type: &str, is_settled: bool) {
         let type_hash = self.source.type_hash(dds_type, self.info.get().type_hash);
+        let has_keys = self.source.has_keys(dds_type, self.info.get().has_keys != 0);
+        let of_route = DdsType { name: dds_type, hash: type_hash, has_keys };
         let RouteInfo { bound_topic, bound_after, bound_count, .. } = *self.info.get();
-        let mut info = RouteInfo { type_hash, bound_topic, bound_after, bound_count, ..RouteInfo::default() };
-        let durability = self.source.durability(dds_type, self.info.get().durability());
+        let mut info = RouteInfo {
+            type_hash,
+            has_keys: has_keys.into(),
+            bound_topic,
+            bound_after,
+            bound_count,
+            ..RouteInfo::default()
+        };
+        let durability = self.source.durability(of_route, self.info.get().durability());
         info.transient_local = u64::from(durability == Durability::TransientLocal);
         if is_settled {
             info.dds_type = FixedText::new(dds_type);
         }
-        if let Some(other) = self.source.find_other_type(DdsType { name: dds_type, hash: type_hash }) {
+        if let Some(other) = self.source.find_other_type(of_route) {
             info.other_writer = other.guid;
             info.other_type = FixedText::new(&other.dds_type);
             info.other_hash = other.type_hash;
@@ -339,7 +351,17 @@ impl Input {
         if info.other_writer != Guid::default() && info.other_writer != self.info.get().other_writer {
             let (route, topic, writer) = (&self.id, &self.dds_topic, info.other_writer);
             let other = info.other_type.as_str();
-            if other == dds_type {
+            if other == dds_type && writer.has_keys() != has_keys {
+                error!(
+                    route,
+                    topic,
+                    ?writer,
+                    dds_type,
+                    has_keys,
+                    "a publisher announces the type with keys and others without, so DDS does not match both: \
+                     build all nodes with the same version of its package"
+                );
+            } else if other == dds_type {
                 let other_hash = info.other_hash;
                 error!(
                     route, topic, ?writer, dds_type, %type_hash, %other_hash,
@@ -377,8 +399,11 @@ impl Input {
             // would lose samples. But a TRANSIENT_LOCAL publisher sends its history only to a reader that is
             // TRANSIENT_LOCAL itself, so an idle VOLATILE reader is replaced.
             let idle = std::mem::take(&mut current.idle);
-            if current.qos.durability <= qos.durability && !(idle && current.qos.durability < qos.durability)
-            {
+            let fits = current.qos.durability <= qos.durability
+                && !(idle && current.qos.durability < qos.durability);
+            // A reader without keys matches no publisher with keys, and the reverse. The route changes over
+            // when it has no publisher of the former kind.
+            if fits && current.has_keys == (self.info.get().has_keys != 0) {
                 return Ok(());
             }
         }
@@ -407,7 +432,8 @@ impl Input {
     ) -> Result<(), RoleError> {
         self.remove_reader(participant, qos.reliability);
         let topic = self.dds_topic.as_str();
-        let announced_type = DdsType { name: dds_type, hash: self.info.get().type_hash };
+        let (hash, has_keys) = (self.info.get().type_hash, self.info.get().has_keys != 0);
+        let announced_type = DdsType { name: dds_type, hash, has_keys };
         let reader = match qos.reliability {
             Reliability::Reliable => participant.create_reader_after(
                 topic,
@@ -427,6 +453,7 @@ impl Input {
             route = self.id,
             topic,
             dds_type,
+            has_keys,
             qos = label(qos.reliability, qos.durability),
             depth = qos.depth,
             "DDS reader created"
@@ -437,7 +464,7 @@ impl Input {
             }
         }
         self.settled_type = Some(dds_type.to_owned());
-        let active = ActiveReader { guid: reader.guid(), qos, writers: 0, idle: false };
+        let active = ActiveReader { guid: reader.guid(), has_keys, qos, writers: 0, idle: false };
         self.readers.insert(qos.reliability, active);
         self.inbox.add(reader);
         self.lend_memory();

@@ -2,7 +2,7 @@
 
 use tracing::{info, warn};
 
-use crate::config::{InputTopic, OutputTopic, RoutePattern, Settings};
+use crate::config::{NeverInputs, OutputTopic, RoutePattern, Settings};
 use crate::dds::Endpoint;
 use crate::model::{FixedText, Guid, MonotonicNs, PatternRecord, TopicName, TopicPrefix};
 use crate::policy::{Location, MAX_TOPIC_WRITERS, MAX_WAITING_TOPICS, RoutePlaces, TRIAL_MS};
@@ -16,21 +16,16 @@ const MAX_NAME_BYTES: usize = 127;
 pub(in crate::process) const PATTERN_BYTES: u64 =
     ((MAX_WAITING_TOPICS + 64) * MAX_TOPIC_WRITERS * 1024) as u64;
 
-/// What the default outputs begin with, of this bridge and of others in the domain.
-const DEFAULT_OUTPUTS: &str = "/adaptive_bridge/**";
-
 /// All patterns of the bridge.
 pub(super) struct Patterns {
     patterns: Vec<Pattern>,
-    /// The topics that are inputs of other routes or outputs in the domain of the publishers, and those of
-    /// the bridge's own messages.
-    taken: Vec<TopicName>,
+    never_inputs: NeverInputs,
     /// The outputs of other routes, each with its DDS domain.
     fixed_outputs: Vec<(u16, TopicName)>,
-    /// The prefixes of outputs in the domain of the publishers: what has one is never an input.
-    outputs: Vec<TopicPrefix>,
     /// The writers of the topics that the policy remembers.
     writers: Vec<Endpoint>,
+    /// The number of forgotten topics when those of forgotten ones were removed.
+    pruned_at: u64,
 }
 
 struct Pattern {
@@ -47,28 +42,11 @@ struct Pattern {
 
 impl Patterns {
     pub fn open(settings: &Settings, boards: &Boards) -> Self {
-        let fixed = settings.routes.iter().filter_map(|route| match &route.input_topic {
-            InputTopic::Topic(topic) => Some(topic.clone()),
-            InputTopic::Pattern(_) => None,
-        });
-        let own =
-            [&settings.probes.request_topic, &settings.probes.response_topic, &settings.diagnostics.topic];
-        let mut taken: Vec<_> = fixed.chain(own.into_iter().cloned()).collect();
-        let mut outputs: Vec<_> = TopicPrefix::parse(DEFAULT_OUTPUTS).into_iter().collect();
         let mut fixed_outputs = Vec::new();
         for lane in &settings.lanes {
-            let domain_id = lane.network.domain_id;
-            let is_beside_inputs = domain_id == settings.input.domain_id;
             for output in &lane.outputs {
-                match &output.topic {
-                    OutputTopic::Topic(topic) => {
-                        fixed_outputs.push((domain_id, topic.clone()));
-                        taken.extend(is_beside_inputs.then(|| topic.clone()));
-                    }
-                    OutputTopic::Prefix(prefix) if is_beside_inputs && !outputs.contains(prefix) => {
-                        outputs.push(prefix.clone());
-                    }
-                    OutputTopic::Prefix(_) => {}
+                if let OutputTopic::Topic(topic) = &output.topic {
+                    fixed_outputs.push((lane.network.domain_id, topic.clone()));
                 }
             }
         }
@@ -92,7 +70,8 @@ impl Patterns {
             }
         };
         let patterns = settings.patterns.iter().map(pattern).collect();
-        Self { patterns, taken, fixed_outputs, outputs, writers: Vec::new() }
+        let never_inputs = NeverInputs::of(settings);
+        Self { patterns, never_inputs, fixed_outputs, writers: Vec::new(), pruned_at: 0 }
     }
 
     /// The routes that are places.
@@ -127,7 +106,7 @@ impl Patterns {
         let Some(of) = self.patterns.iter().position(|pattern| pattern.settings.is_for(name)) else { return };
         // Not a name of ROS 2: no subscriber could have it.
         let Ok(topic) = TopicName::try_from(name) else { return };
-        if self.taken.contains(&topic) || self.outputs.iter().any(|prefix| prefix.is_within(name)) {
+        if self.never_inputs.contains(&topic) {
             return;
         }
         let is_possible = writer.dds_type.len() <= MAX_NAME_BYTES && self.has_outputs_for(of, &topic);
@@ -199,8 +178,11 @@ impl Patterns {
 
     /// Forgets what the policy has forgotten, and writes the boards.
     pub fn housekeeping(&mut self) {
-        let Self { patterns, writers, .. } = self;
-        if writers.len() > patterns.iter().map(|pattern| pattern.settings.max_routes).sum::<usize>() {
+        let Self { patterns, writers, pruned_at, .. } = self;
+        // Only after a topic was forgotten: thousands of forged writers take milliseconds.
+        let forgotten = patterns.iter().map(|pattern| pattern.places.forgotten).sum();
+        if *pruned_at != forgotten {
+            *pruned_at = forgotten;
             writers.retain(|writer| {
                 let name = writer.topic.strip_prefix("rt").and_then(|name| TopicName::try_from(name).ok());
                 name.is_some_and(|name| patterns.iter().any(|pattern| pattern.places.knows(&name)))

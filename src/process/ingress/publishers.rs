@@ -259,7 +259,7 @@ fn halves(guid: Guid) -> [u64; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{InstanceName, LaneName, RouteId, SourceTimestamp};
+    use crate::model::{InstanceName, LaneName, RouteId, SampleKey, SourceTimestamp};
     use crate::shm::{BridgeShape, ShmNode};
 
     const ONE: Guid = Guid([1; 16]);
@@ -293,7 +293,7 @@ mod tests {
     }
 
     fn origin(writer: Guid, sequence: i64, source_timestamp: SourceTimestamp) -> SampleOrigin {
-        SampleOrigin { source_timestamp, writer, sequence }
+        SampleOrigin { source_timestamp, writer, sequence, key: SampleKey::NONE }
     }
 
     /// Takes the sample if it is new, and returns the number of samples missing before it.

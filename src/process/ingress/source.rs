@@ -53,11 +53,23 @@ impl Source {
         self.writers.len() < before
     }
 
-    /// Returns a publisher of another type than `dds_type`, or of another definition of it, if there is one.
+    /// Returns a publisher of another type than `dds_type`, of another definition of it, or with keys where
+    /// the others have none or the reverse, if there is one.
     pub fn find_other_type(&self, dds_type: DdsType) -> Option<&Endpoint> {
-        self.writers
-            .iter()
-            .find(|writer| writer.dds_type != dds_type.name || writer.type_hash.contradicts(&dds_type.hash))
+        self.writers.iter().find(|writer| {
+            writer.dds_type != dds_type.name
+                || writer.type_hash.contradicts(&dds_type.hash)
+                || writer.guid.has_keys() != dds_type.has_keys
+        })
+    }
+
+    /// Whether this type has keys: `current` as long as a publisher announces that, or there is none; else
+    /// what the first publisher announces.
+    pub fn has_keys(&self, dds_type: &str, current: bool) -> bool {
+        let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+        let mut kinds = writers.map(|writer| writer.guid.has_keys());
+        let first = kinds.clone().next().unwrap_or(current);
+        if kinds.any(|has_keys| has_keys == current) { current } else { first }
     }
 
     /// The hash of this type: `current` as long as a publisher announces it, or none announces any; else that
@@ -71,8 +83,8 @@ impl Source {
 
     /// The durability of outputs of this type for which the configuration gives none: what all present
     /// publishers offer, or `current` if there is none.
-    pub fn durability(&self, dds_type: &str, current: Durability) -> Durability {
-        let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+    pub fn durability(&self, dds_type: DdsType, current: Durability) -> Durability {
+        let writers = self.writers.iter().filter(|writer| is_of(writer, dds_type));
         writers.map(|writer| writer.durability).min().unwrap_or(current)
     }
 
@@ -88,19 +100,20 @@ impl Source {
     /// Chooses the readers for the known publishers: one for the RELIABLE ones and one for the BEST_EFFORT
     /// ones, each of them TRANSIENT_LOCAL if all its publishers offer that. If the configuration sets the
     /// reliability, one reader is for all publishers. A reader that requests more than a publisher offers
-    /// does not match it.
+    /// does not match it. `had_keys` is what [`has_keys`](Self::has_keys) returned last.
     pub fn plan(
         &self,
         configured_type: Option<&str>,
+        had_keys: bool,
         input: &InputQos,
         max_sample_bytes: usize,
     ) -> ReaderPlan {
         let dds_type = match (configured_type, self.writers.first()) {
             (Some(configured), _) => configured,
-            (None, Some(first)) => match self.find_other_type(first.dds_type.as_str().into()) {
-                Some(_) => return ReaderPlan::TypeConflict(first.dds_type.clone()),
-                None => &first.dds_type,
-            },
+            (None, Some(first)) if self.writers.iter().any(|other| other.dds_type != first.dds_type) => {
+                return ReaderPlan::TypeConflict(first.dds_type.clone());
+            }
+            (None, Some(first)) => &first.dds_type,
             (None, None) => return ReaderPlan::Unknown,
         };
         let depth = match input.history {
@@ -111,8 +124,10 @@ impl Source {
             Some(configured) => reader == configured,
             None => reader == writer.reliability,
         };
+        let has_keys = self.has_keys(dds_type, had_keys);
+        let of_route = DdsType { has_keys, ..dds_type.into() };
         let reader = |reliability| {
-            let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
+            let writers = self.writers.iter().filter(|writer| is_of(writer, of_route));
             let writers = writers.filter(|writer| is_for(reliability, writer));
             let durability = match writers.map(|writer| writer.durability).min() {
                 Some(offered) => input.durability.unwrap_or(offered),
@@ -127,6 +142,11 @@ impl Source {
         }
         ReaderPlan::Readers { dds_type: dds_type.to_owned(), reliable, best_effort }
     }
+}
+
+/// Whether a publisher announces this type, with keys or without as it has them.
+fn is_of(writer: &Endpoint, dds_type: DdsType) -> bool {
+    writer.dds_type == dds_type.name && writer.guid.has_keys() == dds_type.has_keys
 }
 
 /// The most bytes that may wait in the DDS library for ingress on a route.
@@ -177,7 +197,7 @@ mod tests {
     }
 
     fn plan(source: &Source, configured_type: Option<&str>) -> ReaderPlan {
-        source.plan(configured_type, &InputQos::default(), 1 << 20)
+        source.plan(configured_type, false, &InputQos::default(), 1 << 20)
     }
 
     #[test]
@@ -205,20 +225,20 @@ mod tests {
         };
         let mut source = Source::default();
         let one = [Some(Durability::Volatile), None];
-        assert_eq!(durabilities(source.plan(Some("T"), &input, 1 << 20)), one);
+        assert_eq!(durabilities(source.plan(Some("T"), false, &input, 1 << 20)), one);
         // It also applies when a publisher does not match it.
         source.insert(&writer(1, "T", Reliability::BestEffort, Durability::TransientLocal));
-        assert_eq!(durabilities(source.plan(Some("T"), &input, 1 << 20)), one);
+        assert_eq!(durabilities(source.plan(Some("T"), false, &input, 1 << 20)), one);
     }
 
     #[test]
     fn a_configured_best_effort_reliability_gives_one_reader_for_all_publishers() {
         let input = InputQos { reliability: Some(Reliability::BestEffort), ..InputQos::default() };
         let mut source = Source::default();
-        assert_eq!(source.plan(Some("T"), &input, 1 << 20), ReaderPlan::Unknown);
+        assert_eq!(source.plan(Some("T"), false, &input, 1 << 20), ReaderPlan::Unknown);
         source.insert(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
-        source.insert(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
-        let plan = source.plan(Some("T"), &input, 1 << 20);
+        source.insert(&writer(5, "T", Reliability::BestEffort, Durability::Volatile));
+        let plan = source.plan(Some("T"), false, &input, 1 << 20);
         assert_eq!(durabilities(plan), [None, Some(Durability::Volatile)]);
     }
 
@@ -228,10 +248,10 @@ mod tests {
         source.insert(&writer(1, "T", Reliability::Reliable, Durability::TransientLocal));
         let [reliable, best_effort] = durabilities(plan(&source, None));
         assert_eq!((reliable, best_effort), (Some(Durability::TransientLocal), None));
-        source.insert(&writer(2, "T", Reliability::BestEffort, Durability::Volatile));
+        source.insert(&writer(5, "T", Reliability::BestEffort, Durability::Volatile));
         let both = [Some(Durability::TransientLocal), Some(Durability::Volatile)];
         assert_eq!(durabilities(plan(&source, None)), both);
-        assert_eq!(source.reliability_of(Guid([2; 16])), Some(Reliability::BestEffort));
+        assert_eq!(source.reliability_of(Guid([5; 16])), Some(Reliability::BestEffort));
         // A reader requests the weakest durability that its publishers offer.
         source.insert(&writer(3, "T", Reliability::Reliable, Durability::Volatile));
         assert_eq!(durabilities(plan(&source, None)), [Some(Durability::Volatile); 2]);
@@ -244,22 +264,52 @@ mod tests {
     fn outputs_are_transient_local_while_all_present_publishers_of_the_type_are() {
         let (volatile, latched) = (Durability::Volatile, Durability::TransientLocal);
         let mut source = Source::default();
-        assert_eq!([volatile, latched].map(|last| source.durability("T", last)), [volatile, latched]);
+        assert_eq!([volatile, latched].map(|last| source.durability("T".into(), last)), [volatile, latched]);
         source.insert(&writer(1, "T", Reliability::Reliable, latched));
-        source.insert(&writer(2, "U", Reliability::Reliable, volatile));
-        assert_eq!(source.durability("T", volatile), latched);
+        source.insert(&writer(5, "U", Reliability::Reliable, volatile));
+        assert_eq!(source.durability("T".into(), volatile), latched);
         source.insert(&writer(3, "T", Reliability::Reliable, volatile));
-        assert_eq!(source.durability("T", volatile), volatile);
-        assert_eq!(source.durability("T", latched), volatile);
+        assert_eq!(source.durability("T".into(), volatile), volatile);
+        assert_eq!(source.durability("T".into(), latched), volatile);
         source.remove(Guid([3; 16]));
-        assert_eq!(source.durability("T", volatile), latched);
+        assert_eq!(source.durability("T".into(), volatile), latched);
+    }
+
+    #[test]
+    fn publishers_with_keys_and_without_do_not_share_a_reader() {
+        let (reliable, volatile) = (Reliability::Reliable, Durability::Volatile);
+        let keyed = |id: u8, reliability| {
+            let mut writer = writer(id, "T", reliability, volatile);
+            writer.guid.0[15] = 0x02;
+            writer
+        };
+        let mut source = Source::default();
+        assert_eq!([true, false].map(|last| source.has_keys("T", last)), [true, false]);
+        source.insert(&keyed(1, reliable));
+        assert_eq!([true, false].map(|last| source.has_keys("T", last)), [true, true]);
+        // One without keys that comes later gets no reader, and is the one that is named.
+        source.insert(&writer(3, "T", Reliability::BestEffort, volatile));
+        assert!(source.has_keys("T", true));
+        assert_eq!(
+            durabilities(source.plan(None, true, &InputQos::default(), 1 << 20)),
+            [Some(volatile), None]
+        );
+        let other = source.find_other_type(DdsType { has_keys: true, .."T".into() });
+        assert_eq!(other.map(|writer| writer.guid), Some(Guid([3; 16])));
+        // When those with keys are gone, it gets one.
+        source.remove(keyed(1, reliable).guid);
+        assert!(!source.has_keys("T", true));
+        assert_eq!(
+            durabilities(source.plan(None, true, &InputQos::default(), 1 << 20)),
+            [None, Some(volatile)]
+        );
     }
 
     #[test]
     fn removing_a_participant_removes_its_publishers() {
         let mut source = Source::default();
         source.insert(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
-        source.insert(&writer(2, "U", Reliability::Reliable, Durability::Volatile));
+        source.insert(&writer(5, "U", Reliability::Reliable, Durability::Volatile));
         assert!(!source.remove_participant([3; 12]));
         assert!(source.remove_participant([1; 12]));
         assert!(source.find_other_type("U".into()).is_none());
@@ -269,7 +319,7 @@ mod tests {
     fn two_types_are_a_conflict_unless_the_configuration_sets_one() {
         let mut source = Source::default();
         source.insert(&writer(1, "T", Reliability::Reliable, Durability::Volatile));
-        source.insert(&writer(2, "U", Reliability::BestEffort, Durability::Volatile));
+        source.insert(&writer(5, "U", Reliability::BestEffort, Durability::Volatile));
         assert_eq!(plan(&source, None), ReaderPlan::TypeConflict("T".into()));
         let decided = plan(&source, Some("T"));
         assert!(matches!(&decided, ReaderPlan::Readers { dds_type, .. } if dds_type == "T"), "{decided:?}");
@@ -280,7 +330,7 @@ mod tests {
     fn the_type_hash_in_force_changes_only_when_no_publisher_announces_it_any_more() {
         let mut source = Source::default();
         assert_eq!(source.type_hash("T", TypeHash([1; 32])), TypeHash([1; 32]));
-        for (id, hash) in [(1, TypeHash::UNKNOWN), (2, TypeHash([2; 32])), (3, TypeHash([3; 32]))] {
+        for (id, hash) in [(1, TypeHash::UNKNOWN), (5, TypeHash([2; 32])), (3, TypeHash([3; 32]))] {
             let writer = writer(id, "T", Reliability::Reliable, Durability::Volatile);
             source.insert(&Endpoint { type_hash: hash, ..writer });
         }
@@ -290,7 +340,7 @@ mod tests {
         assert_eq!(source.type_hash("T", TypeHash([3; 32])), TypeHash([3; 32]));
         assert_eq!(source.type_hash("T", TypeHash([4; 32])), TypeHash([2; 32]));
         let find = |source: &Source, hash| {
-            let found = source.find_other_type(DdsType { name: "T", hash: TypeHash([hash; 32]) });
+            let found = source.find_other_type(DdsType { hash: TypeHash([hash; 32]), .."T".into() });
             found.map(|writer| writer.guid)
         };
         assert_eq!(find(&source, 2), Some(Guid([3; 16])));

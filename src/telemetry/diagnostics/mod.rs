@@ -23,6 +23,7 @@ pub const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
 pub const DIAGNOSTIC_ARRAY_TYPE: DdsType = DdsType {
     name: "diagnostic_msgs::msg::dds_::DiagnosticArray_",
     hash: TypeHash::from_hex(b"5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
+    has_keys: false,
 };
 
 /// The maximum size of an array, so that each fits in one UDP datagram. A larger report is split into several

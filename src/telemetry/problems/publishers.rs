@@ -85,6 +85,18 @@ pub(super) fn other_type(now: &Snapshot, route: &RouteReading) -> Option<Problem
                 printable(&type_name(announced.name))
             ),
         ),
+        Some(announced) if announced.has_keys != info.other_writer.has_keys() => {
+            let (its, others) = if announced.has_keys { ("without", "with") } else { ("with", "without") };
+            (
+                Level::Warn,
+                format!(
+                    "{publisher} announces {its_type} {its} keys, the publishers and outputs of {} {others}, and \
+                     DDS does not match both, so none of its samples is taken; build all nodes with the same \
+                     version of that package",
+                    route.input_topic
+                ),
+            )
+        }
         Some(announced) => (
             Level::Warn,
             format!(
@@ -202,22 +214,29 @@ mod tests {
     #[test]
     fn a_publisher_that_announces_another_type_is_a_problem() {
         let scan = FixedText::new("sensor_msgs::msg::dds_::LaserScan_");
-        let problem = |dds_type, other_type, other_hash| {
+        let of_writer = |writer: Guid, dds_type, other_type, other_hash| {
             let problems = problems_after(|now| {
                 now.routes[0].info = RouteInfo {
                     dds_type,
                     type_hash: TypeHash([1; 32]),
-                    other_writer: Guid([1; 16]),
+                    other_writer: writer,
                     other_type,
                     other_hash: TypeHash([other_hash; 32]),
                     ..RouteInfo::default()
                 };
                 let (node, host) = (FixedText::new("/imu"), FixedText::new("10.0.0.7"));
-                now.named_endpoints.push(NamedEndpoint { endpoint: Guid([1; 16]), node, host });
+                now.named_endpoints.push(NamedEndpoint { endpoint: writer, node, host });
             });
             let [problem] = problems.as_slice() else { panic!("{problems:?}") };
             problem.clone()
         };
+        let problem =
+            |dds_type, other_type, other_hash| of_writer(Guid([1; 16]), dds_type, other_type, other_hash);
+        let with_keys = of_writer(Guid([2; 16]), scan, scan, 1);
+        assert!(
+            with_keys.contains("/imu on 10.0.0.7 announces sensor_msgs/msg/LaserScan with keys"),
+            "{with_keys}"
+        );
         let cloud = FixedText::new("sensor_msgs::msg::dds_::PointCloud2_");
         let disputed = problem(FixedText::default(), cloud, 2);
         assert!(

@@ -95,6 +95,8 @@ pub struct RouteReport {
     pub(crate) message_type: Option<String>,
     /// The hash of the message type's definition that the outputs announce; null while it is unknown.
     pub(crate) type_hash: Option<String>,
+    /// Whether the type has keys, as the publishers announce it.
+    pub(crate) has_keys: bool,
     #[serde(flatten)]
     pub(crate) counters: IngressCounters,
     /// The publishers that have sent samples.
@@ -301,6 +303,7 @@ impl Snapshot {
             pattern: now.pattern.as_ref().map(ToString::to_string),
             message_type: now.message_type.as_deref().map(printable),
             type_hash: Some(now.info.type_hash).filter(TypeHash::is_known).map(|hash| hash.to_string()),
+            has_keys: now.info.has_keys != 0,
             counters: *counters,
             publishers: now.publishers.iter().map(|account| self.publisher_report(account)).collect(),
             drops_in_window: counters.drops.since_reading(former.map(|former| former.drops)),

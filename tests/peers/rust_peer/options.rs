@@ -101,7 +101,11 @@ const WAITING_BYTES: usize = 64 << 20;
 
 impl Options {
     pub fn dds_type(&self) -> DdsType<'_> {
-        DdsType { name: &self.type_name, hash: TypeHash::from_hex(self.type_hash.as_bytes()) }
+        DdsType {
+            name: &self.type_name,
+            hash: TypeHash::from_hex(self.type_hash.as_bytes()),
+            has_keys: false,
+        }
     }
 
     /// The size of a publisher's sample; sizes take turns.

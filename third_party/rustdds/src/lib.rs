@@ -223,7 +223,9 @@ pub use dds::{
   },
   topic::{Topic, TopicDescription, TopicKind},
   typedesc::TypeDesc,
-  with_key::{datareader::SelectByKey, WriteOptions, WriteOptionsBuilder},
+  with_key::{
+    datareader::SelectByKey, InstanceChange, InstancePayload, WriteOptions, WriteOptionsBuilder,
+  },
 };
 /// Needed to specify serialized data representation in case it is other than
 /// CDR.

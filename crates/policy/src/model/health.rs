@@ -322,6 +322,8 @@ pub struct RouteInfo {
     pub other_hash: TypeHash,
     /// 1 if all present publishers offer TRANSIENT_LOCAL, or the last ones did, else 0.
     pub transient_local: u64,
+    /// 1 if the type has keys, as the publishers announce it, else 0. It is 0 before there was a publisher.
+    pub has_keys: u64,
     /// The input topic of a route that has its topic by a pattern; empty while it has none.
     pub bound_topic: FixedText,
     /// The last sequence number of the route before it got this topic. What is numbered up to it is of
@@ -345,7 +347,7 @@ impl RouteInfo {
     /// The type that the outputs of the route announce; `None` while it is unknown.
     pub fn announced_type(&self) -> Option<DdsType<'_>> {
         let name = self.dds_type.as_str();
-        (!name.is_empty()).then_some(DdsType { name, hash: self.type_hash })
+        (!name.is_empty()).then_some(DdsType { name, hash: self.type_hash, has_keys: self.has_keys != 0 })
     }
 }
 
@@ -499,7 +501,7 @@ mod tests {
         assert_eq!((info.announced_type(), info.durability()), (None, Durability::Volatile));
         let (name, hash) = ("std_msgs::msg::dds_::String_", TypeHash([7; 32]));
         (info.dds_type, info.type_hash, info.transient_local) = (FixedText::new(name), hash, 1);
-        assert_eq!(info.announced_type(), Some(DdsType { name, hash }));
+        assert_eq!(info.announced_type(), Some(DdsType { name, hash, has_keys: false }));
         assert_eq!(info.durability(), Durability::TransientLocal);
     }
 

@@ -40,7 +40,7 @@ pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};
 pub use readers::{MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, OutputReaders, ReaderRecord, UnmatchedReader};
-pub use sample::{AgeBasis, Encapsulation, Guid, SampleHeader};
+pub use sample::{AgeBasis, Encapsulation, Guid, KeyedPayload, SampleHeader, SampleKey};
 pub use thresholds::{ClassifierThresholds, SafetyRules};
 pub use time::{MonotonicNs, SourceTimestamp, WallNs};
 pub use topic_pattern::{PatternRecord, TopicPattern, TopicPrefix};

@@ -42,6 +42,13 @@ impl Guid {
         let [a, b, c, d, e, f, g, h, i, j, k, l, ..] = self.0;
         [a, b, c, d, e, f, g, h, i, j, k, l]
     }
+
+    /// Whether it is a reader or a writer of a topic with keys (RTPS 2.5 table 9.1); endpoints match only if
+    /// both have keys or neither has.
+    #[inline]
+    pub const fn has_keys(self) -> bool {
+        matches!(self.0[15] & 0x0f, 0x02 | 0x07)
+    }
 }
 
 impl fmt::Display for Guid {
@@ -57,6 +64,89 @@ impl fmt::Display for Guid {
 impl Serialize for Guid {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(self)
+    }
+}
+
+/// What a sample of a topic with keys says of its key beside the payload, as its publisher sends it. The
+/// bridge does not know the type, so it knows a key only by its hash.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct SampleKey {
+    hash: [u8; 16],
+    flags: u64,
+}
+
+/// What the payload of a sample of a topic with keys is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum KeyedPayload {
+    /// The data.
+    Data,
+    /// The key alone.
+    Key,
+    /// There is none; the hash tells the key.
+    Absent,
+}
+
+impl SampleKey {
+    /// That of a sample of a topic without keys.
+    pub const NONE: Self = Self { hash: [0; 16], flags: 0 };
+
+    const DISPOSED: u64 = 1;
+    const UNREGISTERED: u64 = 2;
+    const IS_KEYED: u64 = 4;
+    const HAS_HASH: u64 = 8;
+    const IS_KEY: u64 = 16;
+    const IS_ABSENT: u64 = 32;
+
+    /// That of a sample with this key hash, if the publisher sends one, these flags of PID_STATUS_INFO (RTPS
+    /// 2.5 clause 9.6.4.9), and this kind of payload.
+    pub const fn new(hash: Option<[u8; 16]>, status_info: u8, payload: KeyedPayload) -> Self {
+        let mut flags = Self::IS_KEYED | (status_info as u64 & (Self::DISPOSED | Self::UNREGISTERED));
+        flags |= match payload {
+            KeyedPayload::Data => 0,
+            KeyedPayload::Key => Self::IS_KEY,
+            KeyedPayload::Absent => Self::IS_ABSENT,
+        };
+        match hash {
+            Some(hash) => Self { hash, flags: flags | Self::HAS_HASH },
+            None => Self { hash: [0; 16], flags },
+        }
+    }
+
+    /// Whether the sample is of a topic with keys.
+    #[inline]
+    pub const fn is_keyed(&self) -> bool {
+        self.flags & Self::IS_KEYED != 0
+    }
+
+    /// The key hash; `None` if the publisher sends none.
+    #[inline]
+    pub const fn hash(&self) -> Option<[u8; 16]> {
+        if self.flags & Self::HAS_HASH != 0 { Some(self.hash) } else { None }
+    }
+
+    /// The flags of PID_STATUS_INFO.
+    #[inline]
+    pub const fn status_info(&self) -> u8 {
+        (self.flags & (Self::DISPOSED | Self::UNREGISTERED)) as u8
+    }
+
+    /// Whether the sample disposes or unregisters its key.
+    #[inline]
+    pub const fn is_end(&self) -> bool {
+        self.status_info() != 0
+    }
+
+    /// What the payload is.
+    #[inline]
+    pub const fn payload(&self) -> KeyedPayload {
+        if self.flags & Self::IS_KEY != 0 {
+            KeyedPayload::Key
+        } else if self.flags & Self::IS_ABSENT != 0 {
+            KeyedPayload::Absent
+        } else {
+            KeyedPayload::Data
+        }
     }
 }
 
@@ -81,6 +171,8 @@ pub struct SampleHeader {
     pub encapsulation: Encapsulation,
     /// The instant from which its age is measured.
     pub age_basis: AgeBasis,
+    /// What it says of its key.
+    pub key: SampleKey,
 }
 
 impl SampleHeader {
@@ -145,6 +237,29 @@ mod tests {
     }
 
     #[test]
+    fn what_a_sample_says_of_its_key_is_kept() {
+        assert!(!SampleKey::NONE.is_keyed());
+        for hash in [None, Some([0; 16]), Some([7; 16])] {
+            for status_info in 0..=3 {
+                for payload in [KeyedPayload::Data, KeyedPayload::Key, KeyedPayload::Absent] {
+                    let key = SampleKey::new(hash, status_info, payload);
+                    assert!(key.is_keyed());
+                    assert_eq!((key.hash(), key.status_info(), key.payload()), (hash, status_info, payload));
+                    assert_eq!(key.is_end(), status_info != 0);
+                }
+            }
+        }
+        // Other flags are reserved.
+        assert_eq!(SampleKey::new(None, 0xfc, KeyedPayload::Data).status_info(), 0);
+        let kinds = [0x02, 0x03, 0x04, 0x07].map(|kind| {
+            let mut guid = Guid([1; 16]);
+            guid.0[15] = kind;
+            guid.has_keys()
+        });
+        assert_eq!(kinds, [true, false, false, true]);
+    }
+
+    #[test]
     fn a_delay_is_kept_in_microseconds_up_to_71_minutes() {
         for (late_ns, kept_ns) in [(0, 0), (999, 0), (1_000, 1_000), (2_345_678, 2_345_000)] {
             let basis = AgeBasis::arrival(late_ns);
@@ -168,6 +283,7 @@ mod tests {
             writer_guid: Guid::default(),
             encapsulation: Encapsulation::CDR_LE,
             age_basis: AgeBasis::SOURCE,
+            key: SampleKey::NONE,
         };
         assert_eq!((header.age_source(), header.age_from()), (source, MonotonicNs(10_000_000)));
         header.age_basis = AgeBasis::arrival(4_000_000);

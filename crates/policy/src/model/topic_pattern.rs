@@ -26,6 +26,11 @@ impl TopicPattern {
         &self.0
     }
 
+    /// What all topics of the pattern begin with: the tokens before the first wild card.
+    pub fn literal_start(&self) -> &str {
+        self.0.find("/*").map_or(&self.0, |end| &self.0[..end])
+    }
+
     /// Whether the pattern matches a topic name. It takes at most the product of their lengths in steps.
     pub fn matches(&self, topic: &str) -> bool {
         let (Some(pattern), Some(topic)) = (self.0.strip_prefix('/'), topic.strip_prefix('/')) else {
@@ -128,10 +133,10 @@ impl TopicPrefix {
         output.as_str().strip_prefix(self.0.as_str()).filter(|input| input.starts_with('/'))
     }
 
-    /// Whether a topic name contains the tokens of the prefix, one after the other: it is an output with this
-    /// prefix, or one that another bridge forwards below a prefix of its own.
+    /// Whether a topic name contains the tokens of the prefix, one after the other, and another token: it is
+    /// an output with this prefix, or one that another bridge forwards below a prefix of its own.
     pub fn is_within(&self, topic: &str) -> bool {
-        format!("{topic}/").contains(&format!("{}/", self.0))
+        topic.contains(&format!("{}/", self.0))
     }
 }
 
@@ -219,13 +224,15 @@ mod tests {
         let input = TopicName::try_from("/camera/front").unwrap();
         let output = prefix.output_of(&input).unwrap();
         assert_eq!(output.as_str(), "/bridge/critical/camera/front");
-        for within in [output.as_str(), "/bridge/critical", "/other/bridge/critical/x"] {
+        for within in [output.as_str(), "/other/bridge/critical/x"] {
             assert!(prefix.is_within(within), "{within}");
         }
-        for other in ["/bridge/critical_2/x", "/my_bridge/critical/x", "/bridge/x"] {
+        for other in ["/bridge/critical_2/x", "/my_bridge/critical/x", "/bridge/x", "/bridge/critical"] {
             assert!(!prefix.is_within(other), "{other}");
         }
         assert_eq!(prefix.to_string(), "/bridge/critical/**");
+        let starts = ["/a/b/**", "/a/*/c", "/**", "/a"].map(|text| pattern(text).literal_start().to_owned());
+        assert_eq!(starts, ["/a/b", "/a", "", "/a"]);
         for wrong in ["/bridge/critical", "/**", "/bridge/*/**", "/bridge/critical/", "bridge/**"] {
             assert_eq!(TopicPrefix::parse(wrong), None, "{wrong}");
         }

@@ -61,12 +61,15 @@ pub struct DdsType<'a> {
     pub name: &'a str,
     /// The hash of its definition, if it is known.
     pub hash: TypeHash,
+    /// Whether it has keys, which the types of ROS 2 itself have not. DDS announces that by the entity ids of
+    /// readers and writers.
+    pub has_keys: bool,
 }
 
-/// A type whose hash is unknown.
+/// A type without keys whose hash is unknown.
 impl<'a> From<&'a str> for DdsType<'a> {
     fn from(name: &'a str) -> Self {
-        Self { name, hash: TypeHash::UNKNOWN }
+        Self { name, hash: TypeHash::UNKNOWN, has_keys: false }
     }
 }
 

@@ -229,7 +229,7 @@ pub fn mode_and_source(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{DropPolicy, SourceTimestamp};
+    use crate::model::{DropPolicy, SampleKey, SourceTimestamp};
 
     fn effective_mode(
         policy: &LanePolicy,
@@ -262,7 +262,8 @@ mod tests {
     }
 
     fn stamps(sequence: u64, taken_at: MonotonicNs) -> SampleStamps {
-        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
+        let key = SampleKey::NONE;
+        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100, key }
     }
 
     /// A route, its budget, and the dropped samples; each item is its sequence number.

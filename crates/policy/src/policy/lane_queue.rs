@@ -3,7 +3,7 @@
 use alloc::collections::VecDeque;
 
 use super::staleness::{age_ns, is_stale};
-use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SourceTimestamp, WallNs};
+use crate::model::{DropPolicy, DropReason, MonotonicNs, SampleHeader, SampleKey, SourceTimestamp, WallNs};
 
 /// The metadata by which the queue decides; it does not read the sample itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -17,6 +17,8 @@ pub struct SampleStamps {
     pub taken_at: MonotonicNs,
     /// Size of the serialized payload.
     pub bytes: u64,
+    /// What it says of its key.
+    pub key: SampleKey,
 }
 
 impl SampleStamps {
@@ -28,7 +30,14 @@ impl SampleStamps {
             source_timestamp: header.age_source(),
             taken_at: header.age_from(),
             bytes,
+            key: header.key,
         }
+    }
+
+    /// Whether the sample has data that a newer sample of its key replaces. Samples without key hash count as
+    /// of one key.
+    fn is_superseded_by(&self, newer: &Self) -> bool {
+        !self.key.is_end() && !newer.key.is_end() && self.key.hash() == newer.key.hash()
     }
 }
 
@@ -49,6 +58,10 @@ pub struct Allowance {
 
 impl Allowance {
     fn is_stale(&self, stamps: &SampleStamps) -> bool {
+        // The end of a key is no value that becomes wrong with its age.
+        if stamps.key.is_end() {
+            return false;
+        }
         let age_ns = age_ns(stamps.source_timestamp, stamps.taken_at, self.now, self.now_wall);
         is_stale(age_ns, self.stale_threshold_ms)
     }
@@ -59,6 +72,11 @@ impl Allowance {
 /// The caller offers samples in the order of their sequence numbers. Each is either sent or dropped, which
 /// passes it to the caller's `on_drop` with the reason, so that offered = sent + dropped + waiting, always.
 /// The queue allocates only on construction and when its capacity changes.
+///
+/// Samples of a topic with keys ([`SampleKey::is_keyed`]): with `DropOldest`, a newer sample takes the place
+/// of the waiting one of its key, so that each key waits once and all take turns. A sample that disposes or
+/// unregisters a key is neither superseded nor stale; it is dropped only from a queue that is full of such
+/// samples, as queue full.
 #[derive(Debug)]
 pub struct LaneQueue<T> {
     /// The oldest is at the front.
@@ -115,8 +133,18 @@ impl<T> LaneQueue<T> {
         stamps: SampleStamps,
         mut on_drop: impl FnMut(T, SampleStamps, DropReason),
     ) {
+        if stamps.key.is_keyed()
+            && self.policy == DropPolicy::DropOldest
+            && let Some(waiting) =
+                self.waiting.iter_mut().rev().find(|(_, waiting)| waiting.key.hash() == stamps.key.hash())
+            && waiting.1.is_superseded_by(&stamps)
+        {
+            let (superseded, its_stamps) = core::mem::replace(waiting, (item, stamps));
+            on_drop(superseded, its_stamps, DropReason::Superseded);
+            return;
+        }
         if self.waiting.len() >= self.limit {
-            if self.policy == DropPolicy::DropLatest {
+            if self.policy == DropPolicy::DropLatest && !stamps.key.is_end() {
                 on_drop(item, stamps, DropReason::QueueFull);
                 return;
             }
@@ -167,6 +195,18 @@ impl<T> LaneQueue<T> {
 
     /// Drops the sample that the policy chooses when the queue is full.
     fn drop_one(&mut self, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
+        if self.waiting.front().is_some_and(|(_, stamps)| stamps.key.is_keyed()) {
+            let mut places = 0..self.waiting.len();
+            let is_data = |place: &usize| !self.waiting[*place].1.key.is_end();
+            let data = match self.policy {
+                DropPolicy::DropOldest | DropPolicy::DropStale => places.find(is_data),
+                DropPolicy::DropLatest => places.rfind(is_data),
+            };
+            if let Some((item, stamps)) = self.waiting.remove(data.unwrap_or(0)) {
+                on_drop(item, stamps, DropReason::QueueFull);
+            }
+            return;
+        }
         let (dropped, reason) = match self.policy {
             DropPolicy::DropOldest => (self.waiting.pop_front(), DropReason::Superseded),
             DropPolicy::DropStale => (self.waiting.pop_front(), DropReason::QueueFull),
@@ -179,6 +219,9 @@ impl<T> LaneQueue<T> {
 
     /// Keeps as many of the newest samples as the allowance permits, and drops all older ones.
     fn supersede(&mut self, allowance: &Allowance, on_drop: &mut impl FnMut(T, SampleStamps, DropReason)) {
+        if self.waiting.front().is_some_and(|(_, stamps)| stamps.key.is_keyed()) {
+            return;
+        }
         let mut kept = 0;
         let mut older_bytes = 0_u64;
         let mut oldest_kept = self.waiting.len();
@@ -224,12 +267,14 @@ impl<T> LaneQueue<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::KeyedPayload;
 
     const NOW_MS: u64 = 10_000;
 
     fn stamps(sequence: u64, age_ms: u64) -> SampleStamps {
         let taken_at = MonotonicNs((NOW_MS - age_ms) * 1_000_000);
-        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100 }
+        let key = SampleKey::NONE;
+        SampleStamps { sequence, source_timestamp: SourceTimestamp::NONE, taken_at, bytes: 100, key }
     }
 
     fn allowance(tokens: u64) -> Allowance {
@@ -385,5 +430,64 @@ mod tests {
         }
         assert!(queue.len() <= 4);
         assert_eq!(queue.waiting.capacity(), room);
+    }
+
+    /// Offers a fresh sample with key hash `[key; 16]`, or none for 0, which ends the key if `status_info` is
+    /// not 0.
+    fn offer_keyed(bench: &mut Bench, sequence: u64, key: u8, status_info: u8) {
+        let hash = (key > 0).then_some([key; 16]);
+        let key = SampleKey::new(hash, status_info, KeyedPayload::Data);
+        let dropped = &mut bench.dropped;
+        let stamps = SampleStamps { key, ..stamps(sequence, 0) };
+        bench.queue.offer(sequence, stamps, |item, _, reason| dropped.push((item, reason)));
+    }
+
+    #[test]
+    fn the_freshest_sample_of_each_key_waits_and_the_keys_take_turns() {
+        let mut bench = Bench::new(DropPolicy::DropOldest, &[]);
+        for (sequence, key) in [(1, 1), (2, 2), (3, 1), (4, 1), (5, 3)] {
+            offer_keyed(&mut bench, sequence, key, 0);
+        }
+        let superseded = DropReason::Superseded;
+        assert_eq!(bench.dropped, [(1, superseded), (3, superseded)]);
+        // One that is updated more often than the lane sends does not keep the others from their turn.
+        assert_eq!(bench.take(&allowance(1)), Some(4));
+        offer_keyed(&mut bench, 6, 1, 0);
+        assert_eq!(bench.take(&allowance(1)), Some(2));
+        offer_keyed(&mut bench, 7, 1, 0);
+        assert_eq!([5, 7].map(|_| bench.take(&allowance(9))), [Some(5), Some(7)]);
+        assert_eq!(bench.dropped[2..], [(6, superseded)]);
+        // A fourth key in a queue of three.
+        for (sequence, key) in [(8, 1), (9, 2), (10, 3), (11, 4)] {
+            offer_keyed(&mut bench, sequence, key, 0);
+        }
+        assert_eq!(bench.dropped[3..], [(8, DropReason::QueueFull)]);
+        // Those without a hash count as of one key.
+        let mut bench = Bench::new(DropPolicy::DropOldest, &[]);
+        for sequence in 1..=3 {
+            offer_keyed(&mut bench, sequence, 0, 0);
+        }
+        assert_eq!((bench.take(&allowance(1)), bench.queue.len()), (Some(3), 0));
+    }
+
+    #[test]
+    fn the_end_of_a_key_is_not_superseded_and_not_stale() {
+        for policy in [DropPolicy::DropOldest, DropPolicy::DropStale, DropPolicy::DropLatest] {
+            let mut bench = Bench::new(policy, &[]);
+            for (sequence, key, status_info) in [(1, 1, 0), (2, 1, 1), (3, 1, 0), (4, 2, 2)] {
+                offer_keyed(&mut bench, sequence, key, status_info);
+            }
+            // The queue of three drops data for it.
+            let lost = if policy == DropPolicy::DropLatest { 3 } else { 1 };
+            assert_eq!(bench.dropped, [(lost, DropReason::QueueFull)], "{policy:?}");
+            let late = Allowance { now: MonotonicNs((NOW_MS + 900) * 1_000_000), ..allowance(1) };
+            assert_eq!([2, 4].map(|_| bench.take(&late)), [Some(2), Some(4)], "{policy:?}");
+            assert_eq!(bench.dropped[1..], [(4 - lost, DropReason::Stale)], "{policy:?}");
+            // One that is full of them.
+            for sequence in 5..=8 {
+                offer_keyed(&mut bench, sequence, sequence as u8, 3);
+            }
+            assert_eq!(bench.dropped[2..], [(5, DropReason::QueueFull)], "{policy:?}");
+        }
     }
 }

@@ -23,7 +23,7 @@ pub const MAX_WAITING_TOPICS: usize = 256;
 
 /// The most writers of a topic that are remembered. A topic that lost all of these counts as one without a
 /// writer, but keeps its place while samples arrive.
-pub const MAX_TOPIC_WRITERS: usize = 16;
+pub const MAX_TOPIC_WRITERS: usize = 64;
 
 /// A topic that gets a place.
 #[derive(Clone, Debug, PartialEq, Eq)]

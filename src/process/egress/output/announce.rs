@@ -3,6 +3,7 @@
 use tracing::{error, info};
 
 use super::super::super::role::RoleError;
+use super::super::former_readers::FormerReaders;
 use super::super::offer::Offer;
 use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
@@ -35,6 +36,19 @@ impl Output {
         self.start_offer(latched);
     }
 
+    /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
+    /// match no such publisher either, so nothing that they could get is lost; what is not sent yet is sent
+    /// first.
+    fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
+        if has_keys != self.has_keys
+            && !self.count_sent()
+            && let Some(former) = self.writer.take()
+        {
+            self.remove_writer(former, participant);
+            self.history = self.offer.history();
+        }
+    }
+
     /// Drops a writer, whose readers leave with it.
     fn remove_writer(&mut self, writer: RawWriter, participant: &mut Participant) {
         self.unmatched.clear();
@@ -59,10 +73,14 @@ impl Output {
     pub(super) fn follow_topic(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else { return };
         let Some(topic) = self.topic.next(&info) else { return };
-        // The former topic has had no publisher for a while, so what is still unsent is in no reader's reach.
+        // The former topic has had no publisher for a while, but a reader that was out of reach may not have
+        // acknowledged its last samples.
+        self.count_sent();
+        let behind = self.readers.get().unconfirmed(self.counters.get());
         let unsent = self.unsent.clear() as u64;
         let queued = self.queued;
         self.counters.update(|counters| {
+            counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
             counters.drops.add(DropReason::NoWriter, unsent);
             counters.waiting = queued;
         });
@@ -70,6 +88,8 @@ impl Output {
             self.remove_writer(former, participant);
             participant.forget_topic(&self.topic.dds_topic);
         }
+        // They were readers of the former topic.
+        self.former_readers = FormerReaders::default();
         self.topic.set(&info, &topic);
         let (offer, latched_offer) = self.configured;
         self.start_offer(offer);
@@ -92,6 +112,7 @@ impl Output {
         };
         self.durability.set(info.durability());
         self.follow_durability(participant);
+        self.follow_kind(participant, dds_type.has_keys);
         match &self.writer {
             None => {
                 if let Err(failure) = self.make_writer(participant, dds_type) {
@@ -119,6 +140,7 @@ impl Output {
             lane = self.lane,
             topic = self.topic.dds_topic,
             dds_type = dds_type.name,
+            has_keys = dds_type.has_keys,
             reliability = ?qos.reliability,
             durability = ?qos.durability,
             "DDS writer created"
@@ -128,6 +150,10 @@ impl Output {
         }
         self.writer = Some(writer);
         self.type_hash = dds_type.hash;
+        if self.has_keys != dds_type.has_keys {
+            self.has_keys = dds_type.has_keys;
+            self.durability.set_changed();
+        }
         Ok(())
     }
 }

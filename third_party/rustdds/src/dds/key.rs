@@ -53,6 +53,10 @@ impl KeyHash {
     Self([0; 16])
   }
 
+  pub(crate) fn from_bytes(bytes: [u8; 16]) -> Self {
+    Self(bytes)
+  }
+
   pub fn to_vec(self) -> Vec<u8> {
     Vec::from(self.0)
   }

@@ -235,6 +235,26 @@ impl Publisher {
       .create_datawriter_no_key(self, None, topic, qos, false)
   }
 
+  /// A writer for a topic of either kind, with keys or without, that encodes payloads
+  /// without knowledge of the key: of a topic with keys, each sample is to be written with
+  /// [`instance_change`](crate::WriteOptionsBuilder::instance_change).
+  pub fn create_datawriter_raw<D, SA>(
+    &self,
+    topic: &Topic,
+    qos: Option<QosPolicies>,
+  ) -> CreateResult<NoKeyDataWriter<D, SA>>
+  where
+    SA: adapters::no_key::SerializerAdapter<D>,
+  {
+    let kind = match topic.kind() {
+      TopicKind::WithKey => EntityKind::WRITER_WITH_KEY_USER_DEFINED,
+      TopicKind::NoKey => EntityKind::WRITER_NO_KEY_USER_DEFINED,
+    };
+    let inner = self.inner_lock();
+    let entity_id = inner.unwrap_or_new_entity_id(None, kind)?;
+    inner.create_datawriter_no_key(self, Some(entity_id), topic, qos, false)
+  }
+
   pub fn create_datawriter_no_key_cdr<D>(
     &self,
     topic: &Topic,
@@ -977,6 +997,23 @@ impl Subscriber {
       .create_simple_datareader_no_key(self, topic, None, qos)
   }
 
+  /// A reader for a topic of either kind, with keys or without, that decodes payloads
+  /// without knowledge of the key: [`WriteOptions::instance_change`](crate::WriteOptions::instance_change)
+  /// of a sample tells what it says of its instance.
+  pub fn create_simple_datareader_raw<D, DA>(
+    &self,
+    topic: &Topic,
+    qos: Option<QosPolicies>,
+  ) -> CreateResult<no_key::SimpleDataReader<D, DA>>
+  where
+    D: 'static,
+    DA: 'static + adapters::no_key::DeserializerAdapter<D>,
+  {
+    self
+      .inner
+      .create_simple_datareader_raw(self, topic, None, qos)
+  }
+
   pub fn create_datareader_no_key_cdr<D>(
     &self,
     topic: &Topic,
@@ -1399,9 +1436,24 @@ impl InnerSubscriber {
     if topic.kind() != TopicKind::NoKey {
       return Err(CreateError::TopicKind(TopicKind::NoKey));
     }
+    self.create_simple_datareader_raw(outer, topic, entity_id_opt, qos)
+  }
 
-    let entity_id =
-      self.unwrap_or_new_entity_id(entity_id_opt, EntityKind::READER_NO_KEY_USER_DEFINED)?;
+  pub fn create_simple_datareader_raw<D: 'static, SA>(
+    &self,
+    outer: &Subscriber,
+    topic: &Topic,
+    entity_id_opt: Option<EntityId>,
+    qos: Option<QosPolicies>,
+  ) -> CreateResult<no_key::SimpleDataReader<D, SA>>
+  where
+    SA: adapters::no_key::DeserializerAdapter<D> + 'static,
+  {
+    let (kind, has_keys) = match topic.kind() {
+      TopicKind::WithKey => (EntityKind::READER_WITH_KEY_USER_DEFINED, true),
+      TopicKind::NoKey => (EntityKind::READER_NO_KEY_USER_DEFINED, false),
+    };
+    let entity_id = self.unwrap_or_new_entity_id(entity_id_opt, kind)?;
 
     let d = self.create_simple_datareader_internal::<NoKeyWrapper<D>, DAWrapper<SA>>(
       outer,
@@ -1411,7 +1463,12 @@ impl InnerSubscriber {
       false,
     )?;
 
-    Ok(no_key::SimpleDataReader::<D, SA>::from_keyed(d))
+    let reader = no_key::SimpleDataReader::<D, SA>::from_keyed(d);
+    Ok(if has_keys {
+      reader.take_keys_as_data()
+    } else {
+      reader
+    })
   }
 
   pub fn participant(&self) -> Option<DomainParticipant> {

@@ -50,7 +50,7 @@ use crate::{
   structure::{
     dds_cache::DDSCache,
     entity::RTPSEntity,
-    guid::{EntityId, GuidPrefix, TokenDecode, GUID},
+    guid::{EntityId, EntityKind, GuidPrefix, TokenDecode, GUID},
     locator::Locator,
   },
   //QosPolicyBuilder,
@@ -1143,8 +1143,11 @@ impl DPEventLoop {
       })
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
 
+    let remote_kind = remote_reader.reader_proxy.remote_reader_guid.entity_id.entity_kind;
     for writer in self.writers.values_mut() {
-      if remote_reader.subscription_topic_data.topic_name() == writer.topic_name() {
+      if remote_reader.subscription_topic_data.topic_name() == writer.topic_name()
+        && have_the_same_topic_kind(remote_kind, writer.guid().entity_id.entity_kind)
+      {
         #[cfg(not(feature = "security"))]
         let match_to_reader = true;
         #[cfg(feature = "security")]
@@ -1235,8 +1238,11 @@ impl DPEventLoop {
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
 
     // update writer proxies in local readers
+    let remote_kind = remote_writer.writer_proxy.remote_writer_guid.entity_id.entity_kind;
     for reader in self.message_receiver.available_readers.values_mut() {
-      if &remote_writer.publication_topic_data.topic_name == reader.topic_name() {
+      if &remote_writer.publication_topic_data.topic_name == reader.topic_name()
+        && have_the_same_topic_kind(remote_kind, reader.guid().entity_id.entity_kind)
+      {
         #[cfg(not(feature = "security"))]
         let match_to_writer = true;
         #[cfg(feature = "security")]
@@ -1462,6 +1468,12 @@ impl DPEventLoop {
       // inform discovery?
     }
   }
+}
+
+// Endpoints match only if both have keys or neither has, as in Fast DDS and Cyclone DDS:
+// one would not understand the other's changes of instances.
+fn have_the_same_topic_kind(one: EntityKind, other: EntityKind) -> bool {
+  one.is_with_key() == other.is_with_key()
 }
 
 fn udp_addresses(locators: &[Locator]) -> Vec<SocketAddr> {

@@ -15,6 +15,7 @@ use crate::{
   dds::{
     ddsdata::DDSData,
     lent::{Lender, Lent, LentMemory},
+    with_key::datawriter::InstanceChange,
   },
   messages::submessages::{
     elements::serialized_payload::SerializedPayload,
@@ -84,6 +85,22 @@ impl Memory {
   }
 }
 
+// What a Writer need not repeat with each fragment: that of whichever came with it first.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct StatedOnce {
+  pub source_timestamp: Option<Timestamp>,
+  pub instance_change: Option<InstanceChange>,
+}
+
+impl StatedOnce {
+  fn or(self, later: Self) -> Self {
+    Self {
+      source_timestamp: self.source_timestamp.or(later.source_timestamp),
+      instance_change: self.instance_change.or(later.instance_change),
+    }
+  }
+}
+
 // This is for the assembly of a single object
 struct AssemblyBuffer {
   memory: Memory,
@@ -94,8 +111,7 @@ struct AssemblyBuffer {
   fragment_count: usize,
   received_bitmap: BitVec,
 
-  // Of whichever fragment came with one first.
-  source_timestamp: Option<Timestamp>,
+  stated: StatedOnce,
 
   // Not of the system's clock, which may be set meanwhile.
   modified_at: Instant,
@@ -146,7 +162,7 @@ impl AssemblyBuffer {
       fragment_size,
       fragment_count,
       received_bitmap: BitVec::from_elem(fragment_count, false),
-      source_timestamp: None,
+      stated: StatedOnce::default(),
       modified_at: Instant::now(),
     })
   }
@@ -281,16 +297,17 @@ impl FragmentAssembler {
     }
   }
 
-  // Returns completed DDSData and its source timestamp, when complete, and
-  // disposes the assembly buffer. A writer need not repeat the timestamp with
-  // each fragment, and Cyclone DDS does not when it repairs.
+  // Returns completed DDSData and what was stated with it, when complete, and
+  // disposes the assembly buffer. A writer need not repeat that with each
+  // fragment: Cyclone DDS omits the timestamp when it repairs, and sends the inline
+  // QoS with the first fragment only.
   pub fn new_datafrag(
     &mut self,
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
-    source_timestamp: Option<Timestamp>,
+    stated: StatedOnce,
     lender: &Lender,
-  ) -> Option<(DDSData, Option<Timestamp>)> {
+  ) -> Option<(DDSData, StatedOnce)> {
     let writer_sn = datafrag.writer_sn;
     let is_key = flags.contains(DATAFRAG_Flags::Key);
 
@@ -322,19 +339,19 @@ impl FragmentAssembler {
       return None;
     }
 
-    assembly_buffer.source_timestamp = assembly_buffer.source_timestamp.or(source_timestamp);
+    assembly_buffer.stated = assembly_buffer.stated.or(stated);
 
     if assembly_buffer.is_complete() {
       debug!("new_datafrag: COMPLETED FRAGMENT");
       if let Some(assembly_buffer) = self.remove(writer_sn) {
         // Return what we have assembled.
-        let source_timestamp = assembly_buffer.source_timestamp;
+        let stated = assembly_buffer.stated;
         let dds_data = assembly_buffer
           .memory
           .into_dds_data(assembly_buffer.data_size, is_key)
           .inspect_err(|e| error!("Deserializing SerializedPayload from DATAFRAG: {e:?}"))
           .ok()?;
-        Some((dds_data, source_timestamp)) // completed data from fragments
+        Some((dds_data, stated)) // completed data from fragments
       } else {
         error!("Assembly buffer mysteriously lost");
         None
@@ -441,9 +458,9 @@ impl FragmentAssemblers {
     reliable: bool,
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
-    source_timestamp: Option<Timestamp>,
+    stated: StatedOnce,
     lender: impl FnOnce() -> Lender,
-  ) -> Option<(DDSData, Option<Timestamp>)> {
+  ) -> Option<(DDSData, StatedOnce)> {
     let assembler = self
       .by_writer
       .entry(writer)
@@ -451,7 +468,7 @@ impl FragmentAssemblers {
     let is_first = !assembler.is_partially_received(datafrag.writer_sn);
     let lender = if is_first { lender() } else { Lender::default() };
     let before = assembler.own_bytes;
-    let completed = assembler.new_datafrag(datafrag, flags, source_timestamp, &lender);
+    let completed = assembler.new_datafrag(datafrag, flags, stated, &lender);
     self.own_bytes = self.own_bytes - before + assembler.own_bytes;
     if assembler.is_empty() {
       self.by_writer.remove(&writer);
@@ -506,7 +523,7 @@ mod tests {
   use bytes::Bytes;
   use enumflags2::BitFlags;
 
-  use super::{AssemblyBuffer, FragmentAssembler, FragmentAssemblers, Memory};
+  use super::{AssemblyBuffer, FragmentAssembler, FragmentAssemblers, Memory, StatedOnce};
   use crate::{
     dds::{
       ddsdata::DDSData,
@@ -552,7 +569,7 @@ mod tests {
       let assembler = assemblers.get(writer);
       assembler.is_some_and(|assembler| assembler.is_partially_received(SequenceNumber::new(1)))
     };
-    assemblers.new_datafrag(writer, true, &first, flags, None, Lender::default);
+    assemblers.new_datafrag(writer, true, &first, flags, StatedOnce::default(), Lender::default);
     assemblers.garbage_collect(Duration::from_secs(10));
     assert!(is_unfinished(&assemblers));
     std::thread::sleep(Duration::from_millis(2));
@@ -617,7 +634,7 @@ mod tests {
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
     let mut fa = FragmentAssembler::new(true);
     assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), None, &Lender::default())
+      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), StatedOnce::default(), &Lender::default())
       .is_none());
   }
 
@@ -631,7 +648,7 @@ mod tests {
 
   fn insert(fas: &mut FragmentAssemblers, writer: GUID, reliable: bool, fragment: &DataFrag) {
     let none = BitFlags::<DATAFRAG_Flags>::empty();
-    let completed = fas.new_datafrag(writer, reliable, fragment, none, None, Lender::default);
+    let completed = fas.new_datafrag(writer, reliable, fragment, none, StatedOnce::default(), Lender::default);
     assert!(completed.is_none());
   }
 
@@ -690,7 +707,7 @@ mod tests {
     for number in 1..=250 {
       for (sample, size) in [(1, 300 << 10), (2, 200 << 10), (3, 100)] {
         let fragment = first_of(sample, 50, size);
-        fas.new_datafrag(writer(number), true, &fragment, none, None, Lender::built_in);
+        fas.new_datafrag(writer(number), true, &fragment, none, StatedOnce::default(), Lender::built_in);
       }
       assert!(fas.own_bytes <= 4 << 20, "{} bytes", fas.own_bytes);
     }
@@ -726,7 +743,7 @@ mod tests {
     for number in 1..=count * 32 {
       let fragment = datafrag(number, 1, 1 << 15, data_size, vec![7; 1 << 15]);
       let none = BitFlags::<DATAFRAG_Flags>::empty();
-      let completed = fas.new_datafrag(writer(1), true, &fragment, none, None, lender);
+      let completed = fas.new_datafrag(writer(1), true, &fragment, none, StatedOnce::default(), lender);
       assert_eq!(completed.is_some(), number == count * 32);
       if let Some((data, _)) = completed {
         assert_eq!(data.payload_size(), data_size as usize);
@@ -787,7 +804,7 @@ mod tests {
         let to = (from + usize::from(frag_size)).min(100);
         let fragment = datafrag(number, 1, frag_size, 100, whole[from..to].to_vec());
         assert!(done.is_none());
-        done = fa.new_datafrag(&fragment, BitFlags::empty(), None, &lends());
+        done = fa.new_datafrag(&fragment, BitFlags::empty(), StatedOnce::default(), &lends());
       }
       let (data, _) = done.expect("complete");
       assert_eq!(data.payload_size(), 100);
@@ -800,7 +817,7 @@ mod tests {
   fn nothing_of_an_older_sample_is_left_in_memory_that_is_lent() {
     let mut fa = FragmentAssembler::new(true);
     let mut insert = |fragment: &DataFrag| {
-      fa.new_datafrag(fragment, BitFlags::empty(), None, &lends())
+      fa.new_datafrag(fragment, BitFlags::empty(), StatedOnce::default(), &lends())
         .is_some()
     };
     assert!(!insert(&datafrag(1, 1, 50, 100, vec![1; 50])));
@@ -828,12 +845,12 @@ mod tests {
     let mut fa = FragmentAssembler::new(true);
     let key = datafrag(1, 1, 50, 50, vec![1; 50]);
     let (data, _) = fa
-      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), None, &refuse)
+      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), StatedOnce::default(), &refuse)
       .expect("complete");
     assert!(matches!(data, DDSData::DisposeByKey { .. }));
     let short = datafrag(1, 1, 3, 3, vec![1; 3]);
     assert!(fa
-      .new_datafrag(&short, BitFlags::empty(), None, &refuse)
+      .new_datafrag(&short, BitFlags::empty(), StatedOnce::default(), &refuse)
       .is_none());
   }
 }

@@ -7,7 +7,7 @@ use enumflags2::BitFlags;
 use bytes::Bytes;
 
 use crate::{
-  dds::ddsdata::DDSData,
+  dds::{ddsdata::DDSData, with_key::datawriter::WriteOptions},
   messages::{
     header::Header,
     protocol_id::ProtocolId,
@@ -318,7 +318,11 @@ impl MessageBuilder {
     // When disposing, we also indicate "unregistered", although we do not
     // support whole register/unregister mechanism at all. TODO: Does this
     // make sense?
+    push_instance_change(&mut param_list, &cache_change.write_options);
     match cache_change.data_value {
+      // Said above.
+      _ if cache_change.write_options.instance_change().is_some() => (),
+
       DDSData::Data { .. } => (), // data sample, not dispose
 
       DDSData::DisposeByKey { key_hash, .. } => {
@@ -500,6 +504,8 @@ impl MessageBuilder {
         return self;
       }
     }
+    // With each fragment: a reader may take it from the one that it receives first.
+    push_instance_change(&mut param_list, &cache_change.write_options);
 
     // If we are sending related sample identity, then insert that.
     if let Some(si) = cache_change.write_options.related_sample_identity() {
@@ -758,6 +764,25 @@ impl MessageBuilder {
       },
       submessages: self.submessages,
     }
+  }
+}
+
+// What a sample of a topic with keys tells of its instance, if a raw writer sends it.
+fn push_instance_change(inline_qos: &mut ParameterList, options: &WriteOptions) {
+  let Some(change) = options.instance_change() else {
+    return;
+  };
+  if let Some(key_hash) = change.key_hash {
+    inline_qos.push(Parameter {
+      parameter_id: ParameterId::PID_KEY_HASH,
+      value: key_hash.to_vec(),
+    });
+  }
+  if change.status_info != 0 {
+    inline_qos.push(Parameter {
+      parameter_id: ParameterId::PID_STATUS_INFO,
+      value: vec![0, 0, 0, change.status_info],
+    });
   }
 }
 

@@ -25,7 +25,7 @@ use crate::{
       CountWithChange, DataReaderStatus, DomainParticipantStatusEvent, StatusChannelSender,
     },
     with_key::{
-      datawriter::{WriteOptions, WriteOptionsBuilder},
+      datawriter::{InstanceChange, InstancePayload, WriteOptions, WriteOptionsBuilder},
       simpledatareader::ReaderCommand,
     },
   },
@@ -45,7 +45,9 @@ use crate::{
   network::udp_sender::UDPSender,
   polling::{ReadySender, SharedTimer, WakeReceiver},
   rtps::{
-    constant::ACKNACK_DELAY, fragment_assembler::FragmentAssemblers, message_receiver::MessageReceiverState,
+    constant::ACKNACK_DELAY,
+    fragment_assembler::{FragmentAssemblers, StatedOnce},
+    message_receiver::MessageReceiverState,
     rtps_writer_proxy::RtpsWriterProxy, timed_event::DpTimerEvent, Message,
   },
   structure::{
@@ -704,6 +706,14 @@ impl Reader {
 
     let writer_guid = GUID::new_with_prefix_and_id(mr_state.source_guid_prefix, data.writer_id);
     let writer_seq_num = data.writer_sn; // for borrow checker
+    if let Some(change) = self.instance_change(data.inline_qos.as_ref()) {
+      let payload = match (data_flags.contains(DATA_Flags::Key), &data.serialized_payload) {
+        (_, None) => InstancePayload::Absent,
+        (true, Some(_)) => InstancePayload::Key,
+        (false, Some(_)) => InstancePayload::Data,
+      };
+      write_options_b = write_options_b.instance_change(InstanceChange { payload, ..change });
+    }
 
     match self.data_to_dds_data(data, data_flags) {
       Ok(dds_data) => self.process_received_data(
@@ -777,19 +787,32 @@ impl Reader {
     // Feed to fragment assembler ...
     let writer_seq_num = datafrag.writer_sn; // for borrow checker
     let reliable = self.reliability != policy::Reliability::BestEffort;
+    let instance_change = self.instance_change(datafrag.inline_qos.as_ref());
+    let stated = StatedOnce {
+      source_timestamp: mr_state.source_timestamp,
+      instance_change: instance_change.filter(|change| *change != InstanceChange::default()),
+    };
     let completed_dds_data = self.fragment_assemblers.new_datafrag(
       writer_guid,
       reliable,
       datafrag,
       datafrag_flags,
-      mr_state.source_timestamp,
+      stated,
       || lender(self.my_guid.entity_id, &self.topic_cache),
     );
 
     // ... and continue processing, if data was completed.
-    if let Some((dds_data, source_timestamp)) = completed_dds_data {
-      if let Some(source_timestamp) = source_timestamp {
+    if let Some((dds_data, stated)) = completed_dds_data {
+      if let Some(source_timestamp) = stated.source_timestamp {
         write_options_b = write_options_b.source_timestamp(source_timestamp);
+      }
+      if instance_change.is_some() {
+        let payload = match dds_data {
+          DDSData::Data { .. } => InstancePayload::Data,
+          _ => InstancePayload::Key,
+        };
+        let change = stated.instance_change.unwrap_or_default();
+        write_options_b = write_options_b.instance_change(InstanceChange { payload, ..change });
       }
       self.process_received_data(
         dds_data,
@@ -801,6 +824,14 @@ impl Reader {
     } else {
       self.garbage_collect_fragments();
     }
+  }
+
+  // What a sample tells of its instance but for its payload; None if the topic has no
+  // keys. Built-in readers know their types.
+  fn instance_change(&self, inline_qos: Option<&ParameterList>) -> Option<InstanceChange> {
+    let kind = self.my_guid.entity_id.entity_kind;
+    (kind.is_with_key() && kind.is_user_defined())
+      .then(|| inline_qos.map_or_else(InstanceChange::default, InlineQos::instance_change))
   }
 
   fn garbage_collect_fragments(&mut self) {

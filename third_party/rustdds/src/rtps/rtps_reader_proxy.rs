@@ -499,6 +499,7 @@ impl RtpsReaderProxy {
       // SEDP), so loopback stays in `unicast_locator_list` here; the bucket is
       // only meaningful for proxies used as live send destinations.
       loopback_unicast_locators: Vec::new(),
+      // Cyclone DDS does not match a Reader that expects it.
       expects_in_line_qos: false,
       is_active: true,
       acknacks_while_joining: None,

@@ -24,6 +24,7 @@ use crate::{
     statusevents::{
       CountWithChange, DataWriterStatus, DomainParticipantStatusEvent, StatusChannelSender,
     },
+    with_key::datawriter::InstanceChange,
   },
   messages::submessages::submessages::{AckNack, AckSubmessage},
   network::{udp_sender::UDPSender, util::IfAddr},
@@ -678,8 +679,18 @@ impl Writer {
     // 8.3.8.3.3), so such a sample is sent whole whatever the MTU is.
     budget
       .saturating_sub(hb_reserve)
-      .saturating_sub(DATA_SUBMESSAGE_OVERHEAD)
+      .saturating_sub(DATA_SUBMESSAGE_OVERHEAD + self.inline_qos_bytes())
       .max(FRAGMENT_SIZE)
+  }
+
+  // What the inline QoS of a sample of a topic with keys takes at most.
+  fn inline_qos_bytes(&self) -> usize {
+    let kind = self.my_guid.entity_id.entity_kind;
+    if kind.is_with_key() && kind.is_user_defined() {
+      InstanceChange::MAX_INLINE_QOS_BYTES
+    } else {
+      0
+    }
   }
 
   fn num_frags_and_frag_size(&self, payload_size: usize) -> (u32, u16) {
@@ -2062,7 +2073,7 @@ impl Writer {
       }
       let header_len = part.len_serialized() + INFO_DST_SUBMESSAGE_SIZE;
       let count = frags_per_datafrag(
-        header_len,
+        header_len + self.inline_qos_bytes(),
         budget,
         start,
         fragment_count,
@@ -3187,7 +3198,7 @@ impl<'a> Iterator for FragmentationIter<'a> {
               // *size* is constant (RTPS rule); only the *count* per submessage
               // adapts to the path MTU.
               let k = frags_per_datafrag(
-                message_builder.len_serialized(),
+                message_builder.len_serialized() + writer.inline_qos_bytes(),
                 budget,
                 start,
                 num_frags,

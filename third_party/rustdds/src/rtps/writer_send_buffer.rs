@@ -399,12 +399,8 @@ impl WriterSendBuffer {
     may_block: bool,
   ) -> SequenceNumber {
     let seq = inner.last_seq.plus_1();
-    if let (false, Some(depth), Some(source)) = (
-      shared.volatile,
-      shared.keep_last,
-      write_options.history_source(),
-    ) {
-      inner.history.record(source, seq, depth);
+    if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
+      inner.history.record(&write_options, seq, depth);
     }
     let cc = CacheChange::new(shared.writer_guid, seq, write_options, data);
     inner.retained_bytes += cc.data_value.payload_size();

@@ -171,6 +171,12 @@ impl EntityKind {
     e == 0x02 || e == 0x03 || e == 0x08
   }
 
+  /// Whether it is a reader or a writer of a topic with keys.
+  pub fn is_with_key(&self) -> bool {
+    let e = self.0 & 0x0F;
+    e == 0x02 || e == 0x07
+  }
+
   pub fn is_built_in(&self) -> bool {
     (self.0 & 0xF0) == 0xC0
   }

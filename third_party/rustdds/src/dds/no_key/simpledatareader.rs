@@ -49,6 +49,16 @@ where
     }
   }
 
+  /// For a topic with keys of which the application does not know the type: samples that
+  /// dispose or unregister an instance are decoded as others are, from the key that they
+  /// have as payload, or from nothing.
+  /// [`WriteOptions::instance_change`](crate::WriteOptions::instance_change) tells them apart.
+  pub(crate) fn take_keys_as_data(self) -> Self {
+    Self {
+      keyed_simpledatareader: self.keyed_simpledatareader.take_keys_as_data(),
+    }
+  }
+
   /// From now on samples of the topic that arrive in fragments are put together
   /// in that memory, as far as it lends any. A decoder's
   /// [`decode_lent`](crate::no_key::Decode::decode_lent) may take what this

@@ -13,6 +13,7 @@ use crate::{
   dds::{
     adapters::with_key::SerializerAdapter,
     ddsdata::DDSData,
+    key::KeyHash,
     pubsub::Publisher,
     qos::{
       policy::{Liveliness, Reliability, UserData},
@@ -45,6 +46,7 @@ pub struct WriteOptionsBuilder {
   source_timestamp: Option<Timestamp>,
   to_single_reader: Option<GUID>,
   history_source: Option<GUID>,
+  instance_change: Option<InstanceChange>,
   best_effort_may_block: bool,
 }
 
@@ -59,6 +61,7 @@ impl WriteOptionsBuilder {
       source_timestamp: self.source_timestamp,
       to_single_reader: self.to_single_reader,
       history_source: self.history_source,
+      instance_change: self.instance_change,
       best_effort_may_block: self.best_effort_may_block,
     }
   }
@@ -99,6 +102,14 @@ impl WriteOptionsBuilder {
     self
   }
 
+  /// What the sample of a topic with keys tells of its instance, for a raw writer, which
+  /// does not know the type: it sends this as it is.
+  #[must_use]
+  pub fn instance_change(mut self, change: InstanceChange) -> Self {
+    self.instance_change = Some(change);
+    self
+  }
+
   /// Whether a best-effort `write` call is allowed to block under send-socket
   /// congestion.
   ///
@@ -121,6 +132,57 @@ impl WriteOptionsBuilder {
   }
 }
 
+/// What a sample of a topic with keys tells of its instance (RTPS v2.5 Sections 8.7.4,
+/// 9.6.4.8 and 9.6.4.9), as its writer sends it.
+#[derive(Clone, Copy, Eq, PartialEq, Ord, PartialOrd, Debug, Default)]
+pub struct InstanceChange {
+  /// The PID_KEY_HASH, which a writer need not send.
+  pub key_hash: Option<[u8; 16]>,
+  /// The flags of PID_STATUS_INFO; 0 if the writer sends none.
+  pub status_info: u8,
+  /// What the payload is.
+  pub payload: InstancePayload,
+}
+
+/// What the payload of a sample of a topic with keys is.
+#[derive(Clone, Copy, Eq, PartialEq, Ord, PartialOrd, Debug, Default)]
+pub enum InstancePayload {
+  /// The data.
+  #[default]
+  Data,
+  /// The key alone, of a sample that disposes or unregisters the instance.
+  Key,
+  /// There is none: the key hash tells the instance.
+  Absent,
+}
+
+impl InstanceChange {
+  /// The flag of an instance that is disposed.
+  pub const DISPOSED: u8 = 1;
+  /// The flag of an instance that the writer will not write any more.
+  pub const UNREGISTERED: u8 = 2;
+
+  // What the inline QoS of a sample takes in all: two parameters and the sentinel.
+  pub(crate) const MAX_INLINE_QOS_BYTES: usize = 4 + 16 + 4 + 4 + 4;
+
+  fn wrap(self, payload: SerializedPayload) -> DDSData {
+    let kind = if self.status_info & Self::DISPOSED == 0 {
+      ChangeKind::NotAliveUnregistered
+    } else {
+      ChangeKind::NotAliveDisposed
+    };
+    match (self.payload, self.key_hash) {
+      (InstancePayload::Data, _) => DDSData::new(payload),
+      (InstancePayload::Absent, Some(hash)) => {
+        DDSData::new_disposed_by_key_hash(kind, KeyHash::from_bytes(hash))
+      }
+      (InstancePayload::Key | InstancePayload::Absent, _) => {
+        DDSData::new_disposed_by_key(kind, payload)
+      }
+    }
+  }
+}
+
 /// Type to be used with write_with_options.
 /// Use WriteOptionsBuilder to construct this.
 #[derive(Clone, Eq, PartialEq, Ord, PartialOrd, Debug, Default)]
@@ -130,6 +192,7 @@ pub struct WriteOptions {
   to_single_reader: Option<GUID>,                  /* try to send to one Reader only
                                                     * future extension room fo other fields. */
   history_source: Option<GUID>,
+  instance_change: Option<InstanceChange>,
   // nonblocking-transmit: opt-in blocking back-pressure for best-effort writers.
   // Defaults to `false` (DDS v1.4 section 2.2.2.4.2.11: `write` must not block
   // for best-effort reliability). See `WriteOptionsBuilder::best_effort_may_block`.
@@ -154,6 +217,12 @@ impl WriteOptions {
     self.history_source
   }
 
+  /// What the sample tells of its instance: of a Writer of a topic with keys that a raw
+  /// reader or writer knows.
+  pub fn instance_change(&self) -> Option<InstanceChange> {
+    self.instance_change
+  }
+
   /// Whether a best-effort `write` call is allowed to block under send-socket
   /// congestion (see [`WriteOptionsBuilder::best_effort_may_block`]).
   ///
@@ -173,6 +242,7 @@ impl From<Option<Timestamp>> for WriteOptions {
       source_timestamp,
       to_single_reader: None,
       history_source: None,
+      instance_change: None,
       best_effort_may_block: false,
     }
   }
@@ -409,7 +479,10 @@ where
     let (encoding, options) = SA::output_encapsulation(&data);
     let mut payload = SerializedPayload::new_from_bytes(encoding, send_buffer);
     payload.representation_options = options;
-    let ddsdata = DDSData::new(payload);
+    let ddsdata = match write_options.instance_change() {
+      Some(change) => change.wrap(payload),
+      None => DDSData::new(payload),
+    };
 
     // Admission allocates the sequence number and stores the sample only if the
     // reliable send window has room; otherwise it blocks up to

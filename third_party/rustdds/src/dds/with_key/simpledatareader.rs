@@ -11,6 +11,7 @@ use std::{
   task::{Context, Poll, Waker},
 };
 
+use bytes::Bytes;
 use futures::stream::{FusedStream, Stream};
 use serde::de::DeserializeOwned;
 #[allow(unused_imports)]
@@ -33,9 +34,10 @@ use crate::{
     },
   },
   discovery::discovery::DiscoveryCommand,
+  messages::submessages::elements::serialized_payload::SerializedPayload,
   mio_source::PollEventSource,
   polling::{BoundSender, WakeSender},
-  serialization::CDRDeserializerAdapter,
+  serialization::{CDRDeserializerAdapter, RepresentationIdentifier},
   structure::{
     cache_change::CacheChange,
     dds_cache::TopicCache,
@@ -138,6 +140,9 @@ pub struct SimpleDataReader<D: Keyed, DA: DeserializerAdapter<D> = CDRDeserializ
   // Whether samples of Writers that a Reliable Reader of the topic receives from
   // are left to that Reader.
   ignores_reliable_writers: AtomicBool,
+
+  // Whether the decoder gets a key as it gets data, see `WriteOptions::instance_change`.
+  takes_keys_as_data: bool,
 }
 
 impl<D, DA> Drop for SimpleDataReader<D, DA>
@@ -232,7 +237,13 @@ where
       event_source,
       lends_memory: AtomicBool::new(false),
       ignores_reliable_writers: AtomicBool::new(false),
+      takes_keys_as_data: false,
     })
+  }
+
+  pub(crate) fn take_keys_as_data(mut self) -> Self {
+    self.takes_keys_as_data = true;
+    self
   }
 
   pub(crate) fn ignore_reliable_writers(&self) {
@@ -282,7 +293,20 @@ where
   where
     S: for<'de> Decode<'de, DA::Decoded, DA::DecodedKey, Error = DA::Error>,
   {
-    match cc.data_value {
+    let (absent, as_data);
+    let data_value = match &cc.data_value {
+      DDSData::DisposeByKey { key, .. } if self.takes_keys_as_data => {
+        as_data = DDSData::new(key.clone());
+        &as_data
+      }
+      DDSData::DisposeByKeyHash { .. } if self.takes_keys_as_data => {
+        absent = SerializedPayload::new_from_bytes(RepresentationIdentifier::CDR_LE, Bytes::new());
+        as_data = DDSData::new(absent);
+        &as_data
+      }
+      other => other,
+    };
+    match *data_value {
       DDSData::Data {
         ref serialized_payload,
         ref lent,

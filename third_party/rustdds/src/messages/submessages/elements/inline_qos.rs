@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use log::{debug, error, info, trace, warn};
 
 use crate::{
-  dds::key::KeyHash,
+  dds::{key::KeyHash, with_key::datawriter::InstanceChange},
   messages::submessages::elements::{parameter_list::ParameterList, RepresentationIdentifier},
   serialization::{pl_cdr_adapters::PlCdrDeserializeError, speedy_pl_cdr_helpers::*},
   structure::{cache_change::ChangeKind, parameter_id::ParameterId, rpc::SampleIdentity},
@@ -52,6 +52,26 @@ impl InlineQos {
       Some(p) => Some(KeyHash::from_pl_cdr_bytes(p.value.clone())?),
       None => None,
     })
+  }
+
+  /// What a sample tells of its instance but for its payload.
+  pub fn instance_change(params: &ParameterList) -> InstanceChange {
+    let mut change = InstanceChange::default();
+    for parameter in &params.parameters {
+      match parameter.parameter_id {
+        ParameterId::PID_KEY_HASH => {
+          change.key_hash = <[u8; 16]>::try_from(parameter.value.as_slice()).ok();
+        }
+        // Four octets, whatever the byte order.
+        ParameterId::PID_STATUS_INFO => {
+          change.status_info = parameter.value.get(3).map_or(0, |flags| {
+            flags & (InstanceChange::DISPOSED | InstanceChange::UNREGISTERED)
+          });
+        }
+        _ => {}
+      }
+    }
+    change
   }
 
   pub fn related_sample_identity(
