@@ -56,7 +56,7 @@ mod tests {
     fn what_the_bridge_writes_or_reads_itself_matches_no_pattern() {
         let text = "topics: [{id: all, input_topic: /**, outputs: {video: /out/**}}, \
                     {id: b, input_topic: /scan, critical_output: /x}]\n\
-                    lanes: {video: {class: noncritical, domain_id: 7}}";
+                    lanes: {video: {domain_id: 7}}";
         let settings = parse(text, "f.yaml", &|_| None).unwrap();
         let never = NeverInputs::of(&settings);
         let contains = |topic: &str| never.contains(&TopicName::try_from(topic).unwrap());

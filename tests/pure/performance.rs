@@ -286,7 +286,7 @@ fn targets_are_met_or_missed() {
     let unknown = ("1.04 (1.00 to 96.0)".to_owned(), "not known".to_owned());
     assert_eq!(row("noncritical lane killed / undisturbed"), unknown);
     assert!(!readme.contains("noncritical lane repeat / undisturbed"), "what is no target is one");
-    assert_eq!(row("growth of the memory of ingress"), met("0.00 KiB/h"));
+    assert_eq!(row("growth of the memory of ingress"), met("0.00 (0.00 to 0.00) KiB/h"));
     assert_eq!(row("growth of the memory of critical").1, "**missed**");
     // A case that was not measured has no target.
     assert!(!readme.contains("100 Hz of 2,948 B, other"));

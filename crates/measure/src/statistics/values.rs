@@ -39,7 +39,7 @@ fn sorted(values: &[f64]) -> Vec<f64> {
 /// The growth of a value per unit of time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Growth {
-    /// The median of the slopes between all pairs of points (Theil and Sen), which is robust against outliers.
+    /// The median of the slopes between all pairs of points (Theil and Sen), which outliers do not move.
     pub slope: f64,
     /// The lower end of the slope's 95 % confidence interval (Sen, 1968).
     pub low: f64,
