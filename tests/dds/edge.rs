@@ -635,9 +635,11 @@ fn take_keyed(reader: &RawReader) -> (Vec<u8>, SampleKey) {
 #[test]
 fn what_a_sample_says_of_its_key_passes_unchanged() {
     let (mut here, mut there) = (participant("here", 83), participant("there", 83));
+    let mut elsewhere = participant("elsewhere", 83);
     let keyed = DdsType { has_keys: true, ..TYPE.into() };
     let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
-    let stock = there.create_reader("rt/keyed", TYPE, &qos).unwrap();
+    // Of a participant of its own: readers of one topic of a participant share its samples.
+    let stock = elsewhere.create_reader("rt/keyed", TYPE, &qos).unwrap();
     let reader = there.create_reader("rt/keyed", keyed, &qos).unwrap();
     let writer = here.create_writer("rt/keyed", keyed, &QosProfile::CRITICAL, 64).unwrap();
     wait_for_reader(&writer);

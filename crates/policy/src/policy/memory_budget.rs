@@ -44,8 +44,8 @@ struct Pool {
 
 /// The shared memory that the pools of all routes may take together, and what each has taken.
 ///
-/// No route can take what another one needs: its reserve and, once its samples are known, room for
-/// [`KEPT_SAMPLES`] of the largest, up to an equal share of the budget.
+/// No route can take what another one needs: its reserve and, once its samples are known, room for three
+/// of the largest, up to an equal share of the budget.
 #[derive(Clone, Debug)]
 pub struct MemoryBudget {
     limit_bytes: u64,
