@@ -1660,7 +1660,7 @@ mod tests {
   use crate::{
     dds::{qos::policy::Reliability, statusevents::sync_status_channel, typedesc::TypeDesc},
     polling::{new_shared_timer, wake_channel, LoopWaker},
-    structure::{dds_cache::DDSCache, guid::EntityKind},
+    structure::{dds_cache::DDSCache, duration::Duration, guid::EntityKind},
     QosPolicyBuilder,
   };
   use super::*;
