@@ -493,7 +493,7 @@ impl Output {
 
     /// Writes a sample that was forwarded before a restart again, for late joiners.
     fn restore(&mut self, sample: &ShmSample) {
-        if self.topic.is_former(sample.header().sequence) {
+        if self.topic.is_former(sample.header().sequence) || sample.header().key.is_keyed() != self.has_keys {
             return;
         }
         let Some(history) = &mut self.history else { return };
@@ -502,7 +502,6 @@ impl Output {
         let kept = history.kept(&payload, header);
         if kept.is_none()
             && let Some(writer) = &self.writer
-            && header.key.is_keyed() == self.has_keys
         {
             let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
             let written = writer.write_from(Some(publisher), payload, encapsulation, timestamp, header.key);

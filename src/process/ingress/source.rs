@@ -63,13 +63,12 @@ impl Source {
         })
     }
 
-    /// Whether this type has keys: `current` as long as a publisher announces that, or there is none; else
-    /// what the first publisher announces.
+    /// Whether this type has keys: if all present publishers announce that, or `current` if there is none. So
+    /// no announcement with keys takes a route from publishers of a stock ROS 2 type, which has none.
     pub fn has_keys(&self, dds_type: &str, current: bool) -> bool {
         let writers = self.writers.iter().filter(|writer| writer.dds_type == dds_type);
-        let mut kinds = writers.map(|writer| writer.guid.has_keys());
-        let first = kinds.clone().next().unwrap_or(current);
-        if kinds.any(|has_keys| has_keys == current) { current } else { first }
+        let mut kinds = writers.map(|writer| writer.guid.has_keys()).peekable();
+        if kinds.peek().is_none() { current } else { kinds.all(|has_keys| has_keys) }
     }
 
     /// The hash of this type: `current` as long as a publisher announces it, or none announces any; else that
@@ -287,21 +286,21 @@ mod tests {
         assert_eq!([true, false].map(|last| source.has_keys("T", last)), [true, false]);
         source.insert(&keyed(1, reliable));
         assert_eq!([true, false].map(|last| source.has_keys("T", last)), [true, true]);
-        // One without keys that comes later gets no reader, and is the one that is named.
+        // One without keys gets the reader, whenever it comes, and the other one is named.
         source.insert(&writer(3, "T", Reliability::BestEffort, volatile));
-        assert!(source.has_keys("T", true));
-        assert_eq!(
-            durabilities(source.plan(None, true, &InputQos::default(), 1 << 20)),
-            [Some(volatile), None]
-        );
-        let other = source.find_other_type(DdsType { has_keys: true, .."T".into() });
-        assert_eq!(other.map(|writer| writer.guid), Some(Guid([3; 16])));
-        // When those with keys are gone, it gets one.
-        source.remove(keyed(1, reliable).guid);
-        assert!(!source.has_keys("T", true));
+        assert_eq!([true, false].map(|last| source.has_keys("T", last)), [false, false]);
         assert_eq!(
             durabilities(source.plan(None, true, &InputQos::default(), 1 << 20)),
             [None, Some(volatile)]
+        );
+        let other = source.find_other_type("T".into());
+        assert_eq!(other.map(|writer| writer.guid), Some(keyed(1, reliable).guid));
+        // When it is gone, the one with keys gets it again.
+        source.remove(Guid([3; 16]));
+        assert_eq!([true, false].map(|last| source.has_keys("T", last)), [true, true]);
+        assert_eq!(
+            durabilities(source.plan(None, false, &InputQos::default(), 1 << 20)),
+            [Some(volatile), None]
         );
     }
 

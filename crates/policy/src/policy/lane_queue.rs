@@ -133,10 +133,15 @@ impl<T> LaneQueue<T> {
         stamps: SampleStamps,
         mut on_drop: impl FnMut(T, SampleStamps, DropReason),
     ) {
+        // If one of two samples does not tell its key, they may have the same one: data does not pass the end
+        // of such a key.
+        let may_pass = |waiting: &SampleStamps| {
+            waiting.key.hash() != stamps.key.hash()
+                && !(waiting.key.is_end() && (waiting.key.hash().is_none() || stamps.key.hash().is_none()))
+        };
         if stamps.key.is_keyed()
             && self.policy == DropPolicy::DropOldest
-            && let Some(waiting) =
-                self.waiting.iter_mut().rev().find(|(_, waiting)| waiting.key.hash() == stamps.key.hash())
+            && let Some(waiting) = self.waiting.iter_mut().rev().find(|(_, waiting)| !may_pass(waiting))
             && waiting.1.is_superseded_by(&stamps)
         {
             let (superseded, its_stamps) = core::mem::replace(waiting, (item, stamps));
@@ -144,7 +149,9 @@ impl<T> LaneQueue<T> {
             return;
         }
         if self.waiting.len() >= self.limit {
-            if self.policy == DropPolicy::DropLatest && !stamps.key.is_end() {
+            // An end of a key is not dropped for data.
+            let only_ends = || self.waiting.iter().all(|(_, waiting)| waiting.key.is_end());
+            if !stamps.key.is_end() && (self.policy == DropPolicy::DropLatest || only_ends()) {
                 on_drop(item, stamps, DropReason::QueueFull);
                 return;
             }
@@ -462,6 +469,14 @@ mod tests {
             offer_keyed(&mut bench, sequence, key, 0);
         }
         assert_eq!(bench.dropped[3..], [(8, DropReason::QueueFull)]);
+        // Data does not pass an end that may be of the same key: the key would stay ended.
+        for keys in [[0, 1, 0], [1, 0, 1]] {
+            let mut bench = Bench::new(DropPolicy::DropOldest, &[]);
+            for (sequence, key, status_info) in [(1, keys[0], 0), (2, keys[1], 1), (3, keys[2], 0)] {
+                offer_keyed(&mut bench, sequence, key, status_info);
+            }
+            assert_eq!([1, 2, 3].map(|_| bench.take(&allowance(9))), [Some(1), Some(2), Some(3)]);
+        }
         // Those without a hash count as of one key.
         let mut bench = Bench::new(DropPolicy::DropOldest, &[]);
         for sequence in 1..=3 {
@@ -488,6 +503,8 @@ mod tests {
                 offer_keyed(&mut bench, sequence, sequence as u8, 3);
             }
             assert_eq!(bench.dropped[2..], [(5, DropReason::QueueFull)], "{policy:?}");
+            offer_keyed(&mut bench, 9, 9, 0);
+            assert_eq!(bench.dropped[3..], [(9, DropReason::QueueFull)], "{policy:?}: data for an end");
         }
     }
 }

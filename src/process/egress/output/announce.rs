@@ -37,14 +37,18 @@ impl Output {
     }
 
     /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
-    /// match no such publisher either, so nothing that they could get is lost; what is not sent yet is sent
-    /// first.
+    /// match no such publisher either. What is not sent yet is sent first; what a reader that was out of reach
+    /// has not acknowledged counts as unconfirmed.
     fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
         if has_keys != self.has_keys
             && !self.count_sent()
             && let Some(former) = self.writer.take()
         {
+            let behind = self.readers.get().unconfirmed(self.counters.get());
             self.remove_writer(former, participant);
+            self.counters.update(|counters| {
+                counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
+            });
             self.history = self.offer.history();
         }
     }
