@@ -13,7 +13,7 @@ use nix::errno::Errno;
 use nix::fcntl::{FallocateFlags, fallocate};
 use nix::sys::sysinfo::sysinfo;
 
-use super::channel::{PAGE_BYTES, PoolSize, RouteChannel, SLOT_HEADER_BYTES};
+use super::channel::{LOANED_SLOTS, PoolSize, RouteChannel, SLOT_HEADER_BYTES, page_bytes};
 use super::error::ShmError;
 use super::root::SHM_DIR;
 use super::segment::{free_bytes, no_room};
@@ -21,9 +21,11 @@ use crate::config::Settings;
 use crate::model::TrafficClass;
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
-/// The budget if the configuration sets none: this, or an eighth of the machine's memory if that is less.
-pub const DEFAULT_BUDGET_BYTES: u64 = 256 << 20;
-const DEFAULT_BUDGET_DIVISOR: u64 = 8;
+/// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less, which
+/// is half of what `/dev/shm` has by default. Nothing is allocated for it, so it only bounds what a stalled lane
+/// may hold: two stalled lanes with five cameras of 6 MB hold 1.6 GiB.
+pub const DEFAULT_BUDGET_BYTES: u64 = 2 << 30;
+const DEFAULT_BUDGET_DIVISOR: u64 = 4;
 
 /// Why a slot gets no memory for its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -37,6 +39,9 @@ pub enum NoMemory {
     /// The file system has no room.
     #[error("/dev/shm is full")]
     FileSystem,
+    /// The kernel refused.
+    #[error("cannot allocate shared memory: {0}")]
+    System(Errno),
     /// The pool is not where it should be.
     #[error("the slot is outside of its pool")]
     NoSuchSlot,
@@ -71,7 +76,7 @@ impl PoolBudget {
                 lane.class() == TrafficClass::Critical
                     && lane.outputs.iter().any(|output| output.route == index)
             });
-            demand_of(&RouteChannel::of(settings, index).pool_size(), is_critical)
+            demand_of(&RouteChannel::of(settings, index), is_critical)
         };
         let demands: Vec<_> = (0..settings.routes.len()).map(demand).collect();
         Arc::new(Self { state: Mutex::new(MemoryBudget::new(budget_bytes(settings), &demands)) })
@@ -79,7 +84,7 @@ impl PoolBudget {
 
     /// A budget for pools of the critical lane.
     pub fn of_channels(channels: &[RouteChannel], bytes: u64) -> Arc<Self> {
-        let demand = |channel: &RouteChannel| demand_of(&channel.pool_size(), true);
+        let demand = |channel: &RouteChannel| demand_of(channel, true);
         let demands: Vec<_> = channels.iter().map(demand).collect();
         Arc::new(Self { state: Mutex::new(MemoryBudget::new(bytes, &demands)) })
     }
@@ -99,8 +104,10 @@ impl PoolBudget {
     }
 }
 
-fn demand_of(pool: &PoolSize, is_critical: bool) -> PoolDemand {
-    PoolDemand { first_bytes: pool.first_bytes, most_bytes: pool.bytes, is_critical }
+fn demand_of(channel: &RouteChannel, is_critical: bool) -> PoolDemand {
+    let pool = channel.pool_size();
+    let steady_samples = (channel.retained_samples + LOANED_SLOTS + 1) as u64;
+    PoolDemand { first_bytes: pool.first_bytes, most_bytes: pool.bytes, steady_samples, is_critical }
 }
 
 /// The budget of the configuration, or the default on this machine.
@@ -153,7 +160,7 @@ impl SlotMemory {
         let length = file.metadata().map_err(|error| failure(error.to_string()))?.len();
         let first_offset = (first_address - mapping.start) as u64 + mapping.offset;
         let end = first_offset + pool.slots as u64 * pool.stride_bytes;
-        if first_offset + SLOT_HEADER_BYTES as u64 > PAGE_BYTES || end > length {
+        if first_offset + SLOT_HEADER_BYTES as u64 > page_bytes() || end > length {
             return Err(failure(format!("its first slot is at {first_offset}, it has {length} bytes")));
         }
         let pages = if pool.is_sparse { 1 } else { u32::MAX };
@@ -168,7 +175,7 @@ impl SlotMemory {
                 slots.allocate(slot, 0, 1).map_err(no_room)?;
             }
             // The end of the last slot shares its page with the free list.
-            let tail = (end / PAGE_BYTES) * PAGE_BYTES;
+            let tail = (end / page_bytes()) * page_bytes();
             allocate(&slots.file, tail, length - tail).map_err(no_room)?;
         } else {
             allocate(&slots.file, 0, length).map_err(no_room)?;
@@ -194,31 +201,31 @@ impl SlotMemory {
             return Err(NoMemory::NoSuchSlot);
         };
         let present = pages.load(Ordering::Relaxed);
-        let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(PAGE_BYTES) as u32;
+        let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(page_bytes()) as u32;
         // What lies beyond the pages of this slot is on the first page of the next one, or of the free list.
-        let most = (self.pool.stride_bytes / PAGE_BYTES) as u32;
+        let most = (self.pool.stride_bytes / page_bytes()) as u32;
         if needed.min(most) <= present {
             return Ok(());
         }
         let wanted = size_class(needed).min(most);
-        let more = u64::from(wanted - present) * PAGE_BYTES;
-        self.budget.lock().take(self.route, more, u64::from(wanted) * PAGE_BYTES).map_err(|refusal| {
+        let more = u64::from(wanted - present) * page_bytes();
+        self.budget.lock().take(self.route, more, u64::from(wanted) * page_bytes()).map_err(|refusal| {
             match refusal {
                 BudgetRefusal::Quota => NoMemory::Quota,
                 BudgetRefusal::Budget => NoMemory::Budget,
             }
         })?;
-        if self.allocate(slot, present, wanted).is_err() {
+        if let Err(errno) = self.allocate(slot, present, wanted) {
             self.budget.lock().give_back(self.route, more);
-            return Err(NoMemory::FileSystem);
+            return Err(if errno == Errno::ENOSPC { NoMemory::FileSystem } else { NoMemory::System(errno) });
         }
         pages.store(wanted, Ordering::Relaxed);
         Ok(())
     }
 
     fn allocate(&self, slot: usize, from_page: u32, to_page: u32) -> nix::Result<()> {
-        let first = slot as u64 * self.pool.stride_bytes + u64::from(from_page) * PAGE_BYTES;
-        allocate(&self.file, first, u64::from(to_page - from_page) * PAGE_BYTES)
+        let first = slot as u64 * self.pool.stride_bytes + u64::from(from_page) * page_bytes();
+        allocate(&self.file, first, u64::from(to_page - from_page) * page_bytes())
     }
 }
 

@@ -1,5 +1,6 @@
 //! The channel of a route: one publisher (ingress), the lanes and taps as subscribers, a pool of slots.
 
+use std::sync::OnceLock;
 use std::thread;
 use std::time::Duration;
 
@@ -10,6 +11,8 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::header::publish_subscribe::Header as IceoryxHeader;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+use nix::unistd::{SysconfVar, sysconf};
 
 use super::error::ShmError;
 use super::header::WireHeader;
@@ -68,8 +71,15 @@ pub struct RouteChannel {
     pub retained_samples: usize,
 }
 
-/// The unit in which the kernel allocates a file in shared memory.
-pub(super) const PAGE_BYTES: u64 = 4096;
+/// The size of a page of memory: 4 KiB, or 16 or 64 KiB on some computers with arm64. Pages are what a file in
+/// shared memory consists of.
+pub(super) fn page_bytes() -> u64 {
+    static PAGE_BYTES: OnceLock<u64> = OnceLock::new();
+    *PAGE_BYTES.get_or_init(|| match sysconf(SysconfVar::PAGE_SIZE) {
+        Ok(Some(bytes)) => bytes.unsigned_abs(),
+        _ => 4096,
+    })
+}
 
 /// The layout of a slot in iceoryx2: its header, the bridge's header, the payload, each aligned, and the slot
 /// aligned to the largest of them.
@@ -125,14 +135,14 @@ impl RouteChannel {
         let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
         let slots = lanes + self.max_taps * share(TAP) + self.retained_samples + LOANED_SLOTS;
         let stride = (SLOT_HEADER_BYTES + self.max_sample_bytes).next_multiple_of(SLOT_ALIGN) as u64;
-        let is_sparse = stride > PAGE_BYTES;
+        let is_sparse = stride > page_bytes();
         // Each slot begins at the same place of a page, so that its header is on one page.
-        let stride_bytes = if is_sparse { stride.next_multiple_of(PAGE_BYTES) } else { stride };
+        let stride_bytes = if is_sparse { stride.next_multiple_of(page_bytes()) } else { stride };
         // In addition, a free list of 4 bytes for each slot, and the description of the segment.
         let of_slots =
-            |slot_bytes: u64| (slots as u64 * (slot_bytes + 4) + 1024).next_multiple_of(PAGE_BYTES);
+            |slot_bytes: u64| (slots as u64 * (slot_bytes + 4) + 1024).next_multiple_of(page_bytes());
         let bytes = of_slots(stride_bytes);
-        let first_bytes = if is_sparse { of_slots(PAGE_BYTES) } else { bytes };
+        let first_bytes = if is_sparse { of_slots(page_bytes()) } else { bytes };
         PoolSize { slots, stride_bytes, is_sparse, first_bytes, bytes }
     }
 

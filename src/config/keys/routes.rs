@@ -248,7 +248,7 @@ pub(super) const ROWS: &[Row] = &[
     restarts(
         &["shared_memory.budget_bytes"],
         Whole(1_048_576, 1_099_511_627_776, " bytes"),
-        "268435456, or an eighth of the machine's memory if that is less",
+        "2147483648, or a quarter of the machine's memory if that is less",
     )
     .doc(
         "The most shared memory that the samples of all routes take together. A route takes what its samples \

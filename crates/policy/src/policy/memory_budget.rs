@@ -7,10 +7,6 @@ const CRITICAL_RESERVE_BYTES: u64 = 1 << 20;
 /// What a pool on noncritical lanes alone can always take.
 const NONCRITICAL_RESERVE_BYTES: u64 = 256 << 10;
 
-/// The largest samples of a route for which room is withheld from other routes: one that ingress fills, one
-/// that the lanes hold, and one that waits.
-const KEPT_SAMPLES: u64 = 3;
-
 /// Why a pool gets no more shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BudgetRefusal {
@@ -27,6 +23,10 @@ pub struct PoolDemand {
     pub first_bytes: u64,
     /// What it takes if each slot has the largest sample.
     pub most_bytes: u64,
+    /// The samples of a steady flow: those that are retained, those that ingress fills, and one that waits. A
+    /// retained sample leaves its slot only when the next one is published, so with fewer a route that is
+    /// refused memory never gets any.
+    pub steady_samples: u64,
     /// Whether the critical lane serves the route.
     pub is_critical: bool,
 }
@@ -40,12 +40,20 @@ struct Pool {
     reserve_bytes: u64,
     largest_bytes: u64,
     most_bytes: u64,
+    steady_samples: u64,
+}
+
+impl Pool {
+    /// What a steady flow of the largest sample needs, with what the pool has at the start.
+    fn steady_bytes(&self) -> u64 {
+        self.first_bytes.saturating_add(self.largest_bytes.saturating_mul(self.steady_samples))
+    }
 }
 
 /// The shared memory that the pools of all routes may take together, and what each has taken.
 ///
-/// No route can take what another one needs: its reserve and, once its samples are known, room for three
-/// of the largest, up to an equal share of the budget.
+/// No route can take what another one needs: its reserve and, once its samples are known, room for a steady
+/// flow of the largest, up to an equal share of the budget. If all pools fit the budget, nothing is refused.
 #[derive(Clone, Debug)]
 pub struct MemoryBudget {
     limit_bytes: u64,
@@ -74,12 +82,15 @@ impl MemoryBudget {
                 reserve_bytes: one.first_bytes.saturating_add(reserve.min(share_bytes / 2)),
                 largest_bytes: 0,
                 most_bytes: one.most_bytes,
+                steady_samples: one.steady_samples,
             }
         });
+        let most_bytes = demands.iter().fold(0_u64, |sum, one| sum.saturating_add(one.most_bytes));
+        let has_quota = demands.len() > 1 && most_bytes > limit_bytes;
         Self {
             limit_bytes,
             share_bytes,
-            quota_bytes: if demands.len() > 1 { free_bytes / 2 } else { free_bytes },
+            quota_bytes: if has_quota { free_bytes / 2 } else { free_bytes },
             used_bytes,
             peak_bytes: used_bytes,
             pools: pools.collect(),
@@ -95,10 +106,11 @@ impl MemoryBudget {
         pool.largest_bytes = pool.largest_bytes.max(sample_bytes);
         let used = pool.used_bytes.saturating_add(bytes);
         let in_reserve = used <= pool.reserve_bytes;
-        let over_quota = used.saturating_sub(pool.first_bytes) > self.quota_bytes;
+        let over_quota =
+            used.saturating_sub(pool.first_bytes) > self.quota_bytes && used > pool.steady_bytes();
         let withheld = |(index, pool): (usize, &Pool)| {
-            let kept = pool.largest_bytes.saturating_mul(KEPT_SAMPLES).min(self.share_bytes);
-            let kept = pool.first_bytes.saturating_add(kept).max(pool.reserve_bytes).min(pool.most_bytes);
+            let kept = pool.steady_bytes().min(pool.first_bytes.saturating_add(self.share_bytes));
+            let kept = kept.max(pool.reserve_bytes).min(pool.most_bytes);
             if index == route { 0 } else { kept.saturating_sub(pool.used_bytes) }
         };
         // What the others need does not count against the reserve, which was withheld from them.
@@ -153,7 +165,13 @@ mod tests {
     const MIB: u64 = 1 << 20;
 
     fn critical(count: usize) -> Vec<PoolDemand> {
-        vec![PoolDemand { first_bytes: 480 << 10, most_bytes: 2_000 * MIB, is_critical: true }; count]
+        let demand = PoolDemand {
+            first_bytes: 480 << 10,
+            most_bytes: 2_000 * MIB,
+            steady_samples: 3,
+            is_critical: true,
+        };
+        vec![demand; count]
     }
 
     /// Takes memory for samples of that size until there is none, and returns their number and why.
@@ -189,7 +207,7 @@ mod tests {
         budget.take(1, 6 * MIB, 6 * MIB).unwrap();
         let (count, refusal) = fill(&mut budget, 0, 6 * MIB);
         assert_eq!((count, refusal), (21, Quota));
-        for _ in 1..KEPT_SAMPLES {
+        for _ in 1..3 {
             budget.take(1, 6 * MIB, 6 * MIB).unwrap();
         }
         for other in 2..8 {
@@ -219,6 +237,26 @@ mod tests {
         fill(&mut others, 0, 4 << 10);
         fill(&mut others, 2, 4 << 10);
         assert_eq!(fill(&mut others, 1, 4 << 10), (64, Budget));
+    }
+
+    #[test]
+    fn nothing_is_refused_if_all_pools_fit_the_budget() {
+        let mut demands = critical(3);
+        demands.iter_mut().for_each(|one| one.most_bytes = 85 * MIB);
+        let mut budget = MemoryBudget::new(256 * MIB, &demands);
+        for route in 0..3 {
+            for _ in 0..42 {
+                budget.take(route, 2 * MIB, 2 * MIB).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn a_route_has_room_for_its_steady_flow_although_that_exceeds_the_quota() {
+        let mut demands = critical(2);
+        demands[0].steady_samples = 12;
+        let mut budget = MemoryBudget::new(100 * MIB, &demands);
+        assert_eq!(fill(&mut budget, 0, 6 * MIB), (12, Quota));
     }
 
     #[test]
