@@ -21,9 +21,9 @@ use crate::config::Settings;
 use crate::model::TrafficClass;
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
-/// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less, which
-/// is half of what `/dev/shm` has by default. Nothing is allocated for it, so it only bounds what a stalled lane
-/// may hold: two stalled lanes with five cameras of 6 MB hold 1.6 GiB.
+/// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less,
+/// which is half of what `/dev/shm` has by default. Nothing is allocated for it: it only bounds what stalled
+/// lanes may hold. Two stalled lanes with five cameras of 6 MB hold 1.6 GiB.
 pub const DEFAULT_BUDGET_BYTES: u64 = 2 << 30;
 const DEFAULT_BUDGET_DIVISOR: u64 = 4;
 

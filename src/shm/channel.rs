@@ -71,8 +71,8 @@ pub struct RouteChannel {
     pub retained_samples: usize,
 }
 
-/// The size of a page of memory: 4 KiB, or 16 or 64 KiB on some computers with arm64. Pages are what a file in
-/// shared memory consists of.
+/// The size of a page of memory: 4 KiB, or 16 or 64 KiB on some computers with arm64. A file in shared memory
+/// consists of pages.
 pub(super) fn page_bytes() -> u64 {
     static PAGE_BYTES: OnceLock<u64> = OnceLock::new();
     *PAGE_BYTES.get_or_init(|| match sysconf(SysconfVar::PAGE_SIZE) {

@@ -37,8 +37,8 @@ impl Output {
     }
 
     /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
-    /// match no such publisher either. What is not sent yet is sent first; what a reader that was out of reach
-    /// has not acknowledged counts as unconfirmed.
+    /// match no such publisher either. What is not sent yet is sent first; what a reader that was out of
+    /// reach has not acknowledged counts as unconfirmed.
     fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
         if has_keys != self.has_keys
             && !self.count_sent()
