@@ -88,39 +88,45 @@ impl Message {
         .sum::<usize>();
 
     let mut buf = Vec::with_capacity(total);
-    self.header.write_to_stream_with_ctx(endianness, &mut buf)?;
-    for sm in &self.submessages {
-      // Mirror the generic Submessage::write_to exactly: the submessage header
-      // is written in the message endianness, the body in its own endianness.
-      sm.header.write_to_stream_with_ctx(endianness, &mut buf)?;
-      let body_endianness = endianness_flag(sm.header.flags);
-      sm.body
-        .write_to_stream_with_ctx(body_endianness, &mut buf)?;
-    }
+    self.write_first(&self.submessages, endianness, &mut buf)?;
     debug_assert_eq!(buf.len(), total);
     Ok(buf)
   }
 
+  // Writes the header and the first submessages.
+  fn write_first(
+    &self,
+    submessages: &[Submessage],
+    endianness: Endianness,
+    buf: &mut Vec<u8>,
+  ) -> Result<(), speedy::Error> {
+    self.header.write_to_stream_with_ctx(endianness, &mut *buf)?;
+    for sm in submessages {
+      // Mirror the generic Submessage::write_to exactly: the submessage header
+      // is written in the message endianness, the body in its own endianness.
+      sm.header.write_to_stream_with_ctx(endianness, &mut *buf)?;
+      let body_endianness = endianness_flag(sm.header.flags);
+      sm.body
+        .write_to_stream_with_ctx(body_endianness, &mut *buf)?;
+    }
+    Ok(())
+  }
+
   /// Serializes this message without copying the fragments with which it ends.
   pub(crate) fn write_in_pieces(&self, endianness: Endianness) -> Result<Pieces, speedy::Error> {
-    let (last, others, fragments) = match self.submessages.split_last() {
-      Some((last, others)) => match &last.body {
-        SubmessageBody::Writer(WriterSubmessage::DataFrag(fragments, _))
-          if fragments.serialized_payload.len() >= MIN_SEPARATE_BYTES =>
-        {
-          (last, others, fragments)
-        }
-        _ => return self.write_to_vec_fast(endianness).map(Pieces::whole),
-      },
-      None => return self.write_to_vec_fast(endianness).map(Pieces::whole),
+    let with_fragments = self.submessages.split_last().and_then(|(last, others)| match &last.body {
+      SubmessageBody::Writer(WriterSubmessage::DataFrag(fragments, _))
+        if fragments.serialized_payload.len() >= MIN_SEPARATE_BYTES =>
+      {
+        Some((last, others, fragments))
+      }
+      _ => None,
+    });
+    let Some((last, others, fragments)) = with_fragments else {
+      return self.write_to_vec_fast(endianness).map(Pieces::whole);
     };
     let mut head = Vec::with_capacity(256);
-    self.header.write_to_stream_with_ctx(endianness, &mut head)?;
-    for sm in others {
-      sm.header.write_to_stream_with_ctx(endianness, &mut head)?;
-      sm.body
-        .write_to_stream_with_ctx(endianness_flag(sm.header.flags), &mut head)?;
-    }
+    self.write_first(others, endianness, &mut head)?;
     last.header.write_to_stream_with_ctx(endianness, &mut head)?;
     FragmentsHead(fragments)
       .write_to_stream_with_ctx(endianness_flag(last.header.flags), &mut head)?;
