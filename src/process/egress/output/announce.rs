@@ -37,27 +37,26 @@ impl Output {
     }
 
     /// Removes a writer of a type without keys when the publishers have keys, or the reverse. Its readers
-    /// match no such publisher either. What is not sent yet is sent first; what a reader that was out of
-    /// reach has not acknowledged counts as unconfirmed.
+    /// match no such publisher either. What is not sent yet is sent first.
     fn follow_kind(&mut self, participant: &mut Participant, has_keys: bool) {
         if has_keys != self.has_keys
             && !self.count_sent()
             && let Some(former) = self.writer.take()
         {
-            let behind = self.readers.get().unconfirmed(self.counters.get());
             self.remove_writer(former, participant);
-            self.counters.update(|counters| {
-                counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
-            });
             self.history = self.offer.history();
         }
     }
 
-    /// Drops a writer, whose readers leave with it.
+    /// Drops a writer, whose readers leave with it: what they have not acknowledged counts as unconfirmed.
     fn remove_writer(&mut self, writer: RawWriter, participant: &mut Participant) {
         self.unmatched.clear();
+        let behind = self.readers.get().unconfirmed(self.counters.get());
         self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
-        self.counters.update(|counters| counters.readers = 0);
+        self.counters.update(|counters| {
+            counters.readers = 0;
+            counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
+        });
         self.overrun.count(&writer, &mut self.counters);
         self.overrun = Overrun::default();
         let guid = writer.guid();
@@ -77,14 +76,10 @@ impl Output {
     pub(super) fn follow_topic(&mut self, participant: &mut Participant) {
         let Some(info) = self.boards.route_info(self.route) else { return };
         let Some(topic) = self.topic.next(&info) else { return };
-        // The former topic has had no publisher for a while, but a reader that was out of reach may not have
-        // acknowledged its last samples.
         self.count_sent();
-        let behind = self.readers.get().unconfirmed(self.counters.get());
         let unsent = self.unsent.clear() as u64;
         let queued = self.queued;
         self.counters.update(|counters| {
-            counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
             counters.drops.add(DropReason::NoWriter, unsent);
             counters.waiting = queued;
         });
