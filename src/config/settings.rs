@@ -70,6 +70,12 @@ impl Settings {
         self.node_name.as_ref().map_or_else(|| process.to_owned(), |name| format!("{name}_{process}"))
     }
 
+    /// Whether the critical lane serves a route.
+    pub fn is_critical(&self, route: usize) -> bool {
+        let mut lanes = self.lanes.iter().filter(|lane| lane.class() == TrafficClass::Critical);
+        lanes.any(|lane| lane.outputs.iter().any(|output| output.route == route))
+    }
+
     /// The lane with that name.
     pub fn lane(&self, name: &LaneName) -> Option<&Lane> {
         self.lanes.iter().find(|lane| lane.name == *name)
@@ -203,6 +209,22 @@ impl OutputTopic {
         match self {
             Self::Topic(topic) => Some(topic.clone()),
             Self::Prefix(prefix) => prefix.output_of(input?),
+        }
+    }
+
+    /// The topic; `None` if it depends on the input topic.
+    pub const fn topic(&self) -> Option<&TopicName> {
+        match self {
+            Self::Topic(topic) => Some(topic),
+            Self::Prefix(_) => None,
+        }
+    }
+
+    /// What is before the input topic, if it depends on that.
+    pub const fn prefix(&self) -> Option<&TopicPrefix> {
+        match self {
+            Self::Topic(_) => None,
+            Self::Prefix(prefix) => Some(prefix),
         }
     }
 }

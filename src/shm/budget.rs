@@ -18,7 +18,6 @@ use super::error::ShmError;
 use super::root::SHM_DIR;
 use super::segment::{free_bytes, no_room};
 use crate::config::Settings;
-use crate::model::TrafficClass;
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
 /// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less,
@@ -71,13 +70,7 @@ pub struct PoolBudget {
 impl PoolBudget {
     /// The budget of the configured routes.
     pub fn of(settings: &Settings) -> Arc<Self> {
-        let demand = |index| {
-            let is_critical = settings.lanes.iter().any(|lane| {
-                lane.class() == TrafficClass::Critical
-                    && lane.outputs.iter().any(|output| output.route == index)
-            });
-            demand_of(&RouteChannel::of(settings, index), is_critical)
-        };
+        let demand = |index| demand_of(&RouteChannel::of(settings, index), settings.is_critical(index));
         let demands: Vec<_> = (0..settings.routes.len()).map(demand).collect();
         Arc::new(Self { state: Mutex::new(MemoryBudget::new(budget_bytes(settings), &demands)) })
     }

@@ -122,6 +122,7 @@ impl EndpointMonitor {
     ) -> Result<Self, RoleError> {
         let (_, network_of_lane) = networks(settings);
         let mut watched = Vec::with_capacity(participants.len());
+        let never_inputs = Rc::new(NeverInputs::of(settings));
         for (network, participant) in participants.iter().enumerate() {
             let mut guarded = Vec::new();
             let mut outputs = BTreeSet::new();
@@ -133,11 +134,12 @@ impl EndpointMonitor {
                     guarded.push(GuardedTopic {
                         topic: topic.clone(),
                         guarded: Guarded::Input,
-                        alternative: noncritical_output(settings, route),
+                        alternative: noncritical_output(settings, route)
+                            .and_then(OutputTopic::topic)
+                            .cloned(),
                     });
                 }
             }
-            let never_inputs = Rc::new(NeverInputs::of(settings));
             let mut patterns: Vec<_> = settings
                 .patterns
                 .iter()
@@ -162,7 +164,9 @@ impl EndpointMonitor {
                         guarded.push(GuardedTopic {
                             topic: topic.clone(),
                             guarded: Guarded::CriticalOutput,
-                            alternative: noncritical_output(settings, output.route),
+                            alternative: noncritical_output(settings, output.route)
+                                .and_then(OutputTopic::topic)
+                                .cloned(),
                         });
                     }
                 }
@@ -387,13 +391,11 @@ impl WatchedNetwork {
     }
 }
 
-fn noncritical_output(settings: &Settings, route: usize) -> Option<TopicName> {
+/// The output of a route that hosts other than this one should read.
+fn noncritical_output(settings: &Settings, route: usize) -> Option<&OutputTopic> {
     let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
     let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
-    match &outputs.find(|output| output.route == route)?.topic {
-        OutputTopic::Topic(topic) => Some(topic.clone()),
-        OutputTopic::Prefix(_) => None,
-    }
+    outputs.find(|output| output.route == route).map(|output| &output.topic)
 }
 
 /// A pattern without its outputs.
@@ -403,17 +405,12 @@ fn watched_pattern(
     never_inputs: &Rc<NeverInputs>,
     has_inputs: bool,
 ) -> WatchedPattern {
-    let noncritical = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Noncritical);
-    let mut outputs = noncritical.flat_map(|lane| &lane.outputs);
-    let alternative = outputs.find(|output| output.route == pattern.first_route);
+    let alternative = noncritical_output(settings, pattern.first_route);
     WatchedPattern {
         settings: pattern.clone(),
         has_inputs,
         outputs: Vec::new(),
-        alternative: alternative.and_then(|output| match &output.topic {
-            OutputTopic::Prefix(prefix) => Some(prefix.clone()),
-            OutputTopic::Topic(_) => None,
-        }),
+        alternative: alternative.and_then(OutputTopic::prefix).cloned(),
         never_inputs: never_inputs.clone(),
     }
 }

@@ -238,13 +238,11 @@ fn urgent_routes(settings: &Settings) -> impl Iterator<Item = usize> {
     let lowest = settings.routes.iter().map(|route| route.priority).min().unwrap_or(0);
     // The ports are bound before a place has a topic.
     let is_fixed = |route: &Route| !route.input_topic.is_place();
-    let is_critical = |index| {
-        let mut lanes = settings.lanes.iter().filter(|lane| lane.class() == TrafficClass::Critical);
-        lanes.any(|lane| lane.outputs.iter().any(|output| output.route == index))
-    };
     let routes = settings.routes.iter().enumerate();
     routes
-        .filter(move |(index, route)| route.priority > lowest && is_fixed(route) && is_critical(*index))
+        .filter(move |(index, route)| {
+            route.priority > lowest && is_fixed(route) && settings.is_critical(*index)
+        })
         .map(|(index, _)| index)
 }
 

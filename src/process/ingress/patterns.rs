@@ -2,7 +2,7 @@
 
 use tracing::{info, warn};
 
-use crate::config::{NeverInputs, OutputTopic, RoutePattern, Settings};
+use crate::config::{Lane, NeverInputs, RoutePattern, Settings};
 use crate::dds::Endpoint;
 use crate::model::{FixedText, Guid, MonotonicNs, PatternRecord, TopicName, TopicPrefix};
 use crate::policy::{Location, MAX_TOPIC_WRITERS, MAX_WAITING_TOPICS, RoutePlaces, TRIAL_MS};
@@ -42,21 +42,15 @@ struct Pattern {
 
 impl Patterns {
     pub fn open(settings: &Settings, boards: &Boards) -> Self {
-        let mut fixed_outputs = Vec::new();
-        for lane in &settings.lanes {
-            for output in &lane.outputs {
-                if let OutputTopic::Topic(topic) = &output.topic {
-                    fixed_outputs.push((lane.network.domain_id, topic.clone()));
-                }
-            }
-        }
+        let fixed_outputs = settings.lanes.iter().flat_map(|lane| {
+            let topics = lane.outputs.iter().filter_map(|output| output.topic.topic());
+            topics.map(|topic| (lane.network.domain_id, topic.clone()))
+        });
+        let fixed_outputs = fixed_outputs.collect();
         let pattern = |pattern: &RoutePattern| {
-            let of_first = |lane: &crate::config::Lane| {
+            let of_first = |lane: &Lane| {
                 let output = lane.outputs.iter().find(|output| output.route == pattern.first_route)?;
-                match &output.topic {
-                    OutputTopic::Prefix(prefix) => Some((lane.network.domain_id, prefix.clone())),
-                    OutputTopic::Topic(_) => None,
-                }
+                Some((lane.network.domain_id, output.topic.prefix()?.clone()))
             };
             let message_type = &settings.routes[pattern.first_route].message_type;
             Pattern {
