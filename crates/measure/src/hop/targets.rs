@@ -282,18 +282,13 @@ pub fn slope(growth: Option<Growth>) -> String {
 /// The trend of the memory, and its slope in KiB per hour.
 pub fn trend(series: &SoakSeries) -> (Trend, Option<Growth>) {
     let end = series.points.last().map_or(0.0, |point| point.0);
-    let points: Vec<(f64, f64)> =
-        series.points.iter().copied().filter(|point| point.0 >= end * WARM_UP).collect();
-    let Some(per_second) = growth(&points) else { return (Trend::TooShort, None) };
-    let seconds = end - points.first().map_or(0.0, |point| point.0);
-    let per_hour = Growth {
-        slope: per_second.slope * 3_600.0,
-        low: per_second.low * 3_600.0,
-        high: per_second.high * 3_600.0,
-    };
-    let trend = if per_second.slope * seconds > ALLOCATION_STEP_KIB {
+    let warm = series.points.iter().filter(|point| point.0 >= end * WARM_UP);
+    let by_hour: Vec<(f64, f64)> = warm.map(|(at_s, value)| (at_s / 3_600.0, *value)).collect();
+    let Some(per_hour) = growth(&by_hour) else { return (Trend::TooShort, None) };
+    let hours = end / 3_600.0 - by_hour.first().map_or(0.0, |point| point.0);
+    let trend = if per_hour.slope * hours > ALLOCATION_STEP_KIB {
         if per_hour.slope > MAX_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
-    } else if ALLOCATION_STEP_KIB / seconds * 3_600.0 > MAX_KIB_PER_HOUR {
+    } else if ALLOCATION_STEP_KIB / hours > MAX_KIB_PER_HOUR {
         Trend::TooShort
     } else {
         Trend::Flat
