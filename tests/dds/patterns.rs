@@ -6,14 +6,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use adaptive_bridge::clock;
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take};
-use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos};
+use adaptive_bridge::model::{Durability, QosProfile, Reliability};
 use adaptive_bridge::policy::{MAX_WAITING_TOPICS, TRIAL_MS};
-use bytes::Bytes;
 use serde_json::Value;
 use support::bridge::Bridge;
+use support::flow::{take_numbers, write_numbers};
 use support::wait_until;
 
 const DOMAIN: u16 = 121;
@@ -44,19 +43,7 @@ impl Publisher {
     fn start(mut participant: Participant, topic: &str) -> Self {
         let writer = participant.create_writer(topic, TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
         let stop = Arc::new(AtomicBool::new(false));
-        let is_stopped = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let mut number = 0_u32;
-            while !is_stopped.load(Ordering::Relaxed) {
-                let payload = [number.to_le_bytes(), [0; 4]].concat();
-                let stamp = SourceTimestamp::from_wall(clock::wall());
-                writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
-                number += 1;
-                std::thread::sleep(Duration::from_millis(10));
-            }
-            writer.wait_acknowledged(support::patience());
-            (number, writer)
-        });
+        let thread = write_numbers(writer, Duration::from_millis(10), &stop);
         Self { stop, thread, _participant: participant }
     }
 
@@ -74,12 +61,6 @@ fn reader(participant: &mut Participant, topic: &str) -> RawReader {
         deadline_ms: None,
     };
     participant.create_reader(topic, TYPE, &qos).unwrap()
-}
-
-fn take_all(reader: &RawReader, numbers: &mut Vec<u32>) {
-    let mut on_sample =
-        |payload: &[u8], _| numbers.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
-    while reader.take(&mut on_sample) != Take::Empty {}
 }
 
 fn route<'a>(status: &'a Value, topic: &str) -> Option<&'a Value> {
@@ -106,7 +87,7 @@ fn forged_topics_displace_no_topic_with_samples_and_are_counted() {
 
     let flow = Publisher::start(participant("flow"), "rt/camera/flow");
     wait_until("samples of the topic in use", || {
-        take_all(&flow_reader, &mut flow_numbers);
+        take_numbers(&flow_reader, &mut flow_numbers);
         flow_numbers.len() > 10
     });
     let began = Instant::now();
@@ -131,7 +112,7 @@ fn forged_topics_displace_no_topic_with_samples_and_are_counted() {
     // Another participant's topic gets the next place that a trial frees, and keeps it.
     let late = Publisher::start(participant("late"), "rt/camera/late");
     wait_until("samples of the late topic", || {
-        take_all(&late_reader, &mut late_numbers);
+        take_numbers(&late_reader, &mut late_numbers);
         late_numbers.len() > 10
     });
     let late_route = route(&bridge.status(), "/camera/late").unwrap()["id"].clone();
@@ -146,8 +127,8 @@ fn forged_topics_displace_no_topic_with_samples_and_are_counted() {
     let (flow_sent, late_sent) = (flow.end(), late.end());
     let last = |numbers: &[u32]| numbers.last().map(|number| number + 1);
     wait_until("the last samples", || {
-        take_all(&flow_reader, &mut flow_numbers);
-        take_all(&late_reader, &mut late_numbers);
+        take_numbers(&flow_reader, &mut flow_numbers);
+        take_numbers(&late_reader, &mut late_numbers);
         last(&flow_numbers) == Some(flow_sent) && last(&late_numbers) == Some(late_sent)
     });
     // Each from the first one that the subscriber received.

@@ -17,13 +17,42 @@ use super::wait_until;
 
 const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 
+/// Writes numbered samples at this interval until `stop` is set and the last one is acknowledged. Returns how
+/// many, and the writer, which remains in DDS until it is dropped.
+pub fn write_numbers(
+    writer: RawWriter,
+    interval: Duration,
+    stop: &Arc<AtomicBool>,
+) -> JoinHandle<(u32, RawWriter)> {
+    let is_stopped = Arc::clone(stop);
+    std::thread::spawn(move || {
+        let mut number = 0_u32;
+        while !is_stopped.load(Ordering::Relaxed) {
+            let payload = [number.to_le_bytes(), [0; 4]].concat();
+            let stamp = SourceTimestamp::from_wall(clock::wall());
+            writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
+            number += 1;
+            std::thread::sleep(interval);
+        }
+        writer.wait_acknowledged(super::patience());
+        (number, writer)
+    })
+}
+
+/// Takes the numbered samples that have arrived.
+pub fn take_numbers(reader: &RawReader, numbers: &mut Vec<u32>) {
+    let mut on_sample =
+        |payload: &[u8], _| numbers.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
+    while reader.take(&mut on_sample) != Take::Empty {}
+}
+
 /// A subscriber of each lane and a publisher, which publishes from when the bridge has matched all three.
 pub struct Flow {
     reader: RawReader,
     _noncritical: RawReader,
     received: Vec<u32>,
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<u32>>,
+    thread: Option<JoinHandle<(u32, RawWriter)>>,
     _participants: [Participant; 2],
 }
 
@@ -51,20 +80,7 @@ impl Flow {
             ["critical", "noncritical"].iter().all(|name| lane(status, name)["readers"] == 1)
         });
         let stop = Arc::new(AtomicBool::new(false));
-        let is_stopped = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let mut number = 0_u32;
-            while !is_stopped.load(Ordering::Relaxed) {
-                let payload = [number.to_le_bytes(), [0; 4]].concat();
-                let stamp = SourceTimestamp::from_wall(clock::wall());
-                writer.write(Bytes::from(payload), Encapsulation::CDR_LE, stamp).unwrap();
-                number += 1;
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            // Keeps the writer until the last sample is acknowledged.
-            writer.wait_acknowledged(super::patience());
-            number
-        });
+        let thread = write_numbers(writer, Duration::from_millis(5), &stop);
         let participants = [publisher, subscriber];
         Self {
             reader,
@@ -78,11 +94,7 @@ impl Flow {
 
     /// Takes the samples that have arrived; returns the number of samples received so far.
     pub fn received(&mut self) -> usize {
-        let received = &mut self.received;
-        let mut on_sample = |payload: &[u8], _| {
-            received.push(u32::from_le_bytes(payload[..4].try_into().unwrap()));
-        };
-        while self.reader.take(&mut on_sample) != Take::Empty {}
+        take_numbers(&self.reader, &mut self.received);
         self.received.len()
     }
 
@@ -117,7 +129,7 @@ impl Flow {
 
     fn stop(&mut self) -> u32 {
         self.stop.store(true, Ordering::Relaxed);
-        self.thread.take().unwrap().join().unwrap()
+        self.thread.take().unwrap().join().unwrap().0
     }
 }
 
