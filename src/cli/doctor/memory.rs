@@ -74,7 +74,7 @@ fn free_space(needed: Needed, space: &Space) -> Finding {
     );
     let command = format!("sudo mount -o remount,size={}M {SHM}", (mib(most) + mib(space.size)).max(64));
     if space.is_allocated {
-        Finding::ok(check, format!("{found}; the running bridge has already a part of it"))
+        Finding::ok(check, format!("{found}; the running bridge already has a part of it"))
     } else if space.free < at_start {
         Finding::error(check, found)
             .means("The bridge does not start, because it allocates the headers of its samples at the start.")
