@@ -210,7 +210,7 @@ pub mod serialization;
 #[doc(inline)]
 pub use dds::{
   key::{Key, Keyed},
-  lent::{AssemblyLimits, LentMemory, SampleMemory},
+  lent::{AssemblyLimits, LentMemory, PartialArrival, SampleMemory},
   participant::{DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener},
   pubsub::{Publisher, Subscriber},
   qos,

@@ -5,6 +5,8 @@ use std::{
   sync::{Arc, Mutex, PoisonError},
 };
 
+use crate::structure::{guid::GUID, sequence_number::SequenceNumber, time::Timestamp};
+
 /// Where the application has memory for samples that arrive in fragments: one
 /// that is put together there need not be copied from the library's memory. See
 /// [`set_sample_memory`](crate::no_key::SimpleDataReader::set_sample_memory).
@@ -61,6 +63,21 @@ impl SampleMemory for BuiltIn {
   }
 }
 
+/// A sample of which fragments have arrived, but not all of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PartialArrival {
+  /// The Writer that sends it.
+  pub writer: GUID,
+  /// Its sequence number.
+  pub sequence_number: SequenceNumber,
+  /// Its source timestamp, if a fragment that arrived had one.
+  pub source_timestamp: Option<Timestamp>,
+  /// Its encapsulation header: the representation identifier and the options.
+  pub encapsulation: [u8; 4],
+  /// The payload bytes without a gap from its beginning, which do not change any more.
+  pub complete_bytes: usize,
+}
+
 /// Memory for one sample. The library drops it when the sample never becomes
 /// complete, or when nobody takes it.
 pub trait LentMemory: Send {
@@ -72,6 +89,10 @@ pub trait LentMemory: Send {
   fn write(&mut self, from: usize, data: &[u8]) {
     self.bytes()[from..from + data.len()].copy_from_slice(data);
   }
+
+  /// Fragments have arrived that lengthen the part without a gap at the sample's beginning,
+  /// and others are missing. On the thread that receives, which waits meanwhile.
+  fn arrived(&mut self, _arrival: &PartialArrival) {}
 
   /// Gives the memory, with the whole sample in it, back to the application that
   /// lent it, and has now taken the sample. The library does not call this.

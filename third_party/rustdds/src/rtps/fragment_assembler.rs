@@ -14,7 +14,7 @@ use log::{debug, error, info, trace, warn};
 use crate::{
   dds::{
     ddsdata::DDSData,
-    lent::{Lender, Lent, LentMemory},
+    lent::{PartialArrival, Lender, Lent, LentMemory},
     with_key::datawriter::InstanceChange,
   },
   messages::submessages::{
@@ -110,6 +110,8 @@ struct AssemblyBuffer {
   fragment_size: u16,
   fragment_count: usize,
   received_bitmap: BitVec,
+  // The fragments before the first one that is missing.
+  complete_fragments: usize,
 
   stated: StatedOnce,
 
@@ -162,6 +164,7 @@ impl AssemblyBuffer {
       fragment_size,
       fragment_count,
       received_bitmap: BitVec::from_elem(fragment_count, false),
+      complete_fragments: 0,
       stated: StatedOnce::default(),
       modified_at: Instant::now(),
     })
@@ -248,6 +251,32 @@ impl AssemblyBuffer {
   pub fn is_complete(&self) -> bool {
     self.received_bitmap.all() // return if all are received
   }
+
+  // Tells the owner of lent memory how far the sample is without a gap, if that is further
+  // than before.
+  fn report_arrival(&mut self, writer: GUID, sequence_number: SequenceNumber) {
+    let Memory::Lent {
+      encapsulation,
+      payload,
+    } = &mut self.memory
+    else {
+      return;
+    };
+    let before = self.complete_fragments;
+    while self.received_bitmap.get(self.complete_fragments) == Some(true) {
+      self.complete_fragments += 1;
+    }
+    let bytes = self.complete_fragments * usize::from(self.fragment_size);
+    if self.complete_fragments > before && bytes > ENCAPSULATION_LEN {
+      payload.arrived(&PartialArrival {
+        writer,
+        sequence_number,
+        source_timestamp: self.stated.source_timestamp,
+        encapsulation: *encapsulation,
+        complete_bytes: bytes.min(self.data_size) - ENCAPSULATION_LEN,
+      });
+    }
+  }
 }
 
 // Upper bound on the number of concurrent (incomplete) reassembly buffers kept
@@ -303,6 +332,7 @@ impl FragmentAssembler {
   // QoS with the first fragment only.
   pub fn new_datafrag(
     &mut self,
+    writer: GUID,
     datafrag: &DataFrag,
     flags: BitFlags<DATAFRAG_Flags>,
     stated: StatedOnce,
@@ -358,6 +388,7 @@ impl FragmentAssembler {
       }
     } else {
       debug!("new_dataFrag: FRAGMENT NOT COMPLETED YET");
+      assembly_buffer.report_arrival(writer, sn);
       // Only a new buffer can exceed a limit.
       if is_first && self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS {
         self.evict();
@@ -392,6 +423,14 @@ impl FragmentAssembler {
       self.assembly_buffers.pop_first()
     };
     self.own_bytes -= evicted.map_or(0, |(_, buffer)| buffer.own_bytes());
+  }
+
+  // Discards the unfinished samples before this one.
+  fn discard_before(&mut self, first: SequenceNumber) {
+    let kept = self.assembly_buffers.split_off(&first);
+    for discarded in std::mem::replace(&mut self.assembly_buffers, kept).into_values() {
+      self.own_bytes -= discarded.own_bytes();
+    }
   }
 
   /// Whether there is no unfinished sample.
@@ -468,7 +507,7 @@ impl FragmentAssemblers {
     let is_first = !assembler.is_partially_received(datafrag.writer_sn);
     let lender = if is_first { lender() } else { Lender::default() };
     let before = assembler.own_bytes;
-    let completed = assembler.new_datafrag(datafrag, flags, stated, &lender);
+    let completed = assembler.new_datafrag(writer, datafrag, flags, stated, &lender);
     self.own_bytes = self.own_bytes - before + assembler.own_bytes;
     if assembler.is_empty() {
       self.by_writer.remove(&writer);
@@ -497,6 +536,20 @@ impl FragmentAssemblers {
 
   pub fn get(&self, writer: GUID) -> Option<&FragmentAssembler> {
     self.by_writer.get(&writer)
+  }
+
+  /// Discards the unfinished samples of a Writer before this one: the Writer does not
+  /// offer them any more, or the Reader has them.
+  pub fn discard_before(&mut self, writer: GUID, first: SequenceNumber) {
+    let Some(fa) = self.by_writer.get_mut(&writer) else {
+      return;
+    };
+    let before = fa.own_bytes;
+    fa.discard_before(first);
+    self.own_bytes -= before - fa.own_bytes;
+    if fa.is_empty() {
+      self.by_writer.remove(&writer);
+    }
   }
 
   pub fn remove(&mut self, writer: GUID) {
@@ -634,7 +687,7 @@ mod tests {
     let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
     let mut fa = FragmentAssembler::new(true);
     assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty(), StatedOnce::default(), &Lender::default())
+      .new_datafrag(GUID::GUID_UNKNOWN, &bad, BitFlags::<DATAFRAG_Flags>::empty(), StatedOnce::default(), &Lender::default())
       .is_none());
   }
 
@@ -804,7 +857,7 @@ mod tests {
         let to = (from + usize::from(frag_size)).min(100);
         let fragment = datafrag(number, 1, frag_size, 100, whole[from..to].to_vec());
         assert!(done.is_none());
-        done = fa.new_datafrag(&fragment, BitFlags::empty(), StatedOnce::default(), &lends());
+        done = fa.new_datafrag(GUID::GUID_UNKNOWN, &fragment, BitFlags::empty(), StatedOnce::default(), &lends());
       }
       let (data, _) = done.expect("complete");
       assert_eq!(data.payload_size(), 100);
@@ -814,10 +867,27 @@ mod tests {
   }
 
   #[test]
+  fn unfinished_samples_that_the_writer_withdraws_are_discarded() {
+    let mut fas = FragmentAssemblers::default();
+    let (one, other) = (writer(1), writer(2));
+    for number in 1..=3 {
+      insert(&mut fas, one, true, &first_of(number, 50, 100));
+    }
+    insert(&mut fas, other, true, &first_of(1, 50, 100));
+    let each = fas.own_bytes / 4;
+    fas.discard_before(one, SequenceNumber::new(3));
+    assert_eq!(fas.own_bytes, 2 * each);
+    fas.discard_before(one, SequenceNumber::new(4));
+    assert!(fas.get(one).is_none() && fas.get(other).is_some());
+    fas.discard_before(one, SequenceNumber::new(9));
+    assert_eq!(fas.own_bytes, each);
+  }
+
+  #[test]
   fn nothing_of_an_older_sample_is_left_in_memory_that_is_lent() {
     let mut fa = FragmentAssembler::new(true);
     let mut insert = |fragment: &DataFrag| {
-      fa.new_datafrag(fragment, BitFlags::empty(), StatedOnce::default(), &lends())
+      fa.new_datafrag(GUID::GUID_UNKNOWN, fragment, BitFlags::empty(), StatedOnce::default(), &lends())
         .is_some()
     };
     assert!(!insert(&datafrag(1, 1, 50, 100, vec![1; 50])));
@@ -845,12 +915,12 @@ mod tests {
     let mut fa = FragmentAssembler::new(true);
     let key = datafrag(1, 1, 50, 50, vec![1; 50]);
     let (data, _) = fa
-      .new_datafrag(&key, DATAFRAG_Flags::Key.into(), StatedOnce::default(), &refuse)
+      .new_datafrag(GUID::GUID_UNKNOWN, &key, DATAFRAG_Flags::Key.into(), StatedOnce::default(), &refuse)
       .expect("complete");
     assert!(matches!(data, DDSData::DisposeByKey { .. }));
     let short = datafrag(1, 1, 3, 3, vec![1; 3]);
     assert!(fa
-      .new_datafrag(&short, BitFlags::empty(), StatedOnce::default(), &refuse)
+      .new_datafrag(GUID::GUID_UNKNOWN, &short, BitFlags::empty(), StatedOnce::default(), &refuse)
       .is_none());
   }
 }

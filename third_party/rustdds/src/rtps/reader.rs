@@ -1086,6 +1086,9 @@ impl Reader {
 
         // remove changes until first_sn.
         writer_proxy.irrelevant_changes_up_to(heartbeat.first_sn);
+        this
+          .fragment_assemblers
+          .discard_before(writer_guid, writer_proxy.all_ackable_before());
 
         let marker_moved = this
           .acquire_the_topic_cache_guard()
@@ -1299,6 +1302,11 @@ impl Reader {
       }
       all_ackable_before = writer_proxy.all_ackable_before();
     }
+    // Of a sample that the Writer withdraws, some fragments may be here, in memory that the
+    // application has lent.
+    self
+      .fragment_assemblers
+      .discard_before(writer_guid, all_ackable_before);
 
     // Get the topic cache and mark progress
     let marker_moved = self.reliability != policy::Reliability::BestEffort
