@@ -37,6 +37,8 @@ pub(crate) struct ReaderProgress {
   reliable: bool,
   first_offered: SequenceNumber,
   history: Option<OfferedHistory>,
+  // Samples that had been withdrawn when the reader was matched.
+  withdrawn_before: u64,
   acked_before: AtomicI64,
   overrun: AtomicU64,
 }
@@ -69,6 +71,7 @@ impl ReaderProgress {
       reliable,
       first_offered,
       history: None,
+      withdrawn_before: 0,
       acked_before: AtomicI64::new(first_offered.into()),
       overrun: AtomicU64::new(0),
     }
@@ -77,6 +80,13 @@ impl ReaderProgress {
   #[must_use]
   pub fn with_history(mut self, history: Option<OfferedHistory>) -> Self {
     self.history = history;
+    self
+  }
+
+  /// Of a Writer that had withdrawn so many samples when the reader was matched.
+  #[must_use]
+  pub fn without_withdrawn(mut self, withdrawn: u64) -> Self {
+    self.withdrawn_before = withdrawn;
     self
   }
 
@@ -130,14 +140,22 @@ impl ReaderProgress {
     self.overrun.load(Ordering::Relaxed)
   }
 
-  pub fn snapshot(&self, last: SequenceNumber) -> MatchedReader {
+  /// `withdrawn` samples were withdrawn by now, `withdrawn_from` of them from a number on.
+  pub fn snapshot(
+    &self,
+    last: SequenceNumber,
+    withdrawn: u64,
+    withdrawn_from: impl Fn(SequenceNumber) -> u64,
+  ) -> MatchedReader {
     let through_last = |first| self.offered_between(first, last.plus_1());
+    let offered = through_last(self.first_offered);
     MatchedReader {
       guid: self.reader,
       reliable: self.reliable,
-      offered: through_last(self.first_offered),
+      offered: offered.saturating_sub(withdrawn - self.withdrawn_before),
       unacknowledged: if self.reliable {
-        through_last(SequenceNumber::new(self.acked_before.load(Ordering::Relaxed)))
+        let first = SequenceNumber::new(self.acked_before.load(Ordering::Relaxed));
+        through_last(first).saturating_sub(withdrawn_from(first))
       } else {
         0
       },

@@ -395,7 +395,12 @@ impl RtpsReaderProxy {
   /// the first ones, as many as a GAP can list. A reader that lacks nearly everything
   /// gets one GAP for all that is gone: 256 samples in each round trip would not catch
   /// up with 1 kHz behind 200 ms.
-  pub fn take_evicted_requests(&mut self, first_available: SequenceNumber) -> EvictedRequests {
+  /// Of those in `withdrawn`, the reader misses nothing.
+  pub fn take_evicted_requests(
+    &mut self,
+    first_available: SequenceNumber,
+    withdrawn: &BTreeSet<SequenceNumber>,
+  ) -> EvictedRequests {
     let still_retained = self.unsent_changes.split_off(&first_available);
     let mut evicted = std::mem::replace(&mut self.unsent_changes, still_retained);
     let Some(&first) = evicted.first() else {
@@ -408,6 +413,7 @@ impl RtpsReaderProxy {
       **sn >= self.overrun_counted_before
         && **sn >= self.first_offered()
         && self.offered_after(**sn).is_none()
+        && !withdrawn.contains(sn)
     };
     let missed = evicted.iter().filter(uncounted).count() as u64;
     let counted_before = last.plus_1();
@@ -415,6 +421,12 @@ impl RtpsReaderProxy {
     if evicted.len() >= BULK_GAP_MIN_SAMPLES && span <= 2 * evicted.len() as i64 {
       let unknown_from = max(counted_before, self.overrun_counted_before);
       let unknown = self.offered_between(unknown_from, first_available);
+      let withdrawn = if unknown_from < first_available {
+        withdrawn.range(unknown_from..first_available).count()
+      } else {
+        0
+      };
+      let unknown = unknown.saturating_sub(withdrawn as u64);
       self.add_overrun(missed + unknown, first_available);
       return EvictedRequests::AllFrom {
         first,

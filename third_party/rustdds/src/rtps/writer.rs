@@ -97,6 +97,17 @@ enum Audience {
   Datagrams(usize),
 }
 
+/// How far a sample was sent before it was written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct EarlySent {
+  sequence_number: SequenceNumber,
+  // The first fragment that was not sent, and to whom the others were sent.
+  next: u32,
+  audience: Audience,
+  // All matches until then: a reader that matched later lacks what was sent.
+  matches: i32,
+}
+
 /// Item 1 (DATA aggregation): outcome of attempting to coalesce one or more
 /// consecutive unfragmented multicast-to-all samples into a single datagram.
 pub(crate) enum BatchOutcome {
@@ -272,6 +283,8 @@ pub(crate) struct Writer {
   partly_sent: Option<CacheChange>,
   // Whom it is being sent to.
   audience: Audience,
+  // How far the sample that is not written yet was sent.
+  early_sent: Option<EarlySent>,
 
   /// Contains timer that needs to be set to timeout with duration of
   /// self.heartbeat_period timed_event_handler sends notification when timer
@@ -381,6 +394,7 @@ impl Writer {
       blocked_sockets: BTreeSet::new(),
       partly_sent: None,
       audience: Audience::All,
+      early_sent: None,
       timed_event_timer,
       like_stateless: i.like_stateless,
       qos_policies: i.qos_policies,
@@ -870,7 +884,7 @@ impl Writer {
     while turn_bytes < PENDING_TURN_MAX_BYTES {
       let last_available = self.send_buffer.last_change_sequence_number();
       if self.last_sent() >= last_available {
-        return false;
+        return self.send_early();
       }
       let sequence_number = self.last_sent().plus_1();
 
@@ -924,6 +938,10 @@ impl Writer {
         self.sample_cursor = SampleCursor::Fresh;
         self.send_buffer.set_sent_frontier(sequence_number);
         self.mark_change_sent_to_all_readers(sequence_number);
+        if self.send_buffer.is_withdrawn(sequence_number) {
+          // So that the readers ask for it now, and forget its fragments. No sample may follow.
+          self.handle_heartbeat_tick(false);
+        }
         continue;
       };
       let write_options = cc.write_options.clone();
@@ -1003,6 +1021,14 @@ impl Writer {
             Audience::Datagrams(_) if first_audience != Some(self.audience) => SampleCursor::Fresh,
             _ => self.sample_cursor,
           };
+          if let (SampleCursor::Fresh, Some(early)) = (cursor, self.early_sent) {
+            if early.sequence_number == sequence_number
+              && audiences[..] == [early.audience]
+              && early.matches == self.matched_readers_count_total
+            {
+              cursor = SampleCursor::Frag(FragmentNumber::new(early.next));
+            }
+          }
           let mut progress = SendProgress::Complete;
           let mut blocked_audience = Audience::All;
           for audience in audiences {
@@ -1086,6 +1112,86 @@ impl Writer {
       }
     }
     self.last_sent() < self.send_buffer.last_change_sequence_number()
+  }
+
+  // Sends what is complete of a sample that is not written yet, but never its last fragment,
+  // so that no reader has the sample before it is written. At most
+  // `PENDING_TURN_MAX_BYTES`; returns whether more is left for another turn.
+  fn send_early(&mut self) -> bool {
+    let Some(early) = self.send_buffer.early(false) else {
+      return false;
+    };
+    let cc = early.change;
+    let payload_size = cc.data_value.payload_size();
+    if !self.push_mode
+      || self.security_plugins.is_some()
+      || self.readers.is_empty()
+      || self.readers.values().any(RtpsReaderProxy::is_joining)
+      || cc.sequence_number != self.last_sent().plus_1()
+      || payload_size <= self.max_unfragmented_serialized_payload(None)
+    {
+      return false;
+    }
+    let matches = self.matched_readers_count_total;
+    let is_same = |sent: &EarlySent| {
+      sent.sequence_number == cc.sequence_number && sent.matches == matches
+    };
+    let sent = match self.early_sent.filter(is_same) {
+      Some(sent) => sent,
+      None => {
+        let now = Instant::now();
+        for reader in self.readers.values_mut() {
+          reader.retry_large_datagrams(now);
+        }
+        // With datagrams of several sizes, each fragment would go out once for each.
+        let [audience] = self.audiences(payload_size)[..] else {
+          return false;
+        };
+        self.withdraw_from_best_effort_readers(cc.sequence_number);
+        EarlySent {
+          sequence_number: cc.sequence_number,
+          next: 1,
+          audience,
+          matches,
+        }
+      }
+    };
+    let (num_frags, fragment_size) = self.num_frags_and_frag_size(payload_size);
+    let complete = early.available.min(payload_size) / usize::from(fragment_size);
+    let limit = (complete as u32).min(num_frags - 1);
+    let budget = self.audience_budget(None, sent.audience);
+    let first = SampleCursor::Frag(FragmentNumber::new(sent.next));
+    let mut messages =
+      FragmentationIter::new_resume(self, &cc, None, budget, false, first).through(limit);
+    let mut next = sent.next;
+    let mut blocked = BTreeSet::new();
+    let mut turn_bytes = 0;
+    while turn_bytes < PENDING_TURN_MAX_BYTES {
+      let Some((_, message)) = messages.next() else {
+        break;
+      };
+      if next == 1 && self.send_buffer.early(true).is_none() {
+        // It was withdrawn meanwhile.
+        return false;
+      }
+      let is_addressed = |reader: &&RtpsReaderProxy| match sent.audience {
+        Audience::All => true,
+        Audience::Datagrams(budget) => reader.written_budget(payload_size) == budget,
+      };
+      let receivers = &mut self.receivers().filter(is_addressed);
+      blocked =
+        self.send_message_to_readers(DeliveryMode::Multicast, message, receivers, TrafficClass::Bulk);
+      if !blocked.is_empty() {
+        break;
+      }
+      let sent_before = next;
+      next = messages.next_fragment();
+      turn_bytes += (next - sent_before) as usize * usize::from(fragment_size);
+    }
+    let more = blocked.is_empty() && turn_bytes >= PENDING_TURN_MAX_BYTES;
+    self.early_sent = Some(EarlySent { next, ..sent });
+    self.blocked_sockets.extend(blocked);
+    more
   }
 
   /// nonblocking-transmit: drain and return the sockets on which the last push
@@ -1798,7 +1904,7 @@ impl Writer {
         reader_proxy.mark_change_sent(unsent_sn);
       } else if let Some(first_available) = gone_before {
         // The reader requests samples that are gone.
-        let evicted = reader_proxy.take_evicted_requests(first_available);
+        let evicted = reader_proxy.take_evicted_requests(first_available, &self.send_buffer.withdrawn());
         debug!(
           "Reader {reader_guid:?} missed samples from {unsent_sn:?} on. I have only from \
            {first_available:?}. Topic {:?}",
@@ -1811,10 +1917,16 @@ impl Writer {
           None if self.is_withdrawn_later(reader_proxy, unsent_sn) => {
             reader_proxy.mark_change_sent(unsent_sn);
           }
+          // The reader misses nothing: the sample has another number.
+          None if self.send_buffer.is_withdrawn(unsent_sn) => {
+            reader_proxy.mark_change_sent(unsent_sn);
+            let withdrawn = EvictedRequests::Listed(BTreeSet::from([unsent_sn]));
+            gap = self.withdraw_msg(gap, &withdrawn, reader_guid);
+          }
           None => {
             // A write has evicted it since `gone_before` was read, or the send
             // buffer has a hole there.
-            let evicted = reader_proxy.take_evicted_requests(unsent_sn.plus_1());
+            let evicted = reader_proxy.take_evicted_requests(unsent_sn.plus_1(), &BTreeSet::new());
             gap = self.withdraw_msg(gap, &evicted, reader_guid);
           }
         }
@@ -1893,12 +2005,18 @@ impl Writer {
   // What was written after the match is gone only when the reader is a whole window behind.
   // It does not wait then.
   fn is_withdrawn_later(&self, reader_proxy: &RtpsReaderProxy, gone: SequenceNumber) -> bool {
-    if !reader_proxy.qos().is_reliable() || !reader_proxy.offers_of_history(gone) {
+    let is_told_in_order =
+      reader_proxy.offers_of_history(gone) || self.send_buffer.is_withdrawn(gone);
+    if !reader_proxy.qos().is_reliable() || !is_told_in_order {
       return false;
     }
     let first_lacking = reader_proxy.all_acked_before;
     let first_to_come = self.send_buffer.available_after(first_lacking);
-    first_to_come.unwrap_or(first_lacking) < gone
+    let mut first_to_come = first_to_come.unwrap_or(first_lacking);
+    while first_to_come < gone && self.send_buffer.is_withdrawn(first_to_come) {
+      first_to_come = first_to_come.plus_1();
+    }
+    first_to_come < gone
   }
 
   // Tells a reader that it gets these samples no more: a HEARTBEAT that begins after
@@ -3045,6 +3163,8 @@ struct FragmentationIter<'a> {
   reader_entity_id: EntityId,
   send_heartbeat: bool,
   finished: bool,
+  // The last fragment that may be sent.
+  through: u32,
   state: FragmentationIterState,
 }
 
@@ -3095,7 +3215,22 @@ impl<'a> FragmentationIter<'a> {
       state,
       reader_entity_id,
       finished: false,
+      through: u32::MAX,
       send_heartbeat,
+    }
+  }
+
+  // Ends before the first datagram with a fragment after this one.
+  fn through(mut self, last: u32) -> Self {
+    self.through = last;
+    self
+  }
+
+  // The first fragment of the next datagram.
+  fn next_fragment(&self) -> u32 {
+    match self.state {
+      FragmentationIterState::Fragmented(FragmentedState::Fragments { next, .. }, _) => next,
+      _ => 1,
     }
   }
 
@@ -3205,6 +3340,9 @@ impl<'a> Iterator for FragmentationIter<'a> {
                 fragment_size,
                 data_size,
               );
+              if start + k - 1 > self.through {
+                return None;
+              }
 
               let sample_size_u32 = match u32::try_from(data_size) {
                 Ok(n) => n,
@@ -4541,7 +4679,7 @@ mod tests {
       (1..=200).for_each(|number| reader.request_change(from(number)));
       let day_at_1_khz = from(86_400_000);
       assert_eq!(
-        reader.take_evicted_requests(day_at_1_khz),
+        reader.take_evicted_requests(day_at_1_khz, &BTreeSet::new()),
         EvictedRequests::AllFrom {
           first: from(1),
           before: day_at_1_khz
@@ -4553,7 +4691,7 @@ mod tests {
       for expected in [&[300, 301, 555][..], &[556], &[5_000], &[]] {
         let expected = expected.iter().copied().map(from).collect();
         assert_eq!(
-          reader.take_evicted_requests(day_at_1_khz),
+          reader.take_evicted_requests(day_at_1_khz, &BTreeSet::new()),
           EvictedRequests::Listed(expected)
         );
       }
@@ -4728,6 +4866,157 @@ mod tests {
       assert_eq!(send(20, 8), [vec![], vec![]], "samples of one datagram");
       assert_eq!(send(1, 200_000), [vec![(1, 13)], vec![]]);
       assert_eq!(send(1, 200_000), [vec![(1, 14)], vec![]]);
+    }
+
+    // What a reader at `socket` has got, by now: the fragments of each number, and the last
+    // numbers of HEARTBEATs.
+    fn received_fragments(socket: &std::net::UdpSocket) -> (Vec<(i64, Vec<u32>)>, Vec<i64>) {
+      socket
+        .set_read_timeout(Some(StdDuration::from_millis(200)))
+        .unwrap();
+      let mut buffer = [0; 65_536];
+      let (mut samples, mut heartbeats) = (BTreeMap::<i64, Vec<u32>>::new(), Vec::new());
+      while let Ok(len) = socket.recv(&mut buffer) {
+        let datagram = bytes::Bytes::copy_from_slice(&buffer[..len]);
+        for submessage in Message::read_from_buffer(&datagram).unwrap().submessages {
+          match submessage.body {
+            SubmessageBody::Writer(WriterSubmessage::Heartbeat(heartbeat, _)) => {
+              heartbeats.push(heartbeat.last_sn.into());
+            }
+            SubmessageBody::Writer(WriterSubmessage::DataFrag(data, _)) => {
+              let first = u32::from(data.fragment_starting_num);
+              let count = u32::from(data.fragments_in_submessage);
+              let fragments = samples.entry(data.writer_sn.into()).or_default();
+              fragments.extend(first..first + count);
+            }
+            _ => {}
+          }
+        }
+      }
+      (samples.into_iter().collect(), heartbeats)
+    }
+
+    const EARLY_BYTES: usize = 30_000;
+    // With the encapsulation header.
+    const EARLY_FRAGMENTS: u32 = (EARLY_BYTES + 4).div_ceil(FRAGMENT_SIZE) as u32;
+
+    fn early_sample() -> DDSData {
+      let payload = vec![7; EARLY_BYTES];
+      DDSData::new(SerializedPayload::new(RepresentationIdentifier::CDR_LE, payload))
+    }
+
+    fn complete_early(f: &mut Fixture) -> i64 {
+      let options = WriteOptionsBuilder::new().completes_early().build();
+      let none = Some(StdDuration::ZERO);
+      let admission = f
+        .writer
+        .send_buffer
+        .admit_blocking(options, early_sample(), none);
+      let Admission::Admitted {
+        sequence_number, ..
+      } = admission
+      else {
+        panic!("the write failed");
+      };
+      while f.writer.process_pending() {}
+      sequence_number.into()
+    }
+
+    fn begin_early(f: &mut Fixture, available: usize) -> bool {
+      let options = WriteOptions::default();
+      let begun = f
+        .writer
+        .send_buffer
+        .begin_early(options, early_sample(), available);
+      while f.writer.process_pending() {}
+      begun
+    }
+
+    fn with_socket() -> (Fixture, std::net::UdpSocket) {
+      let mut f = keep_last();
+      let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+      let reader = f.writer.readers.get_mut(&f.reader_guid).unwrap();
+      reader.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+      (f, socket)
+    }
+
+    #[test]
+    fn a_sample_is_sent_as_it_becomes_complete() {
+      let (mut f, socket) = with_socket();
+      let mut fragments = Vec::new();
+      assert!(begin_early(&mut f, 10_000));
+      assert!(!begin_early(&mut f, 10_000), "one at a time");
+      for available in [10_000, 12_000, 25_000, EARLY_BYTES, EARLY_BYTES + 4] {
+        f.writer.send_buffer.extend_early(available);
+        while f.writer.process_pending() {}
+        let (samples, heartbeats) = received_fragments(&socket);
+        assert_eq!(heartbeats, Vec::<i64>::new(), "the sample is not offered yet");
+        for (number, sent) in samples {
+          assert_eq!(number, 1);
+          fragments.extend(sent);
+        }
+        assert!(fragments.len() <= available / FRAGMENT_SIZE, "of {available} bytes");
+      }
+      let all_but_the_last: Vec<u32> = (1..EARLY_FRAGMENTS).collect();
+      assert_eq!(fragments, all_but_the_last);
+      assert_eq!(f.writer.send_buffer.last_change_sequence_number(), SequenceNumber::new(0));
+
+      assert_eq!(complete_early(&mut f), 1);
+      let (samples, heartbeats) = received_fragments(&socket);
+      fragments.extend(samples.into_iter().flat_map(|(_, sent)| sent));
+      assert_eq!(fragments, (1..=EARLY_FRAGMENTS).collect::<Vec<_>>(), "each once");
+      assert_eq!(heartbeats, [1]);
+    }
+
+    #[test]
+    fn a_sample_that_never_becomes_complete_is_withdrawn() {
+      let (mut f, socket) = with_socket();
+      write(&f, 3, 8);
+      acknowledge(&mut f, 4, &[], 1);
+      assert!(begin_early(&mut f, 15_000));
+      // Another sample comes first.
+      f.writer.send_buffer.withdraw_early();
+      write_with(&f, WriteOptions::default(), 1, 8);
+      assert_eq!(f.writer.send_buffer.last_change_sequence_number(), SequenceNumber::new(5));
+      received(&socket);
+      acknowledge(&mut f, 4, &[4], 2);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(4, 5)]);
+      let reader = only_reader(&f);
+      assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (4, 1, 0));
+      // Its number is used again if no fragment was sent.
+      f.writer.set_last_sent(SequenceNumber::new(4));
+      assert!(begin_early(&mut f, 0));
+      assert!(!f.writer.send_buffer.withdraw_early());
+      assert_eq!(complete_early(&mut f), 6);
+    }
+
+    #[test]
+    fn a_reader_that_is_behind_hears_later_of_a_sample_that_was_withdrawn() {
+      let (mut f, socket) = with_socket();
+      write(&f, 3, 8);
+      assert!(begin_early(&mut f, 15_000));
+      write(&f, 1, 8);
+      received(&socket);
+      // The HEARTBEAT that withdraws a sample withdraws those before it, too.
+      acknowledge(&mut f, 2, &[2, 3, 4], 1);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), []);
+      acknowledge(&mut f, 4, &[4], 2);
+      f.repair_round();
+      assert_eq!(withdrawn(&socket), [(4, 5)]);
+      assert_eq!(only_reader(&f).overrun, 0);
+    }
+
+    #[test]
+    fn who_was_matched_in_the_middle_gets_the_whole_sample() {
+      let (mut f, socket) = with_socket();
+      assert!(begin_early(&mut f, 15_000));
+      received(&socket);
+      f.writer.matched_readers_count_total += 1;
+      assert_eq!(complete_early(&mut f), 1);
+      let (samples, _) = received_fragments(&socket);
+      assert_eq!(samples, [(1, (1..=EARLY_FRAGMENTS).collect())]);
     }
 
     #[test]

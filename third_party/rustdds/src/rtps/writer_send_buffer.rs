@@ -51,6 +51,13 @@ struct Inner {
   first_seq: SequenceNumber, // oldest still retained (default 1)
   last_seq: SequenceNumber,  // latest allocated (default 0 == nothing yet)
 
+  // The sample of which fragments are sent before all of it is written.
+  early: Option<Early>,
+  // Numbers that readers have fragments of, and no sample: it was withdrawn.
+  withdrawn: BTreeSet<SequenceNumber>,
+  // How many there ever were.
+  withdrawn_total: u64,
+
   // What late joiners get beside `changes`, if the samples come from several sources.
   history: SourceHistory,
 
@@ -103,7 +110,49 @@ struct Inner {
   parked_threads: usize,
 }
 
+/// A sample that is not written yet, of which the Writer may send the first fragments.
+#[derive(Clone)]
+pub(crate) struct Early {
+  /// With the number that the next sample gets, and the whole length of the payload, of
+  /// which only the first `available` bytes may be read.
+  pub change: CacheChange,
+  /// Bytes of the serialized payload that are complete.
+  pub available: usize,
+  // Whether a fragment was sent, so that the number can't be that of another sample.
+  is_begun: bool,
+}
+
+impl Early {
+  // Whether this is the same sample, as far as its fragments tell.
+  fn completed_by(&self, write_options: &WriteOptions, data: &DDSData) -> bool {
+    let begun = &self.change;
+    begun.data_value.payload_size() == data.payload_size()
+      && begun.write_options.source_timestamp() == write_options.source_timestamp()
+  }
+}
+
+// A reader that acknowledges nothing may ask for a number for as long as it is matched;
+// without the record it counts as one more that the reader missed.
+const MAX_WITHDRAWN: usize = 1024;
+
 impl Inner {
+  // Gives up the sample that is sent early. Its number is not used again if a reader may
+  // have a fragment with it.
+  fn withdraw_early(&mut self) -> bool {
+    let Some(early) = self.early.take() else {
+      return false;
+    };
+    if early.is_begun {
+      self.last_seq = early.change.sequence_number;
+      self.withdrawn.insert(self.last_seq);
+      self.withdrawn_total += 1;
+      if self.withdrawn.len() > MAX_WITHDRAWN {
+        self.withdrawn.pop_first();
+      }
+    }
+    early.is_begun
+  }
+
   fn evict_oldest(&mut self) {
     if let Some((oldest, evicted)) = self.changes.pop_first() {
       self.first_seq = oldest.plus_1();
@@ -127,8 +176,9 @@ impl Inner {
   fn gone_from(&self, first: SequenceNumber, reader: &ReaderProgress) -> u64 {
     let kept = self.history.kept_between(first, self.first_seq);
     let kept = kept.filter(|number| reader.offered_after(*number).is_none()).count();
+    let withdrawn = self.withdrawn.iter().filter(|number| (first..self.first_seq).contains(*number));
     let not_retained = reader.offered_between(first, self.first_seq);
-    not_retained.saturating_sub(kept as u64)
+    not_retained.saturating_sub((kept + withdrawn.count()) as u64)
   }
 
   fn advertised_first(&self) -> SequenceNumber {
@@ -202,6 +252,9 @@ impl WriterSendBuffer {
           written_bytes: 0,
           readers: BTreeMap::new(),
           left_overrun: 0,
+          early: None,
+          withdrawn: BTreeSet::new(),
+          withdrawn_total: 0,
           history: SourceHistory::default(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
@@ -398,6 +451,11 @@ impl WriterSendBuffer {
     data: DDSData,
     may_block: bool,
   ) -> SequenceNumber {
+    let completes = write_options.completes_early()
+      && inner.early.take_if(|early| early.completed_by(&write_options, &data)).is_some();
+    if !completes {
+      inner.withdraw_early();
+    }
     let seq = inner.last_seq.plus_1();
     if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
       inner.history.record(&write_options, seq, depth);
@@ -442,6 +500,57 @@ impl WriterSendBuffer {
       }
     }
     seq
+  }
+
+  /// Offers the first `available` bytes of a sample that is not written yet. `data` has
+  /// the length of the whole serialized payload. Returns whether the Writer may send them:
+  /// not if another sample is offered already, and not of a Writer that keeps samples for
+  /// late joiners.
+  pub fn begin_early(&self, write_options: WriteOptions, data: DDSData, available: usize) -> bool {
+    let shared = &*self.shared;
+    let mut inner = shared.inner.lock().unwrap();
+    let may = shared.reliable_writer && shared.volatile && !shared.is_builtin;
+    if !may || inner.early.is_some() {
+      return false;
+    }
+    let number = inner.last_seq.plus_1();
+    inner.early = Some(Early {
+      change: CacheChange::new(shared.writer_guid, number, write_options, data),
+      available,
+      is_begun: false,
+    });
+    true
+  }
+
+  /// Offers more bytes of the sample that was begun.
+  pub fn extend_early(&self, available: usize) {
+    if let Some(early) = &mut self.shared.inner.lock().unwrap().early {
+      early.available = early.available.max(available);
+    }
+  }
+
+  /// Gives up the sample that was begun; the next one gets another number if fragments of
+  /// it were sent. Returns whether they were.
+  pub fn withdraw_early(&self) -> bool {
+    self.shared.inner.lock().unwrap().withdraw_early()
+  }
+
+  /// The sample that was begun. `is_begun` marks it as one of which fragments are sent.
+  pub fn early(&self, is_begun: bool) -> Option<Early> {
+    let mut inner = self.shared.inner.lock().unwrap();
+    let early = inner.early.as_mut()?;
+    early.is_begun |= is_begun;
+    Some(early.clone())
+  }
+
+  /// Whether the number is that of a sample that was withdrawn.
+  pub fn is_withdrawn(&self, sn: SequenceNumber) -> bool {
+    self.shared.inner.lock().unwrap().withdrawn.contains(&sn)
+  }
+
+  /// The numbers of samples that were withdrawn.
+  pub fn withdrawn(&self) -> BTreeSet<SequenceNumber> {
+    self.shared.inner.lock().unwrap().withdrawn.clone()
   }
 
   // Whether the oldest sample is one for a late joiner that the event loop has not sent
@@ -576,7 +685,9 @@ impl WriterSendBuffer {
     } else {
       Self::history_first_locked(&self.shared, &inner)
     };
-    let progress = ReaderProgress::new(reader, reliable, first_offered).with_history(history);
+    let progress = ReaderProgress::new(reader, reliable, first_offered)
+      .with_history(history)
+      .without_withdrawn(inner.withdrawn_total);
     let progress = Arc::new(progress);
     inner.readers.insert(reader, progress.clone());
     progress
@@ -652,7 +763,9 @@ impl WriterSendBuffer {
   pub fn matched_readers(&self) -> Vec<MatchedReader> {
     let inner = self.shared.inner.lock().unwrap();
     let last = inner.last_seq;
-    inner.readers.values().map(|r| r.snapshot(last)).collect()
+    let withdrawn_from = |first| inner.withdrawn.range(first..).count() as u64;
+    let snapshot = |r: &Arc<ReaderProgress>| r.snapshot(last, inner.withdrawn_total, withdrawn_from);
+    inner.readers.values().map(snapshot).collect()
   }
 
   /// The lowest sequence number still retained (or the next-to-be-written if

@@ -117,6 +117,30 @@ where
       .map_err(unwrap_no_key_write_error)
   }
 
+  /// Begins to send a sample that is not complete yet, see
+  /// [`with_key::DataWriter::begin_early`](crate::with_key::DataWriter::begin_early).
+  pub fn begin_early(
+    &self,
+    data: D,
+    write_options: datawriter_with_key::WriteOptions,
+    available: usize,
+  ) -> bool {
+    let data = NoKeyWrapper::<D> { d: data };
+    self
+      .keyed_datawriter
+      .begin_early(data, write_options, available)
+  }
+
+  /// More of the sample that was begun is complete: its first `available` bytes.
+  pub fn extend_early(&self, available: usize) {
+    self.keyed_datawriter.extend_early(available);
+  }
+
+  /// Gives up the sample that was begun. Returns whether readers had a part of it.
+  pub fn withdraw_early(&self) -> bool {
+    self.keyed_datawriter.withdraw_early()
+  }
+
   /// The highest sequence number that was sent to every reader matched at that time.
   pub fn sent_through(&self) -> crate::structure::sequence_number::SequenceNumber {
     self.keyed_datawriter.sent_through()

@@ -48,6 +48,7 @@ pub struct WriteOptionsBuilder {
   history_source: Option<GUID>,
   instance_change: Option<InstanceChange>,
   best_effort_may_block: bool,
+  completes_early: bool,
 }
 
 impl WriteOptionsBuilder {
@@ -63,6 +64,7 @@ impl WriteOptionsBuilder {
       history_source: self.history_source,
       instance_change: self.instance_change,
       best_effort_may_block: self.best_effort_may_block,
+      completes_early: self.completes_early,
     }
   }
 
@@ -128,6 +130,13 @@ impl WriteOptionsBuilder {
   #[must_use]
   pub fn best_effort_may_block(mut self, may_block: bool) -> Self {
     self.best_effort_may_block = may_block;
+    self
+  }
+
+  /// This is the whole of the sample that [`DataWriter::begin_early`] began.
+  #[must_use]
+  pub fn completes_early(mut self) -> Self {
+    self.completes_early = true;
     self
   }
 }
@@ -197,6 +206,7 @@ pub struct WriteOptions {
   // Defaults to `false` (DDS v1.4 section 2.2.2.4.2.11: `write` must not block
   // for best-effort reliability). See `WriteOptionsBuilder::best_effort_may_block`.
   best_effort_may_block: bool,
+  completes_early: bool,
 }
 
 impl WriteOptions {
@@ -233,6 +243,11 @@ impl WriteOptions {
   pub fn best_effort_may_block(&self) -> bool {
     self.best_effort_may_block
   }
+
+  /// Whether this is the whole of the sample that was begun early.
+  pub fn completes_early(&self) -> bool {
+    self.completes_early
+  }
 }
 
 impl From<Option<Timestamp>> for WriteOptions {
@@ -244,6 +259,7 @@ impl From<Option<Timestamp>> for WriteOptions {
       history_source: None,
       instance_change: None,
       best_effort_may_block: false,
+      completes_early: false,
     }
   }
 }
@@ -515,6 +531,47 @@ where
         Err(WriteError::WouldBlock { data })
       }
     }
+  }
+
+  /// Begins to send a large sample that is not complete yet: `data` serializes to its whole
+  /// length, of which the library reads only the first `available` bytes, encapsulation
+  /// header included, until [`extend_early`](Self::extend_early) says that there are more.
+  /// It never sends the last fragment, so no reader has the sample before it is written with
+  /// [`WriteOptionsBuilder::completes_early`]. Any other write, and
+  /// [`withdraw_early`](Self::withdraw_early), gives the sample up; readers are told.
+  ///
+  /// Returns false, and does nothing, if another sample was begun, and for writers other than
+  /// RELIABLE, VOLATILE ones.
+  pub fn begin_early(&self, data: D, write_options: WriteOptions, available: usize) -> bool {
+    let Ok(bytes) = SA::to_bytes(&data) else {
+      return false;
+    };
+    let (encoding, options) = SA::output_encapsulation(&data);
+    let mut payload = SerializedPayload::new_from_bytes(encoding, bytes);
+    payload.representation_options = options;
+    let begun = self
+      .send_buffer
+      .begin_early(write_options, DDSData::new(payload), available);
+    if begun {
+      self.ring_doorbell();
+    }
+    begun
+  }
+
+  /// More of the sample that was begun is complete: its first `available` bytes.
+  pub fn extend_early(&self, available: usize) {
+    self.send_buffer.extend_early(available);
+    self.ring_doorbell();
+  }
+
+  /// Gives up the sample that was begun, if there is one. Returns whether readers had a part
+  /// of it.
+  pub fn withdraw_early(&self) -> bool {
+    let was_sent = self.send_buffer.withdraw_early();
+    if was_sent {
+      self.ring_doorbell();
+    }
+    was_sent
   }
 
   /// The highest sequence number that was sent to every reader matched at that time.
