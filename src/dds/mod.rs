@@ -27,8 +27,8 @@ pub use network::{host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{
-    ArrivalFlag, AssemblyLimits, Inbox, LentMemory, Payload, RawReader, ReaderEvent, SampleMemory,
-    SampleOrigin, Take, TakePayload,
+    ArrivalFlag, AssemblyLimits, Inbox, LentMemory, PartialArrival, Payload, RawReader, ReaderEvent,
+    SampleMemory, SampleOrigin, Take, TakePayload, partial_sample,
 };
 pub use writer::{RawWriter, WriteError, WriterEvent, Written};
 

@@ -11,9 +11,9 @@ use bytes::Bytes;
 
 use super::rustdds::no_key::{Decode, DeserializerAdapter, SimpleDataReader};
 use super::rustdds::{DataReaderStatus, InstancePayload, RepresentationIdentifier, StatusEvented};
-use crate::model::{Encapsulation, Guid, KeyedPayload, SampleKey, SourceTimestamp};
+use crate::model::{Encapsulation, Guid, KeyedPayload, PartialSample, SampleKey, SourceTimestamp};
 
-pub use super::rustdds::{AssemblyLimits, LentMemory, SampleMemory};
+pub use super::rustdds::{AssemblyLimits, LentMemory, PartialArrival, SampleMemory};
 
 /// One take in so many tries the last reader first, so that a flood of samples at the first reader cannot
 /// block it.
@@ -338,6 +338,21 @@ impl Inbox {
             }
         }
         TakePayload::Empty
+    }
+}
+
+/// What the DDS library tells of a sample of which only a part has arrived; number, place and times are to be
+/// added.
+pub fn partial_sample(arrival: &PartialArrival) -> PartialSample {
+    PartialSample {
+        writer_guid: Guid(arrival.writer.to_bytes()),
+        writer_sequence: arrival.sequence_number.into(),
+        source_timestamp: arrival
+            .source_timestamp
+            .map_or(SourceTimestamp::NONE, |time| SourceTimestamp(time.to_ticks())),
+        available: arrival.complete_bytes as u64,
+        encapsulation: Encapsulation(arrival.encapsulation),
+        ..PartialSample::default()
     }
 }
 

@@ -16,6 +16,9 @@ use crate::model::{
     Encapsulation, Guid, KeyedPayload, ReaderRecord, SampleKey, SourceTimestamp, TypeHash, UnmatchedPolicy,
 };
 
+/// The bytes of the encapsulation header before each payload.
+const ENCAPSULATION_BYTES: usize = 4;
+
 /// Why a sample was not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WriteError {
@@ -116,13 +119,61 @@ impl RawWriter {
         timestamp: SourceTimestamp,
         key: SampleKey,
     ) -> Result<Written, WriteError> {
-        let payload = RawPayload { bytes: payload, encapsulation };
         let mut options = with_key(stamped(timestamp), key);
         if let Some(publisher) = publisher {
             options = options.history_source(GUID::from_bytes(publisher.0));
         }
+        self.write_with(payload, encapsulation, options)
+    }
+
+    fn write_with(
+        &self,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        options: WriteOptionsBuilder,
+    ) -> Result<Written, WriteError> {
+        let payload = RawPayload { bytes: payload, encapsulation };
         let (sample, readers) = self.inner.write_counting_readers(payload, options.build())?;
         Ok(Written { readers, sequence: i64::from(sample.sequence_number) })
+    }
+
+    /// Begins to send a sample that is not complete yet: of `payload`, the library reads only the first
+    /// `available` bytes, until [`extend_early`](Self::extend_early) says that there are more. No reader has
+    /// the sample before [`complete_early`](Self::complete_early): the library does not send the last
+    /// fragment. Returns false, and does nothing, if another sample was begun or the writer is not RELIABLE
+    /// and VOLATILE. Any other write gives the sample up.
+    pub fn begin_early(
+        &self,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+        available: usize,
+    ) -> bool {
+        let payload = RawPayload { bytes: payload, encapsulation };
+        self.inner.begin_early(payload, stamped(timestamp).build(), available + ENCAPSULATION_BYTES)
+    }
+
+    /// The first `available` bytes of the sample that was begun are complete.
+    pub fn extend_early(&self, available: usize) {
+        self.inner.extend_early(available + ENCAPSULATION_BYTES);
+    }
+
+    /// Writes the whole of the sample that was begun, or a sample like any other if none was.
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn complete_early(
+        &self,
+        payload: Bytes,
+        encapsulation: Encapsulation,
+        timestamp: SourceTimestamp,
+    ) -> Result<Written, WriteError> {
+        self.write_with(payload, encapsulation, stamped(timestamp).completes_early())
+    }
+
+    /// Gives up the sample that was begun, of which readers may have a part, and tells them.
+    pub fn withdraw_early(&self) {
+        self.inner.withdraw_early();
     }
 
     /// Removes the samples of a publisher from the history for late joiners.

@@ -22,7 +22,7 @@ use crate::config::Settings;
 use crate::model::{
     AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName,
     LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
-    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PatternRecord, ProcessHealth,
+    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord, ProcessHealth,
     PublisherAccount, RouteId, RouteInfo, SubscriberRecord, fnv1a,
 };
 
@@ -77,7 +77,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 9;
+const LAYOUT_VERSION: u32 = 10;
 /// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
@@ -97,6 +97,7 @@ struct Layout {
     absence: usize,
     route_info: usize,
     pattern: usize,
+    partial: usize,
     ingress: usize,
     publisher: usize,
     lane: usize,
@@ -127,6 +128,7 @@ impl Layout {
             absence: next(MAX_ABSENCES * Cell::<AbsenceRecord>::WORDS),
             route_info: next(routes * Cell::<RouteInfo>::WORDS),
             pattern: next(routes * Cell::<PatternRecord>::WORDS),
+            partial: next(routes * Cell::<PartialSample>::WORDS),
             ingress: next(routes * Cell::<IngressCounters>::WORDS),
             publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
             lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
@@ -231,6 +233,8 @@ boards! {
     route_info, route_info_writer(route: usize): RouteInfo = |layout| layout.check_route(route);
     /// The state of the pattern whose first place is this route, from ingress.
     pattern, pattern_writer(route: usize): PatternRecord = |layout| layout.check_route(route);
+    /// The large sample of a route of which ingress has received a part.
+    partial, partial_writer(route: usize): PartialSample = |layout| layout.check_route(route);
     /// The counters of ingress for a route.
     ingress, ingress_writer(route: usize): IngressCounters = |layout| layout.check_route(route);
     /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
@@ -453,6 +457,7 @@ mod tests {
         for route in 0..routes {
             found.push(place(layout.route_info(route)));
             found.push(place(layout.pattern(route)));
+            found.push(place(layout.partial(route)));
             found.push(place(layout.ingress(route)));
             found.extend((0..MAX_PUBLISHERS).map(|index| place(layout.publisher(route, index))));
             let mut stages = vec![Stage::DdsIn];

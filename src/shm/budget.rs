@@ -18,6 +18,7 @@ use super::error::ShmError;
 use super::root::SHM_DIR;
 use super::segment::{free_bytes, no_room};
 use crate::config::Settings;
+use crate::model::FixedText;
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
 /// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less,
@@ -115,6 +116,8 @@ pub fn budget_bytes(settings: &Settings) -> u64 {
 #[derive(Debug)]
 pub(super) struct SlotMemory {
     file: File,
+    /// The name of the file.
+    name: FixedText,
     /// The address of the first slot, and its place in the file.
     first_address: usize,
     first_offset: u64,
@@ -158,7 +161,10 @@ impl SlotMemory {
         }
         let pages = if pool.is_sparse { 1 } else { u32::MAX };
         let pages = (0..pool.slots).map(|_| AtomicU32::new(pages)).collect();
-        let slots = Self { file, first_address, first_offset, pool, pages, budget: budget.clone(), route };
+        let name = mapping.path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let name = FixedText::new(name);
+        let slots =
+            Self { file, name, first_address, first_offset, pool, pages, budget: budget.clone(), route };
         let no_room = |errno| match errno {
             Errno::ENOSPC => no_room(what, pool.first_bytes, free_bytes()),
             errno => ShmError::os("to reserve shared memory", Path::new(SHM_DIR), &errno.into()),
@@ -179,6 +185,11 @@ impl SlotMemory {
     /// What the pool takes of the budget.
     pub(super) fn usage(&self) -> PoolUse {
         self.budget.usage(self.route)
+    }
+
+    /// The name of the pool's file, and where a payload at this address begins in it.
+    pub(super) fn place(&self, payload: usize) -> (FixedText, u64) {
+        (self.name, self.first_offset + payload.wrapping_sub(self.first_address) as u64)
     }
 
     /// Makes sure that the pages of a payload exist, in a slot that the caller holds.

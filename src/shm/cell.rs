@@ -12,8 +12,8 @@ use std::sync::atomic::{Ordering, fence};
 use super::segment::Segment;
 use crate::model::{
     AbsenceRecord, ControlRecord, DropReason, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
-    LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, OutputReaders, PatternRecord,
-    ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
+    LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, OutputReaders, PartialSample,
+    PatternRecord, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -61,8 +61,9 @@ plain! {
     LanePolicy: 5,
     RouteInfo: 3 * 16 + 2 * 4 + 6,
     PatternRecord: 4 + 16,
+    PartialSample: 10 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
-    LaneCounters: 6 + DropReason::COUNT + 5,
+    LaneCounters: 6 + DropReason::COUNT + 7,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
 }

@@ -19,7 +19,7 @@ use super::header::WireHeader;
 use super::node::{NodeShared, ShmNode, StartLock};
 use super::segment::{free_bytes, no_room};
 use super::service::Service;
-use crate::model::SampleHeader;
+use crate::model::{FixedText, SampleHeader};
 
 /// Why a sample could not be copied into shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -169,9 +169,10 @@ impl SamplePublisher {
         let payload = sample.payload_mut();
         let length = payload.len();
         // For an empty payload this is a dangling address.
-        let payload = NonNull::from(payload).cast();
+        let payload = NonNull::from(payload).cast::<u8>();
+        let place = self.slots.place(payload.as_ptr().addr());
         let slot = Slot { sample };
-        Some(LentSlot { payload, length, slot, _permit: permit, _node: self.node.clone() })
+        Some(LentSlot { payload, length, place, slot, _permit: permit, _node: self.node.clone() })
     }
 
     /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
@@ -210,6 +211,7 @@ impl Slot {
 pub struct LentSlot {
     payload: NonNull<u8>,
     length: usize,
+    place: (FixedText, u64),
     slot: Slot,
     // Declared after `slot`, so that the slot is free before the permit is returned.
     _permit: LentPermit,
@@ -227,6 +229,17 @@ impl LentSlot {
         // SAFETY: `length` bytes of the slot, which is mapped as long as `slot` lives, and which no other
         // code accesses before it is published, which consumes `self`.
         unsafe { std::slice::from_raw_parts_mut(self.payload.as_ptr(), self.length) }
+    }
+
+    /// The length of the payload in bytes.
+    #[expect(clippy::len_without_is_empty, reason = "a length that was asked for")]
+    pub const fn len(&self) -> usize {
+        self.length
+    }
+
+    /// The file of the pool in shared memory, and where the payload begins in it.
+    pub const fn place(&self) -> (FixedText, u64) {
+        self.place
     }
 
     /// Returns the slot, with its payload, for publishing.

@@ -73,6 +73,18 @@ impl LaneWaker {
         self.segment.half(self.at + 1)
     }
 
+    /// How often the board of a partial sample has changed.
+    fn progress_count(&self) -> &AtomicU32 {
+        self.segment.half(self.at + 2)
+    }
+
+    /// Wakes the lane because the board of a partial sample has changed.
+    pub fn wake_for_progress(&self) {
+        // Before the wake: a lane that was woken sees it.
+        self.progress_count().fetch_add(1, Ordering::Release);
+        self.wake();
+    }
+
     /// Wakes the lane early if it sleeps on another CPU than `cpu`, a number from [`this_cpu`], on which the
     /// caller expects to call [`wake`](Self::wake) soon. A lane on the same CPU is not affected, because it
     /// would only delay the wake. A wake need not follow.
@@ -117,6 +129,11 @@ impl LaneSleeper {
     /// The number of wakes so far. While it is the same, no sample has arrived.
     pub fn wakes(&self) -> u32 {
         self.words.wake_count().load(Ordering::Acquire)
+    }
+
+    /// How often a board of a partial sample has changed.
+    pub fn progress(&self) -> u32 {
+        self.words.progress_count().load(Ordering::Acquire)
     }
 
     /// Sleeps until a wake, or for `timeout` at most. Returns at once if there was a wake since the last

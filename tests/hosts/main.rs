@@ -6,6 +6,7 @@ mod churn;
 mod control;
 mod control_faults;
 mod crowds;
+mod cut_through;
 mod faults;
 mod forged_participants;
 mod fragments;

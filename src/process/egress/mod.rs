@@ -7,6 +7,7 @@
 
 mod arena;
 mod bound_topic;
+mod early_send;
 mod former_readers;
 mod gaps;
 mod history;
@@ -113,6 +114,8 @@ struct Egress {
     noncritical: Option<Noncritical>,
     arena: CopyArena,
     sleeper: LaneSleeper,
+    /// How often boards of partial samples had changed at the last check.
+    seen_progress: u32,
     policy: PolicyWatch,
     housekeeping_at: MonotonicNs,
     applied_mode: LaneMode,
@@ -162,6 +165,7 @@ impl Egress {
             more_urgent,
             noncritical,
             arena: CopyArena::new(),
+            seen_progress: sleeper.progress(),
             sleeper,
             housekeeping_at: now,
             applied_mode: LaneMode::Normal,
@@ -188,12 +192,22 @@ impl Egress {
         if let Some(lane) = &mut self.noncritical {
             return lane.step(&mut self.outputs, &mut self.participant, &mut self.arena, mode);
         }
+        let progress = self.sleeper.progress();
+        if std::mem::replace(&mut self.seen_progress, progress) != progress {
+            // Before samples are taken: a sample is published before the next one is on the board.
+            for output in &mut self.outputs {
+                output.read_progress();
+            }
+        }
         let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
         for place in 0..self.outputs.len() {
             // The samples of higher priorities that may still go first; the count of wakes at the last check.
             let (mut ahead, mut seen) = (SAMPLES_PER_TURN, None);
             for _ in 0..SAMPLES_PER_TURN {
-                let Some(sample) = self.outputs[place].take() else { break };
+                let Some(sample) = self.outputs[place].take() else {
+                    self.outputs[place].follow_progress();
+                    break;
+                };
                 turn = Turn::Busy;
                 let wakes = Some(self.sleeper.wakes());
                 if std::mem::replace(&mut seen, wakes) != wakes {

@@ -9,6 +9,7 @@ use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
 use super::arena::CopyArena;
 use super::bound_topic::BoundTopic;
+use super::early_send::{EarlySend, Followed};
 use super::former_readers::FormerReaders;
 use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
@@ -20,7 +21,7 @@ use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
 use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
-    OutputReaders, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
+    OutputReaders, PartialSample, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
@@ -55,6 +56,9 @@ pub(super) struct Output {
     type_hash: TypeHash,
     /// Whether the writer is one of a type with keys.
     has_keys: bool,
+    early: EarlySend,
+    /// The board of a partial sample, read and not followed yet.
+    partial: Option<PartialSample>,
     unsent: UnsentSamples<Forwarded>,
     /// Samples taken that wait for a token.
     queued: u64,
@@ -135,6 +139,8 @@ impl Output {
             writer: None,
             type_hash: TypeHash::UNKNOWN,
             has_keys: false,
+            early: EarlySend::default(),
+            partial: None,
             queued: 0,
             tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
             drop_log: DropLog::new(former.drops),
@@ -205,8 +211,51 @@ impl Output {
         }
     }
 
+    /// Reads how much of a large sample has arrived.
+    pub fn read_progress(&mut self) {
+        self.partial = self.boards.partial(self.route);
+    }
+
+    /// Begins to send a large sample of which a part has arrived, sends more of it, or withdraws it. To be
+    /// called when all samples are taken that were published before the board was read.
+    pub fn follow_progress(&mut self) {
+        let Some(partial) = self.partial.take() else { return };
+        let Some(writer) = &self.writer else { return };
+        // A new writer for late joiners, or of a place's next topic, may be due before the next sample.
+        let may_begin = self.history.is_none()
+            && !self.has_keys
+            && !self.is_to_latch()
+            && critical_drop(self.mode).is_none()
+            && self.former_readers.is_empty()
+            && self.counters.get().readers > 0;
+        let followed = self.early.follow(&partial, writer, may_begin, clock::monotonic());
+        let (withdrew, began) = match followed {
+            Followed::Nothing => return,
+            Followed::Began => (0, 1),
+            Followed::Withdrew => (1, 0),
+            Followed::WithdrewAndBegan => (1, 1),
+        };
+        self.counters.update(|counters| {
+            counters.withdrawn += withdrew;
+            counters.begun_early += began;
+        });
+    }
+
+    /// Withdraws the sample that was begun early, if there is one.
+    fn withdraw_early(&mut self) {
+        if self.early.end() {
+            if let Some(writer) = &self.writer {
+                writer.withdraw_early();
+            }
+            self.counters.update(|counters| counters.withdrawn += 1);
+        }
+    }
+
     /// Writes a taken sample to DDS, unless the mode drops it, and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
+        if !self.early.take(sample.header(), sample.payload().len()) {
+            self.withdraw_early();
+        }
         // A noncritical lane polls no sample in such a mode.
         if let Some(reason) = critical_drop(self.mode) {
             return self.drop_sample(&sample, reason);
@@ -250,7 +299,11 @@ impl Output {
         let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
         let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
-        let outcome = writer.write_from(publisher, payload, encapsulation, timestamp, header.key);
+        let outcome = if self.early.end() {
+            writer.complete_early(payload, encapsulation, timestamp)
+        } else {
+            writer.write_from(publisher, payload, encapsulation, timestamp, header.key)
+        };
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
@@ -296,6 +349,7 @@ impl Output {
 
     /// Counts a taken sample that is not sent.
     pub fn drop_sample(&mut self, _sample: &ShmSample, reason: DropReason) {
+        self.withdraw_early();
         self.counters.update(|counters| {
             record_sequence(counters, &self.tracker);
             counters.drops.add(reason, 1);

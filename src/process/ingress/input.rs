@@ -7,22 +7,34 @@ use tracing::{error, info, warn};
 
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
+use super::arrival_progress::ArrivalProgress;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};
 use super::source::{ReaderPlan, Source, label};
 use crate::clock;
-use crate::config::{Route, Settings};
+use crate::config::{Lane, Route, Settings};
 use crate::dds::{
     ArrivalFlag, Endpoint, Inbox, Participant, ReaderEvent, ReaderQos, SampleOrigin, TakePayload,
 };
 use crate::model::{
     AgeBasis, DdsType, DropReason, Durability, Encapsulation, FixedText, Guid, IngressCounters, MonotonicNs,
-    Reliability, RouteInfo, SampleHeader, TopicName,
+    Reliability, RouteInfo, SampleHeader, TopicName, TrafficClass,
 };
-use crate::shm::{BoardWriter, HistogramWriter, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage};
+use crate::shm::{
+    BoardWriter, HistogramWriter, LaneWaker, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage,
+};
 
 /// Interval at which a route without a publisher logs that it waits.
 const REMIND_MS: u64 = 30_000;
+
+/// The critical lanes that serve a route.
+fn critical_lanes(role: &Role, settings: &Settings, route: usize) -> Vec<LaneWaker> {
+    let serves = |&(_, lane): &(usize, &Lane)| {
+        lane.class() == TrafficClass::Critical && lane.outputs.iter().any(|output| output.route == route)
+    };
+    let lanes = settings.lanes.iter().enumerate();
+    lanes.filter(serves).map(|(index, _)| role.boards.waker(index)).collect()
+}
 
 /// The input of one route: takes samples from its DDS readers and publishes them to shared memory.
 pub(super) struct Input {
@@ -88,7 +100,13 @@ impl Input {
             readers: BTreeMap::new(),
             settled_type: None,
             source_changed: true,
-            pool: PoolOwner::new(SamplePublisher::create_within(&role.node, &channel, budget, index)?),
+            pool: PoolOwner::new(
+                SamplePublisher::create_within(&role.node, &channel, budget, index)?,
+                Some(ArrivalProgress::new(
+                    role.boards.partial_writer(index),
+                    critical_lanes(role, settings, index),
+                )),
+            ),
             drop_log: DropLog::new(counters.get().drops),
             counters,
             info,

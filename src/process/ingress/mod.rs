@@ -4,6 +4,7 @@
 //! block. The DDS library's receiving thread takes and publishes the samples ([`receiving`]); the main thread
 //! does the housekeeping; a third thread wakes critical lanes early ([`early_waker`]).
 
+mod arrival_progress;
 mod early_waker;
 mod input;
 pub(super) mod memory;

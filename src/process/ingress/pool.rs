@@ -7,7 +7,8 @@
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use crate::dds::{AssemblyLimits, LentMemory, Payload, SampleMemory};
+use super::arrival_progress::{ArrivalProgress, SampleProgress};
+use crate::dds::{AssemblyLimits, LentMemory, PartialArrival, Payload, SampleMemory};
 use crate::shm::{LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
 
 /// The pool, as the main thread and the DDS library share it.
@@ -16,6 +17,7 @@ pub(super) struct Pool {
     /// Locked while lanes are connected. A borrower does not wait for it: it gets no slot meanwhile.
     connecting: Mutex<()>,
     abandoned: Sender<LentSlot>,
+    progress: Option<Arc<ArrivalProgress>>,
     /// The result of a loan that has ended, which `fill` takes immediately.
     finished: Finished,
 }
@@ -36,10 +38,13 @@ pub(super) struct PoolOwner {
 }
 
 impl PoolOwner {
-    pub fn new(publisher: SamplePublisher) -> Self {
+    /// Owns the pool of a route. `progress` tells the lanes of samples that arrive in parts.
+    pub fn new(publisher: SamplePublisher, progress: Option<ArrivalProgress>) -> Self {
         let (sender, abandoned) = channel();
         let finished = Arc::new(Mutex::new(None));
-        let pool = Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender, finished });
+        let progress = progress.map(Arc::new);
+        let pool =
+            Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender, progress, finished });
         Self { pool, abandoned }
     }
 
@@ -103,7 +108,10 @@ impl SampleMemory for Pool {
         }
         let _not_connecting = self.connecting.try_lock().ok()?;
         let slot = self.publisher.lend(len)?;
-        Some(Box::new(Loan { slot: Some(slot), abandoned: self.abandoned.clone(), finished }))
+        let abandoned = self.abandoned.clone();
+        let sample_progress = SampleProgress::default();
+        let progress = self.progress.clone();
+        Some(Box::new(Loan { slot: Some(slot), progress, sample_progress, abandoned, finished }))
     }
 
     fn limits(&self) -> AssemblyLimits {
@@ -144,6 +152,8 @@ impl LentMemory for Refused {
 struct Loan {
     /// `Some` until `finish` takes it.
     slot: Option<LentSlot>,
+    progress: Option<Arc<ArrivalProgress>>,
+    sample_progress: SampleProgress,
     abandoned: Sender<LentSlot>,
     finished: Finished,
 }
@@ -153,8 +163,17 @@ impl LentMemory for Loan {
         self.slot.as_mut().map_or(&mut [], LentSlot::payload_mut)
     }
 
+    fn arrived(&mut self, arrival: &PartialArrival) {
+        if let (Some(progress), Some(slot)) = (&self.progress, &self.slot) {
+            progress.advance(&mut self.sample_progress, slot.place(), slot.len(), arrival);
+        }
+    }
+
     fn finish(mut self: Box<Self>) {
         if let Some(slot) = self.slot.take() {
+            if let Some(progress) = &self.progress {
+                progress.taken(&self.sample_progress);
+            }
             *lock(&self.finished) = Some(Ok(slot.into_slot()));
         }
     }
@@ -163,6 +182,9 @@ impl LentMemory for Loan {
 impl Drop for Loan {
     fn drop(&mut self) {
         if let Some(slot) = self.slot.take() {
+            if let Some(progress) = &self.progress {
+                progress.given_up(&self.sample_progress);
+            }
             // Fails only after the owner is dropped; then the slot is dropped here.
             let _ = self.abandoned.send(slot);
         }
@@ -192,7 +214,7 @@ mod tests {
         let lanes = vec![QueueLimits { queue_depth: 4, max_borrowed: 2 }];
         let route = RouteId::try_from("scan").unwrap();
         let channel = RouteChannel { route, max_sample_bytes: 100, lanes, max_taps: 0, retained_samples: 0 };
-        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap()), node, root)
+        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap(), None), node, root)
     }
 
     #[test]

@@ -173,6 +173,11 @@ pub struct LaneCounters {
     /// it had repaired them: [`OutputReaders::unconfirmed`](super::OutputReaders::unconfirmed), summed over
     /// the ends.
     pub unconfirmed: u64,
+    /// Samples that the lane began to send before ingress had received all of them.
+    pub begun_early: u64,
+    /// Of those, the ones that it gave up, because another sample came first or they never became complete.
+    /// Those that became complete later were sent as a whole.
+    pub withdrawn: u64,
 }
 
 impl LaneCounters {

@@ -11,6 +11,7 @@ mod health;
 mod modes;
 mod names;
 mod network;
+mod partial;
 mod probe;
 mod qos;
 mod rates;
@@ -36,6 +37,7 @@ pub use health::{
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
 pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
+pub use partial::PartialSample;
 pub use probe::{MAX_ID_BYTES, ProbeRefusal, RefusalCounts, is_probe_id};
 pub use qos::{Durability, History, QosProfile, Reliability};
 pub use rates::{DropPolicy, LaneRates, RatePolicy};

@@ -5,6 +5,7 @@
 mod absences;
 mod classifier;
 mod clock_offset;
+mod cut_through;
 mod intruders;
 mod lane;
 mod lane_mode;
@@ -29,6 +30,7 @@ pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
 };
 pub use clock_offset::ClockOffset;
+pub use cut_through::{MIN_CUT_THROUGH_BYTES, begins_early, step_bytes};
 pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_GUARDED_TOPICS,
     MAX_REMEMBERED_INTRUDERS, NODE_NAME_TIMEOUT_MS, REMEMBER_MS,

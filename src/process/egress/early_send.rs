@@ -1,0 +1,130 @@
+//! Sends a large sample of a critical lane while the rest of it arrives.
+//!
+//! The DDS library sends what ingress has received from the slot in shared memory, but never the last
+//! fragment before the lane has taken the sample from its queue: only then it is accounted for, and the slot
+//! cannot be reused. So no reader has a sample that ingress has not published. If another sample comes first,
+//! or the sample never becomes complete, the lane withdraws it; one that becomes complete later is sent as a
+//! whole. The other samples of the route never wait.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use tracing::warn;
+
+use crate::dds::RawWriter;
+use crate::model::{FixedText, Guid, MonotonicNs, PartialSample, SampleHeader};
+use crate::policy::begins_early;
+use crate::shm::PoolView;
+
+/// The sample of one output that was begun early.
+#[derive(Default)]
+pub(super) struct EarlySend {
+    begun: Option<PartialSample>,
+    /// The writer and the sequence number of the last sample that was taken.
+    taken: (Guid, i64),
+    /// The pool of the route, and the name of its file: a restart of ingress creates another one.
+    pool: Option<(FixedText, Arc<PoolView>)>,
+    /// The pool that could not be mapped, whose samples are not begun.
+    unusable: Option<FixedText>,
+}
+
+/// What [`EarlySend::follow`] did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Followed {
+    Nothing,
+    Began,
+    Withdrew,
+    /// Withdrew one sample and began another.
+    WithdrewAndBegan,
+}
+
+impl EarlySend {
+    /// Notes that a sample was taken, and returns whether it is the one that was begun.
+    pub fn take(&mut self, header: &SampleHeader, len: usize) -> bool {
+        self.taken = (header.writer_guid, header.writer_sequence);
+        self.begun.is_some_and(|begun| {
+            begun.writer_guid == header.writer_guid
+                && begun.writer_sequence == header.writer_sequence
+                && begun.source_timestamp == header.source_timestamp
+                && begun.encapsulation == header.encapsulation
+                && begun.len == len as u64
+        })
+    }
+
+    /// The sample that was begun is written or withdrawn.
+    pub fn end(&mut self) -> bool {
+        self.begun.take().is_some()
+    }
+
+    /// Follows the board of the route, whose samples that were published before it was read are all taken.
+    /// `may_begin` is whether the output may begin a sample.
+    pub fn follow(
+        &mut self,
+        partial: &PartialSample,
+        writer: &RawWriter,
+        may_begin: bool,
+        now: MonotonicNs,
+    ) -> Followed {
+        let mut withdrew = false;
+        if let Some(begun) = &mut self.begun {
+            if begun.number == partial.number {
+                if partial.available > begun.available {
+                    begun.available = partial.available;
+                    writer.extend_early(begun.available as usize);
+                }
+                if partial.ended == 0 {
+                    return Followed::Nothing;
+                }
+            }
+            // It never becomes complete; or the next one is on the board, and it was not among those taken
+            // before, because it was a repetition or was dropped.
+            self.begun = None;
+            writer.withdraw_early();
+            withdrew = true;
+        }
+        let began = partial.ended == 0 && may_begin && self.begin(partial, writer, now);
+        match (withdrew, began) {
+            (false, false) => Followed::Nothing,
+            (false, true) => Followed::Began,
+            (true, false) => Followed::Withdrew,
+            (true, true) => Followed::WithdrewAndBegan,
+        }
+    }
+
+    fn begin(&mut self, partial: &PartialSample, writer: &RawWriter, now: MonotonicNs) -> bool {
+        // A lane that is late takes the sample before it reads the board.
+        let (writer_guid, last) = self.taken;
+        if partial.writer_guid == writer_guid && partial.writer_sequence <= last {
+            return false;
+        }
+        if !begins_early(partial.len, partial.available, now.since(partial.began_at)) {
+            return false;
+        }
+        let payload = self.pool(partial.pool).and_then(|pool| pool.payload(partial.pool_offset, partial.len));
+        let Some(payload) = payload else { return false };
+        let payload = Bytes::from_owner(payload);
+        let available = partial.available.min(partial.len) as usize;
+        if !writer.begin_early(payload, partial.encapsulation, partial.source_timestamp, available) {
+            return false;
+        }
+        self.begun = Some(*partial);
+        true
+    }
+
+    fn pool(&mut self, name: FixedText) -> Option<Arc<PoolView>> {
+        if self.unusable == Some(name) {
+            return None;
+        }
+        if self.pool.as_ref().is_none_or(|(mapped, _)| *mapped != name) {
+            self.pool = None;
+            match PoolView::open(name.as_str()) {
+                Ok(view) => self.pool = Some((name, view)),
+                Err(error) => {
+                    self.unusable = Some(name);
+                    warn!(%error, "large samples of a route are sent only when they are complete");
+                }
+            }
+        }
+        self.pool.as_ref().map(|(_, view)| view.clone())
+    }
+}

@@ -1,0 +1,167 @@
+//! Large samples that the critical lane sends while they arrive: no subscriber sees a sample that ingress has
+//! not published, a part of another one, or less than it would see of stored samples. Peers compare each byte.
+
+use adaptive_bridge::config::DdsNetwork;
+use adaptive_bridge::dds::{Participant, ParticipantOptions, WriterEvent};
+use adaptive_bridge::model::{Encapsulation, QosProfile, SourceTimestamp};
+use bytes::Bytes;
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use support::bed::{Bed, outputs};
+use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::process::signal;
+
+const YAML: &str = "topics:\n  - {id: camera, input_topic: /camera, message_type: sensor_msgs/msg/PointCloud2, \
+                    max_sample_bytes: 4194304}\nlanes: {critical: {queue_depth: 64}}\n";
+const INPUT: &str = "rt/camera";
+const TYPE: &str = "sensor_msgs::msg::dds_::PointCloud2_";
+const CRITICAL: &str = "rt/adaptive_bridge/critical/camera";
+const MIB: usize = 1 << 20;
+
+fn camera(library: Library) -> Peer {
+    let peer = Peer::on(library).type_name(TYPE).large_socket_buffers();
+    peer.keep_last(30)
+}
+
+fn critical(status: &Value) -> &Value {
+    outputs(status).find(|output| output["lane"] == "critical").unwrap()
+}
+
+fn count(status: &Value, what: &str) -> u64 {
+    critical(status)[what].as_u64().unwrap_or_else(|| panic!("{what}: {status}"))
+}
+
+/// Waits until each subscriber has every sample that the lane has forwarded, and ends them.
+fn compare(bed: &Bed, subscribers: Vec<RunningPeer>) -> Value {
+    let status = bed.wait_accounted();
+    let forwarded = count(&status, "forwarded");
+    // A busy machine may keep a subscriber from reading for longer than the lane retains samples.
+    let overrun = count(&status, "reader_overrun");
+    for subscriber in subscribers {
+        subscriber.wait_received(forwarded - overrun);
+        let received: Received = subscriber.end();
+        assert_eq!((received.bad, received.duplicates), (0, 0), "{received:?}");
+        assert!(received.received <= forwarded, "{received:?} {status}");
+    }
+    println!("{forwarded} forwarded, {} begun early, {} withdrawn", count(&status, "begun_early"), {
+        count(&status, "withdrawn")
+    });
+    status
+}
+
+fn subscribers(bed: &Bed) -> Vec<RunningPeer> {
+    let subscribe = |library| bed.subscribe("critical", camera(library), CRITICAL);
+    [Library::Fast, Library::Cyclone].map(subscribe).into()
+}
+
+#[test]
+fn samples_of_two_publishers_are_sent_while_they_arrive() {
+    let test = "samples_of_two_publishers_are_sent_while_they_arrive";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let subscribers = subscribers(&bed);
+    let publish = |(number, library)| {
+        let peer = camera(library).sizes(&[MIB, 200_000, 3_000, 700_001]).rate_hz(30.0).count(100);
+        bed.publish(peer.first_seq(1 + number * 1_000), INPUT)
+    };
+    let publishers = [(0_u64, Library::Fast), (1, Library::Cyclone)].map(publish);
+    for publisher in publishers {
+        let sent: Sent = publisher.finish();
+        assert_eq!((sent.ok, sent.failed), (100, 0));
+    }
+    let status = compare(&bed, subscribers);
+    assert_eq!(count(&status, "forwarded"), 200, "{status}");
+    // A busy machine may complete some samples before the lane runs.
+    assert!(count(&status, "begun_early") >= 20, "{status}");
+    bed.end();
+}
+
+#[test]
+fn a_publisher_that_dies_in_the_middle_of_a_sample_costs_the_others_nothing() {
+    let test = "a_publisher_that_dies_in_the_middle_of_a_sample_costs_the_others_nothing";
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let subscribers = subscribers(&bed);
+    let steady = bed.publish(camera(Library::Cyclone).size(MIB).rate_hz(30.0), INPUT);
+    for round in 1..=20 {
+        let peer = camera(Library::Fast).size(MIB).rate_hz(20.0).first_seq(1 + round * 10_000);
+        let mut dying = bed.publish(peer, INPUT);
+        support::wait_until("a sample", || dying.written() > round % 3);
+        dying.kill9();
+    }
+    let sent: Sent = steady.end();
+    assert_eq!(sent.failed, 0, "{sent:?}");
+    let status = compare(&bed, subscribers);
+    assert!(count(&status, "forwarded") >= sent.ok, "{status}");
+    bed.end();
+}
+
+#[test]
+fn samples_that_never_become_complete_are_withdrawn() {
+    let test = "samples_that_never_become_complete_are_withdrawn";
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let subscribers = subscribers(&bed);
+    let options = ParticipantOptions {
+        network: &DdsNetwork::of_domain(0),
+        namespace: "/".into(),
+        node_name: "stops".into(),
+        graph_gid_bytes: 16,
+        dscp: 0,
+    };
+    let mut node = bed.host("publisher").within(|| Participant::open(&options).unwrap());
+    let writer = node.create_writer(INPUT, TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    let is_match = |event| matches!(event, Some(WriterEvent::Matched { joined: true, .. }));
+    support::wait_until("ingress", || is_match(writer.poll_event()));
+    let steady = bed.publish(camera(Library::Cyclone).size(MIB).rate_hz(10.0), INPUT);
+    // The publisher sends three quarters of each sample.
+    for number in 1..=10 {
+        let payload = Bytes::from(vec![0xEE; MIB]);
+        let timestamp = SourceTimestamp(number << 32);
+        assert!(writer.begin_early(payload, Encapsulation::CDR_LE, timestamp, MIB * 3 / 4));
+        bed.bridge.wait_status("a sample withdrawn", |status| {
+            // Again, because the writer sends nothing early while a reader joins.
+            writer.extend_early(MIB * 3 / 4);
+            count(status, "withdrawn") >= number
+        });
+        writer.withdraw_early();
+        // Ingress lends the DDS library two slots, and learns of the withdrawal with the next HEARTBEAT.
+        #[allow(clippy::disallowed_methods, reason = "three periods of 100 ms")]
+        std::thread::sleep(std::time::Duration::from_millis(300));
+    }
+    let sent: Sent = steady.end();
+    assert_eq!(sent.failed, 0, "{sent:?}");
+    let status = compare(&bed, subscribers);
+    assert_eq!(count(&status, "forwarded"), sent.ok, "{status}");
+    bed.end();
+}
+
+/// Kills ingress, each time after another delay, so that it dies in the middle of samples.
+fn kill_ingress(test: &str, kills: usize) {
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let subscribers = subscribers(&bed);
+    let publisher = bed.publish(camera(Library::Fast).size(2 * MIB).rate_hz(20.0), INPUT);
+    for kill in 1..=kills {
+        for subscriber in &subscribers {
+            subscriber.wait_received(subscriber.received() + 5);
+        }
+        #[allow(clippy::disallowed_methods, reason = "a period of 20 Hz has 50 ms")]
+        std::thread::sleep(std::time::Duration::from_micros(kill as u64 * 3_237 % 50_000));
+        signal(bed.pid("ingress"), Signal::SIGKILL);
+        support::wait_until("a restart", || bed.pids("ingress").len() == kill + 1);
+    }
+    publisher.end::<Sent>();
+    compare(&bed, subscribers);
+    bed.end();
+}
+
+#[test]
+fn no_reader_waits_for_a_sample_of_a_killed_ingress() {
+    kill_ingress("no_reader_waits_for_a_sample_of_a_killed_ingress", 10);
+}
+
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    #[test]
+    fn no_reader_waits_for_a_sample_of_200_killed_ingresses() {
+        super::kill_ingress("no_reader_waits_for_a_sample_of_200_killed_ingresses", 200);
+    }
+}
