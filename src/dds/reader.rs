@@ -50,7 +50,11 @@ impl SampleMemory for SmallSamples {
     }
 
     fn limits(&self) -> AssemblyLimits {
-        AssemblyLimits { max_sample_bytes: self.max_bytes, max_total_bytes: 4 * self.max_bytes }
+        AssemblyLimits {
+            max_sample_bytes: self.max_bytes,
+            max_total_bytes: 4 * self.max_bytes,
+            max_kept_bytes: None,
+        }
     }
 }
 

@@ -125,7 +125,8 @@ pub(super) fn assembly_limits(max_sample_bytes: usize) -> AssemblyLimits {
     let max_sample_bytes = max_sample_bytes + 4;
     let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
     // Three, because the library counts some KiB more for each: two always have room.
-    AssemblyLimits { max_sample_bytes, max_total_bytes: max_total_bytes.max(3 * max_sample_bytes) }
+    let max_total_bytes = max_total_bytes.max(3 * max_sample_bytes);
+    AssemblyLimits { max_sample_bytes, max_total_bytes, max_kept_bytes: None }
 }
 
 /// A sample that the route does not allow: its bytes are discarded as they arrive. It becomes complete like

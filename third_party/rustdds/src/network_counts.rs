@@ -48,6 +48,10 @@ pub struct NetworkCounts {
   pub participants_evicted: u64,
   /// Announcements of endpoints and topics that were dropped: no room for another.
   pub endpoints_refused: u64,
+  /// Unfinished samples that were discarded because those of all readers together
+  /// needed more memory than
+  /// [`with_max_unfinished_bytes`](crate::DomainParticipantBuilder::with_max_unfinished_bytes) allows.
+  pub unfinished_discarded: u64,
 }
 
 /// The counters behind [`NetworkCounts`], which both threads of a participant increment.
@@ -57,6 +61,7 @@ pub struct NetworkCounters {
   pub(crate) announcements_refused: Counter,
   pub(crate) participants_evicted: Counter,
   pub(crate) endpoints_refused: Counter,
+  pub(crate) unfinished_discarded: Counter,
 }
 
 impl NetworkCounters {
@@ -67,6 +72,7 @@ impl NetworkCounters {
       announcements_refused: self.announcements_refused.get(),
       participants_evicted: self.participants_evicted.get(),
       endpoints_refused: self.endpoints_refused.get(),
+      unfinished_discarded: self.unfinished_discarded.get(),
     }
   }
 }

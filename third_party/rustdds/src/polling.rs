@@ -97,6 +97,8 @@ pub(crate) struct Hooks {
   pub urgent_topics: BTreeSet<String>,
   /// See `DomainParticipantBuilder::with_user_data`.
   pub user_data: Vec<u8>,
+  /// See `DomainParticipantBuilder::with_max_unfinished_bytes`.
+  pub max_unfinished_bytes: Option<usize>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

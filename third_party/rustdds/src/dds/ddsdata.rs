@@ -95,6 +95,16 @@ impl DDSData {
     }
   }
 
+  // Memory of the library that the payload takes.
+  pub(crate) fn own_bytes(&self) -> usize {
+    match self {
+      DDSData::Data {
+        serialized_payload, ..
+      } => serialized_payload.len_serialized(),
+      others => others.payload_size(),
+    }
+  }
+
   pub(crate) fn reallocate(&mut self) {
     match self {
       DDSData::Data {

@@ -32,8 +32,13 @@ pub struct AssemblyLimits {
   /// The largest serialized sample. Fragments of a larger one are dropped.
   pub max_sample_bytes: usize,
   /// All samples together, with 4 KiB for each and one bit for each fragment. When they
-  /// need more, one sample of the Writer with the most of it is discarded.
+  /// need more, one sample of the Writer with the most of it is discarded. All Readers of a
+  /// participant together have
+  /// [`DomainParticipantBuilder::with_max_unfinished_bytes`](crate::DomainParticipantBuilder::with_max_unfinished_bytes).
   pub max_total_bytes: usize,
+  /// Complete samples that the topic keeps in the library's memory, whether they were taken
+  /// or not. `None`: only the number of samples in the Readers' History limits them.
+  pub max_kept_bytes: Option<usize>,
 }
 
 impl Default for AssemblyLimits {
@@ -42,6 +47,7 @@ impl Default for AssemblyLimits {
     Self {
       max_sample_bytes: 64 * 1024 * 1024 + 4,
       max_total_bytes: 2 * (64 * 1024 * 1024 + 4),
+      max_kept_bytes: None,
     }
   }
 }
@@ -59,6 +65,7 @@ impl SampleMemory for BuiltIn {
     AssemblyLimits {
       max_sample_bytes: 256 * 1024,
       max_total_bytes: 4 * 1024 * 1024,
+      max_kept_bytes: None,
     }
   }
 }

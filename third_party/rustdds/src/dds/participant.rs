@@ -164,6 +164,17 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Limits the library's memory for samples of which fragments are missing, at all
+  /// Readers of the participant together. When they need more, one sample is discarded of
+  /// the Writer with the most of it at the Reader with the most of it, and counted in
+  /// [`NetworkCounts::unfinished_discarded`](crate::NetworkCounts::unfinished_discarded).
+  /// Without it, each Reader has its own
+  /// [`max_total_bytes`](crate::AssemblyLimits::max_total_bytes).
+  pub fn with_max_unfinished_bytes(mut self, bytes: usize) -> Self {
+    self.hooks.max_unfinished_bytes = Some(bytes);
+    self
+  }
+
   /// Sets the USER_DATA (DDS v1.4 Section 2.2.3.1) that discovery announces with the
   /// participant: [`MAX_PARTICIPANT_USER_DATA`] bytes at most.
   ///

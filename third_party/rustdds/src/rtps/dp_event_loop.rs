@@ -259,6 +259,16 @@ impl DPEventLoop {
     let counters = discovery_db_read(&discovery_db).counters();
     let local_interfaces: Rc<[IfAddr]> = Rc::from(interfaces);
 
+    let mut message_receiver = MessageReceiver::new(
+      participant_guid_prefix,
+      acknack_sender,
+      spdp_liveness_sender,
+      security_plugins_opt.clone(),
+      Rc::clone(&interface_observations),
+      counters,
+    );
+    message_receiver.max_unfinished_bytes = hooks.max_unfinished_bytes;
+
     Ok(Self {
       domain_info,
       poll,
@@ -266,14 +276,7 @@ impl DPEventLoop {
       discovery_db,
       udp_listeners,
       udp_sender: Rc::new(udp_sender),
-      message_receiver: MessageReceiver::new(
-        participant_guid_prefix,
-        acknack_sender,
-        spdp_liveness_sender,
-        security_plugins_opt.clone(),
-        Rc::clone(&interface_observations),
-        counters,
-      ),
+      message_receiver,
       interface_observations,
       local_interfaces,
       only_networks,

@@ -520,18 +520,32 @@ impl FragmentAssemblers {
 
   fn evict_down_to(&mut self, max_bytes: usize) {
     while self.own_bytes > max_bytes {
-      let most = self
-        .by_writer
-        .iter_mut()
-        .max_by_key(|(_, fa)| fa.own_bytes);
-      let Some((&writer, fa)) = most else { break };
-      let before = fa.own_bytes;
-      fa.evict();
-      self.own_bytes -= before - fa.own_bytes;
-      if fa.is_empty() {
-        self.by_writer.remove(&writer);
+      if self.evict() == 0 {
+        break;
       }
     }
+  }
+
+  /// Discards an unfinished sample of the Writer with the most memory, and returns the
+  /// bytes that this frees.
+  pub fn evict(&mut self) -> usize {
+    let most = self
+      .by_writer
+      .iter_mut()
+      .max_by_key(|(_, fa)| fa.own_bytes);
+    let Some((&writer, fa)) = most else { return 0 };
+    let before = fa.own_bytes;
+    fa.evict();
+    let freed = before - fa.own_bytes;
+    self.own_bytes -= freed;
+    if fa.is_empty() {
+      self.by_writer.remove(&writer);
+    }
+    freed
+  }
+
+  pub fn own_bytes(&self) -> usize {
+    self.own_bytes
   }
 
   pub fn get(&self, writer: GUID) -> Option<&FragmentAssembler> {

@@ -124,6 +124,8 @@ impl Default for MessageReceiverState<'_> {
 /// Entities. (See RTPS spec Section 8.3.7)
 pub(crate) struct MessageReceiver {
   pub available_readers: BTreeMap<EntityId, Reader>,
+  // What unfinished samples of all Readers may take of the library's memory.
+  pub max_unfinished_bytes: Option<usize>,
   // GuidPrefix sent in this channel needs to be RTPSMessage source_guid_prefix. Writer needs this
   // to locate RTPSReaderProxy if negative acknack.
   acknack_sender: WakeSender<(GuidPrefix, AckSubmessage)>,
@@ -177,6 +179,7 @@ impl MessageReceiver {
   ) -> Self {
     Self {
       available_readers: BTreeMap::new(),
+      max_unfinished_bytes: None,
       acknack_sender,
       spdp_liveness_sender,
       security_plugins,
@@ -743,6 +746,7 @@ impl MessageReceiver {
       }
 
       WriterSubmessage::DataFrag(datafrag, flags) => {
+        let before = target_reader.unfinished_bytes();
         Self::decode_and_handle_datafrag(
           security_plugins,
           source_guid,
@@ -751,11 +755,38 @@ impl MessageReceiver {
           target_reader,
           &mr_state,
         );
+        // Only the first fragment of a sample takes memory.
+        if target_reader.unfinished_bytes() > before {
+          self.discard_unfinished_over_limit();
+        }
       }
 
       WriterSubmessage::HeartbeatFrag(heartbeatfrag, _flags) => {
         target_reader.handle_heartbeatfrag_msg(&heartbeatfrag, &mr_state);
       }
+    }
+  }
+
+  // Discards unfinished samples until those of all Readers are within the limit: of
+  // the Reader with the most, so that what is claimed of one topic costs no other one
+  // its samples.
+  fn discard_unfinished_over_limit(&mut self) {
+    let Some(max_bytes) = self.max_unfinished_bytes else {
+      return;
+    };
+    let readers = self.available_readers.values();
+    let mut bytes: usize = readers.map(Reader::unfinished_bytes).sum();
+    while bytes > max_bytes {
+      let most = self
+        .available_readers
+        .values_mut()
+        .max_by_key(|reader| reader.unfinished_bytes());
+      let freed = most.map_or(0, Reader::discard_unfinished);
+      if freed == 0 {
+        break;
+      }
+      bytes -= freed;
+      self.counters.unfinished_discarded.increment();
     }
   }
 
@@ -1215,9 +1246,106 @@ mod tests {
     polling::{new_shared_timer, wake_channel, LoopWaker},
     rtps::reader::ReaderIngredients,
     serialization::from_bytes,
-    structure::{dds_cache::DDSCache, guid::EntityKind},
+    structure::{dds_cache::DDSCache, guid::EntityKind, sequence_number::FragmentNumber},
   };
   use super::*;
+
+  fn best_effort_reader(id: u8, topic: &str, writer: GUID) -> Reader {
+    let (notification_sender, _) = crate::mio_source::notification_channel(100);
+    let (_, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+    let (status_sender, _) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+    let (participant_status_sender, _) = sync_status_channel(16).unwrap();
+    let (_, data_reader_command_receiver) = wake_channel::<ReaderCommand>(10, &LoopWaker::new());
+    let qos_policy = QosPolicies::qos_none();
+    let topic_cache_handle = DDSCache::new().add_new_topic(
+      topic.to_string(),
+      TypeDesc::new("test".to_string()),
+      &qos_policy,
+    );
+    let entity =
+      EntityId::create_custom_entity_id([0, 0, id], EntityKind::READER_NO_KEY_USER_DEFINED);
+    let ingredients = ReaderIngredients {
+      guid: GUID::new_with_prefix_and_id(GuidPrefix::new(&[1; 12]), entity),
+      notification_sender,
+      status_sender,
+      topic_name: topic.to_string(),
+      topic_cache_handle,
+      like_stateless: false,
+      qos_policy,
+      data_reader_command_receiver,
+      data_reader_waker: Arc::default(),
+      poll_event_sender,
+      security_plugins: None,
+      discovery_notify: None,
+    };
+    let mut reader = Reader::new(
+      ingredients,
+      Rc::new(UDPSender::new_with_random_port().unwrap()),
+      new_shared_timer(),
+      participant_status_sender,
+    );
+    let qos = QosPolicies::qos_none();
+    reader.matched_writer_add(writer, EntityId::UNKNOWN, vec![], vec![], &qos);
+    reader
+  }
+
+  // Whoever claims large samples on one topic gets no more than what is left, and the
+  // samples of another topic are put together beside them.
+  #[test]
+  fn unfinished_samples_of_all_readers_together_are_bounded() {
+    let waker = LoopWaker::new();
+    let (acknack_sender, _acknacks) = wake_channel(1, &waker);
+    let (spdp_liveness_sender, _spdp_liveness) = wake_channel(1, &waker);
+    let counters: Arc<NetworkCounters> = Arc::default();
+    let mut receiver = MessageReceiver::new(
+      GuidPrefix::new(&[1; 12]),
+      acknack_sender,
+      spdp_liveness_sender,
+      None,
+      Rc::new(RefCell::new(InterfaceObservations::new())),
+      Arc::clone(&counters),
+    );
+    receiver.max_unfinished_bytes = Some(110 << 20);
+    receiver.dest_guid_prefix = receiver.own_guid_prefix;
+    receiver.source_guid_prefix = GuidPrefix::new(&[2; 12]);
+    let writer =
+      EntityId::create_custom_entity_id([0, 0, 9], EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    let source = GUID::new_with_prefix_and_id(receiver.source_guid_prefix, writer);
+    let readers: Vec<EntityId> = (1..=3)
+      .map(|id| {
+        let reader = best_effort_reader(id, &format!("topic{id}"), source);
+        let entity_id = reader.entity_id();
+        receiver.add_reader(reader);
+        entity_id
+      })
+      .collect();
+    let mut begin = |reader: usize, number: i64, data_size: u32| {
+      let first = DataFrag {
+        reader_id: readers[reader],
+        writer_id: writer,
+        writer_sn: SequenceNumber::new(number),
+        fragment_starting_num: FragmentNumber::new(1),
+        fragments_in_submessage: 1,
+        fragment_size: 60_000,
+        data_size,
+        serialized_payload: Bytes::from(vec![7; 60_000]),
+        ..DataFrag::default()
+      };
+      let fragment = WriterSubmessage::DataFrag(first, BitFlags::empty());
+      receiver.handle_writer_submessage(readers[reader], fragment);
+      let bytes = |id| receiver.available_readers[id].unfinished_bytes();
+      let bytes: Vec<usize> = readers.iter().map(|id| bytes(id) >> 20).collect();
+      (bytes, counters.counts().unfinished_discarded)
+    };
+    assert_eq!(begin(0, 1, 50 << 20), (vec![50, 0, 0], 0));
+    assert_eq!(begin(0, 2, 50 << 20), (vec![100, 0, 0], 0));
+    // The other topics have less.
+    assert_eq!(begin(1, 1, 40 << 20), (vec![50, 40, 0], 1));
+    assert_eq!(begin(2, 1, 30 << 20), (vec![0, 40, 30], 2));
+    // One that needs more than the limit is not kept.
+    assert_eq!(begin(0, 3, 60 << 20), (vec![0, 40, 30], 3));
+    assert_eq!(begin(0, 4, 39 << 20), (vec![39, 40, 30], 3));
+  }
 
   #[test]
   fn replies_do_not_go_to_the_address_in_a_datagram() {

@@ -834,6 +834,17 @@ impl Reader {
       .then(|| inline_qos.map_or_else(InstanceChange::default, InlineQos::instance_change))
   }
 
+  /// Memory of the library that unfinished samples take.
+  pub fn unfinished_bytes(&self) -> usize {
+    self.fragment_assemblers.own_bytes()
+  }
+
+  /// Discards an unfinished sample of the Writer with the most memory, and returns the
+  /// bytes that this frees.
+  pub fn discard_unfinished(&mut self) -> usize {
+    self.fragment_assemblers.evict()
+  }
+
   fn garbage_collect_fragments(&mut self) {
     // If GC time/packet limit has been exceeded, iterate through
     // fragment assemblers and discard those assembly buffers whose

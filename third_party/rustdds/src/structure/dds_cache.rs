@@ -121,8 +121,9 @@ pub(crate) struct TopicCache {
   min_keep_samples: History,
   max_keep_samples: i32, // from QoS, for quick, repeated access
   // TODO: Change this to Option<u32>, where None means "no limit".
-  // The most payload bytes that it keeps beyond what is withheld; no limit for topics
-  // of the application, whose readers limit the number and the size of samples.
+  is_built_in: bool,
+  // The most payload bytes that it keeps in the library's memory beyond what is
+  // withheld; for topics of the application what the lender says, if it does.
   max_keep_bytes: Option<usize>,
 
   // The main content of the cache is in this map.
@@ -174,6 +175,7 @@ impl TopicCache {
     let is_built_in = topic_name.starts_with("DCPS");
     let mut new_self = Self {
       topic_name,
+      is_built_in,
       max_keep_bytes: is_built_in.then_some(MAX_KEPT_BYTES_PER_BUILTIN_TOPIC),
       topic_data_type,
       topic_qos: topic_qos.clone(),
@@ -193,6 +195,13 @@ impl TopicCache {
     new_self.update_keep_limits(topic_qos);
 
     new_self
+  }
+
+  pub fn set_lender(&mut self, lender: Lender) {
+    if !self.is_built_in {
+      self.max_keep_bytes = lender.limits().max_kept_bytes;
+    }
+    self.lender = lender;
   }
 
   // Lets Readers that are made from now on begin after what is here.
@@ -314,7 +323,7 @@ impl TopicCache {
     };
     let mut bytes = 0;
     let kept = self.changes.values().rev().take_while(|change| {
-      bytes += change.data_value.payload_size();
+      bytes += change.data_value.own_bytes();
       bytes <= max_keep_bytes
     });
     max(by_count, count - kept.count())
@@ -391,7 +400,7 @@ impl TopicCache {
       1
     };
     // The sender chooses the numbers: it must not choose when its large samples go.
-    let is_large_built_in = self.max_keep_bytes.is_some() && payload_size > 1024;
+    let is_large_built_in = self.is_built_in && payload_size > 1024;
     let gc_triggered =
       modulus <= 1 || semi_random_number.is_multiple_of(modulus) || is_large_built_in;
     if gc_triggered {
@@ -709,6 +718,7 @@ mod tests {
   use crate::{
     dds::{
       ddsdata::DDSData,
+      lent::{AssemblyLimits, Lender, LentMemory, SampleMemory},
       qos::{policy::History, QosPolicies, QosPolicyBuilder},
       typedesc::TypeDesc,
       with_key::datawriter::WriteOptions,
@@ -969,6 +979,44 @@ mod tests {
       "{kept} samples"
     );
     assert_eq!(fill(cache_of("rt/scan")), 1_000);
+  }
+
+  // A History of 1,024 scans may be one of 64 images.
+  #[test]
+  fn a_topic_of_the_application_keeps_as_many_bytes_as_its_lender_says() {
+    struct Keeps;
+
+    impl SampleMemory for Keeps {
+      fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
+        None
+      }
+
+      fn limits(&self) -> AssemblyLimits {
+        AssemblyLimits {
+          max_kept_bytes: Some(1_000_000),
+          ..AssemblyLimits::default()
+        }
+      }
+    }
+
+    let mut cache = keep_all_topic_cache();
+    let mut kept_after = |numbers: std::ops::RangeInclusive<i64>| {
+      for number in numbers {
+        let payload = SerializedPayload::new(RepresentationIdentifier::CDR_LE, vec![0; 99_996]);
+        let change = CacheChange::new(
+          user_writer(),
+          SequenceNumber::new(number),
+          WriteOptions::default(),
+          DDSData::new(payload),
+        );
+        cache.add_change(&Timestamp::now(), change);
+      }
+      cache.set_lender(Lender(Some(Arc::new(Keeps))));
+      cache.changes.len()
+    };
+    assert_eq!(kept_after(1..=30), 30);
+    // What is added is taken before the next collection.
+    assert_eq!(kept_after(31..=50), 11);
   }
 
   #[test]

@@ -153,7 +153,7 @@ where
   fn drop(&mut self) {
     if *self.lends_memory.get_mut() {
       if let Ok(mut topic_cache) = self.topic_cache.lock() {
-        topic_cache.lender = Lender::default();
+        topic_cache.set_lender(Lender::default());
       }
     }
 
@@ -261,7 +261,9 @@ where
 
   pub(crate) fn set_sample_memory(&self, memory: Arc<dyn SampleMemory>) {
     self.lends_memory.store(true, Ordering::Relaxed);
-    self.acquire_the_topic_cache_guard().lender = Lender(Some(memory));
+    self
+      .acquire_the_topic_cache_guard()
+      .set_lender(Lender(Some(memory)));
   }
 
   pub(crate) fn set_waker(&self, w: Option<Waker>) {
