@@ -64,7 +64,7 @@ fn a_file_with_one_topic_has_the_papers_defaults() {
     let degraded = RatePolicy { max_rate_hz: 3.0, queue_samples: 2, ..normal };
     assert_eq!(noncritical.forwarding, Forwarding::Limited(LaneRates { normal, degraded }));
     assert_eq!(critical.forwarding, Forwarding::Everything);
-    assert_eq!(settings.routes[0].max_sample_bytes, 1 << 20);
+    assert_eq!(settings.routes[0].max_sample_bytes, 16 << 20);
     assert_eq!(settings.routes[0].retained_samples, 8);
     assert_eq!(settings.routes[0].input_qos, InputQos::default());
     assert_eq!((settings.policy_hold_ms, settings.graph_gid_bytes), (5000, 16));

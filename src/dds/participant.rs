@@ -102,7 +102,8 @@ impl Participant {
     /// that are still missing after this datagram, as the datagram claims.
     ///
     /// Readers of `urgent_topics`, which are DDS topic names, get a UDP port of their own. What arrives there
-    /// is received before what waits on other ports.
+    /// is received before what waits on other ports. Unfinished samples of all readers together take at most
+    /// `max_unfinished_bytes` of the library's memory.
     ///
     /// While they run, nothing is received, acknowledged or sent. They must be short, wait for nothing and
     /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
@@ -112,11 +113,13 @@ impl Participant {
     /// As for [`open`](Self::open).
     pub fn open_receiving(
         options: &ParticipantOptions,
+        max_unfinished_bytes: usize,
         urgent_topics: impl IntoIterator<Item = String>,
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
         Self::build(options, |builder| {
+            let builder = builder.with_max_unfinished_bytes(max_unfinished_bytes);
             let builder = builder.with_urgent_topics(urgent_topics);
             builder.on_sample_arriving(on_arriving).on_received(on_received)
         })
@@ -207,6 +210,7 @@ impl Participant {
         refusals.add(NetworkRefusal::TooManyParticipants, counts.announcements_refused);
         refusals.add(NetworkRefusal::EvictedParticipant, counts.participants_evicted);
         refusals.add(NetworkRefusal::TooManyEndpoints, counts.endpoints_refused);
+        refusals.add(NetworkRefusal::UnfinishedSample, counts.unfinished_discarded);
         refusals
     }
 

@@ -115,9 +115,9 @@ impl MemoryNeeds {
 fn of_ingress(settings: &Settings) -> MemoryNeed {
     let mut need = MemoryNeed::of_participants(1);
     need.discovery_bytes += settings.patterns.len() as u64 * PATTERN_BYTES;
+    need.fragments_bytes = fragment_bytes(&settings.routes);
     let (mut first_bytes, mut most_bytes) = (0, 0);
     for (index, route) in settings.routes.iter().enumerate() {
-        add(&mut need.fragments_bytes, fragment_bytes(route));
         add(&mut need.waiting_bytes, waiting_bytes(route));
         let pool = RouteChannel::of(settings, index).pool_size();
         add(&mut first_bytes, pool.first_bytes);

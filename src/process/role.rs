@@ -123,11 +123,18 @@ impl Role {
     pub fn join_receiving(
         &mut self,
         options: &ParticipantOptions,
+        max_unfinished_bytes: usize,
         urgent_topics: impl IntoIterator<Item = String>,
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Participant, RoleError> {
-        let participant = Participant::open_receiving(options, urgent_topics, on_arriving, on_received)?;
+        let participant = Participant::open_receiving(
+            options,
+            max_unfinished_bytes,
+            urgent_topics,
+            on_arriving,
+            on_received,
+        )?;
         self.record_participant(&participant);
         Ok(participant)
     }

@@ -12,8 +12,9 @@ use std::sync::atomic::{Ordering, fence};
 use super::segment::Segment;
 use crate::model::{
     AbsenceRecord, ControlRecord, DropReason, IngressCounters, IntruderRecord, LaneCounters, LanePolicy,
-    LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, OutputReaders, PartialSample,
-    PatternRecord, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo, SubscriberRecord,
+    LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, NetworkRefusal,
+    OutputReaders, PartialSample, PatternRecord, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo,
+    SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -51,7 +52,7 @@ macro_rules! plain {
 }
 
 plain! {
-    ProcessHealth: 16,
+    ProcessHealth: 12 + NetworkRefusal::COUNT,
     ControlRecord: 7 + ProbeRefusal::COUNT + 5 + 1 + 16,
     SubscriberRecord: 16 + 9 + 1 + 16,
     IntruderRecord: 4 * 16 + 1,

@@ -26,6 +26,26 @@ fn print(what: &str, received: &Received) {
     println!("{what}: {} received, age p50 {p50:.1}, p95 {p95:.1}, max {max:.1} ms", received.received);
 }
 
+#[test]
+fn a_full_hd_image_and_a_map_of_4_mb_pass_with_the_default_configuration() {
+    let test = "a_full_hd_image_and_a_map_of_4_mb_pass_by_default";
+    let yaml = "topics:\n  - {id: image, input_topic: /image, message_type: sensor_msgs/msg/Image}\n  \
+                - {id: map, input_topic: /map, message_type: nav_msgs/msg/OccupancyGrid}\n";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    for (id, kind, bytes) in [
+        ("image", "sensor_msgs::msg::dds_::Image_", 6_220_800),
+        ("map", "nav_msgs::msg::dds_::OccupancyGrid_", 4_000_000),
+    ] {
+        let peer = || Peer::cyclone().keep_all().type_name(kind).size(bytes);
+        let subscriber = bed.subscribe("critical", peer(), &format!("rt/adaptive_bridge/critical/{id}"));
+        let sent: Sent = bed.publish(peer().rate_hz(5.0).count(10), &format!("rt/{id}")).finish();
+        subscriber.wait_received(sent.ok);
+        subscriber.end::<Received>().assert_all_of(&sent);
+    }
+    bed.wait_accounted();
+    bed.end();
+}
+
 /// Tests of a minute or more: `make test-long`.
 mod long {
     use super::*;

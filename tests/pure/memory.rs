@@ -94,8 +94,13 @@ fn a_limit_is_all_parts_and_a_margin() {
         assert_eq!(limit % MIB, 0);
     }
     // As in docs/hardening.md: fragments of 16 samples, for the publishers of each reliability.
-    assert_eq!(plain.ingress.fragments_bytes / MIB, 2 * 16);
-    let reliable = needs(&routes(1, ", qos_overrides: {input: {reliability: RELIABLE}}"));
-    assert_eq!(reliable.ingress.fragments_bytes / MIB, 16);
-    assert_eq!(needs(&routes(1, ", max_sample_bytes: 10485760")).ingress.fragments_bytes / MIB, 2 * 128);
+    let fragments_mib = |count, more: &str| needs(&routes(count, more)).ingress.fragments_bytes / MIB;
+    let reliable = ", qos_overrides: {input: {reliability: RELIABLE}}";
+    assert_eq!(fragments_mib(1, ", max_sample_bytes: 1048576"), 2 * 16);
+    assert_eq!(fragments_mib(1, &format!(", max_sample_bytes: 1048576{reliable}")), 16);
+    assert_eq!(fragments_mib(1, reliable), 128);
+    assert_eq!(fragments_mib(1, ""), 2 * 128);
+    // All routes together have no more, and each keeps 64 MiB, and 16 MiB that wait for an earlier sample.
+    let sixty = needs(&routes(60, "")).ingress;
+    assert_eq!((sixty.fragments_bytes / MIB, sixty.waiting_bytes / MIB), (2 * 128, 60 * (64 + 16)));
 }

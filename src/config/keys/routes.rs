@@ -241,7 +241,7 @@ pub(super) const ROWS: &[Row] = &[
         .doc("Lock the memory of the process (`mlockall`), so that it has no page faults."),
     restarts(&["shared_memory.root_path"], Other("absolute path"), "chosen by the program")
         .doc("Folder of the bridge's own files."),
-    restarts(&["shared_memory.max_sample_bytes"], SAMPLE, "1048576")
+    restarts(&["shared_memory.max_sample_bytes"], SAMPLE, "16777216")
         .doc("The largest sample of a topic without `max_sample_bytes` of its own."),
     restarts(&["shared_memory.max_taps"], Whole(0, 64, ""), "2")
         .doc("Local programs that may tap a route at once."),

@@ -124,7 +124,9 @@ impl Ingress {
                 InputTopic::Topic(topic) => Some(topic.to_dds()),
                 InputTopic::Pattern(_) => None,
             });
-        let participant = role.join_receiving(&options, urgent_topics, on_arriving, on_received)?;
+        let unfinished = pool::UNFINISHED_IN_ALL_BYTES;
+        let participant =
+            role.join_receiving(&options, unfinished, urgent_topics, on_arriving, on_received)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let patterns = Patterns::open(settings, &role.boards);
         let early_waker = EarlyWaker::start(&participant, &receiving, settings);

@@ -8,6 +8,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use super::arrival_progress::{ArrivalProgress, SampleProgress};
+use super::source::kept_bytes;
 use crate::dds::{AssemblyLimits, LentMemory, PartialArrival, Payload, SampleMemory};
 use crate::shm::{LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
 
@@ -27,8 +28,12 @@ type Finished = Arc<Mutex<Option<Result<Slot, LoanError>>>>;
 /// The most unfinished samples of a route in the DDS library's own memory, which it uses because only two
 /// slots are lent at a time: the samples of half a second at 30 Hz while fragments are repaired.
 const UNFINISHED_SAMPLES: usize = 16;
-/// The most memory of the DDS library for unfinished samples; two always have room.
+/// The most memory of the DDS library for unfinished samples of a reader; two always have room.
 const UNFINISHED_BYTES: usize = 128 << 20;
+/// The most memory of the DDS library for unfinished samples of all routes: two readers at their bound. A
+/// route of full-HD images needs 100 MB to repair half a second at 30 Hz; sixty routes that may have images
+/// would be allowed 15 GiB without it.
+pub(super) const UNFINISHED_IN_ALL_BYTES: usize = 2 * UNFINISHED_BYTES;
 
 /// The pool, as the input of the route owns it.
 pub(super) struct PoolOwner {
@@ -124,9 +129,12 @@ pub(super) fn assembly_limits(max_sample_bytes: usize) -> AssemblyLimits {
     // With the encapsulation header.
     let max_sample_bytes = max_sample_bytes + 4;
     let max_total_bytes = (UNFINISHED_SAMPLES * max_sample_bytes).min(UNFINISHED_BYTES);
-    // Three, because the library counts some KiB more for each: two always have room.
-    let max_total_bytes = max_total_bytes.max(3 * max_sample_bytes);
-    AssemblyLimits { max_sample_bytes, max_total_bytes, max_kept_bytes: None }
+    AssemblyLimits {
+        max_sample_bytes,
+        // Three, because the library counts some KiB more for each: two always have room.
+        max_total_bytes: max_total_bytes.max(3 * max_sample_bytes),
+        max_kept_bytes: Some(kept_bytes(max_sample_bytes)),
+    }
 }
 
 /// A sample that the route does not allow: its bytes are discarded as they arrive. It becomes complete like

@@ -14,6 +14,10 @@ pub(super) struct Source {
     writers: Vec<Endpoint>,
 }
 
+/// Bytes that the DDS library keeps of a route at most, whatever the depth: 10 full-HD images, a third of a
+/// second at 30 Hz. The depth is for samples of the largest size, and the least one is for large samples.
+const KEPT_BYTES: usize = 64 << 20;
+
 /// The readers that a route needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum ReaderPlan {
@@ -151,10 +155,17 @@ fn is_of(writer: &Endpoint, dds_type: DdsType) -> bool {
 /// The most bytes that may wait in the DDS library for ingress on a route.
 pub(super) fn most_waiting_bytes(input: &InputQos, max_sample_bytes: usize) -> usize {
     let of_samples = |samples: usize| samples.saturating_mul(max_sample_bytes);
-    match input.history {
+    let of_depth = match input.history {
         Some(History::KeepLast { depth }) => of_samples(depth as usize),
         _ => WAITING_BYTES.clamp(of_samples(MIN_DEPTH), of_samples(MAX_DEPTH)),
-    }
+    };
+    of_depth.min(kept_bytes(max_sample_bytes))
+}
+
+/// The most bytes of complete samples that the DDS library keeps of a route; two always have room.
+pub(super) const fn kept_bytes(max_sample_bytes: usize) -> usize {
+    let of_two = max_sample_bytes.saturating_mul(2);
+    if of_two > KEPT_BYTES { of_two } else { KEPT_BYTES }
 }
 
 /// The least history depth of a reader.
@@ -357,9 +368,12 @@ mod tests {
         assert_eq!(history_depth(64 << 20), 16);
         for bytes in [1, 30_000, 1_000_000, 3_000_000, 64 << 20] {
             let most = most_waiting_bytes(&InputQos::default(), bytes);
-            assert!(history_depth(bytes) as usize * bytes <= most, "{bytes}");
+            assert!((history_depth(bytes) as usize * bytes).min(kept_bytes(bytes)) <= most, "{bytes}");
         }
-        let input = InputQos { history: Some(History::KeepLast { depth: 3 }), ..InputQos::default() };
-        assert_eq!(most_waiting_bytes(&input, 1_000), 3_000);
+        assert_eq!(most_waiting_bytes(&InputQos::default(), 16 << 20), 64 << 20);
+        assert_eq!(most_waiting_bytes(&InputQos::default(), 64 << 20), 128 << 20);
+        let of_depth = |depth| InputQos { history: Some(History::KeepLast { depth }), ..InputQos::default() };
+        assert_eq!(most_waiting_bytes(&of_depth(3), 1_000), 3_000);
+        assert_eq!(most_waiting_bytes(&of_depth(100), 16 << 20), 64 << 20);
     }
 }

@@ -104,11 +104,19 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
         let refused = refused.iter().filter(|(reason, _)| *reason != NetworkRefusal::MalformedDatagram);
         for (reason, count) in refused {
             let meaning = reason.meaning();
-            let text = format!(
-                "{}: {count} {meaning} in the last {window} ({reason}); nodes that start now may not be found; \
-                 `tcpdump -n udp portrange 7400-7500` shows which host announces so many",
-                process.name
-            );
+            let effect = match reason {
+                NetworkRefusal::UnfinishedSample => {
+                    "so many large samples lose fragments on their way, or a host sends parts of samples; \
+                     `tcpdump -n udp` shows from where; max_sample_bytes of routes with small samples bounds what \
+                     they may claim"
+                }
+                _ => {
+                    "nodes that start now may not be found; `tcpdump -n udp portrange 7400-7500` shows which host \
+                     announces so many"
+                }
+            };
+            let text =
+                format!("{}: {count} {meaning} in the last {window} ({reason}); {effect}", process.name);
             problems.push(Problem::new(about.clone(), Level::Warn, text));
         }
     }
@@ -375,8 +383,14 @@ mod tests {
             let refusals = &mut now.processes[1].health.network_refusals;
             refusals.add(NetworkRefusal::MalformedDatagram, 7);
             refusals.add(NetworkRefusal::TooManyParticipants, 9);
+            now.processes[0].health.network_refusals.add(NetworkRefusal::UnfinishedSample, 2);
         });
-        let [found] = &found[..] else { panic!("{found:?}") };
+        let [unfinished, found] = &found[..] else { panic!("{found:?}") };
+        assert!(
+            unfinished.starts_with("ingress: 2 samples discarded of which fragments were"),
+            "{unfinished}"
+        );
+        assert!(unfinished.contains("max_sample_bytes") && !unfinished.contains("nodes"), "{unfinished}");
         let meaning = NetworkRefusal::TooManyParticipants.meaning();
         let text = format!("egress-critical: 9 {meaning} in the last 1.0 s (too_many_participants); ");
         assert!(found.starts_with(&text), "{found}");
