@@ -21,6 +21,14 @@ use super::segment::{free_bytes, no_room};
 use super::service::Service;
 use crate::model::{FixedText, SampleHeader};
 
+/// The free slots that are tried for a payload until one has the memory or gets it. A slot that was refused
+/// memory returns to the top of the free ones, so without further tries the next payload gets the same one,
+/// also if others have the memory already. Eight take some microseconds.
+const TRIED_SLOTS: usize = 8;
+
+/// A slot without a payload.
+type EmptySlot = SampleMutUninit<Service, [MaybeUninit<u8>], WireHeader>;
+
 /// Why a sample could not be copied into shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum LoanError {
@@ -55,6 +63,8 @@ pub struct SamplePublisher {
     port: Publisher<Service, [u8], WireHeader>,
     max_sample_bytes: usize,
     slots: SlotMemory,
+    /// The slots that ingress holds, and those of them that are lent.
+    loaned: Arc<AtomicUsize>,
     lent: Arc<AtomicUsize>,
     node: Arc<NodeShared>,
 }
@@ -86,7 +96,8 @@ impl SamplePublisher {
                 .initial_max_slice_len(pool.stride_bytes as usize - SLOT_HEADER_BYTES)
                 .allocation_strategy(AllocationStrategy::Static)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
-                .max_loaned_samples(LOANED_SLOTS)
+                // `loaned` bounds those that are filled; others are held for a moment, to search for memory.
+                .max_loaned_samples(pool.slots)
                 // By default iceoryx2 reserves the largest queue for every subscriber.
                 .override_sample_preallocation(move |_| pool.slots)
                 .create()
@@ -111,6 +122,7 @@ impl SamplePublisher {
             slots: SlotMemory::find(first, pool, budget, route, &what)?,
             port,
             max_sample_bytes: channel.max_sample_bytes,
+            loaned: Arc::default(),
             lent: Arc::default(),
             node: shared.clone(),
         })
@@ -132,12 +144,31 @@ impl SamplePublisher {
         if payload.len() > self.max_sample_bytes {
             return Err(LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes });
         }
-        let slot = self.loan(payload.len())?;
-        Ok(Slot { sample: slot.write_from_slice(payload) })
+        let (slot, permit) = self.loan(payload.len())?;
+        Ok(Slot { sample: slot.write_from_slice(payload), _permit: permit })
     }
 
-    /// Takes a free slot with the memory for a payload of that length.
-    fn loan(&self, len: usize) -> Result<SampleMutUninit<Service, [MaybeUninit<u8>], WireHeader>, LoanError> {
+    /// Takes a free slot with the memory for a payload of that length. Without memory for it, tries a few
+    /// others, and returns the first refusal.
+    fn loan(&self, len: usize) -> Result<(EmptySlot, Permit), LoanError> {
+        let permit = Permit::take(&self.loaned, LOANED_SLOTS)
+            .ok_or(LoanError::Failed("ingress holds too many unpublished slots"))?;
+        let (mut slot, refusal) = self.loan_one(len)?;
+        let Some(refusal) = refusal else { return Ok((slot, permit)) };
+        // Held until the end, so that each try gets another slot.
+        let mut refused = [const { None }; TRIED_SLOTS - 1];
+        for place in &mut refused {
+            let Ok((next, refusal)) = self.loan_one(len) else { break };
+            *place = Some(std::mem::replace(&mut slot, next));
+            if refusal.is_none() {
+                return Ok((slot, permit));
+            }
+        }
+        Err(LoanError::NoMemory(refusal))
+    }
+
+    /// Takes a free slot, and returns why it has no memory for a payload of that length if it has none.
+    fn loan_one(&self, len: usize) -> Result<(EmptySlot, Option<NoMemory>), LoanError> {
         let mut slot = self.port.loan_slice_uninit(len).map_err(|error| match error {
             IceoryxLoanError::OutOfMemory => LoanError::PoolExhausted,
             IceoryxLoanError::ExceedsMaxLoanSize => LoanError::TooLarge { len, max: self.max_sample_bytes },
@@ -146,8 +177,8 @@ impl SamplePublisher {
             }
             IceoryxLoanError::InternalFailure => LoanError::Failed("internal failure of iceoryx2"),
         })?;
-        self.slots.ensure(slot.payload_mut().as_ptr().addr(), len).map_err(LoanError::NoMemory)?;
-        Ok(slot)
+        let refusal = self.slots.ensure(slot.payload_mut().as_ptr().addr(), len).err();
+        Ok((slot, refusal))
     }
 
     /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot or memory
@@ -160,8 +191,8 @@ impl SamplePublisher {
         if len > self.max_sample_bytes {
             return None;
         }
-        let permit = LentPermit::take(&self.lent)?;
-        let slot = self.loan(len).ok()?;
+        let lent = Permit::take(&self.lent, LENT_SLOTS)?;
+        let (slot, permit) = self.loan(len).ok()?;
         // SAFETY: any byte is a valid `u8`, and the bytes of the slot, pages of a mapped file, are
         // initialised: by the kernel with zeros, or by an older sample.
         let mut sample = unsafe { slot.assume_init() };
@@ -171,8 +202,8 @@ impl SamplePublisher {
         // For an empty payload this is a dangling address.
         let payload = NonNull::from(payload).cast::<u8>();
         let place = self.slots.place(payload.as_ptr().addr());
-        let slot = Slot { sample };
-        Some(LentSlot { payload, length, place, slot, _permit: permit, _node: self.node.clone() })
+        let slot = Slot { sample, _permit: permit };
+        Some(LentSlot { payload, length, place, slot, _lent: lent, _node: self.node.clone() })
     }
 
     /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of
@@ -195,6 +226,8 @@ fn address_of_first_slot(port: &Publisher<Service, [u8], WireHeader>) -> Option<
 #[derive(Debug)]
 pub struct Slot {
     sample: SampleMut<Service, [u8], WireHeader>,
+    // Declared after `sample`, so that the slot is free before the permit is returned.
+    _permit: Permit,
 }
 
 impl Slot {
@@ -214,7 +247,7 @@ pub struct LentSlot {
     place: (FixedText, u64),
     slot: Slot,
     // Declared after `slot`, so that the slot is free before the permit is returned.
-    _permit: LentPermit,
+    _lent: Permit,
     // Keeps the membership, because the slot may outlive the publisher.
     _node: Arc<NodeShared>,
 }
@@ -248,21 +281,21 @@ impl LentSlot {
     }
 }
 
-/// The permission to lend one of the [`LENT_SLOTS`]; returned when dropped.
+/// The permission to hold one of a limited number of slots; returned when dropped.
 #[derive(Debug)]
-struct LentPermit(Arc<AtomicUsize>);
+struct Permit(Arc<AtomicUsize>);
 
-impl LentPermit {
-    fn take(lent: &Arc<AtomicUsize>) -> Option<Self> {
-        if lent.fetch_add(1, Ordering::Acquire) >= LENT_SLOTS {
-            lent.fetch_sub(1, Ordering::Relaxed);
+impl Permit {
+    fn take(held: &Arc<AtomicUsize>, limit: usize) -> Option<Self> {
+        if held.fetch_add(1, Ordering::Acquire) >= limit {
+            held.fetch_sub(1, Ordering::Relaxed);
             return None;
         }
-        Some(Self(lent.clone()))
+        Some(Self(held.clone()))
     }
 }
 
-impl Drop for LentPermit {
+impl Drop for Permit {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Release);
     }

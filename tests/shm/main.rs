@@ -274,6 +274,38 @@ fn a_stopped_lane_of_a_camera_pins_at_most_its_quota_and_no_other_route_suffers(
 }
 
 #[test]
+fn a_sample_gets_a_slot_that_has_the_memory_although_another_one_is_the_first_free_one() {
+    let place = Place::new();
+    let node = place.node();
+    let channel = RouteChannel { retained_samples: 0, ..routed("camera") };
+    let image = 6_220_800;
+    // Room for one image, and not for a second one.
+    let bytes = channel.pool_size().first_bytes + (10 << 20);
+    let budget = PoolBudget::of_channels(std::slice::from_ref(&channel), bytes);
+    let camera = SamplePublisher::create_within(&node, &channel, &budget, 0).unwrap();
+    let large = camera.copy_in(&vec![7; image]).unwrap();
+    assert_eq!(no_memory(&camera, image), NoMemory::Budget);
+    // Freed after the large one, so that they are before it among the free ones.
+    let small = [(); 2].map(|()| camera.copy_in(&[1; 100]).unwrap());
+    drop(large);
+    drop(small);
+    let used = budget.usage(0).used_bytes;
+    let lane = lane(&node, &channel);
+    for sequence in 1..=20 {
+        assert_eq!(publish(&camera, sequence, image), 1);
+        assert_eq!(sequences(&lane), [sequence]);
+    }
+    assert_eq!(camera.lend(image).unwrap().payload_mut().len(), image);
+    assert_eq!(budget.usage(0).used_bytes, used);
+    // What was tried is free again: there are fewer slots than tries.
+    let _large = camera.copy_in(&vec![7; image]).unwrap();
+    for _ in 0..100 {
+        assert_eq!(no_memory(&camera, image), NoMemory::Budget);
+    }
+    drop(camera.copy_in(&[1; 100]).unwrap());
+}
+
+#[test]
 fn pools_that_do_not_fit_the_budget_at_the_start_are_an_error_that_names_the_key() {
     let place = Place::new();
     let budget = PoolBudget::of_channels(&[channel(1 << 20)], 4096);
