@@ -123,7 +123,8 @@ fn a_sample_is_announced_before_it_is_received() {
     };
     let network = DdsNetwork::of_domain(69);
     let mut there =
-        Participant::open_receiving(&options("there", &network), usize::MAX, [], on_arriving, on_received).unwrap();
+        Participant::open_receiving(&options("there", &network), usize::MAX, [], on_arriving, on_received)
+            .unwrap();
     let mut here = participant("here", 69);
     let reader = there
         .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
@@ -198,7 +199,8 @@ fn a_watch_of_arrivals_sees_samples_and_takes_none() {
     let hold = Arc::new(Mutex::new(()));
     let on_received = support::waits_for(&hold);
     let mut there =
-        Participant::open_receiving(&options("there", &network), usize::MAX, [], |_, _, _| {}, on_received).unwrap();
+        Participant::open_receiving(&options("there", &network), usize::MAX, [], |_, _, _| {}, on_received)
+            .unwrap();
     let mut here = participant("here", 66);
     // BEST_EFFORT: a RELIABLE reader would receive a sample again that the watching thread had taken.
     let reader = there

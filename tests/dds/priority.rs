@@ -72,7 +72,8 @@ fn a_lane_sends_what_waits_on_the_route_of_the_higher_priority_first() {
     wait_matched(&stop);
     let (on_arriving, order) = recorder();
     let mut subscriber =
-        Participant::open_receiving(&options("subscriber", &network), usize::MAX, [], on_arriving, || false).unwrap();
+        Participant::open_receiving(&options("subscriber", &network), usize::MAX, [], on_arriving, || false)
+            .unwrap();
     let mut reader = |lane: &str, route: &str, reliability| {
         let topic = format!("rt/adaptive_bridge/{lane}/{route}");
         subscriber.create_reader(&topic, TYPE, &qos(reliability)).unwrap()
@@ -133,8 +134,14 @@ fn ingress_receives_the_routes_of_higher_priorities_before_what_arrived_earlier(
     let on_received = support::waits_for(&hold);
     let network = DdsNetwork::of_domain(88);
     let urgent = ["rt/stop".to_owned()];
-    let mut there =
-        Participant::open_receiving(&options("there", &network), usize::MAX, urgent, on_arriving, on_received).unwrap();
+    let mut there = Participant::open_receiving(
+        &options("there", &network),
+        usize::MAX,
+        urgent,
+        on_arriving,
+        on_received,
+    )
+    .unwrap();
     let _bulk_reader = there.create_reader("rt/bulk", TYPE, &qos(Reliability::Reliable)).unwrap();
     let _stop_reader = there.create_reader("rt/stop", TYPE, &qos(Reliability::Reliable)).unwrap();
     let mut here = Participant::open(&options("here", &network)).unwrap();

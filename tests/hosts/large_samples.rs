@@ -1,6 +1,7 @@
 //! Large samples between stock nodes: Fast DDS leaves its receive buffer at the kernel's 208 KiB, a fifth of
 //! a sample, and loses some of most samples, also without the bridge.
 
+use serde_json::Value;
 use support::bed::Bed;
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::ros;
@@ -43,6 +44,30 @@ fn a_full_hd_image_and_a_map_of_4_mb_pass_with_the_default_configuration() {
         subscriber.end::<Received>().assert_all_of(&sent);
     }
     bed.wait_accounted();
+    bed.end();
+}
+
+#[test]
+fn a_sample_without_room_in_shared_memory_is_logged_and_a_problem_with_its_reason() {
+    let test = "a_sample_without_room_in_shared_memory_is_logged";
+    let yaml = "topics:\n  - {id: image, input_topic: /image}\nshared_memory: {budget_bytes: 4194304}\n";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    let image = Peer::cyclone().keep_all().type_name("sensor_msgs::msg::dds_::Image_").size(6_220_800);
+    let publisher = image.rate_hz(5.0).publisher().topic("rt/image").start_on(bed.host("publisher"));
+    let is_told = |status: &Value| {
+        let problems = status["problems"].to_string();
+        status["routes"][0]["drops"]["over_budget"].as_u64() > Some(0)
+            && problems.contains("route image: dropped")
+            && problems.contains("shared_memory.budget_bytes is used up")
+    };
+    bed.bridge.wait_status("the refusal", is_told);
+    bed.up.wait_for_log("over_budget");
+    let log = bed.up.log();
+    let mut lines = log.lines();
+    let line = lines.find(|line| line.contains("samples dropped") && line.contains("over_budget"));
+    let line = line.unwrap_or_else(|| panic!("{log}"));
+    assert!(line.contains("image") && line.contains("shared_memory.budget_bytes"), "{line}");
+    let _: Sent = publisher.end();
     bed.end();
 }
 

@@ -252,6 +252,7 @@ pub(super) const ROWS: &[Row] = &[
     )
     .doc(
         "The most shared memory that the samples of all routes take together. A route takes what its samples \
-         need, and leaves the others room for theirs; ingress drops what does not fit as `over_budget`.",
+         need, and leaves the others room for theirs; ingress drops what does not fit as `over_budget` or \
+         `over_quota`.",
     ),
 ];

@@ -23,6 +23,10 @@ use crate::model::{
 use crate::shm::{
     BoardWriter, HistogramWriter, LaneWaker, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage,
 };
+use crate::shm::{
+    BoardWriter, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget, RouteChannel, SamplePublisher,
+    Stage,
+};
 
 /// Interval at which a route without a publisher logs that it waits.
 const REMIND_MS: u64 = 30_000;
@@ -192,7 +196,9 @@ impl Input {
         let dropped = match filled.slot {
             Ok(_) => None,
             Err(LoanError::TooLarge { .. }) => Some(DropReason::TooLarge),
-            Err(LoanError::NoMemory(_)) => Some(DropReason::OverBudget),
+            Err(LoanError::NoMemory(NoMemory::Quota)) => Some(DropReason::OverQuota),
+            Err(LoanError::NoMemory(NoMemory::Budget)) => Some(DropReason::OverBudget),
+            Err(LoanError::NoMemory(_)) => Some(DropReason::ShmFull),
             Err(_) => Some(DropReason::PoolExhausted),
         };
         let count = |counters: &mut IngressCounters| {

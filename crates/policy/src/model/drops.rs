@@ -9,8 +9,14 @@ reasons! {
     // Of ingress.
     TooLarge = "too_large", "larger than the route's max_sample_bytes; raise it",
     PoolExhausted = "pool_exhausted", "no free slot in shared memory; raise queue_depth",
+    /// What is left of the budget is kept for other routes, or there is none.
     OverBudget = "over_budget",
-        "no shared memory left for them; raise shared_memory.budget_bytes, or enlarge /dev/shm if it is full",
+        "shared_memory.budget_bytes is used up, or the rest is kept for other routes; raise it",
+    /// The route holds as much of the budget as one route may.
+    OverQuota = "over_quota",
+        "the route holds as much of shared_memory.budget_bytes as one route may, as when a lane is stopped; \
+         raise it",
+    ShmFull = "shm_full", "/dev/shm is full or gives no memory; enlarge it",
     Malformed = "malformed", "an encapsulation that DDS does not define, or an undecodable payload",
     // Of each lane.
     /// A gap in the route's sequence numbers, left by an ingress process that died between numbering a
