@@ -11,7 +11,9 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::{ConfigArguments, EXIT_CONFIG, EXIT_USAGE, bad_configuration, failed, print};
-use crate::config::{self, ConfigError, InputTopic, OutputTopic, Place, Problem, Route, Row, Settings};
+use crate::config::{
+    self, ConfigError, InputTopic, OutputTopic, Place, Problem, Route, Row, SetParameters, Settings,
+};
 use crate::model::{InstanceName, LaneName, RouteId, TopicPattern, TypeName};
 use crate::process::{InForce, MemoryNeed, MemoryNeeds};
 use crate::shm::{RouteChannel, budget_bytes};
@@ -37,14 +39,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
         return explain(path);
     }
     if arguments.json {
-        let (json, code) = match arguments.config.try_load() {
+        let (json, code) = match load(&arguments.config) {
             Ok(settings) => (json!(Summary::of(&settings)), ExitCode::SUCCESS),
             Err(error) => (problems(&error), ExitCode::from(EXIT_CONFIG)),
         };
         print(format!("{json}\n"))?;
         return Ok(code);
     }
-    let settings = arguments.config.load()?;
+    let settings = load(&arguments.config).map_err(|error| bad_configuration(&error))?;
     let running = InForce::find(&arguments.config.file(), Some(&settings));
     let summary = Summary::of(&settings).to_string();
     let differences = match running {
@@ -56,6 +58,31 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, ExitCode> {
     };
     print(summary + &differences)?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Reads the settings, with which ingress must be able to start.
+fn load(arguments: &ConfigArguments) -> Result<Settings, ConfigError> {
+    let loaded = arguments.try_load_with_budget(&SetParameters::new(), &too_small_budget);
+    loaded.map(|configuration| configuration.settings)
+}
+
+/// What the budget must be, if ingress cannot start with it: the pools take more at the start.
+fn too_small_budget(settings: &Settings) -> Option<String> {
+    let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size());
+    let (slots, first_bytes) = pools.fold((0, 0_u64), |(slots, bytes), pool| {
+        (slots + pool.slots, bytes.saturating_add(pool.first_bytes))
+    });
+    let budget_bytes = budget_bytes(settings);
+    let default = match settings.shared_memory.budget_bytes {
+        Some(_) => String::new(),
+        None => format!("; on this machine it is {budget_bytes} by default"),
+    };
+    (first_bytes > budget_bytes).then(|| {
+        format!(
+            "must be at least {first_bytes}, which the {slots} slots of all routes take before a sample comes; fewer \
+             routes, a lower max_sample_bytes of those with small samples, queue_depth or max_taps take less{default}"
+        )
+    })
 }
 
 /// Reads the path of a key, and offers all paths to the completions of a shell.
@@ -255,13 +282,6 @@ impl fmt::Display for Summary<'_> {
             bytes_text(self.shared_memory_bytes as f64),
             bytes_text(self.budget_bytes as f64)
         )?;
-        if self.first_bytes > self.budget_bytes {
-            writeln!(
-                f,
-                "ingress cannot start: raise shared_memory.budget_bytes, or lower max_sample_bytes of routes with \
-                 small samples, queue_depth or max_taps"
-            )?;
-        }
         writeln!(f, "\nmost memory of each process, the limit that `adaptive-bridge units` sets:")?;
         for memory in &self.memory {
             let parts = memory.parts.parts();
@@ -315,4 +335,44 @@ fn problems(error: &ConfigError) -> serde_json::Value {
     };
     let problems: Vec<_> = error.problems.iter().map(problem).collect();
     json!({ "file": error.file, "problems": problems })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn checked(yaml: &str) -> Result<Settings, ConfigError> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), yaml).unwrap();
+        load(&ConfigArguments { config: Some(file.path().to_owned()), parameters: Vec::new() })
+    }
+
+    #[test]
+    fn a_budget_with_which_ingress_cannot_start_is_a_problem_of_its_line() {
+        let route = "topics: [{id: scan, input_topic: /scan}]\n";
+        let with_budget = |bytes: u64, depth| {
+            format!(
+                "{route}lanes: {{critical: {{queue_depth: {depth}}}}}\nshared_memory:\n  budget_bytes: {bytes}\n"
+            )
+        };
+        let settings = checked(&with_budget(1 << 30, 4096)).unwrap();
+        let needed = RouteChannel::of(&settings, 0).pool_size().first_bytes;
+        assert!(checked(&with_budget(needed, 4096)).is_ok());
+        let error = checked(&with_budget(needed - 1, 4096)).unwrap_err();
+        let [problem] = &error.problems[..] else { panic!("{error}") };
+        assert_eq!((problem.place, problem.key.as_str()), (Place::Line(4), "shared_memory.budget_bytes"));
+        assert_eq!(problem.value, Some((needed - 1).to_string()));
+        assert!(problem.allowed.starts_with(&format!("must be at least {needed}, which")), "{error}");
+        assert!(problem.allowed.ends_with("take less"), "{error}");
+        // Without a budget in the file, no default is enough for 1,024 such routes: 4 KiB for each of 4
+        // million slots.
+        let routes: String =
+            (0..1024).map(|route| format!("- {{id: r{route}, input_topic: /r{route}}}\n")).collect();
+        let yaml = format!("topics:\n{routes}lanes: {{critical: {{queue_depth: 4096}}}}\n");
+        let error = checked(&yaml).unwrap_err();
+        let expected = "shared_memory.budget_bytes: must be given: at least ";
+        assert!(error.to_string().contains(expected), "{error}");
+        assert!(error.to_string().ends_with(" by default"), "{error}");
+        assert!(checked(route).is_ok());
+    }
 }

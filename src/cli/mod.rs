@@ -141,11 +141,21 @@ impl ConfigArguments {
 
     /// Reads the configuration with parameters that were set while the bridge runs.
     fn try_load_with(&self, set: &SetParameters) -> Result<Configuration, ConfigError> {
+        self.try_load_with_budget(set, &|_| None)
+    }
+
+    /// Like [`try_load_with`](Self::try_load_with); `is_refused` says what the budget must be.
+    fn try_load_with_budget(
+        &self,
+        set: &SetParameters,
+        is_refused: &dyn Fn(&Settings) -> Option<String>,
+    ) -> Result<Configuration, ConfigError> {
         let one =
             |(key, value): (&String, &String)| Parameters::One { key: key.clone(), value: value.clone() };
         let parameters = [&self.parameters[..], &set.iter().map(one).collect::<Vec<_>>()].concat();
         let env = |name: &str| std::env::var(name).ok();
-        let mut configuration = config::load_configuration(self.path(), &parameters, &env)?;
+        let path = self.path();
+        let mut configuration = config::load_configuration_with_budget(path, &parameters, &env, is_refused)?;
         configuration.settings.set_parameters = set.clone();
         Ok(configuration)
     }

@@ -40,6 +40,21 @@ pub fn load_configuration(
     parameters: &[Parameters],
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Configuration, ConfigError> {
+    load_configuration_with_budget(path, parameters, env, &|_| None)
+}
+
+/// Loads the configuration as [`load_configuration`] does, and reports `shared_memory.budget_bytes` if
+/// `is_refused` says what it must be, as a phrase that begins with "must": what the pools need depends on the
+/// machine.
+///
+/// # Errors
+/// As for [`load`], and the budget.
+pub fn load_configuration_with_budget(
+    path: Option<&Path>,
+    parameters: &[Parameters],
+    env: &dyn Fn(&str) -> Option<String>,
+    is_refused: &dyn Fn(&Settings) -> Option<String>,
+) -> Result<Configuration, ConfigError> {
     let path = find(path, parameters, env)?.ok_or_else(|| {
         let what = format!(
             "this file does not exist, and neither --config nor ${PATH_VARIABLE} names another; create one with \
@@ -49,7 +64,7 @@ pub fn load_configuration(
     })?;
     let name = path.display().to_string();
     let bytes = yaml::read(&path).map_err(|what| failure(&name, Place::File, what))?;
-    parse_configuration(&bytes, &name, parameters, env)
+    parse_configuration(&bytes, &name, parameters, env, is_refused)
 }
 
 /// Loads the configuration as [`load_configuration`] does; without a file, the defaults with this environment
@@ -65,7 +80,7 @@ pub fn load_or_default(
     const DEFAULTS: &[u8] = b"topics: [{id: none, input_topic: /none}]";
     match find(path, parameters, env)? {
         Some(path) => load_configuration(Some(&path), parameters, env),
-        None => parse_configuration(DEFAULTS, "the defaults", parameters, env),
+        None => parse_configuration(DEFAULTS, "the defaults", parameters, env, &|_| None),
     }
 }
 
@@ -110,7 +125,8 @@ pub fn parse(
     file_name: &str,
     env: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Settings, ConfigError> {
-    parse_configuration(text.as_ref(), file_name, &[], env).map(|configuration| configuration.settings)
+    parse_configuration(text.as_ref(), file_name, &[], env, &|_| None)
+        .map(|configuration| configuration.settings)
 }
 
 fn parse_configuration(
@@ -118,6 +134,7 @@ fn parse_configuration(
     file_name: &str,
     parameters: &[Parameters],
     env: &dyn Fn(&str) -> Option<String>,
+    is_budget_refused: &dyn Fn(&Settings) -> Option<String>,
 ) -> Result<Configuration, ConfigError> {
     let mut document = yaml::parse(text)
         .map_err(|error| failure(file_name, error.line.map_or(Place::File, Place::Line), error.message))?;
@@ -143,8 +160,12 @@ fn parse_configuration(
     }
     let document = document.as_deref();
     let settings = checked(document, problems)?;
-    let no_problems = Problems::default();
-    let root = Field::root(document, &no_problems);
+    let problems = Problems::default();
+    let root = Field::root(document, &problems);
+    if let Some(allowed) = is_budget_refused(&settings) {
+        root.get("shared_memory").get("budget_bytes").report::<()>(&allowed);
+        return Err(ConfigError::new(file_name, parameters::files(parameters), problems.into_inner()));
+    }
     let inline_secret = match settings.security.secret {
         Some(SecretSource::ConfigFile) => root.get("security").get("hmac_secret").text(),
         _ => None,

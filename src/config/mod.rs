@@ -30,7 +30,10 @@ mod yaml;
 pub use in_force::{Configuration, DecodeError, InlineSecret};
 pub use keys::{KEYS, Kind, Row, keys_at, nearest_key, rows};
 pub use listed::Listed;
-pub use load::{DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_or_default, named_path, parse};
+pub use load::{
+    DEFAULT_PATH, PATH_VARIABLE, load, load_configuration, load_configuration_with_budget, load_or_default,
+    named_path, parse,
+};
 pub use never_inputs::NeverInputs;
 pub use parameters::Parameters;
 pub use problem::{ConfigError, Place, Problem};
