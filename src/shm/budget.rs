@@ -18,7 +18,7 @@ use super::error::ShmError;
 use super::root::SHM_DIR;
 use super::segment::{free_bytes, no_room};
 use crate::config::Settings;
-use crate::model::FixedText;
+use crate::model::{FixedText, MonotonicNs};
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
 /// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less,
@@ -26,6 +26,14 @@ use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 /// lanes may hold. Two stalled lanes with five cameras of 6 MB hold 1.6 GiB.
 pub const DEFAULT_BUDGET_BYTES: u64 = 2 << 30;
 const DEFAULT_BUDGET_DIVISOR: u64 = 4;
+
+/// The unit in which slots note when they had a sample: 0.1 s, as ingress does its housekeeping. 32 bits hold
+/// 13 years.
+const TICK_MS: u64 = 100;
+
+/// Until a pool is searched again after a search found no idle slot that is free: slots that stopped lanes
+/// hold, or that are retained, may be idle for long.
+const SEARCH_AGAIN_TICKS: u32 = 10;
 
 /// Why a slot gets no memory for its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -124,6 +132,12 @@ pub(super) struct SlotMemory {
     pool: PoolSize,
     /// The pages of each slot that exist, from its beginning. Only the thread that holds a slot changes them.
     pages: Box<[AtomicU32]>,
+    /// When a payload needed most of these pages last, in ticks.
+    used_at: Box<[AtomicU32]>,
+    /// The time of the last housekeeping, in ticks.
+    now: AtomicU32,
+    /// Not before this tick are idle slots searched for.
+    search_at: AtomicU32,
     budget: Arc<PoolBudget>,
     route: usize,
 }
@@ -162,9 +176,19 @@ impl SlotMemory {
         let pages = if pool.is_sparse { 1 } else { u32::MAX };
         let pages = (0..pool.slots).map(|_| AtomicU32::new(pages)).collect();
         let name = mapping.path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        let name = FixedText::new(name);
-        let slots =
-            Self { file, name, first_address, first_offset, pool, pages, budget: budget.clone(), route };
+        let slots = Self {
+            file,
+            name: FixedText::new(name),
+            first_address,
+            first_offset,
+            pool,
+            pages,
+            used_at: (0..pool.slots).map(|_| AtomicU32::new(0)).collect(),
+            now: AtomicU32::new(0),
+            search_at: AtomicU32::new(0),
+            budget: budget.clone(),
+            route,
+        };
         let no_room = |errno| match errno {
             Errno::ENOSPC => no_room(what, pool.first_bytes, free_bytes()),
             errno => ShmError::os("to reserve shared memory", Path::new(SHM_DIR), &errno.into()),
@@ -197,17 +221,15 @@ impl SlotMemory {
         if len == 0 || !self.pool.is_sparse {
             return Ok(());
         }
-        let from_first = payload.wrapping_sub(SLOT_HEADER_BYTES + self.first_address);
-        let slot = from_first / self.pool.stride_bytes as usize;
-        let (Some(pages), true) =
-            (self.pages.get(slot), from_first.is_multiple_of(self.pool.stride_bytes as usize))
-        else {
-            return Err(NoMemory::NoSuchSlot);
-        };
+        let slot = self.slot_of(payload).ok_or(NoMemory::NoSuchSlot)?;
+        let pages = &self.pages[slot];
         let present = pages.load(Ordering::Relaxed);
         let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(page_bytes()) as u32;
         // What lies beyond the pages of this slot is on the first page of the next one, or of the free list.
         let most = (self.pool.stride_bytes / page_bytes()) as u32;
+        if needed > present / 2 {
+            self.used_at[slot].store(self.now.load(Ordering::Relaxed), Ordering::Relaxed);
+        }
         if needed.min(most) <= present {
             return Ok(());
         }
@@ -220,16 +242,74 @@ impl SlotMemory {
             }
         })?;
         if let Err(errno) = self.allocate(slot, present, wanted) {
-            self.budget.lock().give_back(self.route, more);
+            let mut budget = self.budget.lock();
+            budget.give_back(self.route, more);
+            budget.note_refusal();
             return Err(if errno == Errno::ENOSPC { NoMemory::FileSystem } else { NoMemory::System(errno) });
         }
         pages.store(wanted, Ordering::Relaxed);
         Ok(())
     }
 
-    fn allocate(&self, slot: usize, from_page: u32, to_page: u32) -> nix::Result<()> {
+    /// Notes the time, and returns for how many ticks a slot must be idle to give its memory back, if there
+    /// is such a slot. The caller then passes the free ones to [`give_back`](Self::give_back).
+    pub(super) fn find_idle(&self, now: MonotonicNs) -> Option<u32> {
+        let tick = (now.0 / (TICK_MS * 1_000_000)) as u32;
+        self.now.store(tick, Ordering::Relaxed);
+        let idle_ms = self.budget.lock().idle_ms(now);
+        let is_due = tick.wrapping_sub(self.search_at.load(Ordering::Relaxed)).cast_signed() >= 0;
+        if !is_due || !self.pool.is_sparse {
+            return None;
+        }
+        let ticks = (idle_ms / TICK_MS) as u32;
+        if (0..self.pool.slots).any(|slot| self.is_idle(slot, ticks)) {
+            self.search_at.store(tick.wrapping_add(SEARCH_AGAIN_TICKS), Ordering::Relaxed);
+            return Some(ticks);
+        }
+        None
+    }
+
+    fn is_idle(&self, slot: usize, ticks: u32) -> bool {
+        let since = self.used_at[slot].load(Ordering::Relaxed);
+        let idle = self.now.load(Ordering::Relaxed).wrapping_sub(since);
+        self.pages[slot].load(Ordering::Relaxed) > 1 && idle >= ticks
+    }
+
+    /// Gives the memory of a slot that the caller holds back, `most_bytes` from its end and not the page of
+    /// its header, if the slot has been idle for so many ticks. Returns the bytes.
+    pub(super) fn give_back(&self, payload: usize, ticks: u32, most_bytes: u64) -> u64 {
+        let Some(slot) = self.slot_of(payload).filter(|&slot| self.is_idle(slot, ticks)) else { return 0 };
+        let present = self.pages[slot].load(Ordering::Relaxed);
+        let left = present.saturating_sub((most_bytes / page_bytes()) as u32).max(1);
+        let (first, bytes) = self.range_of(slot, left, present);
+        let flags = FallocateFlags::FALLOC_FL_PUNCH_HOLE | FallocateFlags::FALLOC_FL_KEEP_SIZE;
+        // Without the right to punch a hole, the slot keeps its memory.
+        if fallocate_all(&self.file, flags, first, bytes).is_err() {
+            return 0;
+        }
+        self.pages[slot].store(left, Ordering::Relaxed);
+        // More may be idle.
+        self.search_at.store(self.now.load(Ordering::Relaxed), Ordering::Relaxed);
+        self.budget.lock().give_back(self.route, bytes);
+        bytes
+    }
+
+    /// The number of the slot of a payload.
+    fn slot_of(&self, payload: usize) -> Option<usize> {
+        let from_first = payload.wrapping_sub(SLOT_HEADER_BYTES + self.first_address);
+        let stride = self.pool.stride_bytes as usize;
+        Some(from_first / stride).filter(|&slot| slot < self.pages.len() && from_first.is_multiple_of(stride))
+    }
+
+    /// Where pages of a slot are in the file, and their bytes.
+    fn range_of(&self, slot: usize, from_page: u32, to_page: u32) -> (u64, u64) {
         let first = slot as u64 * self.pool.stride_bytes + u64::from(from_page) * page_bytes();
-        allocate(&self.file, first, u64::from(to_page - from_page) * page_bytes())
+        (first, u64::from(to_page - from_page) * page_bytes())
+    }
+
+    fn allocate(&self, slot: usize, from_page: u32, to_page: u32) -> nix::Result<()> {
+        let (first, bytes) = self.range_of(slot, from_page, to_page);
+        allocate(&self.file, first, bytes)
     }
 }
 
@@ -241,8 +321,12 @@ fn size_class(pages: u32) -> u32 {
 }
 
 fn allocate(file: &File, offset: u64, bytes: u64) -> nix::Result<()> {
+    fallocate_all(file, FallocateFlags::empty(), offset, bytes)
+}
+
+fn fallocate_all(file: &File, flags: FallocateFlags, offset: u64, bytes: u64) -> nix::Result<()> {
     loop {
-        match fallocate(file, FallocateFlags::empty(), offset.cast_signed(), bytes.cast_signed()) {
+        match fallocate(file, flags, offset.cast_signed(), bytes.cast_signed()) {
             Err(Errno::EINTR) => {}
             result => return result,
         }

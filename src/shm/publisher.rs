@@ -19,12 +19,16 @@ use super::header::WireHeader;
 use super::node::{NodeShared, ShmNode, StartLock};
 use super::segment::{free_bytes, no_room};
 use super::service::Service;
-use crate::model::{FixedText, SampleHeader};
+use crate::model::{FixedText, MonotonicNs, SampleHeader};
 
 /// The free slots that are tried for a payload until one has the memory or gets it. A slot that was refused
 /// memory returns to the top of the free ones, so without further tries the next payload gets the same one,
 /// also if others have the memory already. Eight take some microseconds.
 const TRIED_SLOTS: usize = 8;
+
+/// The memory that a pool gives back in one housekeeping at most. Its route waits meanwhile, some 0.4 ms; and
+/// the memory of an image of 6.2 MB is back after 0.4 s.
+const GIVE_BACK_BYTES: u64 = 2 << 20;
 
 /// A slot without a payload.
 type EmptySlot = SampleMutUninit<Service, [MaybeUninit<u8>], WireHeader>;
@@ -204,6 +208,25 @@ impl SamplePublisher {
         let place = self.slots.place(payload.as_ptr().addr());
         let slot = Slot { sample, _permit: permit };
         Some(LentSlot { payload, length, place, slot, _lent: lent, _node: self.node.clone() })
+    }
+
+    /// Gives the memory of free slots that have been idle for long back to the budget, and returns the bytes.
+    /// For periodic housekeeping. It takes all free slots for a moment, so no other thread may take one
+    /// meanwhile. The slots that a steady flow uses are the first free ones afterwards, as before.
+    pub fn give_back_idle(&self, now: MonotonicNs) -> u64 {
+        let Some(idle_ticks) = self.slots.find_idle(now) else { return 0 };
+        let mut held = Vec::new();
+        let mut given_back = 0;
+        while given_back < GIVE_BACK_BYTES
+            && let Ok(mut slot) = self.port.loan_slice_uninit(1)
+        {
+            let payload = slot.payload_mut().as_ptr().addr();
+            given_back += self.slots.give_back(payload, idle_ticks, GIVE_BACK_BYTES - given_back);
+            held.push(slot);
+        }
+        // The free slots are a stack.
+        while held.pop().is_some() {}
+        given_back
     }
 
     /// Connects to new subscribers, delivers the retained samples to them, and reclaims the slots of

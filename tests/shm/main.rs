@@ -274,6 +274,79 @@ fn a_stopped_lane_of_a_camera_pins_at_most_its_quota_and_no_other_route_suffers(
 }
 
 #[test]
+fn the_memory_of_idle_slots_goes_back_to_the_budget_and_that_of_a_steady_flow_stays() {
+    let at = |ms| MonotonicNs(1_000_000_000).plus_ms(ms);
+    let place = Place::new();
+    let node = place.node();
+    let channels = [0, 1].map(|number| RouteChannel { retained_samples: 1, ..routed(&format!("r{number}")) });
+    let budget = PoolBudget::of_channels(&channels, 256 << 20);
+    let create = |number| SamplePublisher::create_within(&node, &channels[number], &budget, number).unwrap();
+    let (first, second) = (create(0), create(1));
+    let (lane_of_first, image) = (lane(&node, &channels[0]), 6_220_800);
+    // A burst that a lane had not taken, and then a flow of one image at a time, which uses a few slots.
+    assert_eq!(first.give_back_idle(at(0)), 0);
+    for sequence in 1..=15 {
+        assert_eq!(publish(&first, sequence, image), 1);
+    }
+    assert_eq!(sequences(&lane_of_first), (1..=15).collect::<Vec<_>>());
+    let flow = |from_ms: u64, to_ms: u64| {
+        let mut given_back = 0;
+        for ms in (from_ms..to_ms).step_by(100) {
+            for _ in 0..3 {
+                publish(&first, 15 + ms, image);
+                assert_eq!(sequences(&lane_of_first), [15 + ms]);
+            }
+            given_back += first.give_back_idle(at(ms));
+        }
+        given_back
+    };
+    assert_eq!(flow(100, 2_000), 0, "a minute has not passed, and no route is short");
+    let (before, allocated) = (budget.usage(0), allocated_bytes(&place));
+    // The other route needs more than is left, and goes on to need it.
+    let stopped = lane(&node, &channels[1]);
+    let images = Cell::new(0);
+    let fill = || {
+        while let Ok(slot) = second.copy_in(&payload(images.get() + 1, image)) {
+            images.set(images.get() + 1);
+            slot.publish(header(images.get())).unwrap();
+        }
+    };
+    fill();
+    let began_at = std::time::Instant::now();
+    let first_step = first.give_back_idle(at(2_000));
+    println!("{first_step} bytes given back in {} µs", began_at.elapsed().as_micros());
+    assert_eq!(first_step, 2 << 20, "not all at once");
+    let mut given_back = first_step;
+    for ms in (2_100..8_000).step_by(100) {
+        fill();
+        given_back += flow(ms, ms + 100);
+    }
+    let after = budget.usage(0);
+    assert_eq!(before.used_bytes - after.used_bytes, given_back);
+    // Of 15 images, the flow needs three slots at most.
+    assert!(given_back >= 12 * (image as u64), "{given_back}");
+    let of_second = budget.usage(1).used_bytes - channels[1].pool_size().first_bytes;
+    assert!(allocated_bytes(&place) + given_back <= allocated + of_second + (1 << 20));
+    assert_eq!(flow(8_100, 10_000), 0, "what a steady flow uses stays");
+    assert_eq!(budget.usage(0).used_bytes, after.used_bytes);
+    // What was published meanwhile is unchanged.
+    for sequence in 1..=images.get() {
+        let sample = stopped.take().unwrap().unwrap();
+        assert_eq!(
+            (sample.header().sequence, sample.payload() == payload(sequence, image)),
+            (sequence, true)
+        );
+    }
+    // After a minute without a sample all of it goes back, but for the retained one.
+    let rest: u64 = (0..100).map(|step| first.give_back_idle(at(71_000 + 1_000 * step))).sum();
+    assert!(rest > 0);
+    let left = budget.usage(0).used_bytes - channels[0].pool_size().first_bytes;
+    assert!((image as u64..8 << 20).contains(&left), "{left}");
+    publish(&first, 1_000_000, image);
+    assert_eq!(lane_of_first.take().unwrap().unwrap().payload(), payload(1_000_000, image));
+}
+
+#[test]
 fn a_sample_gets_a_slot_that_has_the_memory_although_another_one_is_the_first_free_one() {
     let place = Place::new();
     let node = place.node();

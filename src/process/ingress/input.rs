@@ -21,9 +21,6 @@ use crate::model::{
     Reliability, RouteInfo, SampleHeader, TopicName, TrafficClass,
 };
 use crate::shm::{
-    BoardWriter, HistogramWriter, LaneWaker, LoanError, PoolBudget, RouteChannel, SamplePublisher, Stage,
-};
-use crate::shm::{
     BoardWriter, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget, RouteChannel, SamplePublisher,
     Stage,
 };
@@ -285,7 +282,7 @@ impl Input {
     pub fn housekeeping(&mut self, participant: &mut Participant, now: MonotonicNs) -> Result<(), RoleError> {
         self.connect(participant, now)?;
         self.follow_matching();
-        self.pool.housekeeping();
+        self.pool.housekeeping(now);
         self.publishers.set_reliabilities(|writer| self.source.reliability_of(writer));
         let mut counters = *self.counters.get();
         counters.writers = self.matched_writers();

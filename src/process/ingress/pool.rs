@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use super::arrival_progress::{ArrivalProgress, SampleProgress};
 use super::source::kept_bytes;
 use crate::dds::{AssemblyLimits, LentMemory, PartialArrival, Payload, SampleMemory};
+use crate::model::MonotonicNs;
 use crate::shm::{LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
 
 /// The pool, as the main thread and the DDS library share it.
@@ -58,15 +59,16 @@ impl PoolOwner {
         self.pool.clone()
     }
 
-    /// Connects new lanes, and frees the slots that the DDS library has dropped and those of lanes that have
-    /// ended; on the main thread.
-    pub fn housekeeping(&self) {
+    /// Connects new lanes, frees the slots that the DDS library has dropped and those of lanes that have
+    /// ended, and gives the memory of idle slots back; on the main thread, while no other one calls `fill`.
+    pub fn housekeeping(&self, now: MonotonicNs) {
         #[allow(clippy::disallowed_methods, reason = "housekeeping; receiving threads only try this lock")]
         let _connecting = self.pool.connecting.lock().unwrap_or_else(PoisonError::into_inner);
         while let Ok(slot) = self.abandoned.try_recv() {
             drop(slot);
         }
         self.pool.publisher.connect_subscribers();
+        self.pool.publisher.give_back_idle(now);
     }
 
     /// What the pool takes of the budget.
@@ -213,7 +215,7 @@ mod tests {
     use bytes::Bytes;
 
     use super::*;
-    use crate::model::{InstanceName, RouteId};
+    use crate::model::{InstanceName, MonotonicNs, RouteId};
     use crate::shm::{QueueLimits, RouteChannel, ShmNode};
 
     /// A pool for samples of 100 bytes, with the node and the folder that it needs.
@@ -241,7 +243,7 @@ mod tests {
         assert!(lender.lend(10).is_none());
         drop(dropped);
         assert!(lender.lend(10).is_none());
-        owner.housekeeping();
+        owner.housekeeping(MonotonicNs(0));
         assert!(lender.lend(10).is_some());
         let filled = owner.fill(Payload::Bytes(Bytes::from_static(&[1; 100])));
         assert!(filled.slot.is_ok() && !filled.in_place);

@@ -2,10 +2,21 @@
 
 use alloc::vec::Vec;
 
+use crate::model::MonotonicNs;
+
 /// What a pool on the critical lane can always take, whatever the others have taken: 300 scans.
 const CRITICAL_RESERVE_BYTES: u64 = 1 << 20;
 /// What a pool on noncritical lanes alone can always take.
 const NONCRITICAL_RESERVE_BYTES: u64 = 256 << 10;
+
+/// For how long a slot is idle until the memory of its payload is given back: longer than between the samples
+/// of a flow, which would pay for it with an allocation each.
+const IDLE_MS: u64 = 60_000;
+/// The same while a route is short of memory. In a steady flow every slot in use has a sample within a second
+/// at 4 Hz or more; a slower one takes its memory again, which the budget keeps for it.
+const SHORT_IDLE_MS: u64 = 1_000;
+/// For how long after a refusal a route counts as short.
+const SHORT_MS: u64 = 2_000;
 
 /// Why a pool gets no more shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,6 +75,9 @@ pub struct MemoryBudget {
     used_bytes: u64,
     peak_bytes: u64,
     pools: Vec<Pool>,
+    /// Whether memory was refused since `idle_ms` was called last.
+    refused: bool,
+    short_until: MonotonicNs,
 }
 
 impl MemoryBudget {
@@ -94,6 +108,8 @@ impl MemoryBudget {
             used_bytes,
             peak_bytes: used_bytes,
             pools: pools.collect(),
+            refused: false,
+            short_until: MonotonicNs(0),
         }
     }
 
@@ -102,6 +118,12 @@ impl MemoryBudget {
     /// # Errors
     /// The memory is not granted, and nothing is taken.
     pub fn take(&mut self, route: usize, bytes: u64, sample_bytes: u64) -> Result<(), BudgetRefusal> {
+        let taken = self.try_take(route, bytes, sample_bytes);
+        self.refused |= taken.is_err();
+        taken
+    }
+
+    fn try_take(&mut self, route: usize, bytes: u64, sample_bytes: u64) -> Result<(), BudgetRefusal> {
         let pool = &mut self.pools[route];
         pool.largest_bytes = pool.largest_bytes.max(sample_bytes);
         let used = pool.used_bytes.saturating_add(bytes);
@@ -139,6 +161,20 @@ impl MemoryBudget {
         let bytes = bytes.min(pool.used_bytes);
         pool.used_bytes -= bytes;
         self.used_bytes -= bytes;
+    }
+
+    /// Notes that the system had no memory, as if the budget had refused it.
+    pub fn note_refusal(&mut self) {
+        self.refused = true;
+    }
+
+    /// For how long, in milliseconds, a free slot must have had no sample of its size until its memory is
+    /// given back: a minute, and a second while a route is short of memory.
+    pub fn idle_ms(&mut self, now: MonotonicNs) -> u64 {
+        if core::mem::take(&mut self.refused) {
+            self.short_until = now.plus_ms(SHORT_MS);
+        }
+        if now < self.short_until { SHORT_IDLE_MS } else { IDLE_MS }
     }
 
     /// The budget.
@@ -257,6 +293,23 @@ mod tests {
         demands[0].steady_samples = 12;
         let mut budget = MemoryBudget::new(100 * MIB, &demands);
         assert_eq!(fill(&mut budget, 0, 6 * MIB), (12, Quota));
+    }
+
+    #[test]
+    fn idle_memory_is_given_back_sooner_while_a_route_is_short() {
+        let at = |ms| MonotonicNs(0).plus_ms(ms);
+        let mut budget = MemoryBudget::new(10 * MIB, &critical(1));
+        assert_eq!(budget.idle_ms(at(0)), 60_000);
+        fill(&mut budget, 0, MIB);
+        assert_eq!(
+            [5_000, 5_001, 6_999, 7_000].map(|ms| budget.idle_ms(at(ms))),
+            [1_000, 1_000, 1_000, 60_000]
+        );
+        budget.note_refusal();
+        assert_eq!(budget.idle_ms(at(8_000)), 1_000);
+        // A refusal while the route is short makes that longer.
+        fill(&mut budget, 0, MIB);
+        assert_eq!([9_500, 11_499, 11_500].map(|ms| budget.idle_ms(at(ms))), [1_000, 1_000, 60_000]);
     }
 
     #[test]
