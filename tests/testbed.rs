@@ -124,6 +124,37 @@ fn every_size_from_nothing_to_4_mib_passes_between_all_libraries() {
 }
 
 #[test]
+fn a_publisher_of_bursts_waits_for_a_signal_after_each() {
+    let Some((_net, here, there)) = two_hosts("a_publisher_of_bursts_waits_for_a_signal_after_each") else {
+        return;
+    };
+    for library in LIBRARIES {
+        let peer = || Peer::on(library).keep_all().size(100_000).plain().option("--burst", 20);
+        let subscriber = peer().subscriber().start_on(&there);
+        let publisher = peer().publisher().hold().prime().rate_hz(100.0).start_on(&here);
+        go_when_matched(&publisher, &subscriber);
+        for bursts in 1..=3 {
+            publisher.wait_for("a pause", |event| {
+                event["event"] == "paused" && event["attempted"].as_u64() == Some(20 * bursts)
+            });
+            subscriber.wait_received(20 * bursts);
+            publisher.go();
+        }
+        let sent: Sent = publisher.end();
+        let received: Received = subscriber.end();
+        assert!(sent.ok >= 60, "{library:?}: {}", sent.ok);
+        assert_eq!((received.bad, received.size_min, received.size_max), (0, 100_000, 100_000));
+    }
+    // A subscriber of plain samples notices others.
+    let publisher = Peer::cyclone().keep_all().size(1000).count(10);
+    for library in [Library::Cyclone, Library::Rust] {
+        let subscriber = Peer::on(library).keep_all().plain();
+        let (_, received) = transfer((publisher.clone(), &here), (subscriber, &there), 10);
+        assert_eq!(received.bad, 10, "{library:?}");
+    }
+}
+
+#[test]
 fn a_subscriber_reports_samples_of_wrong_bytes_or_wrong_size() {
     let Some((_net, here, there)) = two_hosts("a_subscriber_reports_samples_of_wrong_bytes_or_wrong_size")
     else {

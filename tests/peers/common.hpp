@@ -32,11 +32,13 @@ struct Options {
   uint64_t first_seq = 0;
   std::vector<uint32_t> sizes; // sample `seq` has sizes[seq % n] bytes; empty on a subscriber is "not checked"
   uint64_t seed = 1;
+  bool plain = false;          // only the sequence at both ends of a payload is written and checked
   std::vector<uint8_t> encapsulation{0x00, 0x01, 0x00, 0x00};
   std::string payload_file;
   double source_age_s = 0;     // the source timestamp is so much older than the sample
   int32_t wait_match = 0;
   bool hold = false;           // a publisher begins at SIGUSR1
+  uint64_t burst = 0;          // a publisher waits for SIGUSR1 after each so many samples; 0 is never
   bool prime = false;
   double heartbeat_s = 0;      // 0 is the library's default
   double linger_s = 0;
@@ -98,7 +100,7 @@ using Bytes = std::vector<uint8_t>;
 
 // What the publishers send. The bytes after the header, little endian: 0..8 sequence, 8..16 send time
 // (CLOCK_MONOTONIC, ns), 16..24 source timestamp (CLOCK_REALTIME, ns), then xorshift of seed and sequence; cut off
-// at the sample's size.
+// at the sample's size. With --plain zeros instead, and the sequence again in the last 8.
 class Publisher {
  public:
   explicit Publisher(const Options& options);
@@ -144,6 +146,7 @@ class Publisher {
 
  private:
   bool next();
+  void pause();
   void make_priming_sample();
   void record(bool ok, int64_t call_ns);
   void finish_sending();

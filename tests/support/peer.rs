@@ -323,6 +323,12 @@ impl Peer {
         Peer { each_sample: true, ..self }
     }
 
+    /// Sends and expects payloads of zeros with the sequence number at both ends, which cost the peer little.
+    pub fn plain(mut self) -> Peer {
+        self.arguments.push("--plain".to_owned());
+        self
+    }
+
     /// Treats payloads as opaque: without sequence numbers and without a check of their bytes.
     pub fn opaque(mut self) -> Peer {
         self.arguments.push("--opaque".to_owned());

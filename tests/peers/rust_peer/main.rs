@@ -42,6 +42,11 @@ impl Signals {
         self.stop.load(Ordering::Relaxed)
     }
 
+    /// Forgets the SIGUSR1 that has come, so that `go` waits for another one.
+    fn await_go_again(&self) {
+        self.go.store(false, Ordering::Relaxed);
+    }
+
     fn go(&self) -> bool {
         self.go.load(Ordering::Relaxed)
     }

@@ -9,6 +9,8 @@ use adaptive_bridge::dds::{DdsError, Participant, ParticipantOptions};
 use adaptive_bridge::model::{DdsType, Durability, Encapsulation, History, Reliability, TypeHash};
 use clap::{Parser, ValueEnum};
 
+use super::payload::Filling;
+
 /// A DDS peer on RustDDS: publishes and subscribes serialized samples of any type (see tests/peers/README.md)
 #[derive(Parser, Debug)]
 #[command(name = "rust_peer")]
@@ -52,6 +54,8 @@ pub struct Options {
     size: Vec<usize>,
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
+    #[arg(long)]
+    pub plain: bool,
     #[arg(long, default_value = "00010000", value_parser = encapsulation)]
     pub encap: Encapsulation,
     #[arg(long)]
@@ -62,6 +66,9 @@ pub struct Options {
     pub wait_match: u64,
     #[arg(long)]
     pub hold: bool,
+    /// 0 is no pause
+    #[arg(long, default_value_t = 0)]
+    pub burst: u64,
     #[arg(long)]
     pub prime: bool,
     /// Accepted without effect, as by the peer on Cyclone DDS: the library has no such setting
@@ -106,6 +113,11 @@ impl Options {
             hash: TypeHash::from_hex(self.type_hash.as_bytes()),
             has_keys: false,
         }
+    }
+
+    /// What the payloads contain after their front.
+    pub fn filling(&self) -> Filling {
+        if self.plain { Filling::Plain } else { Filling::Random { seed: self.seed } }
     }
 
     /// The size of a publisher's sample; sizes take turns.

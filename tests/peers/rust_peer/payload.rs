@@ -9,6 +9,28 @@ pub const PRIMING: u64 = u64::MAX;
 /// Most zeros by which RTPS lengthens a payload to whole words.
 const MAX_PADDING: usize = 3;
 
+/// What a payload contains after its front.
+#[derive(Clone, Copy, Debug)]
+pub enum Filling {
+    /// Pseudorandom bytes of the seed and the sequence.
+    Random { seed: u64 },
+    /// Zeros, and the sequence in the last word: a few bytes to write and to check, whatever the size.
+    Plain,
+}
+
+impl Filling {
+    fn fill(self, bytes: &mut [u8], sequence: u64) {
+        match self {
+            Self::Random { seed } => fill(bytes, seed, sequence),
+            Self::Plain => {
+                if let Some(last) = bytes.last_chunk_mut() {
+                    *last = sequence.to_le_bytes();
+                }
+            }
+        }
+    }
+}
+
 /// The beginning of a payload, as far as its size allows.
 #[derive(Clone, Copy, Debug)]
 pub struct Front {
@@ -25,13 +47,13 @@ pub fn word(payload: &[u8], at: usize) -> Option<u64> {
 }
 
 /// A payload of that size.
-pub fn make(front: Front, size: usize, seed: u64) -> Vec<u8> {
+pub fn make(front: Front, size: usize, filling: Filling) -> Vec<u8> {
     let mut payload = vec![0; size.max(FRONT_BYTES)];
     for (at, word) in [front.sequence, front.sent_ns, front.source_ns].into_iter().enumerate() {
         payload[at * 8..][..8].copy_from_slice(&word.to_le_bytes());
     }
     payload.truncate(size);
-    fill(payload.get_mut(FRONT_BYTES..).unwrap_or_default(), seed, front.sequence);
+    filling.fill(payload.get_mut(FRONT_BYTES..).unwrap_or_default(), front.sequence);
     payload
 }
 
@@ -45,16 +67,21 @@ pub enum Verdict {
 }
 
 /// Compares a payload with the one of its sequence number, of that size if the size is known.
-pub fn check(payload: &[u8], size: Option<usize>, seed: u64, sequence: u64) -> Verdict {
+pub fn check(payload: &[u8], size: Option<usize>, filling: Filling, sequence: u64) -> Verdict {
     let padding = size.map(|size| payload.len().checked_sub(size));
     if padding.is_some_and(|padding| padding.is_none_or(|zeros| zeros > MAX_PADDING)) {
         return Verdict::Bad;
     }
     let padding = padding.flatten().unwrap_or(0);
+    let end = payload.len() - padding;
+    if matches!(filling, Filling::Plain) {
+        let last = payload.get(FRONT_BYTES..end).and_then(|rest| rest.last_chunk());
+        let is_whole = last.is_none_or(|last| *last == sequence.to_le_bytes());
+        return if is_whole { Verdict::Whole } else { Verdict::Bad };
+    }
     let mut expected = payload[..payload.len().min(FRONT_BYTES)].to_vec();
     expected.resize(payload.len(), 0);
-    let end = payload.len() - padding;
-    fill(expected.get_mut(FRONT_BYTES..end).unwrap_or_default(), seed, sequence);
+    filling.fill(expected.get_mut(FRONT_BYTES..end).unwrap_or_default(), sequence);
     if expected == payload {
         return if padding > 0 { Verdict::Padded } else { Verdict::Whole };
     }

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use serde_json::json;
 
 use super::options::Options;
-use super::payload::{self, FRONT_BYTES, Front};
+use super::payload::{self, FRONT_BYTES, Filling, Front};
 use super::record::Record;
 use super::{Signals, distribution, emit, emit_ready, microseconds};
 
@@ -104,7 +104,11 @@ impl Publisher<'_> {
         let mut due_ns = begin_ns;
         self.tally.begin_ns = begin_ns;
         loop {
-            if self.tally.attempted > 0 {
+            let attempted = self.tally.attempted;
+            if attempted > 0 && attempted.is_multiple_of(self.options.burst) {
+                self.wait_for_go();
+                due_ns = clock::monotonic().0;
+            } else if attempted > 0 {
                 due_ns += period_ns;
                 // Skips the ticks that have passed, as a timer does: a stalled write lowers the rate.
                 let late_ns = clock::monotonic().0.saturating_sub(due_ns);
@@ -131,6 +135,15 @@ impl Publisher<'_> {
         self.tally.emit_progress();
     }
 
+    /// Waits for the signal to send the next burst.
+    fn wait_for_go(&mut self) {
+        self.signals.await_go_again();
+        emit(&json!({"event": "paused", "attempted": self.tally.attempted, "ok": self.tally.ok}));
+        while !self.signals.stop() && !self.signals.go() {
+            self.pause(SLICE);
+        }
+    }
+
     fn write_next(&mut self) {
         let sequence = self.options.first_seq + self.tally.attempted;
         let source_age_ns = self.options.source_age_ms.as_nanos() as u64;
@@ -138,13 +151,16 @@ impl Publisher<'_> {
         let front = Front { sequence, sent_ns: clock::monotonic().0, source_ns: source.0 };
         let bytes = Bytes::from(match &self.file {
             Some(file) => file.clone(),
-            None => payload::make(front, self.options.size_to_send(sequence), self.options.seed),
+            None => payload::make(front, self.options.size_to_send(sequence), self.options.filling()),
         });
         let before_ns = clock::monotonic().0;
         let outcome =
             self.writer.write(bytes.clone(), self.options.encap, SourceTimestamp::from_wall(source));
         let now_ns = clock::monotonic().0;
-        let hash = payload::hash(&[&self.options.encap.0, &bytes[..]].concat());
+        let hash = match self.options.filling() {
+            Filling::Random { .. } => payload::hash(&[&self.options.encap.0, &bytes[..]].concat()),
+            Filling::Plain => 0,
+        };
         let ok = u8::from(outcome.is_ok());
         self.record.row(format_args!("{sequence},{},{},{ok}", front.sent_ns, now_ns - before_ns));
         self.tally.record(sequence, outcome.is_ok().then_some(hash), before_ns, now_ns);

@@ -11,7 +11,7 @@ use adaptive_bridge::model::SourceTimestamp;
 use serde_json::{Value, json};
 
 use super::options::Options;
-use super::payload::{self, Verdict};
+use super::payload::{self, Filling, Verdict};
 use super::record::Record;
 use super::{Signals, distribution, emit, emit_ready, microseconds};
 
@@ -154,7 +154,7 @@ impl<'s> Subscriber<'s> {
         self.sizes = Some((smallest.min(size), largest.max(size)));
 
         let verdict = sequence.map(|sequence| {
-            payload::check(payload, self.options.expected_size(sequence), self.options.seed, sequence)
+            payload::check(payload, self.options.expected_size(sequence), self.options.filling(), sequence)
         });
         self.bad += u64::from(verdict == Some(Verdict::Bad));
         self.padded += u64::from(verdict == Some(Verdict::Padded));
@@ -163,7 +163,9 @@ impl<'s> Subscriber<'s> {
             self.received += 1;
             self.unnumbered += u64::from(sequence.is_none());
             self.out_of_order += u64::from(!is_later);
-            self.hash = self.hash.wrapping_add(payload::hash(&self.sample));
+            if let Filling::Random { .. } = self.options.filling() {
+                self.hash = self.hash.wrapping_add(payload::hash(&self.sample));
+            }
         } else {
             self.duplicates += 1;
         }
