@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
+use std::ops::Range;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -43,6 +44,15 @@ pub enum Kind {
 
 impl Kind {
     pub const ALL: [Self; 3] = [Self::Direct, Self::Relay, Self::Bridge];
+
+    /// The number of processes that a sample passes.
+    pub const fn stages(self) -> usize {
+        match self {
+            Self::Direct => 2,
+            Self::Relay => 3,
+            Self::Bridge => 4,
+        }
+    }
 
     pub const fn label(self) -> &'static str {
         match self {
@@ -91,6 +101,12 @@ impl Plan {
     /// A bridge with all its processes.
     pub fn whole(scheduling: Scheduling, routes: &[usize]) -> Self {
         Self { lanes_run: true, control: true, ..Self::new(Kind::Bridge, scheduling, routes) }
+    }
+
+    /// The place of a stage: 0 is the publisher, the last one the subscriber.
+    pub fn place(&self, stage: usize, options: &Options) -> Place {
+        let cpu = options.placement.cpu(stage, self.kind.stages());
+        Place { cpu, scheduling: self.scheduling }
     }
 
     fn lane_names(&self) -> Vec<String> {
@@ -333,17 +349,91 @@ impl Peers {
     }
 }
 
-/// A running bed: publisher, subscriber, and the relay or bridge between them.
-pub struct Bed {
+/// What runs between publisher and subscriber: nothing, the relay or a bridge.
+pub struct Middle {
     kind: Kind,
+    relay: Option<Program>,
+    pub bridge: Option<Bridge>,
+}
+
+impl Middle {
+    /// Starts it in a domain.
+    pub fn start(plan: &Plan, domain: u16, options: &Options) -> Result<Self, String> {
+        eprintln!(
+            "starting {}, {} routes, scheduling {}",
+            plan.kind.label(),
+            plan.routes.len(),
+            plan.scheduling.label()
+        );
+        let mut middle = Self { kind: plan.kind, relay: None, bridge: None };
+        match plan.kind {
+            Kind::Direct => {}
+            Kind::Relay => {
+                let routes = Route::to_argument(&Route::all(&plan.routes));
+                let mut program = Program::start("__relay", domain, plan.place(1, options), &[&routes])?;
+                program.numbers("ready")?;
+                middle.relay = Some(program);
+            }
+            Kind::Bridge => {
+                let places = [1, 2].map(|stage| plan.place(stage, options));
+                middle.bridge = Some(Bridge::start(domain, plan, places, &options.bridge)?);
+            }
+        }
+        Ok(middle)
+    }
+
+    /// Names and process ids of its processes.
+    pub fn processes(&self) -> Vec<(String, u32)> {
+        let relay = self.relay.iter().map(|relay| ("relay".to_owned(), relay.child.id()));
+        let bridge = self.bridge.iter().flat_map(|bridge| &bridge.processes);
+        relay.chain(bridge.map(|process| (process.role.clone(), process.child.id()))).collect()
+    }
+
+    /// The CPU time of each of its processes so far.
+    pub fn cpu_ns(&self) -> BTreeMap<String, u64> {
+        self.processes().into_iter().map(|(name, pid)| (name, system::cpu_ns(pid))).collect()
+    }
+
+    /// The counters of some routes before a run, to pass to `finish`. Fails when a process of the bridge has
+    /// ended.
+    pub fn begin(&mut self, routes: &Range<usize>) -> Result<Option<Counters>, String> {
+        let Some(bridge) = &mut self.bridge else { return Ok(None) };
+        bridge.check()?;
+        Ok(Some(Counters::read(&bridge.boards, routes.clone())))
+    }
+
+    /// The counters since `begin`, and the samples that the relay's writer has refused.
+    pub fn finish(
+        &mut self,
+        routes: &Range<usize>,
+        before: Option<Counters>,
+    ) -> Result<(Option<BridgeRun>, u64), String> {
+        let relay_refused = match &mut self.relay {
+            Some(relay) => {
+                relay.send("refused")?;
+                relay.numbers("refused")?.first().copied().unwrap_or(0)
+            }
+            None => 0,
+        };
+        let bridge = match (&self.bridge, before) {
+            (Some(bridge), Some(before)) => {
+                Some(Counters::read(&bridge.boards, routes.clone()).since(&before))
+            }
+            _ => None,
+        };
+        Ok((bridge, relay_refused))
+    }
+}
+
+/// A running bed: publisher, subscriber, and what is between them.
+pub struct Bed {
     routes: usize,
     peers: Peers,
     publisher: Program,
     subscriber: Program,
     /// The subscriber of the noncritical lanes.
     _drain: Option<Program>,
-    relay: Option<Program>,
-    pub bridge: Option<Bridge>,
+    pub middle: Middle,
     next_number: u64,
 }
 
@@ -486,12 +576,6 @@ impl Beds {
         assert!(plans.len() <= MAX_BEDS, "each bed needs a domain");
         let mut beds = Vec::new();
         for (plan, domain) in plans.iter().zip(FIRST_DOMAIN..) {
-            eprintln!(
-                "starting {}, {} routes, scheduling {}",
-                plan.kind.label(),
-                plan.routes.len(),
-                plan.scheduling.label()
-            );
             beds.push(Bed::start(plan, domain, options)?);
         }
         // Discovery traffic continues for some time after the endpoints have matched.
@@ -519,28 +603,11 @@ impl Beds {
 impl Bed {
     fn start(plan: &Plan, domain: u16, options: &Options) -> Result<Self, String> {
         let kind = plan.kind;
-        let stages = match kind {
-            Kind::Direct => 2,
-            Kind::Relay => 3,
-            Kind::Bridge => 4,
-        };
-        let place = |stage| Place { cpu: options.placement.cpu(stage, stages), scheduling: plan.scheduling };
         let all = Route::all(&plan.routes);
         let routes = Route::to_argument(&all);
-        let (mut relay, mut bridge, mut config, mut drain) = (None, None, None, None);
-        match kind {
-            Kind::Direct => {}
-            Kind::Relay => {
-                let mut program = Program::start("__relay", domain, place(1), &[&routes])?;
-                program.numbers("ready")?;
-                relay = Some(program);
-            }
-            Kind::Bridge => {
-                let started = Bridge::start(domain, plan, [place(1), place(2)], &options.bridge)?;
-                config = Some(started.config.to_string_lossy().into_owned());
-                bridge = Some(started);
-            }
-        }
+        let middle = Middle::start(plan, domain, options)?;
+        let config = middle.bridge.as_ref().map(|bridge| bridge.config.to_string_lossy().into_owned());
+        let mut drain = None;
         if plan.lanes_run && plan.lanes > 0 {
             let prefixes: Vec<String> =
                 plan.lane_names().iter().map(|lane| format!("/bench/{lane}/")).collect();
@@ -554,13 +621,12 @@ impl Bed {
             routes,
             prefix: if kind == Kind::Direct { INPUT } else { OUTPUT },
             config,
-            publisher_place: place(0),
-            subscriber_place: place(stages - 1),
+            publisher_place: plan.place(0, options),
+            subscriber_place: plan.place(plan.kind.stages() - 1, options),
         };
         let (publisher, subscriber) = peers.start()?;
         let routes = all.len();
-        let mut bed =
-            Self { kind, routes, peers, publisher, subscriber, _drain: drain, relay, bridge, next_number: 0 };
+        let mut bed = Self { routes, peers, publisher, subscriber, _drain: drain, middle, next_number: 0 };
         bed.warm_up()?;
         Ok(bed)
     }
@@ -576,7 +642,7 @@ impl Bed {
 
     /// Starts another subscriber of the bridge's critical lane.
     pub fn second_subscriber(&self) -> Result<Program, String> {
-        let bridge = self.bridge.as_ref().ok_or("no bridge")?;
+        let bridge = self.middle.bridge.as_ref().ok_or("no bridge")?;
         let routes = Route::to_argument(&Route::all(&bridge.plan.routes));
         let config = bridge.config.to_string_lossy();
         let anywhere = Place { cpu: None, scheduling: Scheduling::Other };
@@ -587,11 +653,11 @@ impl Bed {
     }
 
     pub fn name(&self) -> &'static str {
-        self.kind.label()
+        self.kind().label()
     }
 
     pub fn kind(&self) -> Kind {
-        self.kind
+        self.middle.kind
     }
 
     /// Sends samples until a run loses none, because the writers of relay or bridge match their readers a
@@ -605,26 +671,15 @@ impl Bed {
                 return Ok(());
             }
         }
-        Err(format!("{}: samples do not arrive", self.kind.label()))
+        Err(format!("{}: samples do not arrive", self.name()))
     }
 
     /// Names and process ids of publisher, subscriber and the processes between them.
     pub fn processes(&self) -> Vec<(String, u32)> {
         let program = |name: &str, program: &Program| (name.to_owned(), program.child.id());
         let mut all = vec![program("publisher", &self.publisher), program("subscriber", &self.subscriber)];
-        all.extend(self.middle_processes());
+        all.extend(self.middle.processes());
         all
-    }
-
-    /// Names and process ids of the processes between publisher and subscriber.
-    pub fn middle_processes(&self) -> Vec<(String, u32)> {
-        let relay = self.relay.iter().map(|relay| ("relay".to_owned(), relay.child.id()));
-        let bridge = self.bridge.iter().flat_map(|bridge| &bridge.processes);
-        relay.chain(bridge.map(|process| (process.role.clone(), process.child.id()))).collect()
-    }
-
-    fn cpu_ns(&self) -> BTreeMap<String, u64> {
-        self.middle_processes().into_iter().map(|(name, pid)| (name, system::cpu_ns(pid))).collect()
     }
 
     /// Sends the samples of a case and returns the result.
@@ -636,24 +691,18 @@ impl Bed {
     /// As `measure`; the subscriber stops waiting for missing samples when none has arrived for `timeout_ms`.
     pub fn measure_with_timeout(&mut self, case: &Case, timeout_ms: u64) -> Result<Run, String> {
         let routes = case.first_route..case.first_route + case.routes;
-        if let Some(bridge) = &mut self.bridge {
-            bridge.check()?;
-        }
-        let before = self.bridge.as_ref().map(|bridge| Counters::read(&bridge.boards, routes.clone()));
+        let before = self.middle.begin(&routes)?;
         self.subscriber.send("begin")?;
         std::thread::sleep(Duration::from_millis(150));
-        let cpu_before = self.cpu_ns();
+        let cpu_before = self.middle.cpu_ns();
         self.publisher.send(&format!(
             "send {} {} {} {} {} {}",
             case.first_route, case.routes, case.rate_hz, case.samples, case.bytes, self.next_number
         ))?;
         let sent = self.publisher.numbers("sent")?;
         let earlier = |name: &String| cpu_before.get(name).copied().unwrap_or_default();
-        let cpu_ns = self
-            .cpu_ns()
-            .into_iter()
-            .map(|(name, ns)| (name.clone(), ns.saturating_sub(earlier(&name))))
-            .collect();
+        let cpu_ns = self.middle.cpu_ns().into_iter();
+        let cpu_ns = cpu_ns.map(|(name, ns)| (name.clone(), ns.saturating_sub(earlier(&name)))).collect();
         let [accepted, refused] = sent[..] else { return Err(format!("answer of the publisher: {sent:?}")) };
         self.subscriber.send(&format!("end {accepted} {timeout_ms}"))?;
         let head = self.subscriber.numbers("samples")?;
@@ -677,18 +726,8 @@ impl Bed {
             }
         }
         self.next_number += case.samples as u64;
-        let relay_refused = match &mut self.relay {
-            Some(relay) => {
-                relay.send("refused")?;
-                relay.numbers("refused")?.first().copied().unwrap_or(0)
-            }
-            None => 0,
-        };
-        let bridge = match (&self.bridge, before) {
-            (Some(bridge), Some(before)) => Some(Counters::read(&bridge.boards, routes).since(&before)),
-            _ => None,
-        };
-        Ok(Run { kind: self.kind, accepted, refused, records, damaged, relay_refused, cpu_ns, bridge })
+        let (bridge, relay_refused) = self.middle.finish(&routes, before)?;
+        Ok(Run { kind: self.kind(), accepted, refused, records, damaged, relay_refused, cpu_ns, bridge })
     }
 }
 
@@ -735,7 +774,7 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
 }
 
 /// The counters and latencies of some routes, read from the boards at one instant.
-struct Counters {
+pub struct Counters {
     lost_upstream: u64,
     forwarded: u64,
     by_reference: u64,
@@ -748,7 +787,7 @@ struct Counters {
 }
 
 impl Counters {
-    fn read(boards: &Boards, routes: std::ops::Range<usize>) -> Self {
+    fn read(boards: &Boards, routes: Range<usize>) -> Self {
         let mut counters = Self {
             lost_upstream: 0,
             forwarded: 0,

@@ -233,7 +233,7 @@ impl Disturbance {
             reader.signal(if is_stopped { Signal::SIGSTOP } else { Signal::SIGKILL });
             return Ok(Self::Reader(reader));
         }
-        let bridge = bed.bridge.as_mut().ok_or("no bridge")?;
+        let bridge = bed.middle.bridge.as_mut().ok_or("no bridge")?;
         Ok(match condition {
             Condition::Undisturbed
             | Condition::Repeat
@@ -261,7 +261,7 @@ impl Disturbance {
 
     /// Ends the disturbance and returns the number of killed processes.
     fn end(self, bed: &mut Bed) -> Result<u64, String> {
-        let bridge = bed.bridge.as_mut().ok_or("no bridge")?;
+        let bridge = bed.middle.bridge.as_mut().ok_or("no bridge")?;
         match self {
             Self::None => {}
             // The drop kills the subscriber.

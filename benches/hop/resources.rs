@@ -192,7 +192,7 @@ fn traced(
     arguments: &[&str],
 ) -> Result<(Vec<(String, String)>, u64), String> {
     let mut tracers = Vec::new();
-    for (process, pid) in bed.middle_processes() {
+    for (process, pid) in bed.middle.processes() {
         tracers.push(Tracer::start(tool, arguments, &process, pid)?);
     }
     // Time for the tool to attach to all threads.

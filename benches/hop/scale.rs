@@ -99,7 +99,8 @@ fn take_turns(
                 .collect(),
             cpu_us_per_sample,
             rss_kib: bed
-                .middle_processes()
+                .middle
+                .processes()
                 .into_iter()
                 .map(|(name, pid)| (name, Usage::of(pid).rss_kib))
                 .collect(),

@@ -66,14 +66,14 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
                 }
             }
         };
-        for (process, pid) in bed.middle_processes() {
+        for (process, pid) in bed.middle.processes() {
             // Without shared memory, which has a series of its own: a slot of the pool adds to the resident
             // memory of a process from its first access on.
             let usage = Usage::of(pid);
             add_point(process.clone(), "KiB", usage.rss_kib.saturating_sub(usage.shared_kib) as f64);
             add_point(process, "descriptors", descriptors(pid) as f64);
         }
-        add_point("shared memory".to_owned(), "KiB", shared_kib(&bed.middle_processes()));
+        add_point("shared memory".to_owned(), "KiB", shared_kib(&bed.middle.processes()));
         eprintln!("soak: {:.0} of {} s, {} missing", at_s, duration.as_secs(), soak.missing);
         turn += 1;
         bed.restart_peers(if turn % 2 == 0 { Ending::Killed } else { Ending::Normal })?;
