@@ -107,9 +107,10 @@ fn measure(options: &Options) -> Result<(), String> {
     if failures.is_empty() { Ok(()) } else { Err(failures.join("; ")) }
 }
 
-/// Fills docs/performance-runs.md with the figures of saved runs.
+/// Fills docs/performance-runs.md and docs/performance.md with the figures of saved runs.
 fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
-    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/performance-runs.md");
+    let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs");
+    let page = docs.join("performance-runs.md");
     let with_path = |path: &Path| {
         let path = path.display().to_string();
         move |error: &dyn std::fmt::Display| format!("{path}: {error}")
@@ -129,8 +130,11 @@ fn fill_page(runs: &[PathBuf]) -> Result<(), String> {
         let summary: Summary = serde_json::from_str(&text).map_err(|error| with_path(&path)(&error))?;
         summaries.push((name, summary));
     }
-    let filled = hop::fill(&text, &summaries)?;
-    fs::write(&page, filled).map_err(|error| with_path(&page)(&error))?;
-    println!("filled {} with the figures of {} runs", page.display(), summaries.len());
+    for page in [page, docs.join("performance.md")] {
+        let text = fs::read_to_string(&page).map_err(|error| with_path(&page)(&error))?;
+        let filled = hop::fill(&text, &summaries)?;
+        fs::write(&page, filled).map_err(|error| with_path(&page)(&error))?;
+        println!("filled {} with the figures of {} runs", page.display(), summaries.len());
+    }
     Ok(())
 }

@@ -88,8 +88,8 @@ pub struct Options {
     /// Measure only memory over time
     #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
     pub soak: Option<Duration>,
-    /// Measure nothing; fill docs/performance-runs.md with the figures of the runs, by default of those that
-    /// it already names
+    /// Measure nothing; fill docs/performance-runs.md and performance.md with the figures of the runs, by
+    /// default of those that the first already names
     #[arg(long, value_name = "RUN", num_args = 0..)]
     pub page: Option<Vec<PathBuf>>,
     /// Measure another build of the bridge

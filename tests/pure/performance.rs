@@ -6,9 +6,10 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use adaptive_bridge_measure::hop::{
-    Attempt, Call, Isolation, Latency, Loss, Lossy, Quantiles, Resource, Scale, Soak, SoakSeries, Summary,
-    Throughput, figures, fill, readme, runs_named, soak_failures,
+    Attempt, Call, Isolation, Large, Latency, Loss, Lossy, Quantiles, Resource, Scale, Soak, SoakSeries,
+    Summary, Throughput, figures, fill, large, readme, runs_named, soak_failures,
 };
+use adaptive_bridge_measure::plot::svg::{WIDTH, text_width};
 use adaptive_bridge_measure::statistics::{growth, median, median_interval, quantile};
 use support::root;
 
@@ -147,6 +148,44 @@ fn made_up() -> Summary {
         }),
         ..Summary::default()
     }
+}
+
+/// A run of the section `large` with one library: every size, the small samples, and the stock buffers. The
+/// bridge's hop is a fifth of the relay's, its CPU time four fifths.
+fn large_rows(library: &str) -> Vec<Large> {
+    let sweep = large::SIZES.map(|bytes| (large::RATE_HZ, bytes, false));
+    let small = large::SMALL.map(|(rate_hz, bytes)| (rate_hz, bytes, false));
+    let stock = [1 << 18, 1 << 20, 4 << 20].map(|bytes| (large::RATE_HZ, bytes, true));
+    let cases = sweep.into_iter().chain(small).chain(stock);
+    let row = |(rate_hz, bytes, stock_buffers): (u64, usize, bool),
+               (program, hop_us, cpu_us): (&str, f64, f64)| {
+        let kib = bytes as f64 / 1024.0;
+        Large {
+            library: library.to_owned(),
+            rate_hz,
+            bytes,
+            program: program.to_owned(),
+            stock_buffers,
+            accepted: 180,
+            latency: quantiles(300.0 + kib + hop_us, 900.0),
+            // The latency of direct differs from repetition to repetition.
+            repetitions_p50_us: (0..6).map(|at| 300.0 + kib + f64::from(at) + hop_us).collect(),
+            repetitions_cpu_us: vec![cpu_us; 6],
+            ..Large::default()
+        }
+    };
+    let programs = [("direct", 0.0, 500.0), ("relay", 500.0, 1_000.0), ("bridge", 100.0, 800.0)];
+    cases.flat_map(|case| programs.map(|program| row(case, program))).collect()
+}
+
+/// The row of a size between programs of the library.
+fn large_row<'a>(rows: &'a mut [Large], bytes: usize, program: &str, stock_buffers: bool) -> &'a mut Large {
+    let is_it = |row: &&mut Large| {
+        (row.rate_hz, row.bytes) == (large::RATE_HZ, bytes)
+            && row.program == program
+            && row.stock_buffers == stock_buffers
+    };
+    rows.iter_mut().find(is_it).unwrap()
 }
 
 /// Memory that grows by so many KiB a second.
@@ -317,6 +356,106 @@ fn a_hop_of_many_repetitions_is_met_or_missed_only_when_that_is_certain() {
 }
 
 #[test]
+fn the_targets_of_large_samples_are_judged_by_library_and_size() {
+    let mut rows = large_rows("Fast DDS");
+    // 4 MiB: a hop that is certain to be too high, CPU time that is not, and losses, all of them named.
+    large_row(&mut rows, 4 << 20, "bridge", false).repetitions_p50_us.iter_mut().for_each(|us| *us += 301.0);
+    large_row(&mut rows, 4 << 20, "bridge", false).repetitions_cpu_us =
+        vec![880.0, 910.0, 880.0, 880.0, 880.0, 890.0];
+    for bytes in [1 << 20, 4 << 20] {
+        let row = large_row(&mut rows, bytes, "bridge", true);
+        row.missing = 3;
+        row.reasons = BTreeMap::from([("ingress lost_upstream".to_owned(), 3)]);
+    }
+    rows.extend(large_rows("Cyclone DDS"));
+    let last = rows.len() - 1;
+    (rows[last].missing, rows[last].reasons) = (3, BTreeMap::from([("critical no_reader".to_owned(), 2)]));
+    let readme = readme(&Summary { large: rows, ..Summary::default() });
+    let table = readme.split("## Large samples").nth(1).unwrap();
+    let of_fast = table.split("| Cyclone DDS").next().unwrap();
+    let ratio = "0.20 (0.20 to 0.20)";
+    assert_eq!(
+        cells(of_fast, "hop over the relay's")[..5],
+        [
+            "Fast DDS",
+            "hop over the relay's",
+            "0.20 (0.20 to 0.20), limit 0.50: met",
+            "0.20 (0.20 to 0.20), limit 0.25: met",
+            "0.80 (0.80 to 0.80), limit 0.25: **missed**"
+        ]
+    );
+    // Small samples have no target.
+    assert_eq!(cells(of_fast, "hop over the relay's")[5..], [ratio, ratio]);
+    assert_eq!(
+        cells(of_fast, "| hop, µs")[2..5],
+        [
+            "100 (100 to 100)",
+            "100 (100 to 100), limit 200: met, aim 100: met",
+            "401 (401 to 401), limit 300: **missed**"
+        ]
+    );
+    assert_eq!(cells(of_fast, "CPU over the relay's")[4], "0.88 (0.88 to 0.91), limit 0.90: not known");
+    assert_eq!(
+        cells(of_fast, "lost with 208 KiB buffers")[2..5],
+        [
+            "0 of 180: met",
+            "3 (ingress lost_upstream 3) of 180: **missed**, each named",
+            "3 (ingress lost_upstream 3) of 180: met, each named"
+        ]
+    );
+    let of_cyclone = table.split("| Cyclone DDS").nth(1).unwrap();
+    let lost = cells(of_cyclone, "lost with 208 KiB buffers")[4].clone();
+    assert_eq!(lost, "3 (critical no_reader 2) of 180: **missed**", "one is not named");
+    assert_eq!(
+        cells(table, "| Cyclone DDS, 30 Hz of 8 MiB, relay")[5..7],
+        ["500 (500 to 500)", "1,000 (1,000 to 1,000)"]
+    );
+    // Half a run.
+    let rows = large_rows("RustDDS").into_iter().filter(|row| !row.stock_buffers && row.program != "relay");
+    let readme = self::readme(&Summary { large: rows.collect(), ..Summary::default() });
+    assert_eq!(cells(&readme, "| RustDDS  ")[2..5], ["–", "–", "–"]);
+    assert_eq!(cells(&readme, "lost with 208 KiB buffers")[2], "–");
+}
+
+#[test]
+fn the_plot_of_sizes_has_a_panel_for_hops_and_one_for_cpu_time() {
+    let rows = [large_rows("Fast DDS"), large_rows("RustDDS")].concat();
+    let mut summary = Summary { large: rows, ..Summary::default() };
+    // A hop that is lost in the noise has no place on the axis.
+    large_row(&mut summary.large, 1 << 10, "bridge", false).repetitions_p50_us = vec![200.0; 6];
+    let files = figures(&summary);
+    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(names, ["large-fast-dds.svg", "large-rustdds.svg"]);
+    let document = roxmltree::Document::parse(&files[0].1).unwrap();
+    let texts = || document.descendants().filter(|node| node.tag_name().name() == "text");
+    let x = |node: &roxmltree::Node| -> f64 { node.attribute("x").unwrap().parse().unwrap() };
+    let mut end = 0.0;
+    for mark in ["1 KiB", "4 KiB", "16 KiB", "64 KiB", "256 KiB", "1 MiB", "4 MiB"] {
+        let node = texts().find(|node| node.text() == Some(mark)).unwrap_or_else(|| panic!("no {mark}"));
+        let half = text_width(mark) / 2.0;
+        assert!(x(&node) - half > end, "{mark} is over the mark before it");
+        end = x(&node) + half;
+    }
+    // Titles, which begin at the left edge, end before the right one.
+    assert!(texts().filter_map(|node| node.text()).all(|text| text_width(text) < WIDTH - 60.0));
+    let points = |class: &str| -> Vec<Vec<(f64, f64)>> {
+        let lines = document.descendants().filter(|node| node.attribute("class") == Some(class));
+        let numbers =
+            |point: &str| point.split_once(',').map(|(x, y)| (x.parse().unwrap(), y.parse().unwrap()));
+        let lines = lines.filter_map(|node| node.attribute("points"));
+        lines.map(|points| points.split(' ').filter_map(numbers).collect()).collect()
+    };
+    let (bridge, relay, direct) = (points("line a"), points("line b"), points("line c"));
+    assert_eq!((bridge.len(), relay.len(), direct.len()), (2, 2, 2));
+    assert_eq!((bridge[0].len(), bridge[1].len(), relay[0].len(), direct[0].len()), (6, 7, 7, 7));
+    // From the left edge to the right one; a shorter hop is lower, and so is less CPU time.
+    assert!(relay[0][0].0 < 60.0 && relay[0][6].0 > 450.0, "{:?}", relay[0]);
+    assert!(bridge[0][5].1 > relay[0][6].1 && bridge[1][6].1 > relay[1][6].1);
+    // Of direct the latency, which rises with the size.
+    assert!(direct[0][6].1 < direct[0][0].1, "{:?}", direct[0]);
+}
+
+#[test]
 fn cpu_is_judged_by_the_repetitions_of_each_process() {
     let mut summary = made_up();
     for row in &mut summary.resources {
@@ -429,6 +568,23 @@ fn filling_the_page_keeps_its_text_and_replaces_its_figures() {
 }
 
 #[test]
+fn the_summary_of_large_samples_has_room_on_its_page() {
+    let libraries = ["Fast DDS", "Cyclone DDS", "RustDDS"];
+    let large = libraries.into_iter().flat_map(large_rows).collect();
+    let run = ("2026-01-02T03-04-05Z".to_owned(), Summary { large, ..Summary::default() });
+    let page = fs::read_to_string(root().join("docs/performance.md")).unwrap();
+    let filled = fill(&page, std::slice::from_ref(&run)).unwrap();
+    assert!(filled.contains("(../benches/runs/2026-01-02T03-04-05Z/large-fast-dds.svg)"), "{filled}");
+    assert!(filled.lines().count() <= 150, "{} lines with the figures", filled.lines().count());
+    // Each of its figures is among those of the other page.
+    let runs = fill("<!-- figures:large -->\n<!-- end -->\n", &[run]).unwrap();
+    let section = filled.split("<!-- figures:large-targets -->").nth(1).unwrap();
+    let section = estimates(section.split("<!-- end -->").next().unwrap());
+    assert!(section.len() > 30, "{section:?}");
+    assert!(section.iter().all(|estimate| runs.contains(estimate)), "{runs}");
+}
+
+#[test]
 fn a_page_that_cannot_be_filled_is_refused() {
     for (page, what) in [
         ("<!-- figures:thruput -->\n<!-- end -->\n", "thruput is not a section"),
@@ -448,7 +604,7 @@ fn a_run_is_read_as_it_was_written() {
 }
 
 #[test]
-fn the_figures_of_the_page_are_those_of_its_runs() {
+fn the_figures_of_the_pages_are_those_of_their_runs() {
     let page = fs::read_to_string(root().join("docs/performance-runs.md")).unwrap();
     let runs: Vec<(String, Summary)> = runs_named(&page)
         .into_iter()
@@ -461,9 +617,14 @@ fn the_figures_of_the_page_are_those_of_its_runs() {
         .collect();
     let filled = fill(&page, &runs).unwrap();
     assert!(filled == page, "docs/performance-runs.md: run `cargo bench -- --page` with its runs");
-    for section in ["runs", "targets", "latency-other", "throughput", "resources", "isolation", "soak"] {
+    for section in
+        ["runs", "targets", "latency-other", "large", "throughput", "resources", "isolation", "soak"]
+    {
         assert!(page.contains(&format!("<!-- figures:{section} -->")), "the page has no {section}");
     }
+    let summary = fs::read_to_string(root().join("docs/performance.md")).unwrap();
+    let filled = fill(&summary, &runs).unwrap();
+    assert!(filled == summary, "docs/performance.md: run `cargo bench -- --page`");
 }
 
 /// All medians with their intervals, such as `0.68 (0.59 to 0.76)`.

@@ -1,8 +1,10 @@
 //! The plots of a run.
 
-use super::plot::{Bars, Line, Panel, Series, lines};
+use super::large;
+use super::plot::{Bars, Line, Panel, Scale, Series, lines};
 use super::summary::{Isolation, Summary};
 use super::tables::{PROGRAMS, payloads};
+use super::targets::Estimate;
 use crate::format::{number, payload};
 
 const CLASSES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
@@ -18,6 +20,9 @@ pub fn figures(summary: &Summary) -> Vec<(String, String)> {
     files.extend(cpu(summary).map(|svg| ("cpu.svg".to_owned(), svg)));
     for of in ["routes", "lanes"] {
         files.extend(scale(summary, of).map(|svg| (format!("{of}.svg"), svg)));
+    }
+    for library in large::libraries(summary) {
+        files.extend(of_sizes(summary, library).map(|svg| (large::file_name(library), svg)));
     }
     files.extend(soak(summary).map(|svg| ("soak.svg".to_owned(), svg)));
     files
@@ -50,7 +55,7 @@ fn latency(summary: &Summary, scheduling: &str) -> Option<String> {
     };
     let panels: Vec<Panel> = payloads(rows.iter().copied()).into_iter().map(panel).collect();
     let label = format!("Latency over rate, by payload, scheduling {scheduling}");
-    (!panels.is_empty()).then(|| lines(&label, "samples per second", &panels, true))
+    (!panels.is_empty()).then(|| lines(&label, "samples per second", &panels, Scale::Decades))
 }
 
 fn throughput(summary: &Summary) -> Option<String> {
@@ -149,7 +154,7 @@ fn scale(summary: &Summary, of: &str) -> Option<String> {
             })
             .collect();
     let label = format!("Latency and CPU over the number of {of}");
-    (!rows.is_empty()).then(|| lines(&label, of, &panels, false))
+    (!rows.is_empty()).then(|| lines(&label, of, &panels, Scale::Linear))
 }
 
 fn isolation(summary: &Summary, scheduling: &str) -> Option<String> {
@@ -173,6 +178,31 @@ fn isolation(summary: &Summary, scheduling: &str) -> Option<String> {
     (!rows.is_empty()).then(|| bars.draw())
 }
 
+/// Hop and CPU time over the size, between programs of one library.
+fn of_sizes(summary: &Summary, library: &str) -> Option<String> {
+    type Value = fn(&Summary, &super::summary::Large) -> Option<f64>;
+    let panels = [
+        ("p50, µs: hop of bridge and relay, latency of direct", large::hop_or_latency_us as Value),
+        ("CPU for each sample, µs; of direct: its peers", |_, row| {
+            Estimate::of(&row.repetitions_cpu_us).map(|estimate| estimate.median)
+        }),
+    ]
+    .map(|(title, value)| {
+        let line = |(program, class): (&'static str, &str)| {
+            let rows = large::sweep(summary, library).filter(|row| row.program == program);
+            let points = rows.filter_map(|row| Some((row.bytes as f64, value(summary, row)?)));
+            // A logarithmic axis has no place for a hop that is lost in the noise.
+            let points = points.filter(|point| point.1 > 0.0).collect();
+            Line { name: program, class: class.to_owned(), points }
+        };
+        let lines = [("bridge", "a"), ("relay", "b"), ("direct", "c")].map(line).into_iter();
+        Panel { title: title.to_owned(), lines: lines.filter(|line| !line.points.is_empty()).collect() }
+    });
+    let label = format!("Hop and CPU over the size of a sample, between programs of {library}");
+    let title = format!("size of a sample, at {} Hz", large::RATE_HZ);
+    panels.iter().any(|panel| !panel.lines.is_empty()).then(|| lines(&label, &title, &panels, Scale::Bytes))
+}
+
 fn soak(summary: &Summary) -> Option<String> {
     let soak = summary.soak.as_ref()?;
     let resident: Vec<_> = soak.series.iter().filter(|series| series.unit == "KiB").collect();
@@ -182,6 +212,6 @@ fn soak(summary: &Summary) -> Option<String> {
         points: series.points.iter().map(|(at_s, kib)| (at_s / 60.0, kib / 1024.0)).collect(),
     });
     let panel = Panel { title: "memory, MiB".to_owned(), lines: shown.collect() };
-    (!resident.is_empty())
-        .then(|| lines("Memory of each process over time", "minutes", std::slice::from_ref(&panel), false))
+    let label = "Memory of each process over time";
+    (!resident.is_empty()).then(|| lines(label, "minutes", std::slice::from_ref(&panel), Scale::Linear))
 }

@@ -2,6 +2,7 @@
 //! docs/performance-runs.md. Pure, so that tests can pass invented runs.
 
 mod figures;
+pub mod large;
 mod page;
 mod plot;
 mod summary;
@@ -12,8 +13,8 @@ pub use crate::format::payload;
 pub use figures::figures;
 pub use page::{fill, readme, runs_named};
 pub use summary::{
-    Attempt, Call, Isolation, Latency, Loss, Lossy, Machine, Quantiles, Resource, Scale, Soak, SoakSeries,
-    Summary, Throughput,
+    Attempt, Call, Isolation, Large, Latency, Loss, Lossy, Machine, Quantiles, Resource, Scale, Soak,
+    SoakSeries, Summary, Throughput,
 };
 pub use tables::soak_failures;
 pub use targets::TARGET_HZ;

@@ -1,11 +1,12 @@
-//! Fills the tables of docs/performance-runs.md, and makes the README of a run. The text of the page is
-//! written by hand; everything between `<!-- figures:SECTION -->` and `<!-- end -->` is generated from runs.
+//! Fills the tables of docs/performance-runs.md and docs/performance.md, and makes the README of a run. The
+//! text of the pages is written by hand; everything between `<!-- figures:SECTION -->` and `<!-- end -->` is
+//! generated from runs.
 
 use std::fmt::Write as _;
 
 use super::figures::figures;
 use super::summary::Summary;
-use super::{tables, targets};
+use super::{large, tables, targets};
 
 const BEGIN: &str = "<!-- figures:";
 const END: &str = "<!-- end -->";
@@ -14,8 +15,9 @@ const END: &str = "<!-- end -->";
 const RUNS: &str = "../benches/runs/";
 
 /// All sections, with their titles in the README of a run.
-const SECTIONS: [(&str, &str); 11] = [
+const SECTIONS: [(&str, &str); 12] = [
     ("targets", "Targets"),
+    ("large", "Large samples"),
     ("latency-other", "Latency, scheduling other"),
     ("latency-fifo", "Latency, scheduling fifo, memory locked"),
     ("loss", "Loss"),
@@ -27,6 +29,9 @@ const SECTIONS: [(&str, &str); 11] = [
     ("isolation", "Isolation"),
     ("soak", "Memory over time"),
 ];
+
+/// A section of docs/performance.md, whose figures are all in section `large` too.
+const SUMMARY: &str = "large-targets";
 
 /// Replaces the figures of the page by those of the runs, which are pairs of folder name and summary. Each
 /// section shows the first run that has it, or `Not measured yet.`
@@ -69,7 +74,7 @@ pub fn runs_named(page: &str) -> Vec<String> {
 }
 
 fn of_runs(name: &str, runs: &[(String, Summary)]) -> Result<Option<String>, String> {
-    if !SECTIONS.iter().any(|(known, _)| *known == name) {
+    if name != SUMMARY && !SECTIONS.iter().any(|(known, _)| *known == name) {
         return Err(format!("{name} is not a section of a run"));
     }
     if name == "targets" {
@@ -123,6 +128,8 @@ fn section(name: &str, summary: &Summary, plots: &str) -> Option<String> {
                 + &format!("{hops}\nStages of the bridge:\n\n{stages}\n")
                 + &format!("<details><summary>All figures of each program</summary>\n\n{all}\n</details>\n")
         }
+        "large" => large::section(summary, &plot)?,
+        SUMMARY => large::summary(summary, &plot)?,
         "loss" => tables::loss(summary)?,
         "throughput" => {
             plot("throughput.svg", "Highest rate without loss, by payload") + &tables::throughput(summary)?

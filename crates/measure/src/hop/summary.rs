@@ -33,6 +33,8 @@ pub struct Summary {
     pub scale: Vec<Scale>,
     /// The critical lane while the noncritical one is disturbed.
     pub isolation: Vec<Isolation>,
+    /// Samples by size, between programs of other DDS libraries.
+    pub large: Vec<Large>,
     /// Memory over time.
     pub soak: Option<Soak>,
 }
@@ -291,6 +293,39 @@ pub struct Isolation {
     pub noncritical_forwarded: u64,
     /// How often the noncritical egress was killed.
     pub kills: u64,
+}
+
+/// One program between a publisher and a subscriber of one DDS library, at one rate and payload.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Large {
+    /// The library of publisher and subscriber: `Fast DDS`, `Cyclone DDS`, `RustDDS`.
+    pub library: String,
+    /// `other` or `fifo`.
+    pub scheduling: String,
+    /// The rate of the publisher.
+    pub rate_hz: u64,
+    /// The size of the payload.
+    pub bytes: usize,
+    /// `direct`, `relay`, `bridge`.
+    pub program: String,
+    /// Whether all sockets had the receive buffers of a kernel without settings, 208 KiB.
+    pub stock_buffers: bool,
+    /// Samples that the publisher's writer accepted.
+    pub accepted: u64,
+    /// Of these, samples that the subscriber did not receive.
+    pub missing: u64,
+    /// Samples whose payload differs from the one sent.
+    pub damaged: u64,
+    /// The known reasons of missing samples: drops, by process and drop reason.
+    pub reasons: BTreeMap<String, u64>,
+    /// From the publisher's stamp before its write to the subscriber's after its take.
+    pub latency: Quantiles,
+    /// The median latency of each repetition.
+    pub repetitions_p50_us: Vec<f64>,
+    /// The CPU time for each sample in each repetition: of all processes of relay or bridge; of direct, of
+    /// publisher and subscriber.
+    pub repetitions_cpu_us: Vec<f64>,
 }
 
 /// The memory of a bridge under load over time.

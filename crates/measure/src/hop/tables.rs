@@ -20,7 +20,7 @@ fn by_name(counts: &BTreeMap<String, u64>) -> String {
 }
 
 /// The number of missing samples and the known reasons, such as `7 (critical queue_overflow 7)`.
-fn missing(samples: u64, reasons: &BTreeMap<String, u64>) -> String {
+pub fn missing(samples: u64, reasons: &BTreeMap<String, u64>) -> String {
     if reasons.is_empty() { count(samples) } else { format!("{} ({})", count(samples), by_name(reasons)) }
 }
 

@@ -54,10 +54,7 @@ impl Target {
     /// the limit; with fewer, when the median is.
     fn median_at_most(what: String, limit: f64, unit: &str, values: Vec<f64>) -> Self {
         let Some(estimate) = Estimate::of(&values) else { return Self::at_most(what, limit, unit, None) };
-        let met = match estimate.interval {
-            Some(_) => estimate.is_at_most(limit),
-            None => Some(estimate.median <= limit),
-        };
+        let met = estimate.meets(limit);
         let value = estimate.text() + if unit.is_empty() { "" } else { " " } + unit;
         Self { value, met, ..Self::at_most(what, limit, unit, None) }
     }
@@ -141,12 +138,7 @@ pub fn table(summary: &Summary) -> Option<String> {
     }
     let mut table = Table::new(&["", "target", "measured", ""]);
     for target in targets {
-        let met = match target.met {
-            Some(true) => "met",
-            Some(false) => "**missed**",
-            None => "not known",
-        };
-        table.row([target.what, target.limit, target.value, met.to_owned()]);
+        table.row([target.what, target.limit, target.value, word(target.met).to_owned()]);
     }
     (!table.is_empty()).then(|| table.text())
 }
@@ -194,6 +186,15 @@ fn latency(summary: &Summary, scheduling: &str, targets: &mut Vec<Target>) {
     }
 }
 
+/// Whether a target is met, as tables say it; `None` when the run does not tell.
+pub fn word(met: Option<bool>) -> &'static str {
+    match met {
+        Some(true) => "met",
+        Some(false) => "**missed**",
+        None => "not known",
+    }
+}
+
 /// The ratio of the bridge's hop to the relay's; `None` when the relay's hop is lost in the noise.
 pub fn hop_ratio(bridge_us: f64, relay_us: f64) -> Option<f64> {
     (relay_us > 0.0).then(|| bridge_us / relay_us)
@@ -212,7 +213,7 @@ pub struct Estimate {
 
 impl Estimate {
     /// `None` without values.
-    fn of(values: &[f64]) -> Option<Self> {
+    pub fn of(values: &[f64]) -> Option<Self> {
         (!values.is_empty()).then(|| Self { median: median(values), interval: median_interval(values) })
     }
 
@@ -222,6 +223,15 @@ impl Estimate {
             format!(" ({} to {})", number(Some(low)), number(Some(high)))
         });
         number(Some(self.median)) + &interval
+    }
+
+    /// Whether a target is met: with an interval, whether all of it is at most the limit; without one,
+    /// whether the median is. `None` when the limit is within the interval.
+    pub fn meets(&self, limit: f64) -> Option<bool> {
+        match self.interval {
+            Some(_) => self.is_at_most(limit),
+            None => Some(self.median <= limit),
+        }
     }
 
     /// Whether the median is at most the limit; `None` when the limit is within the interval or there is

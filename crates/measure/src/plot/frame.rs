@@ -53,11 +53,23 @@ pub fn grid_y(svg: &mut Svg, axis: &Axis, most: usize) {
 }
 
 /// Draws vertical grid lines with their labels below, and the title of the axis.
-pub fn grid_x(svg: &mut Svg, axis: &Axis, most: usize, (top, bottom): (f64, f64), title: &str) {
+pub fn grid_x(svg: &mut Svg, axis: &Axis, most: usize, extent: (f64, f64), title: &str) {
+    grid_x_with(svg, axis, most, extent, title, Axis::label);
+}
+
+/// As [`grid_x`], with the texts of the marks.
+pub fn grid_x_with(
+    svg: &mut Svg,
+    axis: &Axis,
+    most: usize,
+    (top, bottom): (f64, f64),
+    title: &str,
+    text: fn(f64) -> String,
+) {
     for mark in axis.marks(most) {
         let x = axis.at(mark);
         svg.line("grid", (x, top), (x, bottom));
-        svg.text("t", (x, bottom + TEXT + 3.0), Anchor::Middle, &Axis::label(mark));
+        svg.text("t", (x, bottom + TEXT + 3.0), Anchor::Middle, &text(mark));
     }
     svg.text("t", ((LEFT + RIGHT) / 2.0, bottom + 2.0 * TEXT + 8.0), Anchor::Middle, title);
 }

@@ -1,8 +1,9 @@
 //! Line charts: panels above each other with a common x axis.
 
 use super::file;
+use crate::format::payload;
 use crate::plot::axis::Axis;
-use crate::plot::frame::{BELOW, Entry, LEFT, RIGHT, grid_x, grid_y, legend};
+use crate::plot::frame::{BELOW, Entry, LEFT, RIGHT, grid_x_with, grid_y, legend};
 use crate::plot::svg::{Anchor, Svg, TEXT};
 
 const PANEL: f64 = 130.0;
@@ -22,8 +23,19 @@ pub struct Panel<'a> {
     pub lines: Vec<Line<'a>>,
 }
 
-/// Draws panels with a common x axis. `logarithmic` applies to both axes; a linear y axis begins at 0.
-pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) -> String {
+/// The scale of both axes.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Scale {
+    /// Linear, the y axis from 0 on.
+    Linear,
+    /// Logarithmic, in decades.
+    Decades,
+    /// Logarithmic; x is a number of bytes, with marks at powers of 4.
+    Bytes,
+}
+
+/// Draws panels with a common x axis.
+pub fn lines(label: &str, x_title: &str, panels: &[Panel], scale: Scale) -> String {
     let mut svg = Svg::default();
     let finite = |panels: &[Panel], of: fn(&(f64, f64)) -> f64| {
         let values = panels.iter().flat_map(|panel| &panel.lines).flat_map(|line| &line.points).map(of);
@@ -32,10 +44,12 @@ pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) ->
         })
     };
     let range = finite(panels, |point| point.0).unwrap_or((1.0, 10.0));
-    let x = if logarithmic {
-        Axis::decades(range, (LEFT, RIGHT))
-    } else {
-        Axis::linear((0.0, range.1), (LEFT, RIGHT))
+    // Sizes are powers of 2, so their axis is a linear one of the exponent.
+    let of_x = |value: f64| if scale == Scale::Bytes { value.log2() } else { value };
+    let x = match scale {
+        Scale::Linear => Axis::linear((0.0, range.1), (LEFT, RIGHT)),
+        Scale::Decades => Axis::decades(range, (LEFT, RIGHT)),
+        Scale::Bytes => Axis::linear((of_x(range.0), of_x(range.1)), (LEFT, RIGHT)),
     };
     let (mut top, mut bottom) = (0.0, 0.0);
     for panel in panels {
@@ -46,10 +60,9 @@ pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) ->
         top = legend(&mut svg, top + TEXT + 4.0, &entries) + 4.0;
         bottom = top + PANEL;
         let range = finite(std::slice::from_ref(panel), |point| point.1).unwrap_or((1.0, 10.0));
-        let y = if logarithmic {
-            Axis::decades(range, (bottom, top))
-        } else {
-            Axis::linear((0.0, range.1 * 1.05), (bottom, top))
+        let y = match scale {
+            Scale::Linear => Axis::linear((0.0, range.1 * 1.05), (bottom, top)),
+            Scale::Decades | Scale::Bytes => Axis::decades(range, (bottom, top)),
         };
         grid_y(&mut svg, &y, 5);
         for line in &panel.lines {
@@ -57,7 +70,7 @@ pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) ->
                 .points
                 .iter()
                 .filter(|point| point.1.is_finite())
-                .map(|point| (x.at(point.0), y.at(point.1)))
+                .map(|point| (x.at(of_x(point.0)), y.at(point.1)))
                 .collect();
             if !points.is_empty() {
                 svg.polyline(&format!("line {}", line.class), &points);
@@ -65,6 +78,8 @@ pub fn lines(label: &str, x_title: &str, panels: &[Panel], logarithmic: bool) ->
         }
         top = bottom + 12.0;
     }
-    grid_x(&mut svg, &x, 8, (bottom, bottom + 4.0), x_title);
+    let mark =
+        if scale == Scale::Bytes { |exponent: f64| payload(exponent.exp2() as usize) } else { Axis::label };
+    grid_x_with(&mut svg, &x, 8, (bottom, bottom + 4.0), x_title, mark);
     file(&svg.finish(bottom + BELOW, label))
 }

@@ -4,7 +4,7 @@ mod bars;
 mod lines;
 
 pub use bars::{Bars, Series};
-pub use lines::{Line, Panel, lines};
+pub use lines::{Line, Panel, Scale, lines};
 
 /// The style sheet of each file. Pages include the files as images, to which a page's style sheet does not
 /// apply.
