@@ -96,6 +96,14 @@ impl Output {
         add(&mut self.samples, key.fields().into_iter().chain(values));
     }
 
+    /// Records that something was not measured, and why.
+    pub fn skip(&mut self, line: String) {
+        eprintln!("bench: {line}");
+        if !self.summary.skipped.contains(&line) {
+            self.summary.skipped.push(line);
+        }
+    }
+
     /// Adds a file that another tool wrote.
     pub fn file(&mut self, name: &str, text: String) {
         self.files.push((name.to_owned(), text));

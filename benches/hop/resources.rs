@@ -211,7 +211,7 @@ fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), St
     let (texts, samples) = match traced(bed, case, "perf", &arguments) {
         Ok(traced) => traced,
         Err(error) => {
-            skip(output, format!("system calls by perf: {error}"));
+            output.skip(format!("system calls by perf: {error}"));
             return Ok(());
         }
     };
@@ -219,10 +219,8 @@ fn count_calls(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), St
         let count =
             text.lines().find(|line| line.contains("raw_syscalls")).and_then(|line| line.split(',').next());
         let Some(count) = count.and_then(|count| count.parse::<f64>().ok()) else {
-            skip(
-                output,
-                format!("system calls by perf: {}", text.lines().last().unwrap_or("it wrote nothing")),
-            );
+            output
+                .skip(format!("system calls by perf: {}", text.lines().last().unwrap_or("it wrote nothing")));
             continue;
         };
         let rows = output.summary.resources.iter_mut();
@@ -244,13 +242,13 @@ fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> 
     let (texts, samples) = match traced(bed, case, "strace", &["-c", "-f", "-q"]) {
         Ok(traced) => traced,
         Err(error) => {
-            skip(output, format!("system calls by strace: {error}"));
+            output.skip(format!("system calls by strace: {error}"));
             return Ok(());
         }
     };
     for (process, text) in texts {
         if !text.contains("syscall") {
-            skip(output, format!("system calls of {process}: strace counted nothing"));
+            output.skip(format!("system calls of {process}: strace counted nothing"));
         }
         for (call, count) in parse_strace(&text) {
             output.summary.calls.push(Call {
@@ -265,14 +263,6 @@ fn trace(bed: &mut Bed, case: &Case, output: &mut Output) -> Result<(), String> 
         output.file(&format!("strace-{}-{process}.txt", bed.name()), text);
     }
     Ok(())
-}
-
-/// Records that something was not measured, and why.
-fn skip(output: &mut Output, line: String) {
-    eprintln!("bench: {line}");
-    if !output.summary.skipped.contains(&line) {
-        output.summary.skipped.push(line);
-    }
 }
 
 /// The calls and counts in the table of `strace -c`: `% time, seconds, usecs/call, calls, [errors,] syscall`.
