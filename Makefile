@@ -53,9 +53,11 @@ test-arm64:
 test-image: peers
 	cargo test --locked --test root -- --nocapture docker::long::
 
-# Measures the latency and CPU time that the bridge adds. Takes an hour and saves the run in benches/runs. Shorter:
+# Measures the latency and CPU time that the bridge adds. Takes 80 minutes and saves the run in benches/runs. Shorter:
 # cargo bench -- --quick, or cargo bench -- --only isolation (benches/README.md).
 bench:
+	$(MAKE) --no-print-directory -C tests/peers
+	cargo build --locked --release --example rust_peer
 	cargo bench --locked -- --save
 
 fuzz:

@@ -22,7 +22,7 @@ use super::options::{Case, Options};
 use super::system::{self, FIFO_PRIORITY, Place, Scheduling};
 
 /// The domain of the first bed. Its ports are below the ephemeral range, and the tests do not use it.
-const FIRST_DOMAIN: u16 = 94;
+pub const FIRST_DOMAIN: u16 = 94;
 
 /// The highest number of beds at a time, in the domains 94 to 99.
 const MAX_BEDS: usize = 6;
@@ -307,7 +307,7 @@ fn program(executable: &Path, is_noncritical: bool) -> Command {
 }
 
 /// Starts a child that the kernel kills when this process ends.
-fn spawn(command: &mut Command) -> Result<Child, String> {
+pub fn spawn(command: &mut Command) -> Result<Child, String> {
     for variable in [
         "ROS_DOMAIN_ID",
         "ROS_AUTOMATIC_DISCOVERY_RANGE",

@@ -52,7 +52,7 @@ impl Route {
         }
     }
 
-    const fn dds_type(self) -> &'static str {
+    pub const fn dds_type(self) -> &'static str {
         if self.max_sample_bytes <= SCAN_BYTES {
             "sensor_msgs::msg::dds_::LaserScan_"
         } else {

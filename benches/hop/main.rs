@@ -10,17 +10,20 @@
 //! Publishers are open loop: sample k is due at `start + k / rate`, no matter how the sample before it went.
 //! The bench records the latency both from the write and from the due time.
 //!
-//! `cargo bench` takes an hour, `cargo bench -- --quick` two minutes. `cargo bench -- --help` lists the other
-//! arguments.
+//! `cargo bench` takes 80 minutes, `cargo bench -- --quick` two minutes. `cargo bench -- --help` lists the
+//! other arguments.
 
 mod beds;
+mod buffers;
 mod cpu_delay;
 mod histogram;
 mod isolation;
+mod large;
 mod latency;
 mod link;
 mod options;
 mod out;
+mod peers;
 mod resources;
 mod scale;
 mod soak;
@@ -42,6 +45,9 @@ use system::Scheduling;
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     if let Some(role) = arguments.first().filter(|role| role.starts_with("__")) {
+        if role == buffers::ROLE {
+            return end(buffers::keep());
+        }
         return link::run(role, &arguments[1..]);
     }
     let options = Options::parse();
@@ -49,7 +55,12 @@ fn main() -> ExitCode {
         Some(runs) => fill_page(runs),
         None => measure(&options),
     };
-    match done {
+    end(done)
+}
+
+/// The exit code of an outcome, whose error is printed.
+fn end(outcome: Result<(), String>) -> ExitCode {
+    match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("bench: {error}");
@@ -86,7 +97,7 @@ fn measure(options: &Options) -> Result<(), String> {
         options.scheduling = Some(Scheduling::Other);
     }
     let first = options.first_scheduling().label();
-    summary.parameters.push(format!("throughput, resources and scale with scheduling {first}"));
+    summary.parameters.push(format!("throughput, resources, scale and large with scheduling {first}"));
     let mut output = Output::new(summary);
     if let Some(duration) = options.soak {
         soak::measure(duration, &options, &mut output)?;
@@ -96,6 +107,7 @@ fn measure(options: &Options) -> Result<(), String> {
         resources::measure(&options, &mut output)?;
         scale::measure(&options, &mut output)?;
         isolation::measure(&options, &mut output)?;
+        large::measure(&options, &mut output)?;
     }
     let stolen_percent = cpu_time().stolen_percent_since(began);
     let line =

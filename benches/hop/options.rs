@@ -52,6 +52,11 @@ pub const SCAN: usize = 2_948;
 /// short ones give a narrower interval than a few long ones.
 const TARGET_REPETITIONS: usize = 20;
 
+/// Repetitions in the section `large`, with three libraries in 20 minutes. With 12, the interval is from the
+/// third lowest to the third highest value, with six from the lowest to the highest.
+const LARGE_TARGET_REPETITIONS: usize = 12;
+const LARGE_REPETITIONS: usize = 6;
+
 /// The highest data rate of the sweep. Of the skipped cases, 4,194 MB/s and more, even direct cannot receive
 /// all: its limits were 1,235 MB/s with 64 KiB, 2,852 with 1 MiB and 4,161 with 4 MiB.
 const MAX_BYTES_PER_S: u64 = 1_100_000_000;
@@ -124,6 +129,12 @@ impl Options {
     /// The repetitions of cases with a target for hop or CPU.
     pub fn target_repetitions(&self) -> usize {
         if self.quick { self.repetitions } else { self.repetitions.max(TARGET_REPETITIONS) }
+    }
+
+    /// The repetitions of a size of the section `large`, whose cells have an interval from six on.
+    pub fn large_repetitions(&self, has_target: bool) -> usize {
+        let least = if has_target { LARGE_TARGET_REPETITIONS } else { LARGE_REPETITIONS };
+        if self.quick { self.repetitions } else { self.repetitions.max(least) }
     }
 
     /// Scales a duration by `--longer`, and to a fifth in a quick run.
