@@ -169,6 +169,7 @@ impl Run {
         if let Some(bridge) = &self.bridge {
             drops.extend(bridge.drops.iter().cloned());
             drops.insert("ingress lost_upstream".to_owned(), bridge.lost_upstream);
+            drops.insert("critical reader_overrun".to_owned(), bridge.reader_overrun);
         }
         drops.retain(|_, count| *count > 0);
         drops
@@ -194,6 +195,8 @@ pub fn add_up(sum: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
 /// The counters of the bridge's boards for one run.
 pub struct BridgeRun {
     pub lost_upstream: u64,
+    /// Forwarded samples that left the critical lane's history before the subscriber had them.
+    pub reader_overrun: u64,
     pub forwarded: u64,
     /// Samples that the lane forwarded without a copy out of shared memory.
     pub by_reference: u64,
@@ -776,6 +779,7 @@ fn configuration(domain: u16, folder: &Path, plan: &Plan, [ingress, egress]: [Pl
 /// The counters and latencies of some routes, read from the boards at one instant.
 pub struct Counters {
     lost_upstream: u64,
+    reader_overrun: u64,
     forwarded: u64,
     by_reference: u64,
     in_place: u64,
@@ -790,6 +794,7 @@ impl Counters {
     fn read(boards: &Boards, routes: Range<usize>) -> Self {
         let mut counters = Self {
             lost_upstream: 0,
+            reader_overrun: 0,
             forwarded: 0,
             by_reference: 0,
             in_place: 0,
@@ -803,6 +808,7 @@ impl Counters {
             let ingress = boards.ingress(route).unwrap_or_default();
             let lane = boards.lane(CRITICAL, route).unwrap_or_default();
             counters.lost_upstream += ingress.lost_upstream;
+            counters.reader_overrun += lane.reader_overrun;
             counters.forwarded += lane.forwarded;
             counters.by_reference += lane.by_reference;
             counters.in_place += ingress.in_place;
@@ -828,6 +834,7 @@ impl Counters {
             self.drops.iter().map(|(name, count)| (name.clone(), count.saturating_sub(earlier(name))));
         BridgeRun {
             lost_upstream: self.lost_upstream - before.lost_upstream,
+            reader_overrun: self.reader_overrun.saturating_sub(before.reader_overrun),
             forwarded: self.forwarded - before.forwarded,
             by_reference: self.by_reference - before.by_reference,
             in_place: self.in_place - before.in_place,
