@@ -58,8 +58,8 @@ impl Drop for PoolView {
     }
 }
 
-/// A payload that ingress may still write. Whoever reads it reads only the bytes that the board
-/// shows as complete, and takes what it has read for the sample only if ingress publishes that sample afterwards:
+/// A payload that ingress may still write. Whoever reads it reads only the bytes that the board shows as
+/// complete, and takes what it has read for the sample only if ingress publishes that sample afterwards:
 /// until then ingress may reuse the slot.
 #[derive(Debug)]
 pub struct PoolPayload {
@@ -70,9 +70,9 @@ pub struct PoolPayload {
 
 impl AsRef<[u8]> for PoolPayload {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: the range is within the mapping, which lives as long as `view`. Another process may write to
-        // the bytes; they are only passed to the kernel, which copies them to a socket, and no decision of
-        // this process depends on them.
+        // SAFETY: the range is within the mapping, which lives as long as `view`. Another process may write
+        // to the bytes; they are only passed to the kernel, which copies them to a socket, and no decision
+        // of this process depends on them.
         unsafe { std::slice::from_raw_parts(self.view.start.as_ptr().add(self.offset), self.len) }
     }
 }

@@ -1,5 +1,5 @@
-//! Large samples that the critical lane sends while they arrive: no subscriber sees a sample that ingress has
-//! not published, a part of another one, or less than it would see of stored samples. Peers compare each byte.
+//! Large samples that the critical lane sends while they arrive: no subscriber gets a sample that ingress has
+//! not published, or a part of another one, and none misses a sample. Peers compare each byte.
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{Participant, ParticipantOptions, WriterEvent};

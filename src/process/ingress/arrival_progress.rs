@@ -1,8 +1,8 @@
 //! Tells the critical lanes of a route how much of a large sample has arrived, so that they begin to send it
 //! while the rest arrives.
 //!
-//! The board of a route shows one sample at a time. It promises nothing: the lanes send the last fragment of a
-//! sample only when ingress has published the sample.
+//! The board of a route shows one sample at a time. It promises nothing: the lanes send the last fragment of
+//! a sample only when ingress has published the sample.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

@@ -16,6 +16,7 @@ const UNSAFE: &[&str] = &[
     // Memory that other processes write, and the futex in it.
     "src/shm/cell.rs",
     "src/shm/header.rs",
+    "src/shm/pool_view.rs",
     "src/shm/publisher.rs",
     "src/shm/segment.rs",
     "src/shm/service.rs",
