@@ -51,6 +51,14 @@ impl EarlySend {
         })
     }
 
+    /// Whether the slot of the sample that was begun has held that sample ever since, as the board shows after
+    /// the sample was taken. A sample that ingress gave up may arrive again in another slot, and the lane may
+    /// have sent bytes of a later one from the former slot.
+    pub fn is_of_same_slot(&self, board: Option<PartialSample>) -> bool {
+        let numbers = board.filter(|board| board.ended == 0).map(|board| board.number);
+        self.begun.is_some_and(|begun| Some(begun.number) == numbers)
+    }
+
     /// The sample that was begun is written or withdrawn.
     pub fn end(&mut self) -> bool {
         self.begun.take().is_some()
@@ -126,5 +134,23 @@ impl EarlySend {
             }
         }
         self.pool.as_ref().map(|(_, view)| view.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_is_completed_only_from_the_slot_that_it_was_begun_in() {
+        let partial = PartialSample { number: 3, writer_sequence: 7, len: 9, ..PartialSample::default() };
+        let mut early = EarlySend { begun: Some(partial), ..EarlySend::default() };
+        let header = SampleHeader { writer_sequence: 7, ..SampleHeader::default() };
+        assert!(early.take(&header, 9) && !early.take(&header, 8));
+        assert!(early.is_of_same_slot(Some(partial)));
+        assert!(!early.is_of_same_slot(Some(PartialSample { ended: 1, ..partial })), "given up");
+        assert!(!early.is_of_same_slot(Some(PartialSample { number: 4, ..partial })), "not known any more");
+        assert!(!early.is_of_same_slot(None));
+        assert!(early.end() && !early.end());
     }
 }

@@ -253,7 +253,8 @@ impl Output {
 
     /// Writes a taken sample to DDS, unless the mode drops it, and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
-        if !self.early.take(sample.header(), sample.payload().len()) {
+        let is_begun = self.early.take(sample.header(), sample.payload().len());
+        if !is_begun || !self.early.is_of_same_slot(self.boards.partial(self.route)) {
             self.withdraw_early();
         }
         // A noncritical lane polls no sample in such a mode.
