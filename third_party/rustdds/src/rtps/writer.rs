@@ -101,6 +101,7 @@ enum Audience {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct EarlySent {
   sequence_number: SequenceNumber,
+  id: u64,
   // The first fragment that was not sent, and to whom the others were sent.
   next: u32,
   audience: Audience,
@@ -939,8 +940,7 @@ impl Writer {
         self.send_buffer.set_sent_frontier(sequence_number);
         self.mark_change_sent_to_all_readers(sequence_number);
         if self.send_buffer.is_withdrawn(sequence_number) {
-          // So that the readers ask for it now, and forget its fragments. No sample may follow.
-          self.handle_heartbeat_tick(false);
+          self.tell_withdrawn(sequence_number);
         }
         continue;
       };
@@ -1022,7 +1022,8 @@ impl Writer {
             _ => self.sample_cursor,
           };
           if let (SampleCursor::Fresh, Some(early)) = (cursor, self.early_sent) {
-            if early.sequence_number == sequence_number
+            if self.send_buffer.completed_early() == Some((sequence_number, early.id))
+              && early.sequence_number == sequence_number
               && audiences[..] == [early.audience]
               && early.matches == self.matched_readers_count_total
             {
@@ -1114,11 +1115,31 @@ impl Writer {
     self.last_sent() < self.send_buffer.last_change_sequence_number()
   }
 
+  // Tells the readers that a sample was withdrawn, so that none waits for it. One that still
+  // lacks earlier samples asks for it when it has them; the HEARTBEAT makes it ask, because
+  // no sample may follow.
+  fn tell_withdrawn(&mut self, sequence_number: SequenceNumber) {
+    let withdrawn = EvictedRequests::Listed(BTreeSet::from([sequence_number]));
+    for reader in self.receivers().filter(|reader| reader.qos().is_reliable()) {
+      if self.is_withdrawn_later(reader, sequence_number) {
+        continue;
+      }
+      let reader_guid = reader.remote_reader_guid;
+      let message = MessageBuilder::new().dst_submessage(self.endianness, reader_guid.prefix);
+      let message = self
+        .withdraw_msg(message, &withdrawn, reader_guid)
+        .add_header_and_build(self.my_guid.prefix);
+      let receiver = &mut std::iter::once(reader);
+      self.send_control_to_readers(DeliveryMode::Unicast, message, receiver);
+    }
+    self.handle_heartbeat_tick(false);
+  }
+
   // Sends what is complete of a sample that is not written yet, but never its last fragment,
   // so that no reader has the sample before it is written. At most
   // `PENDING_TURN_MAX_BYTES`; returns whether more is left for another turn.
   fn send_early(&mut self) -> bool {
-    let Some(early) = self.send_buffer.early(false) else {
+    let Some(early) = self.send_buffer.early() else {
       return false;
     };
     let cc = early.change;
@@ -1133,9 +1154,7 @@ impl Writer {
       return false;
     }
     let matches = self.matched_readers_count_total;
-    let is_same = |sent: &EarlySent| {
-      sent.sequence_number == cc.sequence_number && sent.matches == matches
-    };
+    let is_same = |sent: &EarlySent| sent.id == early.id && sent.matches == matches;
     let sent = match self.early_sent.filter(is_same) {
       Some(sent) => sent,
       None => {
@@ -1150,6 +1169,7 @@ impl Writer {
         self.withdraw_from_best_effort_readers(cc.sequence_number);
         EarlySent {
           sequence_number: cc.sequence_number,
+          id: early.id,
           next: 1,
           audience,
           matches,
@@ -1163,6 +1183,9 @@ impl Writer {
     let first = SampleCursor::Frag(FragmentNumber::new(sent.next));
     let mut messages =
       FragmentationIter::new_resume(self, &cc, None, budget, false, first).through(limit);
+    if !messages.fragmentation_needed() {
+      return false;
+    }
     let mut next = sent.next;
     let mut blocked = BTreeSet::new();
     let mut turn_bytes = 0;
@@ -1170,9 +1193,8 @@ impl Writer {
       let Some((_, message)) = messages.next() else {
         break;
       };
-      if next == 1 && self.send_buffer.early(true).is_none() {
-        // It was withdrawn meanwhile.
-        return false;
+      if !self.send_buffer.mark_early_sent(early.id) {
+        break;
       }
       let is_addressed = |reader: &&RtpsReaderProxy| match sent.audience {
         Audience::All => true,

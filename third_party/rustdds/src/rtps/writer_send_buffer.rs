@@ -53,6 +53,10 @@ struct Inner {
 
   // The sample of which fragments are sent before all of it is written.
   early: Option<Early>,
+  // The samples that were begun so far.
+  early_count: u64,
+  // The number and the id of the sample that was completed last.
+  completed_early: Option<(SequenceNumber, u64)>,
   // Numbers that readers have fragments of, and no sample: it was withdrawn.
   withdrawn: BTreeSet<SequenceNumber>,
   // How many there ever were.
@@ -113,6 +117,8 @@ struct Inner {
 /// A sample that is not written yet, of which the Writer may send the first fragments.
 #[derive(Clone)]
 pub(crate) struct Early {
+  /// Distinguishes it from others that were to have the same number.
+  pub id: u64,
   /// With the number that the next sample gets, and the whole length of the payload, of
   /// which only the first `available` bytes may be read.
   pub change: CacheChange,
@@ -253,6 +259,8 @@ impl WriterSendBuffer {
           readers: BTreeMap::new(),
           left_overrun: 0,
           early: None,
+          early_count: 0,
+          completed_early: None,
           withdrawn: BTreeSet::new(),
           withdrawn_total: 0,
           history: SourceHistory::default(),
@@ -451,10 +459,14 @@ impl WriterSendBuffer {
     data: DDSData,
     may_block: bool,
   ) -> SequenceNumber {
-    let completes = write_options.completes_early()
-      && inner.early.take_if(|early| early.completed_by(&write_options, &data)).is_some();
-    if !completes {
-      inner.withdraw_early();
+    let is_completed = |early: &mut Early| {
+      write_options.completes_early() && early.completed_by(&write_options, &data)
+    };
+    match inner.early.take_if(is_completed) {
+      Some(early) => inner.completed_early = Some((early.change.sequence_number, early.id)),
+      None => {
+        inner.withdraw_early();
+      }
     }
     let seq = inner.last_seq.plus_1();
     if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
@@ -514,7 +526,9 @@ impl WriterSendBuffer {
       return false;
     }
     let number = inner.last_seq.plus_1();
+    inner.early_count += 1;
     inner.early = Some(Early {
+      id: inner.early_count,
       change: CacheChange::new(shared.writer_guid, number, write_options, data),
       available,
       is_begun: false,
@@ -535,12 +549,22 @@ impl WriterSendBuffer {
     self.shared.inner.lock().unwrap().withdraw_early()
   }
 
-  /// The sample that was begun. `is_begun` marks it as one of which fragments are sent.
-  pub fn early(&self, is_begun: bool) -> Option<Early> {
+  /// The sample that was begun.
+  pub fn early(&self) -> Option<Early> {
+    self.shared.inner.lock().unwrap().early.clone()
+  }
+
+  /// Notes that fragments of the sample with this id are sent from now on. Returns false if
+  /// it was completed or withdrawn meanwhile: its number may be that of another one.
+  pub fn mark_early_sent(&self, id: u64) -> bool {
     let mut inner = self.shared.inner.lock().unwrap();
-    let early = inner.early.as_mut()?;
-    early.is_begun |= is_begun;
-    Some(early.clone())
+    let early = inner.early.as_mut().filter(|early| early.id == id);
+    early.map(|early| early.is_begun = true).is_some()
+  }
+
+  /// The number and the id of the sample that was completed last.
+  pub fn completed_early(&self) -> Option<(SequenceNumber, u64)> {
+    self.shared.inner.lock().unwrap().completed_early
   }
 
   /// Whether the number is that of a sample that was withdrawn.
