@@ -548,6 +548,11 @@ impl FragmentAssemblers {
     self.own_bytes
   }
 
+  /// The unfinished samples.
+  pub fn count(&self) -> usize {
+    self.by_writer.values().map(|fa| fa.assembly_buffers.len()).sum()
+  }
+
   pub fn get(&self, writer: GUID) -> Option<&FragmentAssembler> {
     self.by_writer.get(&writer)
   }

@@ -4,7 +4,7 @@ use std::{
   net::SocketAddr,
   rc::Rc,
   sync::{mpsc::TrySendError, Arc},
-  time::Instant,
+  time::{Duration as StdDuration, Instant},
 };
 
 use enumflags2::BitFlags;
@@ -167,6 +167,10 @@ pub(crate) struct MessageReceiver {
   // rtps-protected
   must_be_rtps_protection_special_case: bool,
 }
+
+// Fragments of a sample come within milliseconds, and a repair within the 3 s of a HEARTBEAT of
+// Fast DDS at most: only of a sample that is given up does none come for so long.
+const UNFINISHED_STALE: StdDuration = StdDuration::from_secs(4);
 
 impl MessageReceiver {
   pub fn new(
@@ -767,15 +771,24 @@ impl MessageReceiver {
     }
   }
 
-  // Discards unfinished samples until those of all Readers are within the limit: of
-  // the Reader with the most, so that what is claimed of one topic costs no other one
-  // its samples.
+  // Discards unfinished samples until those of all Readers are within the limit: first those
+  // of which no fragment has come for seconds, then one after the other of the Reader with
+  // the most, so that what is claimed of other topics costs a topic none of its samples.
   fn discard_unfinished_over_limit(&mut self) {
     let Some(max_bytes) = self.max_unfinished_bytes else {
       return;
     };
     let readers = self.available_readers.values();
     let mut bytes: usize = readers.map(Reader::unfinished_bytes).sum();
+    if bytes > max_bytes {
+      for reader in self.available_readers.values_mut() {
+        let before = reader.unfinished_bytes();
+        for _ in 0..reader.discard_stale(UNFINISHED_STALE) {
+          self.counters.unfinished_discarded.increment();
+        }
+        bytes -= before - reader.unfinished_bytes();
+      }
+    }
     while bytes > max_bytes {
       let most = self
         .available_readers

@@ -845,6 +845,14 @@ impl Reader {
     self.fragment_assemblers.evict()
   }
 
+  /// Discards the unfinished samples of which no fragment has come for so long, and returns
+  /// how many.
+  pub fn discard_stale(&mut self, max_age: StdDuration) -> usize {
+    let before = self.fragment_assemblers.count();
+    self.fragment_assemblers.garbage_collect(max_age);
+    before - self.fragment_assemblers.count()
+  }
+
   fn garbage_collect_fragments(&mut self) {
     // If GC time/packet limit has been exceeded, iterate through
     // fragment assemblers and discard those assembly buffers whose
