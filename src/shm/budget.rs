@@ -6,7 +6,7 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use nix::errno::Errno;
@@ -136,6 +136,8 @@ pub(super) struct SlotMemory {
     used_at: Box<[AtomicU32]>,
     /// The time of the last housekeeping, in ticks.
     now: AtomicU32,
+    /// The largest class of a complete sample.
+    noted_bytes: AtomicU64,
     /// Not before this tick are idle slots searched for.
     search_at: AtomicU32,
     budget: Arc<PoolBudget>,
@@ -185,6 +187,7 @@ impl SlotMemory {
             pages,
             used_at: (0..pool.slots).map(|_| AtomicU32::new(0)).collect(),
             now: AtomicU32::new(0),
+            noted_bytes: AtomicU64::new(0),
             search_at: AtomicU32::new(0),
             budget: budget.clone(),
             route,
@@ -216,6 +219,24 @@ impl SlotMemory {
         (self.name, self.first_offset + payload.wrapping_sub(self.first_address) as u64)
     }
 
+    /// Notes the size of a complete sample, of which other routes leave this one room for a steady flow. What
+    /// the first fragment of a sample claims is not noted: anybody may send one.
+    pub(super) fn note_sample(&self, len: usize) {
+        if self.pool.is_sparse {
+            let bytes = self.class_bytes(len);
+            if self.noted_bytes.fetch_max(bytes, Ordering::Relaxed) < bytes {
+                self.budget.lock().note_sample(self.route, bytes);
+            }
+        }
+    }
+
+    /// The bytes of a slot for a sample of that length.
+    fn class_bytes(&self, len: usize) -> u64 {
+        let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(page_bytes()) as u32;
+        let most = (self.pool.stride_bytes / page_bytes()) as u32;
+        u64::from(size_class(needed).min(most)) * page_bytes()
+    }
+
     /// Makes sure that the pages of a payload exist, in a slot that the caller holds.
     pub(super) fn ensure(&self, payload: usize, len: usize) -> Result<(), NoMemory> {
         if len == 0 || !self.pool.is_sparse {
@@ -227,19 +248,17 @@ impl SlotMemory {
         let needed = (self.first_offset + (SLOT_HEADER_BYTES + len) as u64).div_ceil(page_bytes()) as u32;
         // What lies beyond the pages of this slot is on the first page of the next one, or of the free list.
         let most = (self.pool.stride_bytes / page_bytes()) as u32;
-        if needed > present / 2 {
-            self.used_at[slot].store(self.now.load(Ordering::Relaxed), Ordering::Relaxed);
-        }
         if needed.min(most) <= present {
+            if needed > present / 2 {
+                self.note_use(slot);
+            }
             return Ok(());
         }
         let wanted = size_class(needed).min(most);
         let more = u64::from(wanted - present) * page_bytes();
-        self.budget.lock().take(self.route, more, u64::from(wanted) * page_bytes()).map_err(|refusal| {
-            match refusal {
-                BudgetRefusal::Quota => NoMemory::Quota,
-                BudgetRefusal::Budget => NoMemory::Budget,
-            }
+        self.budget.lock().take(self.route, more).map_err(|refusal| match refusal {
+            BudgetRefusal::Quota => NoMemory::Quota,
+            BudgetRefusal::Budget => NoMemory::Budget,
         })?;
         if let Err(errno) = self.allocate(slot, present, wanted) {
             let mut budget = self.budget.lock();
@@ -248,7 +267,12 @@ impl SlotMemory {
             return Err(if errno == Errno::ENOSPC { NoMemory::FileSystem } else { NoMemory::System(errno) });
         }
         pages.store(wanted, Ordering::Relaxed);
+        self.note_use(slot);
         Ok(())
+    }
+
+    fn note_use(&self, slot: usize) {
+        self.used_at[slot].store(self.now.load(Ordering::Relaxed), Ordering::Relaxed);
     }
 
     /// Notes the time, and returns for how many ticks a slot must be idle to give its memory back, if there

@@ -148,6 +148,7 @@ impl SamplePublisher {
         if payload.len() > self.max_sample_bytes {
             return Err(LoanError::TooLarge { len: payload.len(), max: self.max_sample_bytes });
         }
+        self.slots.note_sample(payload.len());
         let (slot, permit) = self.loan(payload.len())?;
         Ok(Slot { sample: slot.write_from_slice(payload), _permit: permit })
     }
@@ -183,6 +184,11 @@ impl SamplePublisher {
         })?;
         let refusal = self.slots.ensure(slot.payload_mut().as_ptr().addr(), len).err();
         Ok((slot, refusal))
+    }
+
+    /// Notes that a payload of that length is complete in a slot that was lent.
+    pub fn note_sample(&self, len: usize) {
+        self.slots.note_sample(len);
     }
 
     /// Lends a free slot for a payload of `len` bytes that is yet to be written; `None` if no slot or memory

@@ -88,6 +88,9 @@ impl PoolOwner {
                 memory.finish();
                 let finished = lock(&self.pool.finished).take();
                 let slot = finished.unwrap_or(Err(LoanError::Failed("not of the pool")));
+                if slot.is_ok() {
+                    self.pool.publisher.note_sample(assembled);
+                }
                 let bytes = match &slot {
                     Err(LoanError::TooLarge { len, .. }) => *len,
                     _ => assembled,

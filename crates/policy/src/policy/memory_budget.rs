@@ -12,9 +12,9 @@ const NONCRITICAL_RESERVE_BYTES: u64 = 256 << 10;
 /// For how long a slot is idle until the memory of its payload is given back: longer than between the samples
 /// of a flow, which would pay for it with an allocation each.
 const IDLE_MS: u64 = 60_000;
-/// The same while a route is short of memory. In a steady flow every slot in use has a sample within a second
-/// at 4 Hz or more; a slower one takes its memory again, which the budget keeps for it.
-const SHORT_IDLE_MS: u64 = 1_000;
+/// The same while a route is short of memory. With the default of eight retained samples, a slot has a sample
+/// each 9 s at 1 Hz: a flow of images at this rate or more keeps its memory.
+const SHORT_IDLE_MS: u64 = 10_000;
 /// For how long after a refusal a route counts as short.
 const SHORT_MS: u64 = 2_000;
 
@@ -113,19 +113,24 @@ impl MemoryBudget {
         }
     }
 
-    /// Takes memory for the pool of a route, for a sample of `sample_bytes` in a slot.
+    /// Notes that a route has samples that take so many bytes in a slot.
+    pub fn note_sample(&mut self, route: usize, sample_bytes: u64) {
+        let pool = &mut self.pools[route];
+        pool.largest_bytes = pool.largest_bytes.max(sample_bytes);
+    }
+
+    /// Takes memory for the pool of a route.
     ///
     /// # Errors
     /// The memory is not granted, and nothing is taken.
-    pub fn take(&mut self, route: usize, bytes: u64, sample_bytes: u64) -> Result<(), BudgetRefusal> {
-        let taken = self.try_take(route, bytes, sample_bytes);
+    pub fn take(&mut self, route: usize, bytes: u64) -> Result<(), BudgetRefusal> {
+        let taken = self.try_take(route, bytes);
         self.refused |= taken.is_err();
         taken
     }
 
-    fn try_take(&mut self, route: usize, bytes: u64, sample_bytes: u64) -> Result<(), BudgetRefusal> {
-        let pool = &mut self.pools[route];
-        pool.largest_bytes = pool.largest_bytes.max(sample_bytes);
+    fn try_take(&mut self, route: usize, bytes: u64) -> Result<(), BudgetRefusal> {
+        let pool = &self.pools[route];
         let used = pool.used_bytes.saturating_add(bytes);
         let in_reserve = used <= pool.reserve_bytes;
         let over_quota =
@@ -213,7 +218,8 @@ mod tests {
     /// Takes memory for samples of that size until there is none, and returns their number and why.
     fn fill(budget: &mut MemoryBudget, route: usize, sample_bytes: u64) -> (usize, BudgetRefusal) {
         for count in 0.. {
-            if let Err(refusal) = budget.take(route, sample_bytes, sample_bytes) {
+            budget.note_sample(route, sample_bytes);
+            if let Err(refusal) = budget.take(route, sample_bytes) {
                 return (count, refusal);
             }
         }
@@ -230,7 +236,8 @@ mod tests {
                     60..64 => 6 * MIB,
                     _ => 2 * MIB,
                 };
-                assert_eq!(budget.take(route, bytes, bytes), Ok(()), "{route}");
+                budget.note_sample(route, bytes);
+                assert_eq!(budget.take(route, bytes), Ok(()), "{route}");
             }
         }
         assert!(budget.used_and_peak().0 < 512 * MIB);
@@ -240,14 +247,17 @@ mod tests {
     fn a_route_cannot_take_the_last_slot_of_another_one() {
         let mut budget = MemoryBudget::new(256 * MIB, &critical(8));
         // A second camera has been seen once; the first one is stuck and takes all that it may.
-        budget.take(1, 6 * MIB, 6 * MIB).unwrap();
+        budget.note_sample(1, 6 * MIB);
+        budget.take(1, 6 * MIB).unwrap();
         let (count, refusal) = fill(&mut budget, 0, 6 * MIB);
         assert_eq!((count, refusal), (21, Quota));
         for _ in 1..3 {
-            budget.take(1, 6 * MIB, 6 * MIB).unwrap();
+            budget.note_sample(1, 6 * MIB);
+            budget.take(1, 6 * MIB).unwrap();
         }
         for other in 2..8 {
-            budget.take(other, 64 << 10, 64 << 10).unwrap();
+            budget.note_sample(other, 64 << 10);
+            budget.take(other, 64 << 10).unwrap();
         }
         assert!(budget.used_and_peak().0 <= budget.limit_bytes());
         // A route that was never seen has its reserve of 1 MiB, although others wait for memory.
@@ -282,7 +292,8 @@ mod tests {
         let mut budget = MemoryBudget::new(256 * MIB, &demands);
         for route in 0..3 {
             for _ in 0..42 {
-                budget.take(route, 2 * MIB, 2 * MIB).unwrap();
+                budget.note_sample(route, 2 * MIB);
+                budget.take(route, 2 * MIB).unwrap();
             }
         }
     }
@@ -303,13 +314,26 @@ mod tests {
         fill(&mut budget, 0, MIB);
         assert_eq!(
             [5_000, 5_001, 6_999, 7_000].map(|ms| budget.idle_ms(at(ms))),
-            [1_000, 1_000, 1_000, 60_000]
+            [10_000, 10_000, 10_000, 60_000]
         );
         budget.note_refusal();
-        assert_eq!(budget.idle_ms(at(8_000)), 1_000);
+        assert_eq!(budget.idle_ms(at(8_000)), 10_000);
         // A refusal while the route is short makes that longer.
         fill(&mut budget, 0, MIB);
-        assert_eq!([9_500, 11_499, 11_500].map(|ms| budget.idle_ms(at(ms))), [1_000, 1_000, 60_000]);
+        assert_eq!([9_500, 11_499, 11_500].map(|ms| budget.idle_ms(at(ms))), [10_000, 10_000, 60_000]);
+    }
+
+    #[test]
+    fn what_is_only_claimed_costs_other_routes_nothing() {
+        let mut claimed = MemoryBudget::new(96 * MIB, &critical(3));
+        let mut noted = claimed.clone();
+        for route in [0, 2] {
+            claimed.take(route, 16 * MIB).unwrap();
+            claimed.give_back(route, 16 * MIB);
+            noted.note_sample(route, 16 * MIB);
+        }
+        let [claimed, noted] = [claimed, noted].map(|mut budget| fill(&mut budget, 1, MIB).0);
+        assert!(noted < claimed, "{noted}, {claimed}: room is kept for samples that were complete");
     }
 
     #[test]
