@@ -62,7 +62,7 @@ plain! {
     LanePolicy: 5,
     RouteInfo: 3 * 16 + 2 * 4 + 6,
     PatternRecord: 4 + 16,
-    PartialSample: 10 + 16,
+    PartialSample: 11 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 7,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,

@@ -12,7 +12,7 @@ use bytes::Bytes;
 use tracing::warn;
 
 use crate::dds::RawWriter;
-use crate::model::{FixedText, Guid, MonotonicNs, PartialSample, SampleHeader};
+use crate::model::{FixedText, MonotonicNs, PartialSample, SampleHeader};
 use crate::policy::begins_early;
 use crate::shm::PoolView;
 
@@ -20,8 +20,8 @@ use crate::shm::PoolView;
 #[derive(Default)]
 pub(super) struct EarlySend {
     begun: Option<PartialSample>,
-    /// The writer and the sequence number of the last sample that was taken.
-    taken: (Guid, i64),
+    /// The number of the last sample that was begun: none is begun twice.
+    last_begun: u64,
     /// The pool of the route, and the name of its file: a restart of ingress creates another one.
     pool: Option<(FixedText, Arc<PoolView>)>,
     /// The pool that could not be mapped, whose samples are not begun.
@@ -39,9 +39,8 @@ pub(super) enum Followed {
 }
 
 impl EarlySend {
-    /// Notes that a sample was taken, and returns whether it is the one that was begun.
-    pub fn take(&mut self, header: &SampleHeader, len: usize) -> bool {
-        self.taken = (header.writer_guid, header.writer_sequence);
+    /// Whether a sample that was taken is the one that was begun.
+    pub fn is_begun(&self, header: &SampleHeader, len: usize) -> bool {
         self.begun.is_some_and(|begun| {
             begun.writer_guid == header.writer_guid
                 && begun.writer_sequence == header.writer_sequence
@@ -51,12 +50,11 @@ impl EarlySend {
         })
     }
 
-    /// Whether the slot of the sample that was begun has held that sample ever since, as the board shows after
-    /// the sample was taken. A sample that ingress gave up may arrive again in another slot, and the lane may
-    /// have sent bytes of a later one from the former slot.
+    /// Whether the slot of the sample that was begun has held that sample ever since, as the board shows
+    /// after the sample was taken. A sample that ingress gave up may arrive again in another slot, and the
+    /// lane may have sent bytes of a later one from the former slot.
     pub fn is_of_same_slot(&self, board: Option<PartialSample>) -> bool {
-        let numbers = board.filter(|board| board.ended == 0).map(|board| board.number);
-        self.begun.is_some_and(|begun| Some(begun.number) == numbers)
+        board.zip(self.begun).is_some_and(|(board, begun)| board.taken_number == begun.number)
     }
 
     /// The sample that was begun is written or withdrawn.
@@ -101,8 +99,7 @@ impl EarlySend {
 
     fn begin(&mut self, partial: &PartialSample, writer: &RawWriter, now: MonotonicNs) -> bool {
         // A lane that is late takes the sample before it reads the board.
-        let (writer_guid, last) = self.taken;
-        if partial.writer_guid == writer_guid && partial.writer_sequence <= last {
+        if partial.number <= self.last_begun.max(partial.taken_number) {
             return false;
         }
         if !begins_early(partial.len, partial.available, now.since(partial.began_at)) {
@@ -116,6 +113,7 @@ impl EarlySend {
             return false;
         }
         self.begun = Some(*partial);
+        self.last_begun = partial.number;
         true
     }
 
@@ -146,10 +144,11 @@ mod tests {
         let partial = PartialSample { number: 3, writer_sequence: 7, len: 9, ..PartialSample::default() };
         let mut early = EarlySend { begun: Some(partial), ..EarlySend::default() };
         let header = SampleHeader { writer_sequence: 7, ..SampleHeader::default() };
-        assert!(early.take(&header, 9) && !early.take(&header, 8));
-        assert!(early.is_of_same_slot(Some(partial)));
-        assert!(!early.is_of_same_slot(Some(PartialSample { ended: 1, ..partial })), "given up");
-        assert!(!early.is_of_same_slot(Some(PartialSample { number: 4, ..partial })), "not known any more");
+        assert!(early.is_begun(&header, 9) && !early.is_begun(&header, 8));
+        let taken = |number, taken_number| Some(PartialSample { number, taken_number, ..partial });
+        assert!(early.is_of_same_slot(taken(3, 3)) && early.is_of_same_slot(taken(4, 3)));
+        assert!(!early.is_of_same_slot(taken(3, 2)), "given up, and received again in another slot");
+        assert!(!early.is_of_same_slot(taken(4, 4)), "not known any more");
         assert!(!early.is_of_same_slot(None));
         assert!(early.end() && !early.end());
     }

@@ -241,6 +241,14 @@ impl Output {
         });
     }
 
+    /// Whether DDS may keep a taken sample of that size in its slot. One borrow stays free, so that the next
+    /// sample can be taken while DDS holds all others.
+    fn may_pass_by_reference(&self, bytes: usize) -> bool {
+        bytes >= self.by_reference_min_bytes
+            && self.history.is_none()
+            && self.subscriber.borrowed() < self.subscriber.max_borrowed()
+    }
+
     /// Withdraws the sample that was begun early, if there is one.
     fn withdraw_early(&mut self) {
         if self.early.end() {
@@ -253,8 +261,11 @@ impl Output {
 
     /// Writes a taken sample to DDS, unless the mode drops it, and accounts for it.
     pub fn send(&mut self, sample: ShmSample, participant: &mut Participant, arena: &mut CopyArena) {
-        let is_begun = self.early.take(sample.header(), sample.payload().len());
-        if !is_begun || !self.early.is_of_same_slot(self.boards.partial(self.route)) {
+        // The DDS library may still send from the slot, so that the slot has to be kept.
+        let completes = self.early.is_begun(sample.header(), sample.payload().len())
+            && self.may_pass_by_reference(sample.payload().len())
+            && self.early.is_of_same_slot(self.boards.partial(self.route));
+        if !completes {
             self.withdraw_early();
         }
         // A noncritical lane polls no sample in such a mode.
@@ -285,10 +296,7 @@ impl Output {
         let header = *sample.header();
         let bytes = sample.payload().len();
         let began_at = clock::monotonic();
-        // One borrow stays free, so that the next sample can be taken while DDS holds all others.
-        let by_reference = bytes >= self.by_reference_min_bytes
-            && self.history.is_none()
-            && self.subscriber.borrowed() < self.subscriber.max_borrowed();
+        let by_reference = self.may_pass_by_reference(bytes);
         let payload = if by_reference {
             Bytes::from_owner(sample)
         } else if self.history.is_some() {
@@ -366,6 +374,9 @@ impl Output {
     /// housekeeping, so most are overwritten in its channel queue; the mode is then the reason of these gaps.
     pub fn set_mode(&mut self, mode: LaneMode) {
         self.mode = mode;
+        if critical_drop(mode).is_some() {
+            self.withdraw_early();
+        }
         self.gap_reason = match (mode, self.class) {
             (LaneMode::Stopped, _) => DropReason::Stopped,
             (LaneMode::Suspended, TrafficClass::Noncritical) => DropReason::Suspended,

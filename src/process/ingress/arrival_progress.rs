@@ -24,9 +24,6 @@ pub(super) struct ArrivalProgress {
 struct State {
     board: BoardWriter<PartialSample>,
     updated_at: MonotonicNs,
-    /// Whether the sample on the board was taken. The board does not say so: a lane that reads it before
-    /// ingress has published the sample would give the sample up.
-    is_taken: bool,
 }
 
 /// The place of one sample on the board, which its slot holds.
@@ -44,7 +41,7 @@ impl ArrivalProgress {
         if board.get().ended == 0 {
             board.update(|partial| partial.ended = 1);
         }
-        let state = State { board, updated_at: MonotonicNs(0), is_taken: false };
+        let state = State { board, updated_at: MonotonicNs(0) };
         Self { state: Mutex::new(state), lanes }
     }
 
@@ -68,7 +65,9 @@ impl ArrivalProgress {
         let may = if is_on_board {
             current.number == progress.number && current.ended == 0
         } else {
-            current.ended != 0 || state.is_taken || now.since(state.updated_at) >= STALLED_NS
+            current.ended != 0
+                || current.taken_number == current.number
+                || now.since(state.updated_at) >= STALLED_NS
         };
         let before = if is_on_board { current.available } else { 0 };
         if !may || (arrival.complete_bytes as u64).saturating_sub(before) < step_bytes(len) as u64 {
@@ -84,19 +83,20 @@ impl ArrivalProgress {
             pool_offset,
             len: len as u64,
             ended: 0,
+            taken_number: current.taken_number,
             pool,
             ..partial_sample(arrival)
         };
         state.board.set(partial);
         state.updated_at = now;
-        state.is_taken = false;
         drop(state);
         self.wake();
     }
 
-    /// The sample is complete and is taken: the board is free for another one.
+    /// The sample is complete and is taken: the board is free for another one. To be called before the sample
+    /// is published, so that a lane that has the sample sees it.
     pub fn taken(&self, progress: &SampleProgress) {
-        self.end(progress, |state| state.is_taken = true);
+        self.end(progress, |state| state.board.update(|partial| partial.taken_number = partial.number));
     }
 
     /// The sample never becomes complete: the lanes give it up.

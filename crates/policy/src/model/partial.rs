@@ -29,6 +29,8 @@ pub struct PartialSample {
     pub encapsulation: Encapsulation,
     /// 1 if the sample never becomes complete, else 0.
     pub ended: u32,
+    /// The number of the last sample that ingress took when it was complete.
+    pub taken_number: u64,
     /// The file of the route's pool in shared memory.
     pub pool: FixedText,
 }

@@ -51,10 +51,12 @@ impl Output {
     /// Drops a writer, whose readers leave with it: what they have not acknowledged counts as unconfirmed.
     fn remove_writer(&mut self, writer: RawWriter, participant: &mut Participant) {
         self.unmatched.clear();
+        let withdrawn = u64::from(self.early.end());
         let behind = self.readers.get().unconfirmed(self.counters.get());
         self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
         self.counters.update(|counters| {
             counters.readers = 0;
+            counters.withdrawn += withdrawn;
             counters.unconfirmed = counters.unconfirmed.saturating_add(behind);
         });
         self.overrun.count(&writer, &mut self.counters);
