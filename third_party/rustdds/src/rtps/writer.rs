@@ -1113,6 +1113,7 @@ impl Writer {
       }
     }
     self.last_sent() < self.send_buffer.last_change_sequence_number()
+      || self.send_buffer.early().is_some()
   }
 
   // Tells the readers that a sample was withdrawn, so that none waits for it. One that still
