@@ -57,18 +57,24 @@ impl EarlySend {
         board.zip(self.begun).is_some_and(|(board, begun)| board.taken_number == begun.number)
     }
 
+    /// Forgets the pool of a former ingress, so that its memory is free.
+    pub fn forget_pool(&mut self) {
+        (self.pool, self.unusable) = (None, None);
+    }
+
     /// The sample that was begun is written or withdrawn.
     pub fn end(&mut self) -> bool {
         self.begun.take().is_some()
     }
 
-    /// Follows the board of the route, whose samples that were published before it was read are all taken.
-    /// `may_begin` is whether the output may begin a sample.
+    /// Follows the board of the route, as it was before the lane took all samples that were published.
+    /// `present` is the board now, if the output may begin a sample: the sample on it may have been taken
+    /// meanwhile, by a lane that is late.
     pub fn follow(
         &mut self,
         partial: &PartialSample,
         writer: &RawWriter,
-        may_begin: bool,
+        present: Option<PartialSample>,
         now: MonotonicNs,
     ) -> Followed {
         let mut withdrew = false;
@@ -88,7 +94,7 @@ impl EarlySend {
             writer.withdraw_early();
             withdrew = true;
         }
-        let began = partial.ended == 0 && may_begin && self.begin(partial, writer, now);
+        let began = present.is_some_and(|present| self.begin(&present, writer, now));
         match (withdrew, began) {
             (false, false) => Followed::Nothing,
             (false, true) => Followed::Began,
@@ -98,8 +104,7 @@ impl EarlySend {
     }
 
     fn begin(&mut self, partial: &PartialSample, writer: &RawWriter, now: MonotonicNs) -> bool {
-        // A lane that is late takes the sample before it reads the board.
-        if partial.number <= self.last_begun.max(partial.taken_number) {
+        if partial.ended != 0 || partial.number <= self.last_begun.max(partial.taken_number) {
             return false;
         }
         if !begins_early(partial.len, partial.available, now.since(partial.began_at)) {

@@ -228,7 +228,8 @@ impl Output {
             && critical_drop(self.mode).is_none()
             && self.former_readers.is_empty()
             && self.counters.get().readers > 0;
-        let followed = self.early.follow(&partial, writer, may_begin, clock::monotonic());
+        let present = if may_begin { self.boards.partial(self.route) } else { None };
+        let followed = self.early.follow(&partial, writer, present, clock::monotonic());
         let (withdrew, began) = match followed {
             Followed::Nothing => return,
             Followed::Began => (0, 1),
@@ -308,8 +309,10 @@ impl Output {
         let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
         let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
-        let outcome = if self.early.end() {
-            writer.complete_early(payload, encapsulation, timestamp)
+        let completes = self.early.end();
+        let outcome = if completes {
+            // A writer that refuses the sample withdraws it.
+            writer.complete_early(payload, encapsulation, timestamp).inspect_err(|_| writer.withdraw_early())
         } else {
             writer.write_from(publisher, payload, encapsulation, timestamp, header.key)
         };
@@ -337,7 +340,10 @@ impl Output {
                     let evicted = unsent.push(Unsent { sequence: written.sequence, account: forwarded });
                     counters.drops.add(DropReason::WriteFailed, u64::from(evicted.is_some()));
                 }
-                Err(_) => counters.drops.add(DropReason::WriteFailed, 1),
+                Err(_) => {
+                    counters.drops.add(DropReason::WriteFailed, 1);
+                    counters.withdrawn += u64::from(completes);
+                }
             }
             counters.waiting = queued + unsent.len() as u64;
         });
@@ -437,8 +443,12 @@ impl Output {
     /// Announces the type as far as it is known by now, follows matching, serves late joiners, logs drops.
     pub fn housekeeping(&mut self, participant: &mut Participant, now: MonotonicNs) {
         self.announce_type(participant);
-        if let Some(health) = self.boards.health(ProcessRole::Ingress) {
+        if let Some(health) = self.boards.health(ProcessRole::Ingress)
+            && health.starts != self.ingress_starts
+        {
             self.ingress_starts = health.starts;
+            self.withdraw_early();
+            self.early.forget_pool();
         }
         self.follow_matching(now);
         self.record_readers(now);
