@@ -174,7 +174,7 @@ impl MemoryBudget {
     }
 
     /// For how long, in milliseconds, a free slot must have had no sample of its size until its memory is
-    /// given back: a minute, and a second while a route is short of memory.
+    /// given back: a minute, and 10 s while a route is short of memory.
     pub fn idle_ms(&mut self, now: MonotonicNs) -> u64 {
         if core::mem::take(&mut self.refused) {
             self.short_until = now.plus_ms(SHORT_MS);
