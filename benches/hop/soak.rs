@@ -18,9 +18,9 @@ const SCANS_S: f64 = 30.0;
 /// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
 const CLOUDS_S: f64 = 25.0;
 
-/// How often publisher and subscriber are restarted before the measurement. The bridge remembers the endpoints of
-/// the last 256 participants that are gone; with one restart a minute, two participants each, it would fill that
-/// memory in two hours, and control would seem to grow by 0.6 MiB an hour.
+/// How often publisher and subscriber are restarted before the measurement. The bridge remembers the
+/// endpoints of the last 256 participants that are gone; with one restart a minute, two participants each, it
+/// would fill that memory in two hours, and control would seem to grow by 0.6 MiB an hour.
 const RESTARTS_BEFORE: usize = 140;
 
 /// The highest number of points of a series in the summary.
