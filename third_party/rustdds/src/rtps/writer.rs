@@ -657,6 +657,12 @@ impl Writer {
     self.readers.values().filter(|reader| !reader.is_joining())
   }
 
+  // Whether a sample that is written now goes to no address. To serialize it, and to cut a
+  // large one into fragments, took as long as with a reader.
+  fn has_no_receiver(&self) -> bool {
+    self.extra_unicast_destinations.is_empty() && self.receivers().next().is_none()
+  }
+
   // The parts of the readers that a sample is written to one after the other, those
   // with the largest datagrams first.
   fn audiences(&self, payload_size: usize) -> Vec<Audience> {
@@ -765,6 +771,12 @@ impl Writer {
     let first_cc = self.send_buffer.get_by_sn(first_seq)?;
     if !self.is_aggregatable(&first_cc) {
       return None;
+    }
+    // Readers that join get one HEARTBEAT for a batch, so there must be one.
+    if self.readers.is_empty() && self.has_no_receiver() {
+      return Some(BatchOutcome::Sent {
+        last_seq: first_seq,
+      });
     }
 
     let is_reliable = self.is_reliable();
@@ -1283,6 +1295,10 @@ impl Writer {
           }
         }
       }
+    }
+
+    if target_reader_opt.is_none() && self.has_no_receiver() {
+      return (false, SendProgress::Complete);
     }
 
     let budget = self.audience_budget(target_reader_opt, audience);
@@ -4989,6 +5005,27 @@ mod tests {
       fragments.extend(samples.into_iter().flat_map(|(_, sent)| sent));
       assert_eq!(fragments, (1..=EARLY_FRAGMENTS).collect::<Vec<_>>(), "each once");
       assert_eq!(heartbeats, [1]);
+    }
+
+    // A message of a RELIABLE Writer ends with a HEARTBEAT, whose number shows that it was built.
+    #[test]
+    fn a_sample_is_not_serialized_for_no_reader() {
+      let (mut f, _socket) = with_socket();
+      let send_two = |f: &mut Fixture| {
+        let before = f.writer.next_heartbeat_count();
+        for payload_len in [8, 100_000] {
+          let last_sent = f.writer.last_sent();
+          write(f, 1, payload_len);
+          f.writer.set_last_sent(last_sent);
+          while f.writer.process_pending() {}
+          let last = f.writer.send_buffer.last_change_sequence_number();
+          assert_eq!(f.writer.last_sent(), last);
+        }
+        f.writer.next_heartbeat_count() - before - 1
+      };
+      assert_eq!(send_two(&mut f), 2);
+      f.writer.reader_lost(f.reader_guid);
+      assert_eq!(send_two(&mut f), 0);
     }
 
     #[test]
