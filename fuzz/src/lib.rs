@@ -30,6 +30,7 @@ pub const TARGETS: &[Target] = &[
     ("rtps_message", rtps_message),
     ("rtps_arriving", rtps_arriving),
     ("rtps_receive", rtps_receive),
+    ("rtps_fragments", rtps_fragments),
     ("rtps_discovery", rtps_discovery),
     ("probe", probe),
 ];
@@ -325,6 +326,13 @@ pub fn rtps_receive(bytes: &[u8]) {
         datagrams.push([b"RTPS\x02\x03\x01\x0f", &fuzzing::SENDER[..], submessages].concat());
     }
     fuzzing::receive(first % 2 == 1, datagrams.iter().map(Vec::as_slice));
+}
+
+/// Fragments of samples that are put together in lent memory, 8 bytes each; the reader is RELIABLE if the
+/// first byte is odd.
+pub fn rtps_fragments(bytes: &[u8]) {
+    let Some((&first, steps)) = bytes.split_first() else { return };
+    fuzzing::assemble(first % 2 == 1, steps);
 }
 
 /// Announcements of another participant and its endpoints; big-endian if the first byte is odd.

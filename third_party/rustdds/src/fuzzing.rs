@@ -8,11 +8,12 @@ use std::{
 };
 
 use bytes::{Bytes, BytesMut};
+use enumflags2::BitFlags;
 
 use crate::{
   dds::{
     ddsdata::DDSData,
-    lent::{LentMemory, Lender, SampleMemory},
+    lent::{LentMemory, Lender, PartialArrival, SampleMemory},
     qos::{policy, QosPolicies, QosPolicyBuilder},
     statusevents::{sync_status_channel, DataReaderStatus},
     typedesc::TypeDesc,
@@ -21,12 +22,16 @@ use crate::{
   discovery::{
     DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData, SpdpDiscoveredParticipantData,
   },
-  messages::submessages::elements::serialized_payload::SerializedPayload,
+  messages::submessages::{
+    elements::serialized_payload::SerializedPayload,
+    submessages::DataFrag,
+  },
   mio_source,
   network::udp_sender::UDPSender,
   rtps::transmit::InterfaceObservations,
   polling::{new_shared_timer, wake_channel, LoopWaker},
   rtps::{
+    fragment_assembler::{FragmentAssemblers, StatedOnce},
     message_receiver::MessageReceiver,
     reader::{Reader, ReaderIngredients},
     rtps_reader_proxy::RtpsReaderProxy,
@@ -40,6 +45,7 @@ use crate::{
     dds_cache::DDSCache,
     duration::Duration,
     guid::{EntityId, EntityKind, GuidPrefix, GUID},
+    sequence_number::{FragmentNumber, SequenceNumber},
   },
   RepresentationIdentifier,
 };
@@ -198,6 +204,102 @@ impl LentMemory for Zeros {
   }
 
   fn finish(self: Box<Self>) {}
+}
+
+/// Puts samples of two writers together in memory that older samples have left, from fragments that overlap, come
+/// again, and contradict each other. Each step takes 8 bytes; the readers are RELIABLE if `reliable` is set.
+///
+/// # Panics
+///
+/// If a sample or a report of its arrival shows a byte that no fragment had, or a byte changes
+/// after it was reported.
+pub fn assemble(reliable: bool, steps: &[u8]) {
+  let lender = || Lender(Some(Arc::new(UsedMemory)));
+  let mut assemblers = FragmentAssemblers::default();
+  for &[sample, start, count, fragment_size, size_high, size_low, content, kind] in
+    steps.as_chunks::<8>().0
+  {
+    let writer = GUID::new(GuidPrefix::new(&[sample & 1; 12]), EntityId::MIN);
+    let writer_sn = SequenceNumber::new(i64::from(sample >> 1 & 3) + 1);
+    if kind == u8::MAX {
+      assemblers.discard_before(writer, writer_sn);
+      continue;
+    }
+    let len = usize::from(count) * usize::from(fragment_size);
+    // One time in 16 it is a byte shorter than it claims.
+    let len = len.saturating_sub((kind & 15 == 1).into());
+    let fragment = DataFrag {
+      reader_id: EntityId::UNKNOWN,
+      writer_id: EntityId::MIN,
+      inline_qos: None,
+      writer_sn,
+      fragment_starting_num: FragmentNumber::new(start.into()),
+      fragments_in_submessage: count.into(),
+      fragment_size: fragment_size.into(),
+      data_size: u16::from_be_bytes([size_high, size_low]).into(),
+      serialized_payload: vec![content % USED; len].into(),
+    };
+    let completed = assemblers.new_datafrag(
+      writer,
+      reliable,
+      &fragment,
+      BitFlags::empty(),
+      StatedOnce::default(),
+      lender,
+    );
+    if let Some((DDSData::Data { lent: Some(lent), .. }, _)) = completed {
+      if let Some(memory) = lent.with(Option::take) {
+        memory.finish();
+      }
+    }
+    assert!(assemblers.own_bytes() <= lender().limits().max_total_bytes);
+  }
+}
+
+// What memory that is lent holds of an older sample. No fragment has this byte.
+const USED: u8 = 0xEE;
+
+struct UsedMemory;
+
+impl SampleMemory for UsedMemory {
+  fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+    Some(Box::new(Watched {
+      bytes: vec![USED; len],
+      reported: Vec::new(),
+    }))
+  }
+}
+
+struct Watched {
+  bytes: Vec<u8>,
+  // The complete bytes of the last report.
+  reported: Vec<u8>,
+}
+
+impl Watched {
+  fn check(&self, complete_bytes: usize) {
+    assert!(self.bytes.starts_with(&self.reported), "reported bytes have changed");
+    assert!(
+      !self.bytes[..complete_bytes].contains(&USED),
+      "bytes of an older sample are reported"
+    );
+  }
+}
+
+impl LentMemory for Watched {
+  fn bytes(&mut self) -> &mut [u8] {
+    &mut self.bytes
+  }
+
+  fn arrived(&mut self, arrival: &PartialArrival) {
+    assert!(arrival.complete_bytes > self.reported.len(), "nothing new is reported");
+    self.check(arrival.complete_bytes);
+    self.reported = self.bytes[..arrival.complete_bytes].to_vec();
+  }
+
+  fn finish(self: Box<Self>) {
+    self.check(self.bytes.len());
+  }
 }
 
 // A writer that has sent something, and its one reader.

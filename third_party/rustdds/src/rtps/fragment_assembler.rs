@@ -172,7 +172,8 @@ impl AssemblyBuffer {
 
   /// Returns `false` if the fragment run is invalid, out of bounds, or not what
   /// the first one of this sample promised. All bytes of a run that is accepted
-  /// are written: memory that is lent may hold an older sample.
+  /// are written, except those of fragments that have arrived before: their bytes may
+  /// have been read already.
   pub fn insert_frags(&mut self, datafrag: &DataFrag) -> bool {
     // Constant for each sample, and by RTPS spec v2.5 Section 8.4.14.1.1 "How to
     // select the fragment size" for each writer.
@@ -230,12 +231,15 @@ impl AssemblyBuffer {
       );
       return false;
     };
-    self.memory.write(from_byte, data);
-
-    for f in 0..frags_in_submessage {
-      self.received_bitmap.set(start_frag_from_0 + f, true);
+    for (fragment, bytes) in data.chunks(frag_size).enumerate() {
+      if self.received_bitmap.get(start_frag_from_0 + fragment) == Some(false) {
+        self
+          .memory
+          .write(from_byte + fragment * frag_size, bytes);
+        self.received_bitmap.set(start_frag_from_0 + fragment, true);
+        self.modified_at = Instant::now();
+      }
     }
-    self.modified_at = Instant::now();
     true
   }
 
@@ -918,6 +922,21 @@ mod tests {
     // And one that begins a sample with a lie is forgotten with it.
     assert!(!insert(&datafrag(1, 2, 50, 100, vec![1; 99])));
     assert!(fa.assembly_buffers.is_empty());
+  }
+
+  // Its bytes may have been sent on before the sample is complete.
+  #[test]
+  fn a_fragment_that_comes_again_changes_no_byte() {
+    let mut fa = FragmentAssembler::new(true);
+    let mut insert = |start, count, content| {
+      let fragment = datafrag(start, count, 50, 150, vec![content; 50 * usize::from(count)]);
+      fa.new_datafrag(GUID::GUID_UNKNOWN, &fragment, BitFlags::empty(), StatedOnce::default(), &lends())
+    };
+    assert!(insert(2, 1, 1).is_none());
+    assert!(insert(1, 2, 2).is_none());
+    let (data, _) = insert(1, 3, 3).expect("complete");
+    let payload = [vec![2; 46], vec![1; 50], vec![3; 50]].concat();
+    assert_eq!(lent(&data), ([2, 2], [2, 2], payload));
   }
 
   #[test]
