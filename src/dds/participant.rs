@@ -1,9 +1,13 @@
 //! A DDS participant that appears as one ROS 2 node.
 
+use std::pin::pin;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
 
 use bytes::Bytes;
+use futures_core::Stream;
 
 use super::arrivals::Arrivals;
 use super::discovery::{Discovery, translate};
@@ -47,6 +51,9 @@ pub struct Participant {
     /// first.
     graph: RawWriter,
     listener: DomainParticipantStatusListener,
+    /// Called for the first change after `poll_discovery` has found none.
+    discovery_waker: Waker,
+    discovery_woken: Receiver<()>,
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
@@ -147,6 +154,7 @@ impl Participant {
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
         let listener = participant.status_listener();
+        let (waker, discovery_woken) = sync_channel(1);
         let graph = make_writer(
             &participant,
             &publisher,
@@ -160,6 +168,8 @@ impl Participant {
             publisher,
             subscriber,
             listener,
+            discovery_waker: Waker::from(Arc::new(DiscoveryWaker(waker))),
+            discovery_woken,
             graph,
             namespace: options.namespace.clone(),
             node_name: options.node_name.clone(),
@@ -390,11 +400,26 @@ impl Participant {
         self.participant.forget_topic(topic);
     }
 
+    /// Waits until discovery reports a change that [`poll_discovery`](Self::poll_discovery) has not returned,
+    /// or for `most`. It may return earlier.
+    #[allow(clippy::disallowed_methods, reason = "no thread of the data path waits for discovery")]
+    pub fn wait_for_discovery(&self, most: Duration) {
+        // It times out, and cannot be disconnected: the waker is a field of this participant.
+        let _ = self.discovery_woken.recv_timeout(most);
+    }
+
     /// Returns the next change that discovery reports, if there is one.
     pub fn poll_discovery(&self) -> Option<Discovery> {
+        let mut changes = pin!(self.listener.as_async_status_stream());
+        let mut context = Context::from_waker(&self.discovery_waker);
         loop {
-            if let Some(change) = translate(self.listener.try_recv_status()?) {
-                return Some(change);
+            match changes.as_mut().poll_next(&mut context) {
+                Poll::Ready(Some(change)) => {
+                    if let Some(change) = translate(change) {
+                        return Some(change);
+                    }
+                }
+                Poll::Ready(None) | Poll::Pending => return None,
             }
         }
     }
@@ -413,6 +438,16 @@ impl Participant {
         {
             tracing::warn!(node = self.node_name, %error, "cannot publish the node's ROS 2 graph entry");
         }
+    }
+}
+
+/// Ends the wait for discovery.
+struct DiscoveryWaker(SyncSender<()>);
+
+impl Wake for DiscoveryWaker {
+    fn wake(self: Arc<Self>) {
+        // If the channel is full, the waiting thread is awake already.
+        let _ = self.0.try_send(());
     }
 }
 

@@ -367,6 +367,29 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
 }
 
 #[test]
+fn a_change_that_discovery_reports_ends_the_wait_for_it() {
+    let here = participant("here", 63);
+    let mut there = None;
+    loop {
+        let changes: Vec<_> = std::iter::from_fn(|| here.poll_discovery()).collect();
+        let is_it =
+            |change: &Discovery| matches!(change, Discovery::Writer(writer) if writer.topic == "rt/wakes");
+        if changes.iter().any(is_it) {
+            return;
+        }
+        if there.is_none() {
+            let mut participant = participant("there", 63);
+            let writer = participant.create_writer("rt/wakes", TYPE, &QosProfile::CRITICAL, 1).unwrap();
+            there = Some((writer, participant));
+        }
+        let most = Duration::from_secs(20);
+        let began = Instant::now();
+        here.wait_for_discovery(most);
+        assert!(began.elapsed() < most, "nothing has ended the wait");
+    }
+}
+
+#[test]
 fn a_writer_takes_every_sample_and_the_reader_that_lags_misses_the_oldest() {
     let mut here = participant("here", 71);
     let mut there = participant("there", 71);

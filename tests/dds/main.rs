@@ -8,6 +8,7 @@
 mod cli;
 mod clocks;
 mod demo;
+mod idle;
 mod metrics;
 mod patterns;
 mod priority;

@@ -38,8 +38,9 @@ use receiving::{Receiving, ServedLane};
 /// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
 const LAST_SAMPLES_MS: u64 = 200;
 
-/// Interval of housekeeping while a route has no publisher. It is short, because a VOLATILE reader loses the
-/// samples that the publisher sends before the reader exists.
+/// The shortest interval of housekeeping. While a route has no publisher, a change that discovery reports
+/// begins housekeeping at once, because a VOLATILE reader loses the samples that the publisher sends before
+/// the reader exists; but not more often than this, because any host can announce endpoints.
 const SEARCHING_MS: u64 = 10;
 
 /// After a restart, how long at most the participant of a killed former process is kept. Until it is disposed
@@ -84,6 +85,8 @@ struct Ingress {
     /// The latest time to dispose of the participant of a killed former process.
     resume_until: MonotonicNs,
     housekeeping_at: MonotonicNs,
+    /// When a change that discovery reports may begin housekeeping; `None` if no route waits for one.
+    search_at: Option<MonotonicNs>,
     received: Meter,
 }
 
@@ -140,6 +143,7 @@ impl Ingress {
             has_resumed: false,
             resume_until,
             housekeeping_at,
+            search_at: None,
             received: Meter::default(),
         };
         ingress.resume_places(housekeeping_at);
@@ -148,10 +152,17 @@ impl Ingress {
         Ok(ingress)
     }
 
+    /// Sleeps until housekeeping is due.
+    #[allow(clippy::disallowed_methods, reason = "other threads receive the samples")]
     fn sleep(&self) {
-        let wait_ns = self.housekeeping_at.since(clock::monotonic());
-        #[allow(clippy::disallowed_methods, reason = "other threads receive the samples")]
-        std::thread::sleep(Duration::from_nanos(wait_ns));
+        let until = |at: MonotonicNs| Duration::from_nanos(at.since(clock::monotonic()));
+        match self.search_at {
+            Some(search_at) => {
+                std::thread::sleep(until(search_at));
+                self.participant.wait_for_discovery(until(self.housekeeping_at));
+            }
+            None => std::thread::sleep(until(self.housekeeping_at)),
+        }
     }
 
     fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
@@ -173,7 +184,8 @@ impl Ingress {
             }
         }
         self.bind_places(now);
-        let mut searching = false;
+        // A topic of a pattern may appear at any time.
+        let mut searching = !self.patterns.places().is_empty();
         let mut resumed = true;
         let mut outcome = Ok(());
         self.for_each_input(|input, participant| {
@@ -199,7 +211,8 @@ impl Ingress {
         if self.participant.have_threads_turned(now) {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
-        self.housekeeping_at = now.plus_ms(if searching { SEARCHING_MS } else { HOUSEKEEPING_MS });
+        self.search_at = searching.then(|| now.plus_ms(SEARCHING_MS));
+        self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
         outcome
     }
 
