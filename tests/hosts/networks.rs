@@ -456,6 +456,51 @@ fn a_link_that_comes_up_after_the_start_is_used() {
     late_network("a late link", "", |robot| robot.set_link(false), |robot| robot.set_link(true));
 }
 
+/// The UDP datagrams that sockets of a host have received.
+fn received_datagrams(host: &Host) -> u64 {
+    let counters = host.run("cat", &["/proc/net/snmp"]);
+    let [names, values] =
+        [0, 1].map(|line| counters.lines().filter(|l| l.starts_with("Udp:")).nth(line).unwrap());
+    let column = names.split_whitespace().position(|name| name == "InDatagrams").unwrap();
+    values.split_whitespace().nth(column).unwrap().parse().unwrap()
+}
+
+/// As `docker0` is while no container runs. Fast DDS takes its address for that of another host, and sends
+/// each sample to it as well if ingress announces it.
+#[test]
+fn an_interface_that_never_had_a_carrier_is_not_announced() {
+    let test = "an_interface_that_never_had_a_carrier_is_not_announced";
+    if let Some(reason) = support::testbed_missing() {
+        return support::skip(test, &reason);
+    }
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let robot = net.host("bridge").clone();
+    for command in [
+        "link add docker0 type veth peer name unused",
+        "address add 172.17.0.1/16 dev docker0",
+        "link set docker0 up",
+    ] {
+        robot.run("ip", &command.split(' ').collect::<Vec<_>>());
+    }
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{}", routes()));
+    let up = bridge.start_on(&robot, "up");
+    let bed = Bed { up, bridge, net };
+    bed.wait_up();
+    let samples = 2_000;
+    let publisher = Peer::fast().publisher().topic(INPUT).rate_hz(500.0).count(samples).wait_match(1).hold();
+    let publisher = publisher.start_on(&robot);
+    publisher.wait_matched(1);
+    let before = received_datagrams(&robot);
+    publisher.go();
+    let sent: Sent = publisher.finish();
+    assert_eq!(sent.ok, samples);
+    let datagrams = received_datagrams(&robot) - before;
+    println!("{datagrams} datagrams for {samples} samples");
+    // Beside the samples there are announcements, HEARTBEATs and acknowledgements.
+    assert!(datagrams < samples * 3 / 2, "{datagrams} datagrams for {samples} samples");
+    bed.end();
+}
+
 /// Tests of a minute or more: `make test-long`.
 mod long {
     use super::*;

@@ -35,7 +35,7 @@ use crate::{
     },
     spdp_participant_data::{Participant_GUID, SpdpDiscoveredParticipantData},
   },
-  network::util::{local_interface_table, IfAddr},
+  network::util::{local_interfaces_after, IfAddr},
   polling::{
     new_shared_timer, timeout_until, LoopWaker, ReadyReceiver, SharedTimer, WakeReceiver,
     WakeSender,
@@ -1104,7 +1104,7 @@ impl Discovery {
   // interfaces.
   fn follow_interfaces(&mut self) {
     self.is_follow_scheduled = false;
-    let interfaces = local_interface_table();
+    let interfaces = local_interfaces_after(&self.interfaces);
     if interfaces == self.interfaces {
       return;
     }

@@ -25,6 +25,9 @@ pub enum NetworkSelector {
 
 /// Whether a participant with these networks uses the address. `None` is all.
 pub(crate) fn is_selected(ifa: &IfAddr, only_networks: Option<&[NetworkSelector]>) -> bool {
+  if !ifa.has_run && !ifa.is_loopback {
+    return false;
+  }
   only_networks.is_none_or(|selectors| {
     selectors.iter().any(|selector| match selector {
       NetworkSelector::Name(name) => *name == ifa.name,
@@ -50,6 +53,10 @@ pub(crate) struct IfAddr {
   pub is_loopback: bool,
   /// Whether the interface is up and has a carrier.
   pub is_running: bool,
+  /// Whether it is running, or was at a former enumeration. One that has never had a carrier,
+  /// such as `docker0` without containers, is neither announced nor used for multicast: Fast DDS
+  /// takes its address for that of another host, and sends each sample twice.
+  pub has_run: bool,
   /// Whether the interface is multicast-capable.
   pub is_multicast: bool,
   /// IPv4 subnet mask for `ip` (only populated for IPv4 addresses). Used to
@@ -93,6 +100,7 @@ fn enumerate_interfaces() -> io::Result<Vec<IfAddr>> {
         index,
         is_loopback,
         is_running,
+        has_run: is_running,
         is_multicast,
         netmask: Some(net.netmask()),
         mtu,
@@ -105,6 +113,7 @@ fn enumerate_interfaces() -> io::Result<Vec<IfAddr>> {
         index,
         is_loopback,
         is_running,
+        has_run: is_running,
         is_multicast,
         // IPv4-only subnet matching for now; IPv6 peers fall back to default.
         netmask: None,
@@ -131,6 +140,20 @@ pub fn local_interface_table() -> Vec<IfAddr> {
       Vec::new()
     }
   }
+}
+
+/// What there is now. An interface that has lost its carrier keeps its address announced: when
+/// it returns, peers must not discover this participant without that address.
+pub(crate) fn local_interfaces_after(former: &[IfAddr]) -> Vec<IfAddr> {
+  with_former(local_interface_table(), former)
+}
+
+fn with_former(mut interfaces: Vec<IfAddr>, former: &[IfAddr]) -> Vec<IfAddr> {
+  for ifa in &mut interfaces {
+    let is_same = |known: &IfAddr| known.name == ifa.name && known.ip == ifa.ip;
+    ifa.has_run |= former.iter().any(|known| known.has_run && is_same(known));
+  }
+  interfaces
 }
 
 /// Resolve the per-peer UDP-payload budget (bytes available for RTPS
@@ -312,7 +335,7 @@ mod tests {
 
   use super::{
     build_ifindex_map_inner, get_local_multicast_ip_addrs_inner, get_local_unicast_locators_inner,
-    listener_locators, multicast_interface_indexes, localhost_spdp_peer_locators, path_mtu_payload_for_peer, IfAddr, InterfaceSelector, NetworkSelector,
+    listener_locators, multicast_interface_indexes, localhost_spdp_peer_locators, path_mtu_payload_for_peer, with_former, IfAddr, InterfaceSelector, NetworkSelector,
   };
   use crate::{
     network::constant::spdp_well_known_unicast_port,
@@ -330,6 +353,7 @@ mod tests {
       index,
       is_loopback,
       is_running: true,
+      has_run: true,
       is_multicast,
       netmask: None,
       mtu: None,
@@ -350,6 +374,7 @@ mod tests {
       index: 1,
       is_loopback,
       is_running: true,
+      has_run: true,
       is_multicast: !is_loopback,
       netmask: Some(Ipv4Addr::from(mask)),
       mtu: Some(mtu),
@@ -377,6 +402,27 @@ mod tests {
     // Only IPv4 is currently supported for multicast enumeration.
     assert_eq!(ips.len(), 1, "should only contain the non-loopback iface");
     assert!(ips.contains(&v4(192, 168, 0, 137)));
+  }
+
+  #[test]
+  fn an_interface_is_used_from_its_first_carrier_on() {
+    let lo = iface(IpAddr::V4(Ipv4Addr::LOCALHOST), 1, true, false);
+    let with_carrier = |has_carrier| IfAddr {
+      is_running: has_carrier,
+      has_run: has_carrier,
+      ..iface(v4(172, 17, 0, 1), 2, false, true)
+    };
+    let mut former = Vec::new();
+    for (has_carrier, is_used) in [(false, false), (true, true), (false, true)] {
+      let now = with_former(vec![lo.clone(), with_carrier(has_carrier)], &former);
+      assert_eq!(get_local_unicast_locators_inner(&now, 7400, None).len(), 1 + usize::from(is_used));
+      assert_eq!(get_local_multicast_ip_addrs_inner(&now, None).len(), usize::from(is_used));
+      assert_eq!(multicast_interface_indexes(&now, None).len(), usize::from(is_used));
+      former = now;
+    }
+    // Its address was removed meanwhile.
+    former.pop();
+    assert!(!with_former(vec![lo, with_carrier(false)], &former)[1].has_run);
   }
 
   #[test]
