@@ -9,7 +9,7 @@ use support::wait_until;
 const AT_ONCE: usize = 100;
 /// The visitors before the first measurement of memory. By then most bounded tables are full, such as that of
 /// the endpoints of the last 256 participants that are gone, and the allocator has its areas.
-const FIRST: usize = 1_000;
+const FIRST: usize = 500;
 /// The visitors after that, or the variable's number rounded up to a multiple of [`FIRST`].
 const MORE: usize = 1_000;
 const MORE_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_VISITORS";
