@@ -1,5 +1,7 @@
 //! Faults of single threads of a process, caused with ptrace(2).
 
+use std::time::{Duration, Instant};
+
 use nix::sys::ptrace;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
@@ -31,6 +33,19 @@ pub fn thread(process: i32, name: Option<&str>) -> Pid {
 /// Waits until the kernel stops or ends the traced thread.
 fn wait(thread: Pid) -> WaitStatus {
     waitpid(thread, Some(WaitPidFlag::__WALL)).unwrap()
+}
+
+/// Waits until the traced thread has ended: for twice the usual time, because `up` lets a process start for
+/// 30 s. If the caller then panics, the kernel lets the thread go on.
+fn wait_end(process: i32, thread: Pid) {
+    let deadline = Instant::now() + 2 * super::patience();
+    while !matches!(
+        waitpid(thread, Some(WaitPidFlag::__WALL | WaitPidFlag::WNOHANG)).unwrap(),
+        WaitStatus::Exited(..) | WaitStatus::Signaled(..)
+    ) {
+        assert!(Instant::now() < deadline, "nothing ended process {process}, whose thread {thread} hangs");
+        std::thread::sleep(Duration::from_millis(10));
+    }
 }
 
 /// Stops the thread. The calling thread traces it from then on.
@@ -68,7 +83,7 @@ pub fn cause(fault: Fault, process: i32, thread: Pid) {
         ptrace::detach(thread, None).unwrap();
     } else {
         // The parent learns of the end of the process only after the tracer has.
-        while !matches!(wait(thread), WaitStatus::Exited(..) | WaitStatus::Signaled(..)) {}
+        wait_end(process, thread);
     }
     super::wait_until(format!("the end of process {process}"), || {
         std::fs::read_to_string(format!("/proc/{process}/stat")).map_or(true, |stat| stat.contains(") Z "))
