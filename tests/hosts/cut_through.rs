@@ -2,8 +2,8 @@
 //! not published, or a part of another one, and none misses a sample. Peers compare each byte.
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Participant, ParticipantOptions, WriterEvent};
-use adaptive_bridge::model::{Encapsulation, QosProfile, SourceTimestamp};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawWriter, ReaderQos, Take, WriterEvent};
+use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -49,6 +49,32 @@ fn compare(bed: &Bed, subscribers: Vec<RunningPeer>) -> Value {
         count(&status, "withdrawn")
     });
     status
+}
+
+/// A participant in the test's own process.
+fn participant(bed: &Bed, host: &str) -> Participant {
+    let options = ParticipantOptions {
+        network: &DdsNetwork::of_domain(0),
+        namespace: "/".into(),
+        node_name: "stops".into(),
+        graph_gid_bytes: 16,
+        dscp: 0,
+    };
+    bed.host(host).within(|| Participant::open(&options).unwrap())
+}
+
+fn wait_matched(writer: &RawWriter, what: &str) {
+    let is_match = |event| matches!(event, Some(WriterEvent::Matched { joined: true, .. }));
+    support::wait_until(what, || is_match(writer.poll_event()));
+}
+
+/// Sends three quarters of a sample, and gives the lane time to send as much.
+fn begin_and_pause(writer: &RawWriter, payload: Bytes, number: u64) -> SourceTimestamp {
+    let timestamp = SourceTimestamp(number << 32);
+    assert!(writer.begin_early(payload, Encapsulation::CDR_LE, timestamp, MIB * 3 / 4));
+    #[allow(clippy::disallowed_methods, reason = "the lane could send the whole sample several times")]
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    timestamp
 }
 
 fn subscribers(bed: &Bed) -> Vec<RunningPeer> {
@@ -102,17 +128,9 @@ fn samples_that_never_become_complete_are_withdrawn() {
     let test = "samples_that_never_become_complete_are_withdrawn";
     let Some(bed) = Bed::start(test, YAML) else { return };
     let subscribers = subscribers(&bed);
-    let options = ParticipantOptions {
-        network: &DdsNetwork::of_domain(0),
-        namespace: "/".into(),
-        node_name: "stops".into(),
-        graph_gid_bytes: 16,
-        dscp: 0,
-    };
-    let mut node = bed.host("publisher").within(|| Participant::open(&options).unwrap());
+    let mut node = participant(&bed, "publisher");
     let writer = node.create_writer(INPUT, TYPE, &QosProfile::CRITICAL, 64).unwrap();
-    let is_match = |event| matches!(event, Some(WriterEvent::Matched { joined: true, .. }));
-    support::wait_until("ingress", || is_match(writer.poll_event()));
+    wait_matched(&writer, "ingress");
     let steady = bed.publish(camera(Library::Cyclone).size(MIB).rate_hz(10.0), INPUT);
     // The publisher sends three quarters of each sample. On a busy machine they may arrive too slowly for the
     // lane to begin; and ingress lends the DDS library two slots at a time.
@@ -133,6 +151,46 @@ fn samples_that_never_become_complete_are_withdrawn() {
     assert_eq!(sent.failed, 0, "{sent:?}");
     let status = compare(&bed, subscribers);
     assert_eq!(count(&status, "forwarded"), sent.ok, "{status}");
+    bed.end();
+}
+
+#[test]
+fn of_a_sample_that_pauses_no_byte_is_sent_before_it_has_arrived() {
+    let test = "of_a_sample_that_pauses_no_byte_is_sent_before_it_has_arrived";
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let [mut here, mut there] = ["publisher", "critical"].map(|host| participant(&bed, host));
+    let qos = ReaderQos {
+        reliability: Reliability::Reliable,
+        durability: Durability::Volatile,
+        depth: 10,
+        deadline_ms: None,
+    };
+    let reader = there.create_reader(CRITICAL, TYPE, &qos).unwrap();
+    let writer = here.create_writer(INPUT, TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_matched(&writer, "ingress");
+    bed.bridge.wait_status("the subscriber", |status| count(status, "readers") == 1);
+    let mut number = 0;
+    // On a busy machine some arrive too slowly for the lane to begin.
+    support::wait_until("samples that were begun early", || {
+        number += 1;
+        let payload = || Bytes::from(vec![number; MIB]);
+        let timestamp = begin_and_pause(&writer, payload(), number.into());
+        writer.complete_early(payload(), Encapsulation::CDR_LE, timestamp).unwrap();
+        // The slot has bytes of former samples where this one has not arrived.
+        let mut wrong = None;
+        support::wait_until(format!("sample {number}"), || {
+            let mut count_wrong = |bytes: &[u8], _| {
+                let others = bytes.iter().filter(|byte| **byte != number).count();
+                wrong = Some((bytes.len(), others));
+            };
+            matches!(reader.take(&mut count_wrong), Take::Sample(_))
+        });
+        assert_eq!(wrong, Some((MIB, 0)), "sample {number}");
+        count(&bed.bridge.status(), "begun_early") >= 5
+    });
+    let status = bed.wait_accounted();
+    assert_eq!(count(&status, "forwarded"), u64::from(number), "{status}");
+    drop(reader);
     bed.end();
 }
 
