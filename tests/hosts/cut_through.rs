@@ -194,6 +194,30 @@ fn of_a_sample_that_pauses_no_byte_is_sent_before_it_has_arrived() {
     bed.end();
 }
 
+#[test]
+fn a_sample_is_begun_early_after_one_that_was_withdrawn() {
+    let test = "a_sample_is_begun_early_after_one_that_was_withdrawn";
+    let Some(bed) = Bed::start(test, YAML) else { return };
+    let subscriber = bed.subscribe("critical", camera(Library::Cyclone), CRITICAL);
+    let mut node = participant(&bed, "publisher");
+    let writer = node.create_writer(INPUT, TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    wait_matched(&writer, "ingress");
+    let mut number = 0;
+    support::wait_until("samples that were begun early and withdrawn", || {
+        number += 1;
+        begin_and_pause(&writer, Bytes::from(vec![0xEE; MIB]), number);
+        writer.withdraw_early();
+        #[allow(clippy::disallowed_methods, reason = "three periods of housekeeping")]
+        std::thread::sleep(std::time::Duration::from_millis(300));
+        // No sample is written in between, which would end the one that was begun.
+        let status = bed.bridge.status();
+        count(&status, "begun_early").min(count(&status, "withdrawn")) >= 3
+    });
+    assert_eq!(subscriber.received(), 0);
+    let _: Received = subscriber.end();
+    bed.end();
+}
+
 /// The most kills before the supervisor waits for seconds until it starts ingress again.
 const KILLS: u64 = 10;
 
