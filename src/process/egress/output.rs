@@ -594,3 +594,6 @@ fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
     counters.first_sequence = tracker.first();
     counters.last_sequence = tracker.last();
 }
+
+#[cfg(test)]
+mod tests;

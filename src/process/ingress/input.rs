@@ -552,3 +552,6 @@ impl Input {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
