@@ -486,8 +486,9 @@ fn an_interface_that_never_had_a_carrier_is_not_announced() {
     let up = bridge.start_on(&robot, "up");
     let bed = Bed { up, bridge, net };
     bed.wait_up();
-    let samples = 2_000;
-    let publisher = Peer::fast().publisher().topic(INPUT).rate_hz(500.0).count(samples).wait_match(1).hold();
+    let samples = 10_000;
+    let publisher =
+        Peer::fast().publisher().topic(INPUT).rate_hz(2_000.0).count(samples).wait_match(1).hold();
     let publisher = publisher.start_on(&robot);
     publisher.wait_matched(1);
     let before = received_datagrams(&robot);
