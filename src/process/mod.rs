@@ -22,6 +22,8 @@ mod role;
 mod scheduling;
 mod stop;
 mod supervisor;
+#[cfg(test)]
+mod test_role;
 
 pub use control::control;
 pub use egress::{egress, end_unused};

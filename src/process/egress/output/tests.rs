@@ -1,18 +1,13 @@
 //! The account of an output, with real shared memory and a real DDS writer.
 
-use std::path::Path;
-use std::time::{Duration, Instant};
-
 use super::*;
-use crate::config::{DropPolicy, Scheduling};
+use crate::config::DropPolicy;
 use crate::dds::{RawReader, ReaderQos};
 use crate::model::{Encapsulation, FixedText, KeyedPayload, Reliability, RouteInfo, SampleKey};
-use crate::process::reload::ReloadRequests;
 use crate::process::role::participant_options;
+use crate::process::test_role::{self, SCAN, TYPE, wait_until};
 use crate::shm::SamplePublisher;
 
-const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
-const SCAN: &str = "topics: [{id: scan, input_topic: /scan}]";
 /// A sample that the lane may begin to send before it is complete.
 const LARGE: usize = 1 << 20;
 /// The lanes by their number.
@@ -30,25 +25,9 @@ struct Host {
     _folder: tempfile::TempDir,
 }
 
-fn settings(folder: &Path, domain_id: u16, yaml: &str) -> Settings {
-    let text = format!(
-        "instance: output_{}_{domain_id}\nros: {{domain_id: {domain_id}}}\n\
-         shared_memory: {{root_path: {}}}\n{yaml}\n",
-        std::process::id(),
-        folder.display()
-    );
-    config::parse(&text, "f.yaml", &|_| None).unwrap_or_else(|error| panic!("{text}\n{error}"))
-}
-
 impl Host {
-    /// Each test has a domain of its own, because they run at the same time.
     fn start(domain_id: u16, lane: usize, yaml: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let settings = settings(folder.path(), domain_id, yaml);
-        let read = settings.clone();
-        let reloads = ReloadRequests::on_signal(move |_| Ok(read.clone().into())).unwrap();
-        let process = ProcessRole::Egress(lane);
-        let role = Role::open(&settings, reloads, process, "egress", &Scheduling::default()).unwrap();
+        let (role, settings, folder) = test_role::open(ProcessRole::Egress(lane), "egress", domain_id, yaml);
         let options = participant_options(&settings, &settings.lanes[lane].network, "egress");
         let participant = Participant::open(&options).unwrap();
         let publisher = SamplePublisher::create(&role.node, &RouteChannel::of(&settings, 0)).unwrap();
@@ -113,14 +92,6 @@ fn header(sequence: u64) -> SampleHeader {
 
 fn keyed(sequence: u64) -> SampleHeader {
     SampleHeader { key: SampleKey::new(Some([3; 16]), 0, KeyedPayload::Data), ..header(sequence) }
-}
-
-fn wait_until(what: &str, mut fulfilled: impl FnMut() -> bool) {
-    let give_up = Instant::now() + Duration::from_secs(30);
-    while !fulfilled() {
-        assert!(Instant::now() < give_up, "{what}");
-        std::thread::sleep(Duration::from_millis(1));
-    }
 }
 
 /// Waits until the output has so many readers.

@@ -1,21 +1,17 @@
 //! The account of a route's input and its readers, with real shared memory and real DDS.
 
-use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 
 use super::*;
-use crate::config::{self, Scheduling};
 use crate::dds::{Payload, RawWriter};
 use crate::model::{Encapsulation, MAX_PUBLISHERS, QosProfile, SampleKey, SourceTimestamp, TypeHash};
 use crate::policy::Location;
-use crate::process::reload::ReloadRequests;
 use crate::process::role::participant_options;
+use crate::process::test_role::{self, SCAN, TYPE, wait_until};
 use crate::shm::ProcessRole;
 
-const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
-const SCAN: &str = "topics: [{id: scan, input_topic: /scan}]";
 const RELIABLE: Reliability = Reliability::Reliable;
 const BEST_EFFORT: Reliability = Reliability::BestEffort;
 const ONE: Guid = Guid([1; 16]);
@@ -29,25 +25,9 @@ struct Host {
     _folder: tempfile::TempDir,
 }
 
-fn settings(folder: &Path, domain_id: u16, yaml: &str) -> Settings {
-    let text = format!(
-        "instance: input_{}_{domain_id}\nros: {{domain_id: {domain_id}}}\n\
-         shared_memory: {{root_path: {}}}\n{yaml}\n",
-        std::process::id(),
-        folder.display()
-    );
-    config::parse(&text, "f.yaml", &|_| None).unwrap_or_else(|error| panic!("{text}\n{error}"))
-}
-
 impl Host {
-    /// Each test has a domain of its own, because they run at the same time.
     fn start(domain_id: u16, yaml: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let settings = settings(folder.path(), domain_id, yaml);
-        let read = settings.clone();
-        let reloads = ReloadRequests::on_signal(move |_| Ok(read.clone().into())).unwrap();
-        let process = ProcessRole::Ingress;
-        let role = Role::open(&settings, reloads, process, "ingress", &Scheduling::default()).unwrap();
+        let (role, settings, folder) = test_role::open(ProcessRole::Ingress, "ingress", domain_id, yaml);
         let participant =
             Participant::open(&participant_options(&settings, &settings.input, "ingress")).unwrap();
         Self { participant, role, settings, _folder: folder }
@@ -106,14 +86,6 @@ fn filled(input: &Input) -> Filled {
 fn publish(input: &mut Input, writer: Guid, sequence: i64) -> bool {
     let filled = filled(input);
     matches!(input.publish(filled, Encapsulation::CDR_LE, &origin(writer, sequence)), Step::Published)
-}
-
-fn wait_until(what: &str, mut fulfilled: impl FnMut() -> bool) {
-    let give_up = Instant::now() + Duration::from_secs(30);
-    while !fulfilled() {
-        assert!(Instant::now() < give_up, "{what}");
-        std::thread::sleep(Duration::from_millis(1));
-    }
 }
 
 #[test]
