@@ -231,14 +231,18 @@ impl AssemblyBuffer {
       );
       return false;
     };
+    let mut is_new = false;
     for (fragment, bytes) in data.chunks(frag_size).enumerate() {
       if self.received_bitmap.get(start_frag_from_0 + fragment) == Some(false) {
         self
           .memory
           .write(from_byte + fragment * frag_size, bytes);
         self.received_bitmap.set(start_frag_from_0 + fragment, true);
-        self.modified_at = Instant::now();
+        is_new = true;
       }
+    }
+    if is_new {
+      self.modified_at = Instant::now();
     }
     true
   }
