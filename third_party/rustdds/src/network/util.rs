@@ -142,8 +142,9 @@ pub fn local_interface_table() -> Vec<IfAddr> {
   }
 }
 
-/// What there is now. An interface that has lost its carrier keeps its address announced: when
-/// it returns, peers must not discover this participant without that address.
+/// Enumerates the interfaces, `former` being those of the time before. One that has run and lost its
+/// carrier stays announced: a peer that discovers this participant when the link returns has to
+/// learn its address there.
 pub(crate) fn local_interfaces_after(former: &[IfAddr]) -> Vec<IfAddr> {
   with_former(local_interface_table(), former)
 }

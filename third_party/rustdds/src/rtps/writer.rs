@@ -657,8 +657,8 @@ impl Writer {
     self.readers.values().filter(|reader| !reader.is_joining())
   }
 
-  // Whether a sample that is written now goes to no address. To serialize it, and to cut a
-  // large one into fragments, took as long as with a reader.
+  // Whether a sample that is written now goes to no address, so that it need not be
+  // serialized.
   fn has_no_receiver(&self) -> bool {
     self.extra_unicast_destinations.is_empty() && self.receivers().next().is_none()
   }
