@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compares hop and CPU time of two builds of the bridge, between independent Cyclone DDS programs.
+"""Compares hop and CPU time of two builds of the bridge, between independent programs of one DDS library.
 
     make peers && cargo build --release
     benches/compare_builds.py OLD/adaptive-bridge target/release/adaptive-bridge
@@ -22,11 +22,11 @@ import tempfile
 import time
 from pathlib import Path
 
-PEER = Path(__file__).resolve().parent.parent / "tests/peers/build/cyclone_peer"
+PEERS = Path(__file__).resolve().parent.parent / "tests/peers/build"
 OUTPUT = "rt/adaptive_bridge/critical/scan"
 INPUT = "rt/scan"
 # The rate in Hz and the sample size in bytes of each case.
-CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20)}
+CASES = {"100hz": (100, 2_948), "1khz": (1_000, 2_948), "1mib": (30, 1 << 20), "4mib": (30, 4 << 20)}
 DIRECT_DOMAIN = 63
 
 
@@ -43,7 +43,7 @@ class Build:
         config.write_text(
             f"instance: compare_{os.getpid()}_{name}\nros: {{domain_id: {domain}}}\n"
             "topics: [{id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, "
-            "max_sample_bytes: 2097152}]\n"
+            "max_sample_bytes: 8388608}]\n"
             f"shared_memory: {{root_path: {folder}/{name}}}\n"
             f"lanes: {{critical: {{queue_depth: 512, {scheduling(cpus[1])}}}}}\n"
             f"processes: {{ingress: {{{scheduling(cpus[0])}}}}}\nclassifier: {{enabled: false}}\n")
@@ -77,26 +77,27 @@ def summary(process):
     return next(event for event in events if event["event"] == "summary")
 
 
-def start_peer(arguments, cpu):
+def start_peer(program, arguments, cpu):
     """Starts a peer that runs on one CPU, or on any if it is None."""
     command = ["taskset", "--cpu-list", str(cpu)] if cpu is not None else []
-    return subprocess.Popen([*command, PEER, *arguments], stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen([*command, program, *arguments], stdout=subprocess.PIPE, text=True)
 
 
-def measure(build, rate_hz, size, seconds, cpus):
+def measure(program, build, rate_hz, size, seconds, cpus):
     """Returns the median latency in us, the CPU time per sample in us, and the number of missing samples.
 
     Without a build it measures the direct flow.
     """
     domain = build.domain if build else DIRECT_DOMAIN
     common = ["--domain", str(domain), "--size", str(size), "--summary", "--history", "1000"]
-    subscriber = start_peer(["--role", "sub", "--topic", OUTPUT if build else INPUT, *common], cpus[1])
+    subscriber = start_peer(
+        program, ["--role", "sub", "--topic", OUTPUT if build else INPUT, *common], cpus[1])
     # Time for the endpoints to match on both sides.
     time.sleep(1.0)
     before_s = build.cpu_s() if build else 0
     publisher = start_peer(
-        ["--role", "pub", "--topic", INPUT, "--wait-match", "1", "--rate", str(rate_hz),
-         "--count", str(int(rate_hz * seconds)), *common], cpus[0])
+        program, ["--role", "pub", "--topic", INPUT, "--wait-match", "1", "--rate", str(rate_hz),
+                  "--count", str(int(rate_hz * seconds)), *common], cpus[0])
     sent = summary(publisher)
     time.sleep(0.3)
     cpu_s = build.cpu_s() - before_s if build else 0
@@ -134,6 +135,7 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("old", help="the adaptive-bridge executable of the old build")
     parser.add_argument("new", help="the adaptive-bridge executable of the new build")
+    parser.add_argument("--peers", choices=("cyclone", "fast"), default="cyclone", help="their DDS library")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=4.0, help="duration of each flow in each round")
     parser.add_argument("--case", choices=CASES, action="append", help="repeatable; default: all cases")
@@ -143,8 +145,9 @@ def main():
                         help="run the programs on these CPUs; with --cpus the rounds differ less")
     parser.add_argument("--json", help="also write every round to this file")
     options = parser.parse_args()
-    if not PEER.exists():
-        sys.exit(f"{PEER} is not built: run `make peers`")
+    program = PEERS / f"{options.peers}_peer"
+    if not program.exists():
+        sys.exit(f"{program} is not built: run `make peers`")
     rounds = {}
     with tempfile.TemporaryDirectory() as folder:
         builds = [
@@ -161,7 +164,7 @@ def main():
                     row = {}
                     for build in flows[turn:] + flows[:turn]:
                         name = build.name if build else "direct"
-                        row[name] = measure(build, rate_hz, size, options.seconds, options.peer_cpus)
+                        row[name] = measure(program, build, rate_hz, size, options.seconds, options.peer_cpus)
                     rounds[case].append(row)
         finally:
             for build in builds:
