@@ -8,6 +8,7 @@
 mod control;
 mod count_log;
 mod egress;
+mod heap;
 mod in_force;
 mod ingress;
 mod lane_override;
