@@ -104,6 +104,8 @@ pub(crate) struct Hooks {
   pub max_unfinished_bytes: Option<usize>,
   /// See `DomainParticipantBuilder::continuing`.
   pub identity: Option<ParticipantIdentity>,
+  /// See `DomainParticipantBuilder::with_discovery_journal`.
+  pub journal: Vec<u8>,
   /// Those of the participant.
   pub numbers: Arc<UsedNumbers>,
 }

@@ -35,6 +35,7 @@ use crate::{
   discovery::{
     discovery::{Discovery, DiscoveryCommand},
     discovery_db::{discovery_db_read, DiscoveryDB},
+    journal,
     sedp_messages::{DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData},
     MAX_PARTICIPANT_USER_DATA,
   },
@@ -192,6 +193,15 @@ impl DomainParticipantBuilder {
   pub fn continuing(mut self, identity: ParticipantIdentity) -> Self {
     self.hooks.numbers = Arc::new(UsedNumbers::after(&identity));
     self.hooks.identity = Some(identity);
+    self
+  }
+
+  /// Knows from the start what a former participant of the same identity knew of others: its
+  /// [`DomainParticipant::discovery_journal`]. It is read as what comes from the network, and
+  /// the participant can't be built if any of it is not sound. Readers that do not announce
+  /// themselves within 10 s are forgotten.
+  pub fn with_discovery_journal(mut self, journal: Vec<u8>) -> Self {
+    self.hooks.journal = journal;
     self
   }
 
@@ -399,6 +409,11 @@ impl DomainParticipantBuilder {
       candidate_participant_guid
     };
 
+    let journal = std::mem::take(&mut self.hooks.journal);
+    let Some(known) = journal::read(&journal, participant_guid.prefix) else {
+      return create_error_bad_parameter!("a journal of {} bytes is not sound", journal.len());
+    };
+
     trace!("DomainParticipant construct start");
 
     // Discovery join channel is used to just send a join handle into the inner
@@ -499,6 +514,7 @@ impl DomainParticipantBuilder {
           discovery_waker,
           discovery_sample_receiver,
         ) {
+          discovery.known = known;
           discovery.discovery_event_loop(); // run the event loop
         }
       })?;
@@ -668,6 +684,14 @@ impl DomainParticipant {
   /// has not the port that goes with the participant id.
   pub fn identity(&self) -> Option<ParticipantIdentity> {
     self.dpi.lock().ok()?.dpi.identity()
+  }
+
+  /// The participants that discovery knows, and their readers of topics that this one has, for
+  /// [`DomainParticipantBuilder::with_discovery_journal`]. The same knowledge gives the same
+  /// bytes.
+  pub fn discovery_journal(&self) -> Vec<u8> {
+    let own = self.guid().prefix;
+    journal::write(&discovery_db_read(&self.discovery_db()), own)
   }
 
   /// Lets the event loop turn once, with a call of the hook that was given to
