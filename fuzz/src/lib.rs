@@ -344,6 +344,13 @@ pub fn rtps_discovery(bytes: &[u8]) {
         false => RepresentationIdentifier::PL_CDR_LE,
     };
     fuzzing::read_discovery(parameters, encoding);
+    // As a journal that has one record, of a participant or of a reader; and as a whole journal.
+    let length = u32::try_from(parameters.len()).unwrap_or(u32::MAX).to_le_bytes();
+    for kind in [1, 2] {
+        let journal = [&[kind][..], &length, parameters].concat();
+        assert!(fuzzing::read_journal(&journal).unwrap_or(0) <= 1);
+    }
+    fuzzing::read_journal(bytes);
 }
 
 /// A probe request or a response: the low byte of its representation identifier, and its payload.

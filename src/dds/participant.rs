@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::pin::pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
@@ -15,6 +16,7 @@ use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
 use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
+use super::identity::{ParticipantIdentity, WriterContinuation};
 use super::network;
 use super::qos::{self, ReaderQos};
 use super::reader::RawReader;
@@ -51,6 +53,8 @@ pub struct Participant {
     /// First, because fields are dropped in this order and the library requires that writers are dropped
     /// first.
     graph: RawWriter,
+    /// The highest sequence number of `graph`.
+    graph_number: Arc<AtomicI64>,
     listener: DomainParticipantStatusListener,
     /// Called for the first change after `poll_discovery` has found none.
     discovery_waker: Waker,
@@ -91,6 +95,9 @@ const GRAPH_READER_QOS: ReaderQos = ReaderQos {
 /// The most unacknowledged graph entries; one is written for each endpoint that is created or dropped.
 const GRAPH_WINDOW_SAMPLES: usize = 1024;
 
+/// A part of the entity id of the writer of graph entries, which is the same in each process.
+const GRAPH_KEY: [u8; 3] = [0xff; 3];
+
 /// An eighth of the shortest time of a watchdog. A check wakes two threads, and housekeeping runs up to 100
 /// times a second.
 const CHECK_TURNS_MS: u64 = 250;
@@ -102,7 +109,23 @@ impl Participant {
     /// The DDS library cannot open its sockets. An absent interface is no error: it is used as soon as the
     /// host has it.
     pub fn open(options: &ParticipantOptions) -> Result<Self, DdsError> {
-        Self::build(options, |builder| builder)
+        Self::build(options, 0, |builder| builder)
+    }
+
+    /// Like [`open`](Self::open), as the participant of a killed process with that identity: others take both
+    /// for the same one. `journal` is the [`discovery_journal`](Self::discovery_journal) of the other
+    /// process, which is read as what comes from the network.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open); a port of the identity is taken, or the journal is not sound as a whole.
+    pub fn open_continuing(
+        options: &ParticipantOptions,
+        identity: ParticipantIdentity,
+        journal: Vec<u8>,
+    ) -> Result<Self, DdsError> {
+        Self::build(options, identity.highest_number, |builder| {
+            builder.continuing(identity.to_rustdds()).with_discovery_journal(journal)
+        })
     }
 
     /// Like [`open`](Self::open), but the thread that receives calls `on_received` after each datagram,
@@ -128,7 +151,7 @@ impl Participant {
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        Self::build(options, |builder| {
+        Self::build(options, 0, |builder| {
             let builder = builder.with_max_unfinished_bytes(max_unfinished_bytes);
             let builder = builder.with_urgent_topics(urgent_topics);
             builder.on_sample_arriving(on_arriving).on_received(on_received)
@@ -137,6 +160,7 @@ impl Participant {
 
     fn build(
         options: &ParticipantOptions,
+        graph_number: i64,
         extend: impl FnOnce(DomainParticipantBuilder) -> DomainParticipantBuilder,
     ) -> Result<Self, DdsError> {
         let mut builder = DomainParticipantBuilder::new(options.network.domain_id);
@@ -158,12 +182,20 @@ impl Participant {
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
         let listener = participant.status_listener();
         let (waker, discovery_woken) = sync_channel(1);
+        let number = Arc::new(AtomicI64::new(graph_number));
+        let told = Arc::clone(&number);
+        let continuation = WriterContinuation {
+            key: GRAPH_KEY,
+            highest_number: graph_number,
+            on_number: Box::new(move |number| told.store(number, Ordering::Relaxed)),
+        };
         let graph = make_writer(
             &participant,
             &publisher,
             graph::TOPIC,
             graph::TYPE,
             qos::of_writer(&GRAPH_QOS, GRAPH_WINDOW_SAMPLES),
+            Some(continuation),
         )?;
         let network_counters = participant.network_counters();
         let opened = Self {
@@ -175,6 +207,7 @@ impl Participant {
             discovery_woken,
             participants_gone: Cell::new(0),
             graph,
+            graph_number: number,
             namespace: options.namespace.clone(),
             node_name: options.node_name.clone(),
             graph_gid_bytes: options.graph_gid_bytes,
@@ -191,6 +224,19 @@ impl Participant {
     /// Its GUID.
     pub fn guid(&self) -> Guid {
         Guid(self.participant.guid().to_bytes())
+    }
+
+    /// What a later process needs to [continue](Self::open_continuing) the participant; `None` if that cannot
+    /// be done, because a port is not the one that goes with the participant id.
+    pub fn identity(&self) -> Option<ParticipantIdentity> {
+        let graph_number = self.graph_number.load(Ordering::Relaxed);
+        let identity = self.participant.identity()?;
+        Some(ParticipantIdentity::from_rustdds(identity, graph_number, self.guid()))
+    }
+
+    /// What discovery knows of other participants and of their readers of this one's topics.
+    pub fn discovery_journal(&self) -> Vec<u8> {
+        self.participant.discovery_journal()
     }
 
     /// Makes the thread that receives call `on_received` of [`open_receiving`](Self::open_receiving) once.
@@ -358,7 +404,24 @@ impl Participant {
         writer_qos: &QosProfile,
         window_samples: usize,
     ) -> Result<RawWriter, DdsError> {
-        self.add_writer(topic, dds_type.into(), qos::of_writer(writer_qos, window_samples))
+        let policies = qos::of_writer(writer_qos, window_samples);
+        self.add_writer(topic, dds_type.into(), policies, None)
+    }
+
+    /// Like [`create_writer`](Self::create_writer), for a writer that continues one of a killed process.
+    ///
+    /// # Errors
+    /// The DDS library cannot create it.
+    pub fn create_writer_continuing(
+        &mut self,
+        topic: &str,
+        dds_type: DdsType<'_>,
+        writer_qos: &QosProfile,
+        window_samples: usize,
+        continuation: WriterContinuation,
+    ) -> Result<RawWriter, DdsError> {
+        let policies = qos::of_writer(writer_qos, window_samples);
+        self.add_writer(topic, dds_type, policies, Some(continuation))
     }
 
     /// Like [`create_writer`](Self::create_writer), but [`RawWriter::write`] of a KEEP_ALL writer waits up to
@@ -376,7 +439,7 @@ impl Participant {
         max_blocking: Duration,
     ) -> Result<RawWriter, DdsError> {
         let policies = qos::of_blocking_writer(writer_qos, window_samples, max_blocking);
-        self.add_writer(topic, dds_type.into(), policies)
+        self.add_writer(topic, dds_type.into(), policies, None)
     }
 
     fn add_writer(
@@ -384,8 +447,10 @@ impl Participant {
         topic: &str,
         dds_type: DdsType<'_>,
         policies: QosPolicies,
+        continuation: Option<WriterContinuation>,
     ) -> Result<RawWriter, DdsError> {
-        let writer = make_writer(&self.participant, &self.publisher, topic, dds_type, policies)?;
+        let writer =
+            make_writer(&self.participant, &self.publisher, topic, dds_type, policies, continuation)?;
         self.writers.push(writer.guid());
         self.publish_graph_entry();
         Ok(writer)
@@ -481,12 +546,19 @@ fn make_writer(
     topic: &str,
     dds_type: DdsType<'_>,
     policies: QosPolicies,
+    continuation: Option<WriterContinuation>,
 ) -> Result<RawWriter, DdsError> {
     let made_topic = make_topic(participant, topic, dds_type, &policies)?;
     let policies = policies.with_user_data(qos::user_data(dds_type.hash));
-    let inner = publisher
-        .create_datawriter_raw(&made_topic, Some(policies))
-        .map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
+    let inner = match continuation {
+        None => publisher.create_datawriter_raw(&made_topic, Some(policies)),
+        Some(continuation) => publisher.create_datawriter_raw_continuing(
+            &made_topic,
+            Some(policies),
+            continuation.into_rustdds(),
+        ),
+    };
+    let inner = inner.map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
     let guid = Guid(inner.guid().to_bytes());
     Ok(RawWriter { inner, guid })
 }

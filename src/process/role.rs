@@ -11,7 +11,7 @@ use super::scheduling;
 use crate::clock;
 use crate::config::{Configuration, DdsNetwork, Scheduling, Settings};
 use crate::dds::{DdsError, Participant, ParticipantOptions};
-use crate::model::{Guid, MonotonicNs, NetworkRefusals, ProcessHealth};
+use crate::model::{MonotonicNs, NetworkRefusals, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
 use crate::telemetry;
 
@@ -62,8 +62,8 @@ pub(super) struct Role {
     reloads: Reloads,
     health: BoardWriter<ProcessHealth>,
     pub notifier: Notifier,
-    /// The participant of the former process; all zero for none, and once it is disposed of.
-    former_participant: Guid,
+    /// What the former process wrote last; its participant is all zero once it is disposed of.
+    pub former: ProcessHealth,
     freed_memory: FreedMemory,
     /// The last field, so that the lock is released only after everything else is dropped.
     _lock: RoleLock,
@@ -96,7 +96,7 @@ impl Role {
         let boards = node.boards(&BridgeShape::of(settings))?;
         let mut health = boards.health_writer(role);
         let now = clock::monotonic();
-        let former_participant = health.get().participant;
+        let former = *health.get();
         health.update(|health| {
             let starts = health.starts + 1;
             *health = ProcessHealth {
@@ -114,7 +114,7 @@ impl Role {
             reloads,
             health,
             notifier: Notifier::new(),
-            former_participant,
+            former,
             freed_memory: FreedMemory::default(),
             _lock: lock,
         })
@@ -124,9 +124,17 @@ impl Role {
     /// that process's participant, so that the others remove it.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
-        self.dispose_former(&participant);
-        self.record_participant(&participant);
+        self.adopt(&participant);
         Ok(participant)
+    }
+
+    /// Like [`join`](Self::join), of a participant that is open. It may be the one of the former process,
+    /// which is not disposed of then.
+    pub fn adopt(&mut self, participant: &Participant) {
+        if participant.guid() != self.former.participant {
+            self.dispose_former(participant);
+        }
+        self.record_participant(participant);
     }
 
     /// Like [`join`](Self::join), with callbacks for the receiving thread; see
@@ -154,7 +162,7 @@ impl Role {
     /// Announces to the other participants, once, that the participant of a killed former process is gone. A
     /// writer then releases the samples that only the former process had not acknowledged.
     pub fn dispose_former(&mut self, participant: &Participant) {
-        participant.dispose_participant(std::mem::take(&mut self.former_participant));
+        participant.dispose_participant(std::mem::take(&mut self.former.participant));
     }
 
     /// Writes the participant to the health board, for a successor that has to dispose of it.

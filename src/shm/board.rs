@@ -20,10 +20,10 @@ use super::segment::Segment;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
-    AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneName,
-    LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
+    AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneIdentity,
+    LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
     MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord, ProcessHealth,
-    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, fnv1a,
+    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, WriterIdentity, fnv1a,
 };
 
 /// The lanes and routes for which the boards have room. It must be the same in all processes of an instance.
@@ -77,7 +77,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 10;
+const LAYOUT_VERSION: u32 = 11;
 /// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
@@ -102,6 +102,9 @@ struct Layout {
     publisher: usize,
     lane: usize,
     output_readers: usize,
+    lane_identity: usize,
+    writer_identity: usize,
+    sent_number: usize,
     histograms: usize,
     words: usize,
 }
@@ -133,6 +136,9 @@ impl Layout {
             publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
             lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
             output_readers: next(lanes * routes * Cell::<OutputReaders>::WORDS),
+            lane_identity: next(lanes * Cell::<LaneIdentity>::WORDS),
+            writer_identity: next(lanes * routes * Cell::<WriterIdentity>::WORDS),
+            sent_number: next(lanes * routes * LINE),
             histograms: next(routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE)),
             words: end,
         }
@@ -245,6 +251,11 @@ boards! {
     /// The readers that are matched with a lane's output of a route.
     output_readers, output_readers_writer(lane: usize, route: usize): OutputReaders =
         |layout| layout.output(lane, route);
+    /// The identity of the participant of a lane's process.
+    lane_identity, lane_identity_writer(lane: usize): LaneIdentity = |layout| layout.check_lane(lane);
+    /// The identity of the DDS writer of a lane's output of a route.
+    writer_identity, writer_identity_writer(lane: usize, route: usize): WriterIdentity =
+        |layout| layout.output(lane, route);
 }
 
 /// All boards of an instance.
@@ -319,6 +330,12 @@ impl Boards {
     pub fn policies(&self) -> Result<Policies<'_>, ShmError> {
         let lock = FileLock::take_soon(&self.policy_lock, FlockArg::LockExclusiveNonblock)?;
         Ok(Policies { boards: self, _lock: lock })
+    }
+
+    /// The highest sequence number of the DDS writer of a lane's output of a route. One process at a time.
+    pub fn sent_number(&self, lane: usize, route: usize) -> SentNumber {
+        let at = self.layout.sent_number + self.layout.output(lane, route) * LINE;
+        SentNumber { segment: self.segment.clone(), at }
     }
 
     /// The waker of a lane, for ingress.
@@ -410,6 +427,25 @@ pub fn write_rows<T: Plain + PartialEq>(writers: &mut [BoardWriter<T>], rows: im
     writers.iter_mut().zip(rows).for_each(|(writer, row)| writer.set(row));
 }
 
+/// The highest sequence number of a DDS writer. A store is that of one word, before the number is sent.
+#[derive(Clone, Debug)]
+pub struct SentNumber {
+    segment: Arc<Segment>,
+    at: usize,
+}
+
+impl SentNumber {
+    /// The number.
+    pub fn get(&self) -> i64 {
+        self.segment.word(self.at).load(Ordering::Acquire).cast_signed()
+    }
+
+    /// Sets the number.
+    pub fn set(&self, number: i64) {
+        self.segment.word(self.at).store(number.cast_unsigned(), Ordering::Release);
+    }
+}
+
 /// The only writer of a histogram.
 #[derive(Debug)]
 pub struct HistogramWriter {
@@ -449,6 +485,7 @@ mod tests {
             found.push((layout.wake(lane), LINE));
             found.push(place(layout.health(ProcessRole::Egress(lane))));
             found.push(place(layout.policy(lane)));
+            found.push(place(layout.lane_identity(lane)));
         }
         found.extend((0..MAX_SUBSCRIBERS).map(|index| place(layout.subscriber(index))));
         found.extend((0..MAX_INTRUDERS).map(|index| place(layout.intruder(index))));
@@ -464,6 +501,8 @@ mod tests {
             for lane in 0..lanes {
                 found.push(place(layout.lane(lane, route)));
                 found.push(place(layout.output_readers(lane, route)));
+                found.push(place(layout.writer_identity(lane, route)));
+                found.push((layout.sent_number + layout.output(lane, route) * LINE, LINE));
                 stages.extend([Stage::Shm(lane), Stage::DdsOut(lane), Stage::Age(lane)]);
             }
             let words = size_of::<LatencyHistogram>().div_ceil(8).next_multiple_of(LINE);

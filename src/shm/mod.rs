@@ -6,6 +6,7 @@
 //! - [`PoolBudget`]: the shared memory that the pools of all routes may take.
 //! - [`LaneWaker`], [`LaneSleeper`]: ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
+//! - [`Journal`]: what the process of a lane has discovered, for the next one.
 //! - [`RoleLock`]: lets at most one process serve a role; [`RoleHolder`]: names that process.
 //! - [`InForceShare`]: the configuration in force, which exists as long as any process of the bridge runs.
 //!
@@ -19,6 +20,7 @@ mod channel;
 mod error;
 mod header;
 mod in_force;
+mod journal;
 mod lock;
 mod membership;
 mod node;
@@ -32,13 +34,14 @@ mod subscriber;
 mod wake;
 
 pub use board::{
-    BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
+    BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, SentNumber, Stage, write_rows,
 };
 pub use budget::{DEFAULT_BUDGET_BYTES, NoMemory, PoolBudget, PoolUse, budget_bytes};
 pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::HeaderError;
 pub use in_force::{BridgeAddress, InForceFile, InForceShare};
+pub use journal::Journal;
 pub use node::{CleanUp, ShmNode};
 pub use pool_view::{PoolPayload, PoolView};
 pub use publisher::{LentSlot, LoanError, PublishError, SamplePublisher, Slot};

@@ -13,6 +13,7 @@ mod fragments;
 mod hangs;
 mod hostile;
 mod hostile_readers;
+mod identity;
 mod interop;
 mod intruders;
 mod keyed;

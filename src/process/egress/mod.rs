@@ -11,6 +11,7 @@ mod early_send;
 mod former_readers;
 mod gaps;
 mod history;
+mod identity;
 mod late_joiners;
 pub(super) mod memory;
 mod noncritical;
@@ -36,6 +37,7 @@ use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, Monotonic
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use arena::CopyArena;
+use identity::Identity;
 use noncritical::Noncritical;
 use output::Output;
 
@@ -53,6 +55,9 @@ const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 /// How often a lane checks whether the DDS library has sent the samples that it accepted. The library's
 /// thread takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
+
+/// How long a lane that continues its former participant waits for its readers before the first sample.
+const FORMER_READERS_MS: u64 = 200;
 
 /// What the lane does after a turn.
 enum Turn {
@@ -109,6 +114,8 @@ struct Egress {
     /// For each output, how many before it have a higher priority.
     more_urgent: Vec<usize>,
     participant: Participant,
+    /// `None` if the lane does not keep its identity.
+    identity: Option<Identity>,
     role: Role,
     /// Chooses which samples to send, and when; `None` in a critical lane.
     noncritical: Option<Noncritical>,
@@ -133,13 +140,16 @@ impl Egress {
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
-        let mut participant = role.join(&options)?;
+        let (mut participant, identity, is_continued) = Identity::join(&mut role, settings, index, &options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;
         for output in &lane.outputs {
             more_urgent.push(lane.outputs.partition_point(|other| priority(other) > priority(output)));
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
+        }
+        if is_continued {
+            await_former_readers(&mut outputs);
         }
         let now = clock::monotonic();
         let noncritical = match &lane.forwarding {
@@ -161,6 +171,7 @@ impl Egress {
             },
             role,
             participant,
+            identity,
             outputs,
             more_urgent,
             noncritical,
@@ -263,7 +274,9 @@ impl Egress {
 
     fn housekeeping(&mut self, now: MonotonicNs) {
         let mut gone = Vec::new();
+        let mut discovery_changed = false;
         while let Some(change) = self.participant.poll_discovery() {
+            discovery_changed = true;
             if matches!(change, Discovery::ReaderGone(_) | Discovery::ParticipantGone { .. }) {
                 gone.push(change);
             }
@@ -274,6 +287,10 @@ impl Egress {
             if !gone.is_empty() {
                 output.forget_unmatched(|reader| gone.iter().any(|change| takes_away(change, reader)));
             }
+        }
+        if let Some(identity) = &mut self.identity {
+            let may_be_kept = self.outputs.iter().all(Output::may_be_continued);
+            identity.housekeeping(&self.participant, discovery_changed, may_be_kept, now);
         }
         if let Some(lane) = &mut self.noncritical
             && self
@@ -327,6 +344,9 @@ impl Egress {
             let last_at = began_at.plus_ms(LAST_SAMPLES_MS);
             while clock::monotonic() < last_at && matches!(self.turn(), Turn::Busy) {}
         }
+        if let Some(identity) = &mut self.identity {
+            identity.end();
+        }
         let give_up_at = began_at.plus_ms(LAST_SAMPLES_MS + LAST_ACKNOWLEDGEMENTS_MS);
         for output in &mut self.outputs {
             let timeout = Duration::from_nanos(give_up_at.since(clock::monotonic()));
@@ -347,6 +367,22 @@ impl Egress {
             // The next process counts as unconfirmed what is not acknowledged now.
             output.record_readers(clock::monotonic());
         }
+    }
+}
+
+/// Waits until the readers of the former process, which know the writers, are matched on this side as well:
+/// what is written before counts as without a reader. The library does that on threads of its own.
+fn await_former_readers(outputs: &mut [Output]) {
+    let give_up_at = clock::monotonic().plus_ms(FORMER_READERS_MS);
+    loop {
+        let now = clock::monotonic();
+        let missing =
+            outputs.iter_mut().filter_map(|output| (!output.has_former_readers_back(now)).then_some(()));
+        if missing.count() == 0 || now >= give_up_at {
+            return;
+        }
+        #[allow(clippy::disallowed_methods, reason = "the lane starts")]
+        std::thread::sleep(Duration::from_millis(1));
     }
 }
 

@@ -13,9 +13,10 @@ use super::early_send::{EarlySend, Followed};
 use super::former_readers::FormerReaders;
 use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
+use super::identity::WriterRecord;
 use super::offer::{Offer, RouteDurability};
 use super::overrun::{Overrun, log_left};
-use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded};
+use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded, record_sequence};
 use crate::clock;
 use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter, WriterEvent};
@@ -69,6 +70,8 @@ pub(super) struct Output {
     readers: BoardWriter<OutputReaders>,
     overrun: Overrun,
     former_readers: FormerReaders,
+    /// `None` if the lane does not keep its identity.
+    record: Option<WriterRecord>,
     /// The publisher of the last sample taken.
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
@@ -148,6 +151,7 @@ impl Output {
             readers,
             overrun: Overrun::default(),
             former_readers,
+            record: WriterRecord::of(role, participant, lane_index, output.route),
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
             started_at: clock::monotonic(),
@@ -587,12 +591,6 @@ impl Output {
         }
         history.add(publisher, kept, self.writer.as_ref(), || present_publishers(&self.boards, self.route));
     }
-}
-
-/// Records the sequence numbers that are accounted for, up to the last sample taken.
-fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
-    counters.first_sequence = tracker.first();
-    counters.last_sequence = tracker.last();
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@
 use std::collections::VecDeque;
 
 use crate::model::{LaneCounters, MonotonicNs};
+use crate::policy::SequenceTracker;
 
 /// A sample that waits to be sent, with what its account needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,6 +72,12 @@ pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
     counters.by_reference += u64::from(sample.by_reference);
     counters.caught_up += u64::from(sample.caught_up);
     counters.last_forwarded_at = sample.written_at;
+}
+
+/// Records the sequence numbers that are accounted for, up to the last sample taken.
+pub(super) fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTracker) {
+    counters.first_sequence = tracker.first();
+    counters.last_sequence = tracker.last();
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ pub(crate) mod content_filter_property;
 #[allow(clippy::module_inception)]
 pub(crate) mod discovery;
 pub(crate) mod discovery_db;
+pub(crate) mod journal;
 
 #[cfg(feature = "security")]
 pub(crate) mod secure_discovery;

@@ -73,6 +73,11 @@ pub fn read_discovery(bytes: &[u8], encoding: RepresentationIdentifier) -> usize
   .count()
 }
 
+/// Reads what a former participant knew. How many records it has, if it is sound.
+pub fn read_journal(bytes: &[u8]) -> Option<usize> {
+  crate::discovery::journal::read(bytes, GuidPrefix::new(&RECEIVER)).map(|known| known.len())
+}
+
 /// Lets a participant receive datagrams. Its reader 000001.07, RELIABLE or not,
 /// has matched the writer 000001.02 of [`SENDER`], and its RELIABLE writer
 /// 000002.02, which has sent a sample of 79 fragments and a small one, the reader

@@ -240,7 +240,10 @@ pub use polling::ThreadTurns;
 pub use network_counts::{NetworkCounters, NetworkCounts};
 /// What a datagram claims to hold, for one who looks at it.
 pub use rtps::arriving::sample_arriving;
-pub use rtps::reader_progress::MatchedReader;
+pub use rtps::{
+  identity::{ContinuedWriter, ParticipantIdentity},
+  reader_progress::MatchedReader,
+};
 /// Part of RTPS DATA submessage: 4-byte header + serialized data
 pub use messages::submessages::elements::serialized_payload::SerializedPayload;
 pub use structure::{

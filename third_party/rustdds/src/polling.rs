@@ -20,7 +20,10 @@ use std::{
 
 use mio1::{Poll, Token, Waker};
 
-use crate::structure::guid::EntityId;
+use crate::{
+  rtps::identity::{ParticipantIdentity, UsedNumbers},
+  structure::guid::EntityId,
+};
 
 /// One waker for one `Poll`. Share clones freely. `wake` before [`install`](Self::install)
 /// is a no-op; the event loop drains its queues once after installing so anything
@@ -99,6 +102,12 @@ pub(crate) struct Hooks {
   pub user_data: Vec<u8>,
   /// See `DomainParticipantBuilder::with_max_unfinished_bytes`.
   pub max_unfinished_bytes: Option<usize>,
+  /// See `DomainParticipantBuilder::continuing`.
+  pub identity: Option<ParticipantIdentity>,
+  /// See `DomainParticipantBuilder::with_discovery_journal`.
+  pub journal: Vec<u8>,
+  /// Those of the participant.
+  pub numbers: Arc<UsedNumbers>,
 }
 
 /// Bounded queue whose send wakes `waker`'s poll.

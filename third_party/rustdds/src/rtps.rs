@@ -5,6 +5,7 @@ pub(crate) mod arriving;
 pub(crate) mod direct_send;
 pub(crate) mod dp_event_loop;
 pub(crate) mod fragment_assembler;
+pub(crate) mod identity;
 pub(crate) mod message_receiver;
 pub(crate) mod newcomers;
 pub(crate) mod outbound;

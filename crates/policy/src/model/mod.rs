@@ -8,6 +8,7 @@ mod counts;
 mod drops;
 mod hash;
 mod health;
+mod identity;
 mod modes;
 mod names;
 mod network;
@@ -34,6 +35,7 @@ pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_PUBLISHERS, ProcessHealth,
     PublisherAccount, RouteInfo,
 };
+pub use identity::{LaneIdentity, WriterIdentity};
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
 pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};

@@ -9,9 +9,20 @@ use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
 use super::Output;
 use crate::dds::{Participant, RawWriter};
-use crate::model::{DdsType, DropReason, Durability, Guid};
+use crate::model::{DdsType, DropReason, Durability, Guid, MonotonicNs};
 
 impl Output {
+    /// Whether the readers of its writer can be served by the next process as if nothing had happened.
+    pub fn may_be_continued(&self) -> bool {
+        self.offer.qos.durability == Durability::Volatile && !self.has_keys && !self.topic.is_place
+    }
+
+    /// Handles matches until all readers of the former process are matched; returns whether they are.
+    pub fn has_former_readers_back(&mut self, now: MonotonicNs) -> bool {
+        self.follow_matching(now);
+        self.former_readers.is_empty()
+    }
+
     /// Whether the publishers offer TRANSIENT_LOCAL and the output does not, though it follows them.
     pub(super) fn is_to_latch(&self) -> bool {
         self.durability.get() == Durability::TransientLocal && self.latched_offer.is_some()
@@ -61,6 +72,9 @@ impl Output {
         });
         self.overrun.count(&writer, &mut self.counters);
         self.overrun = Overrun::default();
+        if let Some(record) = &mut self.record {
+            record.removed();
+        }
         let guid = writer.guid();
         drop(writer);
         participant.remove_endpoint(guid);
@@ -135,7 +149,14 @@ impl Output {
         dds_type: DdsType,
     ) -> Result<(), RoleError> {
         let Offer { qos, window_samples, supersedes } = &self.offer;
-        let writer = participant.create_writer(&self.topic.dds_topic, dds_type, qos, *window_samples)?;
+        let topic = &self.topic.dds_topic;
+        let writer = match &mut self.record {
+            None => participant.create_writer(topic, dds_type, qos, *window_samples)?,
+            Some(record) => {
+                let continuation = record.next(participant.guid(), topic, &dds_type, qos);
+                participant.create_writer_continuing(topic, dds_type, qos, *window_samples, continuation)?
+            }
+        };
         info!(
             route = self.id,
             lane = self.lane,

@@ -35,6 +35,7 @@ use crate::{
   discovery::{
     discovery::{Discovery, DiscoveryCommand},
     discovery_db::{discovery_db_read, DiscoveryDB},
+    journal,
     sedp_messages::{DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData},
     MAX_PARTICIPANT_USER_DATA,
   },
@@ -50,6 +51,7 @@ use crate::{
   rtps::{
     constant::*,
     dp_event_loop::{DPEventLoop, DomainInfo, EventLoopCommand},
+    identity::{ParticipantIdentity, UsedNumbers},
     reader::*,
     writer::WriterIngredients,
   },
@@ -184,6 +186,25 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Takes over the identity of a participant whose process is gone: its GUID prefix, its
+  /// ports, and numbers after those that it used. The participant can't be built if a port is
+  /// taken. To others it is the same participant if its writers are the same, too; see
+  /// [`Publisher::create_datawriter_raw_continuing`].
+  pub fn continuing(mut self, identity: ParticipantIdentity) -> Self {
+    self.hooks.numbers = Arc::new(UsedNumbers::after(&identity));
+    self.hooks.identity = Some(identity);
+    self
+  }
+
+  /// Knows from the start what a former participant of the same identity knew of others: its
+  /// [`DomainParticipant::discovery_journal`]. It is read as what comes from the network, and
+  /// the participant can't be built if any of it is not sound. Readers that do not announce
+  /// themselves within 10 s are forgotten.
+  pub fn with_discovery_journal(mut self, journal: Vec<u8>) -> Self {
+    self.hooks.journal = journal;
+    self
+  }
+
   /// Enable/disable same-host communication over loopback (default: enabled).
   ///
   /// When enabled, the participant (a) additionally announces SPDP to the
@@ -296,6 +317,10 @@ impl DomainParticipantBuilder {
       );
     }
 
+    if let Some(identity) = self.hooks.identity.filter(|identity| !identity.is_valid()) {
+      return create_error_bad_parameter!("{identity:?} cannot be continued");
+    }
+
     // QosPolicies with possible security properties, otherwise default
     let participant_qos = QosPolicies {
       #[cfg(feature = "security")]
@@ -303,7 +328,10 @@ impl DomainParticipantBuilder {
       ..Default::default()
     };
 
-    let candidate_participant_guid = GUID::new_participant_guid();
+    let candidate_participant_guid = match &self.hooks.identity {
+      Some(identity) => GUID::new(GuidPrefix::new(&identity.prefix), EntityId::PARTICIPANT),
+      None => GUID::new_participant_guid(),
+    };
     #[cfg(not(feature = "security"))]
     let participant_guid = candidate_participant_guid;
     // If security plugins are present, security is enabled
@@ -379,6 +407,11 @@ impl DomainParticipantBuilder {
       sec_guid
     } else {
       candidate_participant_guid
+    };
+
+    let journal = std::mem::take(&mut self.hooks.journal);
+    let Some(known) = journal::read(&journal, participant_guid.prefix) else {
+      return create_error_bad_parameter!("a journal of {} bytes is not sound", journal.len());
     };
 
     trace!("DomainParticipant construct start");
@@ -481,6 +514,7 @@ impl DomainParticipantBuilder {
           discovery_waker,
           discovery_sample_receiver,
         ) {
+          discovery.known = known;
           discovery.discovery_event_loop(); // run the event loop
         }
       })?;
@@ -643,6 +677,21 @@ impl DomainParticipant {
   /// ```
   pub fn participant_id(&self) -> u16 {
     self.dpi.lock().unwrap().participant_id()
+  }
+
+  /// What another participant needs to [continue](DomainParticipantBuilder::continuing) this
+  /// one later, with the numbers used so far. `None` if that is not possible, because a socket
+  /// has not the port that goes with the participant id.
+  pub fn identity(&self) -> Option<ParticipantIdentity> {
+    self.dpi.lock().ok()?.dpi.identity()
+  }
+
+  /// The participants that discovery knows, and their readers of topics that this one has, for
+  /// [`DomainParticipantBuilder::with_discovery_journal`]. The same knowledge gives the same
+  /// bytes.
+  pub fn discovery_journal(&self) -> Vec<u8> {
+    let own = self.guid().prefix;
+    journal::write(&discovery_db_read(&self.discovery_db()), own)
   }
 
   /// Lets the event loop turn once, with a call of the hook that was given to
@@ -855,6 +904,10 @@ impl DomainParticipant {
 
   pub(crate) fn urgent_topics(&self) -> Arc<BTreeSet<String>> {
     Arc::clone(&self.dpi.lock().unwrap().dpi.urgent_topics)
+  }
+
+  pub(crate) fn numbers(&self) -> Arc<UsedNumbers> {
+    Arc::clone(&self.dpi.lock().unwrap().dpi.numbers)
   }
 
   /// The USER_DATA that discovery announces.
@@ -1417,6 +1470,7 @@ pub(crate) struct DomainParticipantInner {
   urgent_topics: Arc<BTreeSet<String>>,
   // Of the participant, for discovery.
   user_data: Vec<u8>,
+  numbers: Arc<UsedNumbers>,
   // Port of each listener, and whether it is one to multicast.
   listener_kinds: HashMap<mio1::Token, (u16, bool)>,
 
@@ -1495,13 +1549,15 @@ impl DomainParticipantInner {
       Err(e) => warn!("Cannot get multicast discovery listener: {e:?}"),
     }
 
-    let mut participant_id = 0;
+    let continued_id = hooks.identity.map(|identity| identity.participant_id);
+    let mut participant_id = continued_id.unwrap_or(0);
+    let last_participant_id = continued_id.unwrap_or(119);
 
     let mut discovery_listener = None;
 
-    // Magic value 120 below is from RTPS spec 2.5 Section "9.6.2.3 Default Port
+    // The value 119 above is from RTPS spec 2.5 Section "9.6.2.3 Default Port
     // Numbers"
-    while discovery_listener.is_none() && participant_id < 120 {
+    while discovery_listener.is_none() && participant_id <= last_participant_id {
       discovery_listener = UDPListener::new_unicast_with_buf_size(
         "0.0.0.0",
         spdp_well_known_unicast_port(domain_id, participant_id),
@@ -1546,7 +1602,7 @@ impl DomainParticipantInner {
       &interfaces,
     )
     .or_else(|e| {
-      if matches!(e.kind(), ErrorKind::AddrInUse) {
+      if matches!(e.kind(), ErrorKind::AddrInUse) && continued_id.is_none() {
         // If we do not get the preferred listening port,
         // try again, with "any" port number.
         UDPListener::new_unicast_with_buf_size(
@@ -1569,6 +1625,7 @@ impl DomainParticipantInner {
     listeners.insert(USER_TRAFFIC_LISTENER_TOKEN, user_traffic_listener);
 
     let user_data = std::mem::take(&mut hooks.user_data);
+    let numbers = Arc::clone(&hooks.numbers);
     let mut urgent_topics = std::mem::take(&mut hooks.urgent_topics);
     if !urgent_topics.is_empty() {
       let size = socket_receive_buffer_size;
@@ -1740,6 +1797,7 @@ impl DomainParticipantInner {
       self_locators,
       urgent_topics: Arc::new(urgent_topics),
       user_data,
+      numbers,
       listener_kinds,
       security_plugins_handle,
       only_networks,
@@ -1974,6 +2032,24 @@ impl DomainParticipantInner {
     self.domain_info.participant_id
   }
 
+  fn identity(&self) -> Option<ParticipantIdentity> {
+    let DomainInfo {
+      domain_participant_guid,
+      domain_id,
+      participant_id,
+    } = self.domain_info;
+    let port = user_traffic_unicast_port(domain_id, participant_id);
+    let listeners = &self.listener_kinds;
+    let has_port = listeners.get(&USER_TRAFFIC_LISTENER_TOKEN) == Some(&(port, false));
+    let has_other_port = listeners.contains_key(&URGENT_TRAFFIC_LISTENER_TOKEN);
+    (has_port && !has_other_port).then(|| ParticipantIdentity {
+      prefix: domain_participant_guid.prefix.bytes,
+      participant_id,
+      highest_count: self.numbers.highest_count(),
+      highest_number: self.numbers.highest_number().into(),
+    })
+  }
+
   pub fn discovered_topics(&self) -> Vec<DiscoveredTopicData> {
     let db = self.discovery_db.read().unwrap_or_else(|e| {
       panic!("RustDDS internal bug: DiscoveryDB is poisoned after a prior panic: {e:?}")
@@ -2063,13 +2139,92 @@ mod tests {
     rtps::{submessage::*, Message},
     serialization::CDRSerializerAdapter,
     structure::{
+      entity::RTPSEntity,
       guid::{EntityId, GUID},
       locator::Locator,
       sequence_number::{SequenceNumber, SequenceNumberSet},
     },
     test::{random_data::RandomData, test_domain::test_domain_id},
   };
-  use super::DomainParticipant;
+  use super::{DomainParticipant, DomainParticipantBuilder, ParticipantIdentity};
+
+  // The identity, once the participant has announced itself with a number above this one.
+  fn announced(participant: &DomainParticipant, number: i64) -> ParticipantIdentity {
+    loop {
+      let identity = participant.identity().unwrap();
+      if identity.highest_number > number {
+        return identity;
+      }
+      std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+  }
+
+  // In one process the former participant says goodbye, which is of no matter here.
+  #[test]
+  fn a_participant_continues_the_identity_of_a_former_one() {
+    let domain = test_domain_id(45);
+    let former = DomainParticipant::new(domain).unwrap();
+    let identity = announced(&former, 0);
+    assert_eq!(&identity.prefix, former.guid().prefix.as_ref());
+    let reserved = ParticipantIdentity {
+      highest_count: identity.highest_count + 10_000,
+      highest_number: identity.highest_number + 10_000,
+      ..identity
+    };
+    let continued = || DomainParticipantBuilder::new(domain).continuing(reserved).build();
+    assert!(continued().is_err(), "the ports are taken");
+    let guid = former.guid();
+    drop(former);
+
+    let after = continued().unwrap();
+    assert_eq!(after.guid(), guid);
+    let identity = announced(&after, reserved.highest_number);
+    assert_eq!(identity.participant_id, reserved.participant_id);
+    drop(after);
+
+    let beyond = ParticipantIdentity {
+      highest_count: i32::MAX - 1,
+      ..reserved
+    };
+    assert!(DomainParticipantBuilder::new(domain).continuing(beyond).build().is_err());
+  }
+
+  // A writer with a given entity id tells each number that it gives, the first one too.
+  #[test]
+  fn a_writer_continues_one_of_a_former_process() {
+    let domain = test_domain_id(46);
+    let participant = DomainParticipant::new(domain).unwrap();
+    let qos = QosPolicies::qos_none();
+    let topic = participant
+      .create_topic("t".to_string(), "t".to_string(), &qos, TopicKind::NoKey)
+      .unwrap();
+    let publisher = participant.create_publisher(&qos).unwrap();
+    let told = std::sync::Arc::new(std::sync::atomic::AtomicI64::new(0));
+    let continued = |highest_number| {
+      let told = std::sync::Arc::clone(&told);
+      crate::ContinuedWriter {
+        entity_key: [0xff, 1, 2],
+        highest_number,
+        on_number: Box::new(move |n| told.store(n, std::sync::atomic::Ordering::Relaxed)),
+      }
+    };
+    type Adapter = CDRSerializerAdapter<RandomData, LittleEndian>;
+    let create = |highest| {
+      publisher.create_datawriter_raw_continuing::<RandomData, Adapter>(
+        &topic,
+        None,
+        continued(highest),
+      )
+    };
+    assert!(create(-1).is_err());
+    assert!(create(i64::MAX).is_err());
+    let writer = create(99).unwrap();
+    assert_eq!(writer.guid().entity_id.entity_key, [0xff, 1, 2]);
+    assert_eq!(writer.guid().prefix, participant.guid().prefix);
+    let data = RandomData { a: 1, b: "b".to_string() };
+    writer.write(data, None).unwrap();
+    assert_eq!(told.load(std::sync::atomic::Ordering::Relaxed), 100);
+  }
 
   // TODO: improve basic test when more or the structure is known
   #[test]

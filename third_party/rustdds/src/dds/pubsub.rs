@@ -10,7 +10,7 @@ use byteorder::LittleEndian;
 use log::{debug, error, info, trace, warn};
 
 use crate::{
-  create_error_dropped, create_error_poisoned,
+  create_error_bad_parameter, create_error_dropped, create_error_poisoned,
   dds::{
     adapters,
     key::Keyed,
@@ -34,8 +34,8 @@ use crate::{
   mio_source,
   polling::{wake_channel, BoundSender, Doorbell, ReadySender, WakeSender},
   rtps::{
-    constant::DEFAULT_WRITER_MAX_SAMPLES, reader::ReaderIngredients, writer::WriterIngredients,
-    writer_send_buffer::WriterSendBuffer,
+    constant::DEFAULT_WRITER_MAX_SAMPLES, identity::ContinuedWriter, reader::ReaderIngredients,
+    writer::WriterIngredients, writer_send_buffer::WriterSendBuffer,
   },
   serialization::{CDRDeserializerAdapter, CDRSerializerAdapter},
   structure::{
@@ -179,7 +179,7 @@ impl Publisher {
   {
     self
       .inner_lock()
-      .create_datawriter(self, None, topic, qos, false)
+      .create_datawriter(self, None, topic, qos, false, None)
   }
 
   /// Shorthand for crate_datawriter with Common Data Representation Little
@@ -232,7 +232,7 @@ impl Publisher {
   {
     self
       .inner_lock()
-      .create_datawriter_no_key(self, None, topic, qos, false)
+      .create_datawriter_no_key(self, None, topic, qos, false, None)
   }
 
   /// A writer for a topic of either kind, with keys or without, that encodes payloads
@@ -246,13 +246,30 @@ impl Publisher {
   where
     SA: adapters::no_key::SerializerAdapter<D>,
   {
-    let kind = match topic.kind() {
-      TopicKind::WithKey => EntityKind::WRITER_WITH_KEY_USER_DEFINED,
-      TopicKind::NoKey => EntityKind::WRITER_NO_KEY_USER_DEFINED,
-    };
     let inner = self.inner_lock();
-    let entity_id = inner.unwrap_or_new_entity_id(None, kind)?;
-    inner.create_datawriter_no_key(self, Some(entity_id), topic, qos, false)
+    let entity_id = inner.unwrap_or_new_entity_id(None, writer_kind(topic))?;
+    inner.create_datawriter_no_key(self, Some(entity_id), topic, qos, false, None)
+  }
+
+  /// As [`create_datawriter_raw`](Self::create_datawriter_raw), for a writer that continues
+  /// one of a former process. Of a participant that was built with
+  /// [`continuing`](crate::DomainParticipantBuilder::continuing), the readers that were matched
+  /// with that one stay matched if topic, type, and QoS are the same.
+  pub fn create_datawriter_raw_continuing<D, SA>(
+    &self,
+    topic: &Topic,
+    qos: Option<QosPolicies>,
+    continued: ContinuedWriter,
+  ) -> CreateResult<NoKeyDataWriter<D, SA>>
+  where
+    SA: adapters::no_key::SerializerAdapter<D>,
+  {
+    if !(0..i64::MAX / 2).contains(&continued.highest_number) {
+      return create_error_bad_parameter!("highest number {}", continued.highest_number);
+    }
+    let entity_id = EntityId::new(continued.entity_key, writer_kind(topic));
+    let inner = self.inner_lock();
+    inner.create_datawriter_no_key(self, Some(entity_id), topic, qos, false, Some(continued))
   }
 
   pub fn create_datawriter_no_key_cdr<D>(
@@ -281,7 +298,7 @@ impl Publisher {
   {
     self
       .inner_lock()
-      .create_datawriter(self, Some(entity_id), topic, qos, writer_like_stateless)
+      .create_datawriter(self, Some(entity_id), topic, qos, writer_like_stateless, None)
   }
 
   #[cfg(feature = "security")] // to avoid "never used" warning
@@ -301,6 +318,7 @@ impl Publisher {
       topic,
       qos,
       writer_like_stateless,
+      None,
     )
   }
 
@@ -445,6 +463,13 @@ impl Debug for Publisher {
 
 // "Inner" struct
 
+fn writer_kind(topic: &Topic) -> EntityKind {
+  match topic.kind() {
+    TopicKind::WithKey => EntityKind::WRITER_WITH_KEY_USER_DEFINED,
+    TopicKind::NoKey => EntityKind::WRITER_NO_KEY_USER_DEFINED,
+  }
+}
+
 #[derive(Clone)]
 struct InnerPublisher {
   id: EntityId,
@@ -499,6 +524,7 @@ impl InnerPublisher {
     topic: &Topic,
     optional_qos: Option<QosPolicies>,
     writer_like_stateless: bool, // Create a stateless-like RTPS writer? Usually false
+    continued: Option<ContinuedWriter>,
   ) -> CreateResult<WithKeyDataWriter<D, SA>>
   where
     D: Keyed,
@@ -580,7 +606,14 @@ impl InnerPublisher {
       window_limit,
       backlog_limit,
       max_retain,
-    );
+    )
+    .numbered_with(dp.numbers());
+    let send_buffer = match continued {
+      Some(ContinuedWriter { highest_number, on_number, .. }) => {
+        send_buffer.continue_after(highest_number.into(), on_number)
+      }
+      None => send_buffer,
+    };
     // A KEEP_LAST writer never waits for a reader: what DDS calls KEEP_LAST is that
     // the oldest sample gives way (DDS v1.4 Section 2.2.3.18). The resource limit
     // bounds what is retained for repairs.
@@ -753,6 +786,7 @@ impl InnerPublisher {
     topic: &Topic,
     qos: Option<QosPolicies>,
     writer_like_stateless: bool, // Create a stateless-like RTPS writer? Usually false
+    continued: Option<ContinuedWriter>,
   ) -> CreateResult<NoKeyDataWriter<D, SA>>
   where
     SA: adapters::no_key::SerializerAdapter<D>,
@@ -765,6 +799,7 @@ impl InnerPublisher {
       topic,
       qos,
       writer_like_stateless,
+      continued,
     )?;
     Ok(NoKeyDataWriter::<D, SA>::from_keyed(d))
   }

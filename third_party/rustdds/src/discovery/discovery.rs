@@ -29,6 +29,7 @@ use crate::{
     discovery_db::{
       discovery_db_read, discovery_db_write, DiscoveredVia, DiscoveryDB, ParticipantUpdate,
     },
+    journal::Known,
     sedp_messages::{
       DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData,
       ParticipantMessageData, ParticipantMessageDataKind,
@@ -217,6 +218,8 @@ enum DiscoveryTimerEvent {
   AnswerParticipants,
   // Enumerates the interfaces anew.
   FollowInterfaces,
+  // Those that are left of `unconfirmed`.
+  DropUnconfirmed,
   ParticipantCleanup,
   TopicCleanup,
   PublishParticipantMessage,
@@ -282,6 +285,10 @@ pub(crate) struct Discovery {
 
   // Participants that are new, to be told of this one when the timer ends.
   unanswered: Vec<GuidPrefix>,
+  // What a former participant of the same identity knew, for the start of the loop.
+  pub(crate) known: Vec<Known>,
+  // The readers of those that have not been announced to this one.
+  unconfirmed: BTreeSet<GUID>,
   // Participants whose lease has ended lately, and when it did.
   silent: Vec<(GuidPrefix, std::time::Instant)>,
 
@@ -373,6 +380,9 @@ impl Discovery {
   // Of more participants whose lease has ended, those that have been silent for longest
   // are not reintroduced to: a flood of forged ones costs no more than this.
   const MAX_SILENT: usize = 64;
+  // How long the readers of a journal are believed without an announcement. All are asked for
+  // theirs at the start, and some answer only with their next HEARTBEAT, 3 s later.
+  const CONFIRM_WITHIN: StdDuration = StdDuration::from_secs(10);
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -767,6 +777,8 @@ impl Discovery {
       announced_readers: Announced::default(),
       announced_writers: Announced::default(),
       unanswered: Vec::new(),
+      known: Vec::new(),
+      unconfirmed: BTreeSet::new(),
       silent: Vec::new(),
       // Not as the participant has them: what has changed since is followed then.
       interfaces: Vec::new(),
@@ -786,6 +798,7 @@ impl Discovery {
     }
     self.initialize_participant();
     self.watch_interfaces();
+    self.take_over_known();
 
     // Send out info about user (=non-built-in) Writers and Readers that we have.
     // We are just initializing local participant, so likely there are none yet,
@@ -972,6 +985,7 @@ impl Discovery {
                   }
                 }
                 DiscoveryTimerEvent::FollowInterfaces => self.follow_interfaces(),
+                DiscoveryTimerEvent::DropUnconfirmed => self.drop_unconfirmed(),
                 DiscoveryTimerEvent::AnswerParticipants => {
                   let Some(dp) = self.domain_participant.clone().upgrade() else {
                     error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
@@ -1373,6 +1387,56 @@ impl Discovery {
     }
   }
 
+  // As if those who are known had just announced themselves.
+  fn take_over_known(&mut self) {
+    for known in std::mem::take(&mut self.known) {
+      match known {
+        Known::Participant(data) => self.process_discovered_participant_data(&data),
+        Known::Reader(data) => {
+          let update = discovery_db_write(&self.discovery_db).update_subscription(&data);
+          let Some(discovered_reader_data) = update else {
+            continue; // no room
+          };
+          self.unconfirmed.insert(data.reader_proxy.remote_reader_guid);
+          self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
+            discovered_reader_data,
+          });
+        }
+      }
+    }
+    if !self.unconfirmed.is_empty() {
+      self
+        .discovery_timer
+        .borrow_mut()
+        .set_timeout(Self::CONFIRM_WITHIN, DiscoveryTimerEvent::DropUnconfirmed);
+    }
+  }
+
+  // A reader that ended while there was no process to hear of it. In case it is there all the
+  // same, its participant is to discover this one anew, and to announce all that it has.
+  fn drop_unconfirmed(&mut self) {
+    let mut participants = BTreeSet::new();
+    for reader in std::mem::take(&mut self.unconfirmed) {
+      let is_there = discovery_db_read(&self.discovery_db).get_topic_reader(&reader).is_some();
+      if is_there {
+        participants.insert(reader.prefix);
+        self.reader_is_gone(reader);
+      }
+    }
+    for prefix in participants {
+      self.reintroduce_to(prefix);
+    }
+  }
+
+  fn reader_is_gone(&mut self, guid: GUID) {
+    discovery_db_write(&self.discovery_db).remove_topic_reader(guid);
+    self.send_discovery_notification(DiscoveryNotificationType::ReaderLost { reader_guid: guid });
+    self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
+      guid,
+      reason: LostReason::Disposed,
+    });
+  }
+
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
     // Anybody can dispose any GUID, so the event loop hears only of those that are known.
     if discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true) {
@@ -1510,6 +1574,7 @@ impl Discovery {
         match d {
           Sample::Value(d) => {
             trace!("sedp_receive_subscription - {d:?}");
+            self.unconfirmed.remove(&d.reader_proxy.remote_reader_guid);
             let Some(drd) = discovery_db_write(&self.discovery_db).update_subscription(&d) else {
               continue;
             };
@@ -1530,14 +1595,7 @@ impl Discovery {
           }
           Sample::Dispose(reader_key) => {
             info!("Dispose Reader {reader_key:?}");
-            discovery_db_write(&self.discovery_db).remove_topic_reader(reader_key);
-            self.send_discovery_notification(DiscoveryNotificationType::ReaderLost {
-              reader_guid: reader_key,
-            });
-            self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
-              guid: reader_key,
-              reason: LostReason::Disposed,
-            });
+            self.reader_is_gone(reader_key);
           }
         }
       }

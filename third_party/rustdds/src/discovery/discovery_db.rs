@@ -515,7 +515,6 @@ impl DiscoveryDB {
     }
   }
 
-  #[cfg(feature = "security")]
   pub fn get_topic_reader(&self, guid: &GUID) -> Option<&DiscoveredReaderData> {
     self.external_topic_readers.get(guid)
   }
@@ -1020,6 +1019,17 @@ impl DiscoveryDB {
     )
   }
 
+  /// The readers of a participant whose topics are ours, too.
+  pub fn readers_of_local_topics(
+    &self,
+    prefix: GuidPrefix,
+  ) -> impl Iterator<Item = &DiscoveredReaderData> {
+    let readers = self.external_topic_readers.range(prefix.range());
+    readers
+      .map(|(_, reader)| reader)
+      .filter(|reader| self.is_local_topic(reader.subscription_topic_data.topic_name()))
+  }
+
   // Note:
   // If multiple participants announce the same topic, this will
   // return duplicates, one per announcing participant.
@@ -1144,7 +1154,7 @@ impl DiscoveryDB {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
   use std::{sync::Mutex, time::Duration as StdDuration};
 
   use byteorder::LittleEndian;
@@ -1201,13 +1211,13 @@ mod tests {
     DiscoveryDB::new(GUID::new_participant_guid(), updated_sender, status_sender)
   }
 
-  fn new_participant() -> SpdpDiscoveredParticipantData {
+  pub(crate) fn new_participant() -> SpdpDiscoveredParticipantData {
     let mut participant = spdp_participant_data().unwrap();
     participant.participant_guid = GUID::new_participant_guid();
     participant
   }
 
-  fn new_reader(participant: GUID, number: u32, topic: &str) -> DiscoveredReaderData {
+  pub(crate) fn new_reader(participant: GUID, number: u32, topic: &str) -> DiscoveredReaderData {
     let mut reader = DiscoveredReaderData::default(topic.to_string(), "RandomData".to_string());
     let [_, key @ ..] = number.to_be_bytes();
     let id = EntityId::create_custom_entity_id(key, EntityKind::READER_NO_KEY_USER_DEFINED);

@@ -21,7 +21,7 @@ use std::{
 use speedy::Endianness;
 
 use crate::{
-  rtps::MessageBuilder,
+  rtps::{identity::UsedNumbers, MessageBuilder},
   structure::{
     cache_change::CacheChange,
     guid::{EntityId, GUID},
@@ -54,6 +54,7 @@ pub(crate) struct DirectSend {
   // Written by whoever holds the lock.
   last_sent: AtomicI64,
   heartbeat_count: AtomicI32,
+  numbers: Arc<UsedNumbers>,
 }
 
 impl DirectSend {
@@ -62,7 +63,19 @@ impl DirectSend {
       plan: Mutex::new(None),
       last_sent: AtomicI64::new(0),
       heartbeat_count: AtomicI32::new(1),
+      numbers: Arc::default(),
     }
+  }
+
+  /// Counts after those that the participant takes over.
+  pub fn count_with(&mut self, numbers: Arc<UsedNumbers>) {
+    self.heartbeat_count = AtomicI32::new(numbers.count_before() + 1);
+    self.numbers = numbers;
+  }
+
+  /// What its participant has used.
+  pub fn numbers(&self) -> &UsedNumbers {
+    &self.numbers
   }
 
   /// Held by whoever sends samples for the first time.
@@ -82,7 +95,9 @@ impl DirectSend {
   }
 
   pub fn next_heartbeat_count(&self) -> i32 {
-    self.heartbeat_count.fetch_add(1, Ordering::Relaxed)
+    let count = self.heartbeat_count.fetch_add(1, Ordering::Relaxed);
+    self.numbers.use_count(count);
+    count
   }
 
   /// Sends a sample if that can be done here and now. If not, or if a socket

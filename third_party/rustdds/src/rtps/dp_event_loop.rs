@@ -1326,6 +1326,8 @@ impl DPEventLoop {
       self.participant_status_sender.clone(),
     );
 
+    new_reader.numbers = Arc::clone(&self.hooks.numbers);
+
     // Reader commands share the poll waker. The ready queue records the entity
     // id, so there is nothing to register under the reader token.
     new_reader.set_requested_deadline_check_timer();

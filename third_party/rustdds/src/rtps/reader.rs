@@ -47,6 +47,7 @@ use crate::{
   rtps::{
     constant::ACKNACK_DELAY,
     fragment_assembler::{FragmentAssemblers, StatedOnce},
+    identity::UsedNumbers,
     message_receiver::MessageReceiverState,
     rtps_writer_proxy::RtpsWriterProxy, timed_event::DpTimerEvent, Message,
   },
@@ -142,6 +143,7 @@ pub(crate) struct Reader {
   last_fragment_garbage_collect: Instant,
   matched_writers: BTreeMap<GUID, RtpsWriterProxy>,
   writer_match_count_total: i32, // total count, never decreases
+  pub(crate) numbers: Arc<UsedNumbers>, // of the participant
 
   requested_deadline_missed_count: i32,
   offered_incompatible_qos_count: i32,
@@ -276,6 +278,7 @@ impl Reader {
       last_fragment_garbage_collect: Instant::now(),
       matched_writers: BTreeMap::new(),
       writer_match_count_total: 0,
+      numbers: Arc::default(),
       requested_deadline_missed_count: 0,
       offered_incompatible_qos_count: 0,
       ignores_reliable_writers: false,
@@ -591,11 +594,12 @@ impl Reader {
   }
 
   // return value counts how many new proxies were added
-  fn matched_writer_update(&mut self, proxy: RtpsWriterProxy) -> i32 {
+  fn matched_writer_update(&mut self, mut proxy: RtpsWriterProxy) -> i32 {
     if let Some(op) = self.matched_writer_mut(proxy.remote_writer_guid) {
       op.update_contents(proxy);
       0
     } else {
+      proxy.numbers = Arc::clone(&self.numbers);
       self.matched_writers.insert(proxy.remote_writer_guid, proxy);
       1
     }

@@ -1,12 +1,12 @@
 use core::ops::Bound::{Included, Unbounded};
-use std::{cmp::max, collections::BTreeMap};
+use std::{cmp::max, collections::BTreeMap, sync::Arc};
 
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
 
 use crate::{
   discovery::sedp_messages::DiscoveredWriterData,
-  rtps::constant::MAX_TRACKED_CHANGES_PER_WRITER,
+  rtps::{constant::MAX_TRACKED_CHANGES_PER_WRITER, identity::UsedNumbers},
   structure::{
     guid::{EntityId, GUID},
     locator::Locator,
@@ -66,6 +66,8 @@ pub(crate) struct RtpsWriterProxy {
   pub received_heartbeat_count: i32,
 
   pub sent_ack_nack_count: i32,
+  /// Those of the participant, from the insertion into a Reader on.
+  pub numbers: Arc<UsedNumbers>,
 
   ack_base: SequenceNumber, // We can ACK everything before this number.
   // ack_base can be increased from N-1 to N, if we receive DATA with SequenceNumber N-1
@@ -95,6 +97,7 @@ impl RtpsWriterProxy {
       changes: BTreeMap::new(),
       received_heartbeat_count: 0,
       sent_ack_nack_count: 0,
+      numbers: Arc::default(),
       // Sequence numbering must start at 1.
       // Therefore, we can ACK all sequence numbers below 1 even before receiving anything.
       ack_base: SequenceNumber::new(1),
@@ -105,7 +108,8 @@ impl RtpsWriterProxy {
 
   pub fn next_ack_nack_sequence_number(&mut self) -> i32 {
     // The first is 1: Fast DDS has counted 0 before anything came, and discards it.
-    self.sent_ack_nack_count += 1;
+    self.sent_ack_nack_count = self.sent_ack_nack_count.max(self.numbers.count_before()) + 1;
+    self.numbers.use_count(self.sent_ack_nack_count);
     self.sent_ack_nack_count
   }
 
@@ -348,6 +352,7 @@ impl RtpsWriterProxy {
       changes: BTreeMap::new(),
       received_heartbeat_count: 0,
       sent_ack_nack_count: 0,
+      numbers: Arc::default(),
       ack_base: SequenceNumber::default(),
       last_received_sequence_number: SequenceNumber::new(0),
       last_received_timestamp: Timestamp::INVALID,
@@ -434,6 +439,24 @@ mod bounded_map_tests {
       vec![],
       EntityId::UNKNOWN,
     )
+  }
+
+  // A participant that continues another one counts on: a writer ignores what is not above
+  // the counts that it has seen.
+  #[test]
+  fn acknacks_are_counted_after_those_that_the_participant_takes_over() {
+    let identity = crate::ParticipantIdentity {
+      prefix: [1; 12],
+      participant_id: 0,
+      highest_count: 500,
+      highest_number: 0,
+    };
+    let mut proxy = test_proxy();
+    assert_eq!(proxy.next_ack_nack_sequence_number(), 1);
+    proxy.numbers = Arc::new(UsedNumbers::after(&identity));
+    assert_eq!(proxy.next_ack_nack_sequence_number(), 501);
+    assert_eq!(proxy.next_ack_nack_sequence_number(), 502);
+    assert_eq!(proxy.numbers.highest_count(), 502);
   }
 
   // Regression: a best-effort writer sends no HEARTBEAT/GAP, so the changes map

@@ -4160,6 +4160,11 @@ mod tests {
 
     // A RELIABLE, VOLATILE, KEEP_LAST writer that retains 256 samples, with one reader.
     fn keep_last() -> Fixture {
+      keep_last_after(0)
+    }
+
+    // One whose samples are numbered from the next number on.
+    fn keep_last_after(highest: i64) -> Fixture {
       let qos = QosPolicyBuilder::new()
         .reliability(Reliability::Reliable {
           max_blocking_time: Duration::ZERO,
@@ -4178,13 +4183,14 @@ mod tests {
         256,
         10,
       )
-      .keep_last(10);
+      .keep_last(10)
+      .continue_after(SequenceNumber::new(highest), Box::new(|_| ()));
       let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
       let mut f = Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None);
       let has_nothing = AckNack {
         reader_id: reader,
         writer_id: guid,
-        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(1)),
+        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(highest + 1)),
         count: 0,
       };
       let proxy = f.writer.readers.get_mut(&f.reader_guid).unwrap();
@@ -5005,6 +5011,25 @@ mod tests {
       fragments.extend(samples.into_iter().flat_map(|(_, sent)| sent));
       assert_eq!(fragments, (1..=EARLY_FRAGMENTS).collect::<Vec<_>>(), "each once");
       assert_eq!(heartbeats, [1]);
+    }
+
+    // A reader that acknowledged samples of a former process has what comes after them, gets
+    // what is written next, and is offered nothing of what went before.
+    #[test]
+    fn a_continued_writer_serves_the_readers_of_the_former_one() {
+      let mut f = keep_last_after(41);
+      assert_eq!(only_reader(&f).unacknowledged, 0);
+      acknowledge(&mut f, 42, &[], 1);
+      write(&f, 3, 8);
+      let reader = only_reader(&f);
+      assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (3, 3, 0));
+      // One that lacks the last samples of the former process requests them.
+      acknowledge(&mut f, 40, &[40, 41, 43], 2);
+      assert_eq!(f.repair_round(), 1, "only what there is");
+      acknowledge(&mut f, 45, &[], 3);
+      let reader = only_reader(&f);
+      assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (3, 0, 0));
+      assert_eq!(f.writer.send_buffer.retained_len(), 0);
     }
 
     // A message of a RELIABLE Writer ends with a HEARTBEAT, whose number shows that it was built.

@@ -16,6 +16,7 @@ use crate::{
       DEFAULT_WRITER_MAX_SAMPLES, KEEP_LAST_MAX_RETAINED_BYTES, MAX_ADVERTISED_EVICTED_SAMPLES,
     },
     direct_send::DirectSend,
+    identity::UsedNumbers,
     reader_progress::{MatchedReader, OfferedHistory, ReaderProgress},
     source_history::SourceHistory,
   },
@@ -50,6 +51,7 @@ struct Inner {
   written_bytes: u64,        // payload bytes of all samples ever written
   first_seq: SequenceNumber, // oldest still retained (default 1)
   last_seq: SequenceNumber,  // latest allocated (default 0 == nothing yet)
+  begins_with: SequenceNumber, // what the first sample gets (default 1)
 
   // The sample of which fragments are sent before all of it is written.
   early: Option<Early>,
@@ -197,7 +199,7 @@ impl Inner {
       _ => self.first_seq - SequenceNumber::from(self.max_advertised_evicted),
     };
     let unacknowledged = max(self.acked_before, furthest_back);
-    max(unacknowledged, SequenceNumber::new(1)).min(self.first_seq)
+    max(unacknowledged, self.begins_with).min(self.first_seq)
   }
 }
 
@@ -222,6 +224,8 @@ struct Shared {
   // late-joining readers, so pre-match trimming is disabled.
   volatile: bool,
   topic_name: String,
+  // See `ContinuedWriter`.
+  on_number: Option<Box<dyn Fn(i64) + Send + Sync>>,
 }
 
 /// A shared, flow-controlled buffer of samples between a `DataWriter`
@@ -266,6 +270,7 @@ impl WriterSendBuffer {
           history: SourceHistory::default(),
           first_seq: SequenceNumber::new(1),
           last_seq: SequenceNumber::new(0),
+          begins_with: SequenceNumber::new(1),
           window_limit: window_limit.max(1),
           acked_before: SequenceNumber::new(1),
           reliable_readers_present: false,
@@ -284,7 +289,61 @@ impl WriterSendBuffer {
         keep_last: None,
         volatile,
         topic_name,
+        on_number: None,
       }),
+    }
+  }
+
+  /// Counts with the numbers of the participant; a built-in writer also numbers its samples
+  /// after those. To be called before the buffer is shared.
+  #[must_use]
+  pub fn numbered_with(mut self, numbers: Arc<UsedNumbers>) -> Self {
+    let highest = numbers.highest_number();
+    match Arc::get_mut(&mut self.shared) {
+      Some(shared) => {
+        shared.direct_send.count_with(numbers);
+        if shared.is_builtin {
+          Self::begin_after(shared, highest);
+        }
+      }
+      None => error!("WriterSendBuffer: numbers were set after the buffer was shared"),
+    }
+    self
+  }
+
+  /// Gives the first sample the number after this one, and tells `on_number` of each number
+  /// before it is sent. To be called before the buffer is shared.
+  #[must_use]
+  pub fn continue_after(
+    mut self,
+    highest: SequenceNumber,
+    on_number: Box<dyn Fn(i64) + Send + Sync>,
+  ) -> Self {
+    match Arc::get_mut(&mut self.shared) {
+      Some(shared) => {
+        Self::begin_after(shared, highest);
+        shared.on_number = Some(on_number);
+      }
+      None => error!("WriterSendBuffer: the first number was set after the buffer was shared"),
+    }
+    self
+  }
+
+  fn begin_after(shared: &mut Shared, highest: SequenceNumber) {
+    if let Ok(inner) = shared.inner.get_mut() {
+      let first = highest.plus_1();
+      (inner.first_seq, inner.begins_with, inner.acked_before) = (first, first, first);
+      (inner.last_seq, inner.sent_frontier) = (highest, highest);
+      shared.direct_send.set_last_sent(highest);
+    }
+  }
+
+  fn report_number(shared: &Shared, number: SequenceNumber) {
+    if let Some(on_number) = &shared.on_number {
+      on_number(number.into());
+    }
+    if shared.is_builtin {
+      shared.direct_send.numbers().use_number(number);
     }
   }
 
@@ -469,6 +528,7 @@ impl WriterSendBuffer {
       }
     }
     let seq = inner.last_seq.plus_1();
+    Self::report_number(shared, seq);
     if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
       inner.history.record(&write_options, seq, depth);
     }
@@ -558,8 +618,12 @@ impl WriterSendBuffer {
   /// it was completed or withdrawn meanwhile: its number may be that of another one.
   pub fn mark_early_sent(&self, id: u64) -> bool {
     let mut inner = self.shared.inner.lock().unwrap();
-    let early = inner.early.as_mut().filter(|early| early.id == id);
-    early.map(|early| early.is_begun = true).is_some()
+    let Some(early) = inner.early.as_mut().filter(|early| early.id == id) else {
+      return false;
+    };
+    early.is_begun = true;
+    Self::report_number(&self.shared, early.change.sequence_number);
+    true
   }
 
   /// The number and the id of the sample that was completed last.
@@ -619,14 +683,14 @@ impl WriterSendBuffer {
   /// goes away.
   ///
   /// A reader that has not sent an ACKNACK yet reports `all_acked_before == 0`.
-  /// Sequence numbers start at 1, so the frontier is never below 1: anything
+  /// The frontier is never below the number of the first sample: anything
   /// lower would count a sample that does not exist against the send window.
   pub fn set_acked_frontier(&self, acked_before: Option<SequenceNumber>) {
     let shared = &*self.shared;
     let mut inner = shared.inner.lock().unwrap();
     let advanced = match acked_before {
       Some(sn) => {
-        let sn = max(sn, SequenceNumber::new(1));
+        let sn = max(sn, inner.begins_with);
         let adv = sn > inner.acked_before || !inner.reliable_readers_present;
         inner.acked_before = sn;
         inner.reliable_readers_present = true;
@@ -930,7 +994,7 @@ mod tests {
   use crate::{
     dds::{ddsdata::DDSData, with_key::datawriter::WriteOptionsBuilder},
     messages::submessages::elements::serialized_payload::SerializedPayload,
-    structure::guid::{EntityId, GuidPrefix, GUID},
+    structure::guid::{EntityId, EntityKind, GuidPrefix, GUID},
     RepresentationIdentifier,
   };
 
@@ -1011,6 +1075,79 @@ mod tests {
     assert_eq!(parked(&buf), 0);
     assert!(!admit_now(&buf, WriteOptions::default())); // a wait that is over
     assert_eq!(parked(&buf), 0);
+  }
+
+  fn small_buffer(kind: EntityKind) -> WriterSendBuffer {
+    WriterSendBuffer::new(
+      GUID::dummy_test_guid(kind),
+      "t".to_string(),
+      /* reliable_writer */ true,
+      kind.is_built_in(),
+      /* volatile */ true,
+      /* window_limit */ 2,
+      /* backlog_limit */ 2,
+      /* max_retain */ 2,
+    )
+  }
+
+  // A writer that continues another one is as one that has written nothing: its readers
+  // lack nothing, and its window is empty. It tells each number once, before it can be sent.
+  #[test]
+  fn a_continued_writer_begins_after_the_highest_number() {
+    let told = Arc::new(Mutex::new(Vec::new()));
+    let tell = Arc::clone(&told);
+    let buf = small_buffer(EntityKind::WRITER_NO_KEY_USER_DEFINED)
+      .continue_after(
+        SequenceNumber::new(41),
+        Box::new(move |number| tell.lock().unwrap().push(number)),
+      );
+    assert_eq!(buf.last_change_sequence_number(), SequenceNumber::new(41));
+    assert_eq!(buf.direct_send().last_sent(), SequenceNumber::new(41));
+    assert_eq!(buf.advertised_first(), SequenceNumber::new(42));
+    // A reader that has not acknowledged anything yet.
+    buf.set_acked_frontier(Some(SequenceNumber::zero()));
+    assert!(buf.is_acked_through(SequenceNumber::new(41)));
+    assert_eq!(buf.advertised_first(), SequenceNumber::new(42));
+    assert!(admit_now(&buf, WriteOptions::default()));
+    assert!(buf.get_by_sn(SequenceNumber::new(42)).is_some());
+    assert_eq!(*told.lock().unwrap(), [42]);
+
+    // A number of which fragments are sent before the sample is written, or withdrawn.
+    assert!(buf.begin_early(WriteOptions::default(), sample(), 8));
+    assert_eq!(*told.lock().unwrap(), [42]);
+    assert!(buf.mark_early_sent(buf.early().unwrap().id));
+    assert_eq!(*told.lock().unwrap(), [42, 43]);
+    assert!(buf.withdraw_early());
+    buf.set_acked_frontier(Some(SequenceNumber::new(44)));
+    buf.set_sent_frontier(SequenceNumber::new(43));
+    assert!(admit_now(&buf, WriteOptions::default()));
+    assert_eq!(*told.lock().unwrap(), [42, 43, 44]);
+  }
+
+  #[test]
+  fn a_built_in_writer_begins_after_the_numbers_that_the_participant_takes_over() {
+    let identity = crate::ParticipantIdentity {
+      prefix: [1; 12],
+      participant_id: 0,
+      highest_count: 500,
+      highest_number: 4096,
+    };
+    let numbers = Arc::new(UsedNumbers::after(&identity));
+    let built_in = small_buffer(EntityKind::WRITER_WITH_KEY_BUILT_IN)
+      .numbered_with(Arc::clone(&numbers));
+    let users = small_buffer(EntityKind::WRITER_NO_KEY_USER_DEFINED)
+      .numbered_with(Arc::clone(&numbers));
+    for buf in [&built_in, &users] {
+      assert!(admit_now(buf, WriteOptions::default()));
+    }
+    assert_eq!(built_in.last_change_sequence_number(), SequenceNumber::new(4097));
+    assert_eq!(users.last_change_sequence_number(), SequenceNumber::new(1));
+    assert_eq!(numbers.highest_number(), SequenceNumber::new(4097));
+    for count in [501, 502] {
+      assert_eq!(users.direct_send().next_heartbeat_count(), count);
+    }
+    assert_eq!(built_in.direct_send().next_heartbeat_count(), 501);
+    assert_eq!(numbers.highest_count(), 502);
   }
 
   // nonblocking-transmit: a best-effort writer that opted in via

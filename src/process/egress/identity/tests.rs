@@ -1,0 +1,107 @@
+//! What a process leaves to the next one, with real boards, and when the next one takes it.
+
+use super::*;
+use crate::process::role::participant_options;
+use crate::process::test_role::{self, SCAN, TYPE};
+use crate::shm::ProcessRole;
+
+const LANE: usize = 0;
+const DDS_TYPE: DdsType<'static> =
+    DdsType { name: TYPE, hash: crate::model::TypeHash::UNKNOWN, has_keys: false };
+
+fn record(role: &Role) -> WriterRecord {
+    WriterRecord {
+        board: role.boards.writer_identity_writer(LANE, 0),
+        number: role.boards.sent_number(LANE, 0),
+        route: 0,
+        had_writer: false,
+    }
+}
+
+#[test]
+fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer() {
+    let (role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 71, SCAN);
+    let (ours, others) = (Guid([1; 16]), Guid([2; 16]));
+    let (qos, other_qos) =
+        (QosProfile::CRITICAL, QosProfile { deadline_ms: Some(5), ..QosProfile::CRITICAL });
+    let next =
+        |record: &mut WriterRecord, participant, topic, qos| record.next(participant, topic, &DDS_TYPE, qos);
+
+    let first = next(&mut record(&role), ours, "rt/a", &qos);
+    assert_eq!(first.highest_number, 0);
+    for number in 1..=41 {
+        (first.on_number)(number);
+    }
+    // The process was killed. Each record is that of a next process.
+    let second = next(&mut record(&role), ours, "rt/a", &qos);
+    assert_eq!((second.key, second.highest_number), (first.key, 41));
+    (second.on_number)(42);
+    let third = next(&mut record(&role), ours, "rt/a", &qos);
+    assert_eq!((third.key, third.highest_number), (first.key, 42));
+
+    // Another participant, topic or QoS is another writer.
+    let mut keys = vec![first.key];
+    for (participant, topic, qos) in
+        [(others, "rt/a", &qos), (others, "rt/b", &qos), (others, "rt/b", &other_qos), (ours, "rt/a", &qos)]
+    {
+        let other = next(&mut record(&role), participant, topic, qos);
+        assert_eq!(other.highest_number, 0, "{topic}");
+        assert!(!keys.contains(&other.key), "{topic}");
+        (other.on_number)(7);
+        keys.push(other.key);
+    }
+
+    // So is the next one of the same process, and of the next process, after a goodbye.
+    let mut process = record(&role);
+    let continued = next(&mut process, ours, "rt/a", &qos);
+    assert_eq!(continued.highest_number, 7);
+    let again = next(&mut process, ours, "rt/a", &qos);
+    assert_eq!(again.highest_number, 0);
+    assert_ne!(again.key, continued.key);
+    process.removed();
+    let after = next(&mut record(&role), ours, "rt/a", &qos);
+    assert_ne!(after.key, again.key);
+
+    // A number that no process writes.
+    role.boards.sent_number(LANE, 0).set(i64::MIN);
+    assert_eq!(next(&mut record(&role), ours, "rt/a", &qos).highest_number, 0);
+}
+
+#[test]
+fn keys_are_those_of_no_other_writer() {
+    let keys = [key(0, 1), key(0, 2), key(1, 1), key(1_023, 1), key(1_023, 1_023)];
+    for (place, one) in keys.iter().enumerate() {
+        assert!((0x80..=0xbf).contains(&one[0]), "{one:?}");
+        assert!(!keys[..place].contains(one), "{one:?}");
+    }
+}
+
+#[test]
+fn an_identity_is_given_up_if_others_may_not_know_it_or_it_has_changed() {
+    let participant = Guid([3; 16]);
+    let board = LaneIdentity { participant, conditions: 5, ..LaneIdentity::default() };
+    let alive_at = MonotonicNs(0).plus_ms(60_000);
+    let former = ProcessHealth { participant, alive_at, ..ProcessHealth::default() };
+    let at = |ms| alive_at.plus_ms(ms);
+    assert!(may_continue(&board.sealed(), &former, 5, at(200)));
+    assert!(may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS)));
+    assert!(!may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS + 1)));
+    assert!(!may_continue(&board.sealed(), &former, 6, at(200)));
+    assert!(!may_continue(&board, &former, 5, at(200)), "no checksum");
+    assert!(!may_continue(&LaneIdentity::default().sealed(), &ProcessHealth::default(), 0, at(0)));
+    let unproven = LaneIdentity { unproven: 1, ..board };
+    assert!(!may_continue(&unproven.sealed(), &former, 5, at(200)));
+    let ended = ProcessHealth { ended: 1, ..former };
+    assert!(!may_continue(&board.sealed(), &ended, 5, at(200)));
+    let of_another = ProcessHealth { participant: Guid([4; 16]), ..former };
+    assert!(!may_continue(&board.sealed(), &of_another, 5, at(200)));
+}
+
+#[test]
+fn a_lane_that_is_not_told_to_keeps_no_identity() {
+    let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(LANE), "egress", 72, SCAN);
+    let options = participant_options(&settings, &settings.lanes[LANE].network, "egress");
+    let (participant, identity, continued) = Identity::join(&mut role, &settings, LANE, &options).unwrap();
+    assert!(identity.is_none() && !continued);
+    assert!(WriterRecord::of(&role, &participant, LANE, 0).is_none());
+}

@@ -1,0 +1,121 @@
+//! The identity of a critical lane that is killed: its subscribers stay matched with the next process, and
+//! receive what that one forwards. Uses real processes, signals and DDS peers on separate hosts.
+
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};
+use support::peer::{Peer, Received, RunningPeer, Sent};
+use support::process::signal;
+
+const KEEP: (&str, &str) = ("ADAPTIVE_BRIDGE_KEEP_IDENTITY", "1");
+const KILLS: usize = 5;
+const RATE_HZ: f64 = 200.0;
+
+/// How often a writer has been matched by the subscriber, and unmatched.
+fn matches(subscriber: &RunningPeer) -> (usize, usize) {
+    let events = subscriber.events();
+    let changes = events.iter().filter(|event| event["event"] == "matched");
+    let changes: Vec<i64> = changes.filter_map(|event| event["change"].as_i64()).collect();
+    (
+        changes.iter().filter(|change| **change > 0).count(),
+        changes.iter().filter(|change| **change < 0).count(),
+    )
+}
+
+/// What a subscriber saw.
+struct Seen {
+    name: &'static str,
+    matches: (usize, usize),
+    received: Received,
+}
+
+/// Kills the critical lane under four subscribers, after each `pause`.
+fn kill(bed: &Bed, pause: Duration) -> Vec<Seen> {
+    let subscribers = [
+        ("Fast DDS, RELIABLE", Peer::fast().keep_all()),
+        ("Fast DDS, BEST_EFFORT", Peer::fast().keep_all().best_effort()),
+        ("Cyclone DDS, RELIABLE", Peer::cyclone().keep_all()),
+        ("Cyclone DDS, BEST_EFFORT", Peer::cyclone().keep_all().best_effort()),
+    ]
+    .map(|(name, peer)| (name, bed.subscribe("critical", peer, CRITICAL)));
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT);
+    let all_receive = |more: u64| {
+        let before = subscribers.each_ref().map(|(_, subscriber)| subscriber.received());
+        for ((_, subscriber), before) in subscribers.iter().zip(before) {
+            subscriber.wait_received(before + more);
+        }
+    };
+    all_receive(100);
+    for kills in 1..=KILLS {
+        std::thread::sleep(pause);
+        signal(bed.pid("egress-critical"), Signal::SIGKILL);
+        support::wait_until("a restart", || bed.pids("egress-critical").len() == kills + 1);
+        all_receive(100);
+    }
+    let sent: Sent = publisher.end();
+    sent.assert_not_blocked();
+    bed.wait_accounted();
+    let seen = subscribers.map(|(name, subscriber)| {
+        let matches = matches(&subscriber);
+        Seen { name, matches, received: subscriber.end() }
+    });
+    for Seen { name, matches, received } in &seen {
+        println!(
+            "{name}: matched, unmatched {matches:?}; of {}: {} missing, {} twice, longest gap {:.0} ms",
+            sent.ok, received.missing_count, received.duplicates, received.max_gap_ms
+        );
+    }
+    seen.into()
+}
+
+#[test]
+fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
+    let test = "subscribers_stay_matched_with_a_critical_lane_that_is_killed";
+    // It asserts that few samples are lost.
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start_in(test, SCAN, KEEP) else { return };
+    // A process that was up for less than a second does not leave its identity if it took it over.
+    let subscribers = kill(&bed, Duration::from_millis(1_500));
+    let log = bed.up.log();
+    let continued = log.lines().filter(|line| line.contains("identity") && line.contains("continued=true"));
+    assert_eq!(continued.count(), KILLS, "{log}");
+    for Seen { name, matches, received } in subscribers {
+        assert_eq!(matches, (1, 0), "{name}");
+        received.assert_sound();
+    }
+    bed.end();
+}
+
+#[test]
+fn subscribers_may_come_and_go_while_no_lane_runs() {
+    let test = "subscribers_may_come_and_go_while_no_lane_runs";
+    let Some(bed) = Bed::start_in(test, SCAN, KEEP) else { return };
+    let peers = || [Peer::fast().keep_all(), Peer::cyclone().keep_all()];
+    let [stays, goes] = [(); 2].map(|()| peers().map(|peer| bed.subscribe("critical", peer, CRITICAL)));
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT);
+    let receive = |subscribers: &[RunningPeer]| {
+        let before: Vec<u64> = subscribers.iter().map(RunningPeer::received).collect();
+        for (subscriber, before) in subscribers.iter().zip(before) {
+            subscriber.wait_received(before + 100);
+        }
+    };
+    receive(&stays);
+    signal(bed.pid("egress-critical"), Signal::SIGKILL);
+    let comes = peers().map(|peer| peer.subscriber().topic(CRITICAL).start_on(bed.host("slow")));
+    for subscriber in goes {
+        subscriber.end::<Received>().assert_sound();
+    }
+    receive(&comes);
+    receive(&stays);
+    bed.bridge.wait_status("the readers that are there", |status| {
+        let lane = outputs(status).find(|output| output["lane"] == "critical");
+        lane.is_some_and(|lane| lane["matched_readers"].as_array().is_some_and(|readers| readers.len() == 4))
+    });
+    let _: Sent = publisher.end();
+    for subscriber in stays.into_iter().chain(comes) {
+        assert_eq!(matches(&subscriber), (1, 0));
+        subscriber.end::<Received>().assert_sound();
+    }
+    bed.end();
+}

@@ -1,0 +1,85 @@
+//! What a participant takes over from one of a former process, so that others take it for
+//! the same one.
+
+use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
+
+use crate::structure::sequence_number::SequenceNumber;
+
+/// The identity of a participant. Another process may continue it once its process is gone
+/// and has not said goodbye: readers and writers of others then stay matched.
+///
+/// Both numbers may be higher than what was used; readers ignore what is not above the
+/// numbers that they have seen of a GUID.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ParticipantIdentity {
+  /// The GUID prefix.
+  pub prefix: [u8; 12],
+  /// The participant id, which gives the UDP ports (RTPS 2.5, clause 9.6.2.3).
+  pub participant_id: u16,
+  /// The highest count of any HEARTBEAT, ACKNACK or NACK_FRAG.
+  pub highest_count: i32,
+  /// The highest sequence number of any built-in writer.
+  pub highest_number: i64,
+}
+
+impl ParticipantIdentity {
+  // Half of the range is left for what the participant itself sends.
+  pub(crate) fn is_valid(&self) -> bool {
+    self.participant_id < 120
+      && (0..i32::MAX / 2).contains(&self.highest_count)
+      && (0..i64::MAX / 2).contains(&self.highest_number)
+  }
+}
+
+/// How a user's writer continues one of a former process.
+pub struct ContinuedWriter {
+  /// The first three bytes of the entity id, which the participant must give to no other
+  /// writer: it counts its own from 0.
+  pub entity_key: [u8; 3],
+  /// The first sample gets the number after this one; 0 for a writer that is new. It must be
+  /// the highest number that the former writer sent: of a lower one readers discard samples
+  /// without a word, and of a higher one they report samples as lost.
+  pub highest_number: i64,
+  /// Called with each number before the first datagram with it is sent, by the thread that
+  /// writes or by the event loop. It must return at once and call nothing of the library.
+  pub on_number: Box<dyn Fn(i64) + Send + Sync>,
+}
+
+/// The numbers that a participant has used, above those that it takes over.
+#[derive(Debug, Default)]
+pub(crate) struct UsedNumbers {
+  count_before: i32,
+  count: AtomicI32,
+  number: AtomicI64,
+}
+
+impl UsedNumbers {
+  pub fn after(identity: &ParticipantIdentity) -> Self {
+    Self {
+      count_before: identity.highest_count,
+      count: AtomicI32::new(identity.highest_count),
+      number: AtomicI64::new(identity.highest_number),
+    }
+  }
+
+  /// The count that every HEARTBEAT and ACKNACK exceeds.
+  pub fn count_before(&self) -> i32 {
+    self.count_before
+  }
+
+  pub fn highest_count(&self) -> i32 {
+    self.count.load(Ordering::Relaxed)
+  }
+
+  pub fn highest_number(&self) -> SequenceNumber {
+    SequenceNumber::new(self.number.load(Ordering::Relaxed))
+  }
+
+  pub fn use_count(&self, count: i32) {
+    self.count.fetch_max(count, Ordering::Relaxed);
+  }
+
+  pub fn use_number(&self, number: SequenceNumber) {
+    self.number.fetch_max(number.into(), Ordering::Relaxed);
+  }
+}
