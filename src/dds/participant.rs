@@ -1,6 +1,5 @@
 //! A DDS participant that appears as one ROS 2 node.
 
-use std::cell::Cell;
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -59,8 +58,6 @@ pub struct Participant {
     /// Called for the first change after `poll_discovery` has found none.
     discovery_waker: Waker,
     discovery_woken: Receiver<()>,
-    /// How many participants `poll_discovery` has reported as gone.
-    participants_gone: Cell<u64>,
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
@@ -205,7 +202,6 @@ impl Participant {
             listener,
             discovery_waker: Waker::from(Arc::new(DiscoveryWaker(waker))),
             discovery_woken,
-            participants_gone: Cell::new(0),
             graph,
             graph_number: number,
             namespace: options.namespace.clone(),
@@ -485,20 +481,12 @@ impl Participant {
             match changes.as_mut().poll_next(&mut context) {
                 Poll::Ready(Some(change)) => {
                     if let Some(change) = translate(change) {
-                        if let Discovery::ParticipantGone { .. } = change {
-                            self.participants_gone.update(|gone| gone + 1);
-                        }
                         return Some(change);
                     }
                 }
                 Poll::Ready(None) | Poll::Pending => return None,
             }
         }
-    }
-
-    /// How many participants [`poll_discovery`](Self::poll_discovery) has reported as gone.
-    pub fn participants_gone(&self) -> u64 {
-        self.participants_gone.get()
     }
 
     fn publish_graph_entry(&self) {

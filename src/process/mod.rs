@@ -8,7 +8,6 @@
 mod control;
 mod count_log;
 mod egress;
-mod heap;
 mod in_force;
 mod ingress;
 mod lane_override;

@@ -3,7 +3,6 @@
 
 use tracing::info;
 
-use super::heap::{self, FreedMemory};
 use super::notify::Notifier;
 use super::parameter_store::ParameterStore;
 use super::reload::{ReloadRequests, Reloads};
@@ -64,7 +63,6 @@ pub(super) struct Role {
     pub notifier: Notifier,
     /// What the former process wrote last; its participant is all zero once it is disposed of.
     pub former: ProcessHealth,
-    freed_memory: FreedMemory,
     /// The last field, so that the lock is released only after everything else is dropped.
     _lock: RoleLock,
 }
@@ -82,7 +80,6 @@ impl Role {
         let lock = RoleLock::acquire(&root, &settings.instance, name)?;
         // Before the scheduling, which is for the data path: the reload thread runs without it.
         let reloads = Reloads::start(requests, settings, lock.note_path())?;
-        heap::return_large_blocks();
         scheduling::apply(scheduling);
         let node = ShmNode::open(&root, &settings.instance, name)?;
         let cleaned = node.cleaned_up();
@@ -108,16 +105,7 @@ impl Role {
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self {
-            node,
-            boards,
-            reloads,
-            health,
-            notifier: Notifier::new(),
-            former,
-            freed_memory: FreedMemory::default(),
-            _lock: lock,
-        })
+        Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former, _lock: lock })
     }
 
     /// Opens the DDS participant. If the former process was killed, the participant disposes of
@@ -192,14 +180,6 @@ impl Role {
     pub fn status(&mut self, now: MonotonicNs, describe: impl FnOnce(&mut String)) {
         self.notifier.status(now, describe);
         telemetry::log_left_out(now);
-    }
-
-    /// Returns freed memory to the kernel some time after participants have gone; `participants_gone` is
-    /// their number so far.
-    pub fn return_freed_memory(&mut self, participants_gone: u64, now: MonotonicNs) {
-        if self.freed_memory.is_due(participants_gone, now) {
-            heap::return_freed();
-        }
     }
 
     /// Counts an error that dropped no sample.

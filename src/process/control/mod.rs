@@ -326,8 +326,6 @@ impl Control {
         self.refused_log.log_refused(&self.invalid_responses.refused, now);
         self.accepted_log.log_accepted(&self.invalid_responses.accepted, now);
         self.write_record();
-        let participants_gone = self.participants.iter().map(Participant::participants_gone).sum();
-        self.role.return_freed_memory(participants_gone, now);
         // Checks every participant, also after one has failed, because the check wakes its threads.
         let turned = self.participants.iter_mut().map(|participant| participant.have_threads_turned(now));
         if turned.fold(true, |all, one| all & one) {

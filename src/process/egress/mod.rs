@@ -301,7 +301,6 @@ impl Egress {
             lane.follow_publishers(&mut self.outputs, now);
         }
         self.reload(now);
-        self.role.return_freed_memory(self.participant.participants_gone(), now);
         // While a thread of the DDS library hangs, the lane forwards nothing. Without this report the
         // watchdog restarts the process.
         if self.participant.have_threads_turned(now) {

@@ -208,7 +208,6 @@ impl Ingress {
         if ring {
             self.participant.ring();
         }
-        self.role.return_freed_memory(self.participant.participants_gone(), now);
         if self.participant.have_threads_turned(now) {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
