@@ -14,6 +14,8 @@ const RATE_HZ: f64 = 200.0;
 const KILLS: usize = 5;
 /// Samples that each subscriber receives between two kills: more than the lane takes to match all again.
 const SAMPLES_BETWEEN: u64 = 300;
+/// Samples that are published while no lane runs: fewer than ingress retains, more than it retained before.
+const SAMPLES_WITHOUT_LANE: u64 = 50;
 
 /// A sample as a subscriber reported it.
 #[derive(Clone, Copy)]
@@ -167,4 +169,33 @@ fn what_a_killed_critical_lane_loses_is_counted_and_at_most_one_sample_comes_twi
     }
     assert_accounted(&bed, publisher, subscribers, RATE_HZ);
     bed.end();
+}
+
+/// `up` is stopped meanwhile, so that the lane stays away for a known number of samples. The next process
+/// forwards them when all former subscribers have matched it.
+#[test]
+fn subscribers_receive_what_was_published_while_no_critical_lane_ran() {
+    let test = "subscribers_receive_what_was_published_while_no_critical_lane_ran";
+    let rate_hz = RATE_HZ / 2.0;
+    // On a busy machine a subscriber may take longer to match than the lane waits for it.
+    support::attempts(|| {
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start_without_watchdog(test, SCAN) else { return Ok(()) };
+        let mut subscribers = Subscriber::start_all(&bed);
+        let publisher = bed.publish(Peer::cyclone().keep_last(1000).rate_hz(rate_hz), INPUT);
+        wait_more(&subscribers, 50);
+        let published = || number(&bed.bridge.status()["routes"][0]["published"]);
+        subscribers.iter_mut().for_each(Subscriber::note_kill);
+        bed.up.stop();
+        signal(bed.pid("egress-critical"), Signal::SIGKILL);
+        let before = published();
+        support::wait_until("samples without a lane", || published() >= before + SAMPLES_WITHOUT_LANE);
+        bed.up.cont();
+        wait_more(&subscribers, SAMPLES_BETWEEN);
+        let lane = assert_accounted(&bed, publisher, subscribers, rate_hz);
+        bed.end();
+        // At most the one that the lane held.
+        assert!(number(&lane["drops"]["lane_down"]) <= 1, "ingress retains all others: {lane}");
+        if drops_of(&lane) == 0 { Ok(()) } else { Err(format!("dropped, although retained: {lane}")) }
+    });
 }

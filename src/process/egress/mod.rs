@@ -54,6 +54,9 @@ const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 /// thread takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
 
+/// How often a lane checks whether the readers have matched that its samples wait for after a restart.
+const HOLD_POLL_MS: u64 = 5;
+
 /// What the lane does after a turn.
 enum Turn {
     /// Take another turn at once: samples were handled, and more may wait.
@@ -240,6 +243,9 @@ impl Egress {
         if self.count_sent() {
             until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
         }
+        if self.outputs.iter().any(Output::is_held) {
+            until = MonotonicNs(until.0.min(now.plus_ms(HOLD_POLL_MS).0));
+        }
         let wait_ns = until.since(now);
         if wait_ns == 0 {
             return;
@@ -323,6 +329,7 @@ impl Egress {
         if let Some(lane) = &mut self.noncritical {
             lane.shut_down(&mut self.outputs);
         } else {
+            self.outputs.iter_mut().for_each(Output::end_hold);
             let last_at = began_at.plus_ms(LAST_SAMPLES_MS);
             while clock::monotonic() < last_at && matches!(self.turn(), Turn::Busy) {}
         }
