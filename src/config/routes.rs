@@ -3,6 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::{HashMap, HashSet};
 use std::hash::Hash;
+use std::ops::RangeInclusive;
 
 use super::environment::Environment;
 use super::field::Field;
@@ -19,8 +20,15 @@ const MAX_ROUTES: usize = 1_024;
 /// The most patterns in `exclude`. Each is compared with each topic that discovery reports.
 const MAX_EXCLUDED: usize = 64;
 
-/// Samples retained for a restarted lane when no output is configured TRANSIENT_LOCAL.
-const RETAINED_SAMPLES: usize = 8;
+/// Samples of a route that are retained for a restarted lane when no output is configured TRANSIENT_LOCAL: as
+/// many as fit [`RETAINED_BYTES`] if each is as large as the route allows. 256 are 1.3 s at 200 Hz, and more
+/// than a lane takes to restart; 8 are what a route of images can afford.
+const RETAINED_SAMPLES: RangeInclusive<usize> = 8..=256;
+const RETAINED_BYTES: usize = 16 << 20;
+
+/// Of all routes together, each has an equal share of so many such samples. Each sample takes a page at
+/// least, so that they take 32 MiB before one comes.
+const RETAINED_IN_ALL: usize = 8_192;
 
 pub(super) fn input_network(root: &Field<'_>, environment: &Environment) -> DdsNetwork {
     let base = DdsNetwork {
@@ -59,8 +67,13 @@ pub(super) fn read(
     // problems.
     let (mut routes, mut patterns) = (Vec::new(), Vec::new());
     let mut lanes: Vec<Lane> = drafts.into_iter().map(|draft| draft.lane).collect();
+    let places = read.iter().map(|draft| draft.route_ids.len()).sum();
     for draft in read {
-        let Some(route) = draft.route else { continue };
+        let Some(mut route) = draft.route else { continue };
+        if draft.retains_by_size {
+            let by_size = retained_by_size(route.max_sample_bytes, places);
+            route.retained_samples = route.retained_samples.max(by_size);
+        }
         if let Some(pattern) = draft.pattern {
             patterns.push(RoutePattern { first_route: routes.len(), ..pattern });
         }
@@ -78,6 +91,13 @@ pub(super) fn read(
     (routes, patterns, lanes)
 }
 
+/// The samples of at most so many bytes that each of so many routes retains for a restarted lane.
+fn retained_by_size(max_sample_bytes: usize, routes: usize) -> usize {
+    let by_bytes = RETAINED_BYTES / max_sample_bytes.max(1);
+    let share = RETAINED_IN_ALL / routes.max(1);
+    by_bytes.min(share).clamp(*RETAINED_SAMPLES.start(), *RETAINED_SAMPLES.end())
+}
+
 /// One entry of `topics`, with the parts that are valid.
 struct RouteDraft<'a> {
     field: Field<'a>,
@@ -87,6 +107,8 @@ struct RouteDraft<'a> {
     route: Option<Route>,
     /// The ids of its routes: its own, or those of the pattern's places.
     route_ids: Vec<RouteId>,
+    /// Whether the route retains samples by their size, and not as the file says.
+    retains_by_size: bool,
     pattern: Option<RoutePattern>,
     outputs: Vec<OutputDraft<'a>>,
 }
@@ -118,6 +140,7 @@ impl<'f> RouteReader<'_, 'f> {
                 input: None,
                 route: None,
                 route_ids: Vec::new(),
+                retains_by_size: false,
                 pattern: None,
                 outputs: Vec::new(),
             };
@@ -137,12 +160,14 @@ impl<'f> RouteReader<'_, 'f> {
             field.get("message_type").parsed(TypeName::ALLOWED, |text| TypeName::try_from(text).ok());
         let max_sample_bytes = field.get("max_sample_bytes").count();
         let priority = field.get("priority").count_or_default();
-        let retained_samples = field.get("retained_samples").count();
+        let given_retained = field.get("retained_samples").count();
 
         let overrides = field.section("qos_overrides");
         self.check_lane_keys(&overrides, &["input"]);
         let input_qos = PartialQos::read(&overrides.get("input")).input();
         let outputs = self.outputs(field, id.as_ref(), input_topic.as_ref(), &overrides);
+        let (latched, following) = self.retained_for_late_joiners(&outputs);
+        let retained = given_retained.or(latched.map(|latched| latched.max(following)));
 
         let route = match (&id, &input_topic) {
             (Some(id), Some(input_topic)) => Some(Route {
@@ -153,7 +178,7 @@ impl<'f> RouteReader<'_, 'f> {
                 input_qos,
                 max_sample_bytes: max_sample_bytes.unwrap_or(self.max_sample_bytes),
                 priority,
-                retained_samples: retained_samples.unwrap_or_else(|| self.retained_samples(&outputs)),
+                retained_samples: retained.unwrap_or(following),
             }),
             _ => None,
         };
@@ -172,7 +197,16 @@ impl<'f> RouteReader<'_, 'f> {
             _ => id.clone().into_iter().collect(),
         };
         let input = input_topic.map(|topic| (topic, input));
-        RouteDraft { field: field.clone(), id, input, route, route_ids, pattern, outputs }
+        RouteDraft {
+            field: field.clone(),
+            id,
+            input,
+            route,
+            route_ids,
+            retains_by_size: retained.is_none(),
+            pattern,
+            outputs,
+        }
     }
 
     /// One output for each lane that serves the route.
@@ -256,10 +290,10 @@ impl<'f> RouteReader<'_, 'f> {
         serving
     }
 
-    /// The samples that a restarted lane needs: the largest history of the TRANSIENT_LOCAL outputs. Outputs
-    /// that follow the publishers count with their depth, and never with a KEEP_ALL window, because most stay
-    /// VOLATILE.
-    fn retained_samples(&self, outputs: &[OutputDraft<'_>]) -> usize {
+    /// The samples that late joiners need of a restarted lane: the largest history of the TRANSIENT_LOCAL
+    /// outputs, if there are any, and that of the outputs that follow the publishers. These count with their
+    /// depth, and never with a KEEP_ALL window, because most stay VOLATILE.
+    fn retained_for_late_joiners(&self, outputs: &[OutputDraft<'_>]) -> (Option<usize>, usize) {
         let durable = outputs.iter().filter(|output| output.qos.durability == Durability::TransientLocal);
         let depths = durable.map(|output| match output.qos.depth() {
             Some(depth) => depth as usize,
@@ -267,8 +301,7 @@ impl<'f> RouteReader<'_, 'f> {
             None => self.lanes[output.lane].lane.window_samples_of(&output.qos),
         });
         let following = outputs.iter().filter_map(|output| output.latched_qos?.depth());
-        let following = following.max().map_or(0, |depth| depth as usize);
-        depths.max().unwrap_or(RETAINED_SAMPLES).max(following)
+        (depths.max(), following.max().map_or(0, |depth| depth as usize))
     }
 
     fn lane_names(&self) -> Vec<&str> {
@@ -416,4 +449,51 @@ fn first_of<'m, K: Eq + Hash>(
 /// The key path and place of a field, for a message.
 fn at(field: &Field<'_>) -> String {
     format!("{}, {}", field.path, Place::noun(field.line))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Settings, parse};
+
+    fn settings(text: &str) -> Settings {
+        parse(text, "f.yaml", &|_| None).unwrap_or_else(|error| panic!("{text}\n{error}"))
+    }
+
+    #[test]
+    fn a_route_retains_more_small_samples_for_a_restarted_lane_and_fewer_beside_many_routes() {
+        let retained = |bytes: usize, routes: usize| {
+            let route =
+                |number| format!("- {{id: r{number}, input_topic: /r{number}, max_sample_bytes: {bytes}}}\n");
+            let text = format!("topics:\n{}", (0..routes).map(route).collect::<String>());
+            let retained: HashSet<_> =
+                settings(&text).routes.iter().map(|route| route.retained_samples).collect();
+            let [retained] = retained.into_iter().collect::<Vec<_>>()[..] else {
+                panic!("not the same for all")
+            };
+            retained
+        };
+        for (bytes, routes, samples) in [
+            (1 << 10, 1, 256),
+            (64 << 10, 1, 256),
+            (512 << 10, 1, 32),
+            (2 << 20, 1, 8),
+            (64 << 20, 1, 8),
+            (64 << 10, 32, 256),
+            (64 << 10, 64, 128),
+            (512 << 10, 64, 32),
+            (64 << 10, 1_024, 8),
+        ] {
+            assert_eq!(retained(bytes, routes), samples, "{routes} routes of {bytes} bytes");
+        }
+        // Of a pattern, each place counts.
+        let text = "topics: [{id: any, input_topic: /a/**, max_routes: 64, max_sample_bytes: 1000}]";
+        assert_eq!(settings(text).routes[5].retained_samples, 128);
+        // What the file says stays.
+        let text = "topics: [{id: a, input_topic: /a, max_sample_bytes: 1000, retained_samples: 3}]";
+        assert_eq!(settings(text).routes[0].retained_samples, 3);
+        let text = "topics: [{id: a, input_topic: /a, max_sample_bytes: 1000}]\n\
+                    lanes: {critical: {qos: {durability: TRANSIENT_LOCAL, depth: 5}}}";
+        assert_eq!(settings(text).routes[0].retained_samples, 5);
+    }
 }

@@ -101,7 +101,7 @@ fn qos_comes_from_override_then_profile_then_lane_then_class() {
     let fleet = lane(&settings, "fleet").outputs[0].qos;
     let reliability = Reliability::Reliable;
     assert_eq!(fleet, QosProfile { reliability, lifespan_ms: Some(50), ..QosProfile::NONCRITICAL_RELIABLE });
-    // The deepest TRANSIENT_LOCAL output of each route, else 8.
+    // The deepest TRANSIENT_LOCAL output of each route, else 8 of the largest samples.
     assert_eq!(settings.routes.iter().map(|route| route.retained_samples).collect::<Vec<_>>(), [1, 8, 7]);
 }
 

@@ -128,12 +128,14 @@ impl RouteChannel {
     /// The size of the pool. At the start, ingress allocates the header of each slot. Slots of at most
     /// a page are allocated completely: each needs that page anyway.
     ///
-    /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. So
-    /// the sum of these limits is enough, whatever the lanes do.
+    /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. All
+    /// queues get each sample, and a full one loses its oldest: they hold the last samples, as many as the
+    /// deepest has room for, and so do the retained samples. So the sum of that number, of what may be
+    /// borrowed and of what may be loaned is enough, whatever the lanes do.
     pub fn pool_size(&self) -> PoolSize {
-        let share = |queue: QueueLimits| self.depth(queue) + queue.max_borrowed.max(1);
-        let lanes: usize = self.lanes.iter().map(|&queue| share(queue)).sum();
-        let slots = lanes + self.max_taps * share(TAP) + self.retained_samples + LOANED_SLOTS;
+        let last = self.queues().map(|queue| self.depth(queue)).max().unwrap_or(self.retained_samples);
+        let borrowed: usize = self.lanes.iter().map(|lane| lane.max_borrowed.max(1)).sum();
+        let slots = last + borrowed + self.max_taps * TAP.max_borrowed + LOANED_SLOTS;
         let stride = (SLOT_HEADER_BYTES + self.max_sample_bytes).next_multiple_of(SLOT_ALIGN) as u64;
         let is_sparse = stride > page_bytes();
         // Each slot begins at the same place of a page, so that its header is on one page.

@@ -46,6 +46,7 @@ pub struct SampleSubscriber {
     // Declared first, so that the port is dropped before the membership that it needs, which `borrowed`
     // holds.
     port: Subscriber<Service, [u8], WireHeader>,
+    queue_depth: usize,
     max_borrowed: usize,
     max_sample_bytes: usize,
     borrowed: Arc<BorrowCount>,
@@ -112,6 +113,7 @@ impl SampleSubscriber {
         shared.commit(&what)?;
         Ok(Self {
             port,
+            queue_depth: channel.depth(queue),
             max_borrowed: queue.max_borrowed.max(1),
             max_sample_bytes: channel.max_sample_bytes,
             borrowed: Arc::new(BorrowCount { count: AtomicUsize::new(0), _node: shared.clone() }),
@@ -151,6 +153,11 @@ impl SampleSubscriber {
             return Err(TakeError::Failed("a payload at address 0"));
         };
         Ok(Some(ShmSample { header, payload, length, _slot: slot, _borrow: borrow }))
+    }
+
+    /// The most samples that wait in the queue.
+    pub fn queue_depth(&self) -> usize {
+        self.queue_depth
     }
 
     /// The number of samples that were taken and are not dropped yet.

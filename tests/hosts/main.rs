@@ -18,6 +18,7 @@ mod interop;
 mod intruders;
 mod keyed;
 mod kilted;
+mod lane_restarts;
 mod large_samples;
 mod latched;
 mod networks;

@@ -45,7 +45,9 @@ fn the_need_grows_with_routes_sample_sizes_windows_depths_and_lanes() {
     let sizes = (0..=26).flat_map(|power| [1_usize << power, (1 << power) + 1, 3 << power]);
     let mut sizes: Vec<usize> = sizes.filter(|size| *size <= 64 << 20).collect();
     sizes.sort_unstable();
-    assert_none_shrinks(sizes.iter().map(|size| routes(2, &format!(", max_sample_bytes: {size}"))));
+    // By default a route of larger samples retains fewer.
+    let sized = |size: &usize| routes(2, &format!(", retained_samples: 8, max_sample_bytes: {size}"));
+    assert_none_shrinks(sizes.iter().map(sized));
     for lane in ["critical", "noncritical"] {
         let windows = [1, 2, 10, 33, 256, 1_000, 100_000];
         assert_none_shrinks(windows.iter().map(|window| {

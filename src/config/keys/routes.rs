@@ -116,7 +116,8 @@ pub(super) const ROWS: &[Row] = &[
         &["topics[].retained_samples"],
         Whole(1, 10_000, " samples"),
         "the largest depth among the route's TRANSIENT_LOCAL outputs (KEEP_ALL counts as the lane's \
-         `window_samples`), else 8; at least the depth given for an output without a durability",
+         `window_samples`), else 256, but at most 16 MiB of the largest samples that the route allows, or 8; with \
+         more than 32 routes an equal share of 8192; at least the depth given for an output without a durability",
     )
     .doc(
         "Samples retained in shared memory for a lane that restarts, which it then forwards, and which its \

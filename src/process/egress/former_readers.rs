@@ -12,6 +12,10 @@ use crate::model::{Guid, MonotonicNs, OutputReaders};
 /// have matched a live one.
 const WAIT_MS: u64 = 5_000;
 
+/// After a restart, how long the samples of an output wait for its former readers. Live ones match within
+/// 0.3 s on an idle machine; one that died with the lane delays the samples of the others by this time.
+const HOLD_MS: u64 = 1_000;
+
 /// The former readers of one output that are not matched again yet.
 #[derive(Debug, Default)]
 pub(super) struct FormerReaders {
@@ -19,6 +23,7 @@ pub(super) struct FormerReaders {
     /// Whether there may be others, for which the board had no room.
     more: bool,
     wait_ends_at: MonotonicNs,
+    hold_ends_at: MonotonicNs,
 }
 
 impl FormerReaders {
@@ -33,12 +38,18 @@ impl FormerReaders {
                 missing.push(former);
             }
         }
-        Self { missing, more, wait_ends_at: now.plus_ms(WAIT_MS) }
+        Self { missing, more, wait_ends_at: now.plus_ms(WAIT_MS), hold_ends_at: now.plus_ms(HOLD_MS) }
     }
 
     /// Whether none is missing any more.
     pub const fn is_empty(&self) -> bool {
         self.missing.is_empty() && !self.more
+    }
+
+    /// Whether samples have to wait for those that are missing. Not for readers that the board had no room
+    /// for: nobody knows when the last one of them has matched.
+    pub fn holds(&self, now: MonotonicNs) -> bool {
+        !self.missing.is_empty() && now < self.hold_ends_at
     }
 
     /// Removes a reader that has matched.
@@ -138,6 +149,17 @@ mod tests {
         let mut process = FormerReaders::of(&board, at(14_000));
         process.matched(guid(1));
         assert!(process.is_empty());
+    }
+
+    #[test]
+    fn samples_wait_for_readers_that_may_match_in_time() {
+        let board = matched(&mut first(), [0, 1]);
+        let mut process = FormerReaders::of(&board, at(500));
+        assert!(process.holds(at(500 + HOLD_MS - 1)) && !process.holds(at(500 + HOLD_MS)));
+        process.matched(guid(0));
+        assert!(process.holds(at(500)));
+        process.matched(guid(1));
+        assert!(!process.holds(at(500)) && !first().holds(at(0)));
     }
 
     #[test]

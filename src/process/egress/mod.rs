@@ -58,6 +58,8 @@ const UNSENT_POLL_NS: u64 = 250_000;
 
 /// How long a lane that continues its former participant waits for its readers before the first sample.
 const FORMER_READERS_MS: u64 = 200;
+/// How often a lane checks whether the readers have matched that its samples wait for after a restart.
+const HOLD_POLL_MS: u64 = 5;
 
 /// What the lane does after a turn.
 enum Turn {
@@ -251,6 +253,9 @@ impl Egress {
         if self.count_sent() {
             until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
         }
+        if self.outputs.iter().any(Output::is_held) {
+            until = MonotonicNs(until.0.min(now.plus_ms(HOLD_POLL_MS).0));
+        }
         let wait_ns = until.since(now);
         if wait_ns == 0 {
             return;
@@ -340,6 +345,7 @@ impl Egress {
         if let Some(lane) = &mut self.noncritical {
             lane.shut_down(&mut self.outputs);
         } else {
+            self.outputs.iter_mut().for_each(Output::end_hold);
             let last_at = began_at.plus_ms(LAST_SAMPLES_MS);
             while clock::monotonic() < last_at && matches!(self.turn(), Turn::Busy) {}
         }

@@ -1,9 +1,11 @@
 //! One output: takes the samples of a route from shared memory, writes them to DDS, and accounts for them.
 
 mod announce;
+mod catch_up;
+mod matching;
 
 use bytes::Bytes;
-use tracing::{error, info, warn};
+use tracing::{error, warn};
 
 use super::super::count_log::DropLog;
 use super::super::role::{Role, RoleError};
@@ -15,14 +17,14 @@ use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
 use super::identity::WriterRecord;
 use super::offer::{Offer, RouteDurability};
-use super::overrun::{Overrun, log_left};
+use super::overrun::Overrun;
 use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded, record_sequence};
 use crate::clock;
 use crate::config::{self, Forwarding, Settings};
-use crate::dds::{Participant, RawWriter, WriterEvent};
+use crate::dds::{Participant, RawWriter};
 use crate::model::{
-    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MAX_UNMATCHED_READERS, MonotonicNs,
-    OutputReaders, PartialSample, SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy, UnmatchedReader,
+    DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, PartialSample,
+    SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
 };
 use crate::policy::{SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
@@ -72,6 +74,8 @@ pub(super) struct Output {
     former_readers: FormerReaders,
     /// `None` if the lane does not keep its identity.
     record: Option<WriterRecord>,
+    /// Whether samples wait in the queue until the former readers have matched.
+    is_held: bool,
     /// The publisher of the last sample taken.
     last_publisher: Guid,
     /// Readers of the topic that request a stricter QoS than the writer offers, each with the policy.
@@ -150,6 +154,7 @@ impl Output {
             counters,
             readers,
             overrun: Overrun::default(),
+            is_held: lane.class() == TrafficClass::Critical && !former_readers.is_empty(),
             former_readers,
             record: WriterRecord::of(role, participant, lane_index, output.route),
             last_publisher: Guid::default(),
@@ -179,8 +184,12 @@ impl Output {
 
     /// Takes the next sample that is not accounted for yet, and counts the ones missing before it. Samples
     /// that were forwarded before a restart are skipped; for a TRANSIENT_LOCAL output they are written again,
-    /// because the new writer needs them for late joiners.
+    /// because the new writer needs them for late joiners. After a restart, a critical lane takes none before
+    /// its former readers have matched.
     pub fn take(&mut self) -> Option<ShmSample> {
+        if self.is_held && self.is_still_held() {
+            return None;
+        }
         loop {
             let sample = match self.subscriber.take() {
                 Ok(Some(sample)) => sample,
@@ -209,6 +218,10 @@ impl Output {
             }
             if sample.header().published_at >= self.started_at {
                 self.caught_up = true;
+            }
+            if !self.caught_up && self.is_too_old(sample.header()) {
+                self.drop_sample(&sample, DropReason::LaneDown);
+                continue;
             }
             self.follow_publisher(sample.header().writer_guid);
             return Some(sample);
@@ -462,79 +475,6 @@ impl Output {
         let class = self.class;
         let is_expected = |reason: DropReason| reason.is_expected(class);
         self.drop_log.log_drops(&self.counters.get().drops, &self.id, &self.lane, is_expected, now);
-    }
-
-    /// Forgets the readers without a match for which `is_gone` holds.
-    pub fn forget_unmatched(&mut self, is_gone: impl Fn(Guid) -> bool) {
-        self.unmatched.retain(|(reader, _)| !is_gone(*reader));
-    }
-
-    fn follow_matching(&mut self, now: MonotonicNs) {
-        let Some(writer) = &self.writer else {
-            return;
-        };
-        while let Some(event) = writer.poll_event() {
-            match event {
-                WriterEvent::Matched { reader, joined, readers, missed } => {
-                    self.counters.update(|counters| counters.readers = readers);
-                    if joined {
-                        self.former_readers.matched(reader);
-                        self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
-                    }
-                    info!(route = self.id, lane = self.lane, ?reader, joined, readers, "readers changed");
-                    log_left(&self.id, &self.lane, self.class, reader, missed);
-                    let history = self.history.as_mut();
-                    if let Some(late_joiners) = history.and_then(|it| it.late_joiners.as_mut()) {
-                        if !joined {
-                            late_joiners.left(reader);
-                        } else if !late_joiners.joined(reader, now) {
-                            warn!(
-                                route = self.id,
-                                lane = self.lane,
-                                ?reader,
-                                "too many late joiners wait for the history; this one gets only new samples"
-                            );
-                        }
-                    }
-                }
-                WriterEvent::Incompatible { reader, policy } => {
-                    // The DDS library repeats the event with each announcement of the reader.
-                    if self.unmatched.contains(&(reader, policy)) {
-                        continue;
-                    }
-                    self.unmatched.retain(|(unmatched, _)| *unmatched != reader);
-                    if self.unmatched.len() < MAX_UNMATCHED_READERS {
-                        self.unmatched.push((reader, policy));
-                    }
-                    warn!(
-                        route = self.id,
-                        lane = self.lane,
-                        topic = self.topic.dds_topic,
-                        ?reader,
-                        %policy,
-                        "a reader requests a stricter QoS than this lane offers and receives nothing: change \
-                         its QoS or the lane's"
-                    );
-                }
-            }
-        }
-    }
-
-    /// Writes the matched readers to their board, as many as it has room for, and counts the overruns of all.
-    pub fn record_readers(&mut self, now: MonotonicNs) {
-        self.former_readers.expire(now);
-        let Some(writer) = &self.writer else {
-            return;
-        };
-        let mut current = self.former_readers.on_board(self.counters.get().forwarded);
-        for (place, reader) in current.records.iter_mut().zip(writer.matched_readers()) {
-            *place = reader;
-        }
-        for (place, (reader, policy)) in current.unmatched.iter_mut().zip(&self.unmatched) {
-            *place = UnmatchedReader { reader: *reader, policy: *policy as u64 };
-        }
-        self.readers.set(current);
-        self.overrun.count(writer, &mut self.counters);
     }
 
     /// Reads the durability with the first sample of each publisher: ingress publishes type and durability

@@ -3,7 +3,9 @@
 use super::*;
 use crate::config::DropPolicy;
 use crate::dds::{RawReader, ReaderQos};
-use crate::model::{Encapsulation, FixedText, KeyedPayload, Reliability, RouteInfo, SampleKey};
+use crate::model::{
+    Encapsulation, FixedText, KeyedPayload, MAX_UNMATCHED_READERS, Reliability, RouteInfo, SampleKey,
+};
 use crate::process::role::participant_options;
 use crate::process::test_role::{self, SCAN, TYPE, wait_until};
 use crate::shm::SamplePublisher;
@@ -527,4 +529,60 @@ fn only_what_a_former_process_forwarded_is_written_again() {
     host.publish_next(2);
     assert!(output.take().is_none());
     assert_eq!(written(&output), 3);
+}
+
+#[test]
+fn samples_of_a_critical_lane_wait_for_the_former_readers() {
+    let former = Guid([9; 16]);
+    let mut board = OutputReaders::default();
+    board.former[0] = former;
+    let latched =
+        "topics: [{id: scan, input_topic: /scan, qos_overrides: {critical: {durability: TRANSIENT_LOCAL}}}]";
+    for (domain, lane, yaml, holds) in
+        [(144, CRITICAL, SCAN, true), (145, CRITICAL, latched, false), (146, NONCRITICAL, SCAN, false)]
+    {
+        let mut host = Host::start(domain, lane, yaml);
+        host.announce_type();
+        host.role.boards.output_readers_writer(lane, 0).set(board);
+        let mut output = host.open();
+        // Far from its end, however long this test is held up.
+        output.former_readers = FormerReaders::of(&board, clock::monotonic().plus_ms(60_000));
+        host.publish_next(1);
+        assert_eq!((output.take().is_none(), output.is_held()), (holds, holds), "{yaml}");
+        if holds {
+            output.former_readers.matched(former);
+            assert_eq!((output.take().unwrap().header().sequence, output.is_held()), (1, false));
+            (output.former_readers, output.is_held) = (FormerReaders::of(&board, MonotonicNs(0)), true);
+            host.publish_next(2);
+            assert_eq!(output.take().unwrap().header().sequence, 2, "they have not matched in time");
+        }
+    }
+}
+
+#[test]
+fn a_critical_lane_leaves_out_what_is_too_old_to_catch_up_with() {
+    let mut host = Host::start(147, CRITICAL, SCAN);
+    let mut output = host.open();
+    output.started_at = MonotonicNs(0).plus_ms(100_000);
+    host.role.boards.ingress_writer(0).update(|ingress| ingress.published = 20);
+    let published = |ms| MonotonicNs(0).plus_ms(ms);
+    // When the sample was published, its number, the LIFESPAN, and whether it is too old. Each was taken at
+    // the boot of the machine.
+    for (published_at, sequence, lifespan_ms, is_too_old) in [
+        (published(90_000), 12, None, false),
+        (published(89_999), 12, None, true),
+        (published(0), 13, None, false),
+        (published(90_000), 20, Some(1), true),
+        (published(90_000), 20, Some(u64::MAX), false),
+    ] {
+        output.offer.qos.lifespan_ms = lifespan_ms;
+        let header = SampleHeader { published_at, ..header(sequence) };
+        let header = SampleHeader { taken_at: MonotonicNs(0), ..header };
+        assert_eq!(output.is_too_old(&header), is_too_old, "{published_at:?} {sequence} {lifespan_ms:?}");
+    }
+    output.offer.qos.lifespan_ms = None;
+    let oldest = SampleHeader { published_at: published(0), ..header(1) };
+    assert!(output.is_too_old(&oldest));
+    output.history = Some(History::new(None));
+    assert!(!output.is_too_old(&oldest), "late joiners may need it");
 }

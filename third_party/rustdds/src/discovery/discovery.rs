@@ -691,14 +691,14 @@ impl Discovery {
     );
 
     // The single shared timer for the discovery loop. Register it once and seed
-    // all periodic tasks. The SPDP-publish and participant-message tasks are
-    // seeded with a short initial delay (matching the previous behaviour of
-    // their per-topic timers) so the first announcements go out quickly.
+    // all periodic tasks. The participant-message task is seeded with a short
+    // initial delay. The first announcement does not wait for the timer, see
+    // `announce_first`.
     let discovery_timer = new_shared_timer::<DiscoveryTimerEvent>();
     {
       let mut t = discovery_timer.borrow_mut();
       t.set_timeout(
-        StdDuration::from_millis(100),
+        Self::SPDP_PUBLISH_PERIOD,
         DiscoveryTimerEvent::SendParticipantInfo { reschedule: true },
       );
       t.set_timeout(
@@ -799,6 +799,7 @@ impl Discovery {
     self.initialize_participant();
     self.watch_interfaces();
     self.take_over_known();
+    self.announce_first();
 
     // Send out info about user (=non-built-in) Writers and Readers that we have.
     // We are just initializing local participant, so likely there are none yet,
@@ -1217,6 +1218,15 @@ impl Discovery {
     self.send_discovery_notification(DiscoveryNotificationType::ParticipantUpdated {
       guid_prefix: dp.guid().prefix,
     });
+  }
+
+  // At once: peers answer a participant that is new to them, and until then nobody
+  // matches its endpoints. It goes to the multicast address of our own built-in
+  // reader, of which `initialize_participant` has told the event loop before.
+  fn announce_first(&self) {
+    if let Some(dp) = self.domain_participant.clone().upgrade() {
+      self.spdp_publish(&dp);
+    }
   }
 
   pub fn spdp_receive(&mut self) {
@@ -2566,7 +2576,10 @@ mod tests {
   use crate::{
     dds::{adapters::no_key::DeserializerAdapter, ddsdata::DDSData},
     discovery::sedp_messages::{Endpoint_GUID, TopicBuiltinTopicData},
-    messages::submessages::submessages::{InterpreterSubmessage, WriterSubmessage},
+    messages::submessages::{
+      submessage_flag::DATA_Flags,
+      submessages::{InterpreterSubmessage, WriterSubmessage},
+    },
     network::{constant::*, udp_listener::UDPListener, udp_sender::UDPSender},
     rtps::submessage::*,
     structure::cache_change::ChangeKind,
@@ -2617,7 +2630,8 @@ mod tests {
     );
   }
 
-  // Whether an announcement of a participant is among what arrives until `until`.
+  // Whether an announcement of a participant, and not only its end, is among what
+  // arrives until `until`.
   fn receives_announcement(
     socket: &std::net::UdpSocket,
     of: GuidPrefix,
@@ -2636,8 +2650,9 @@ mod tests {
       let datagram = bytes::Bytes::copy_from_slice(&buffer[..length]);
       let message = crate::rtps::Message::read_from_buffer(&datagram).unwrap();
       let is_announcement = |submessage: &crate::rtps::Submessage| {
-        matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, _))
-          if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER)
+        matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, flags))
+          if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
+            && flags.contains(DATA_Flags::Data))
       };
       if message.header.guid_prefix == of && message.submessages.iter().any(is_announcement) {
         return true;
@@ -2678,6 +2693,19 @@ mod tests {
       return;
     }
     panic!("held up each time");
+  }
+
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn a_participant_is_announced_before_it_can_be_used() {
+    let domain = test_domain_id(49);
+    let port = spdp_well_known_unicast_port(domain, 5);
+    let neighbour = std::net::UdpSocket::bind(("127.0.0.1", port)).unwrap();
+    let participant = DomainParticipant::new(domain).expect("participant creation");
+    let prefix = participant.guid().prefix;
+    drop(participant);
+    let in_5_s = std::time::Instant::now() + StdDuration::from_secs(5);
+    assert!(receives_announcement(&neighbour, prefix, in_5_s));
   }
 
   #[test]

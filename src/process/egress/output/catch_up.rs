@@ -1,0 +1,60 @@
+//! How a restarted critical lane catches up with what was published while it was down.
+//!
+//! A VOLATILE reader never gets what was written before it matched, so the samples wait in the queue until
+//! the readers of the former process have matched again. An output with a history needs no wait: it gives
+//! late joiners what they missed.
+
+use super::Output;
+use crate::clock;
+use crate::model::{SampleHeader, TrafficClass};
+use crate::policy::is_stale;
+
+/// Older samples are left out, except for the last [`ANY_AGE_SAMPLES`]. At 1 Hz ingress retains those of some
+/// minutes, and a subscriber that has lost the lane for so long must not act on all of them.
+const CATCH_UP_MS: u64 = 10_000;
+
+/// The last samples of a route, which are forwarded however old they are: they may be its present state.
+const ANY_AGE_SAMPLES: u64 = 8;
+
+impl Output {
+    /// Whether samples wait in the queue until the former readers have matched.
+    pub const fn is_held(&self) -> bool {
+        self.is_held
+    }
+
+    /// Lets the samples go that wait for former readers.
+    pub fn end_hold(&mut self) {
+        self.is_held = false;
+    }
+
+    /// Whether samples still have to wait for former readers.
+    pub(super) fn is_still_held(&mut self) -> bool {
+        let now = clock::monotonic();
+        self.follow_matching(now);
+        let waits = self.writer.is_some() && self.history.is_none() && self.former_readers.holds(now);
+        // The readers that have matched must not lose samples to the others.
+        self.is_held = waits && (self.counters.get().readers == 0 || !self.is_queue_nearly_full());
+        self.is_held
+    }
+
+    fn is_queue_nearly_full(&self) -> bool {
+        let last = self.boards.ingress(self.route).map_or(0, |ingress| ingress.published);
+        let waiting = last.saturating_sub(self.tracker.last());
+        waiting >= self.subscriber.queue_depth() as u64 / 8 * 7
+    }
+
+    /// Whether a sample from before the start of this process is too old to be forwarded: its LIFESPAN has
+    /// ended, or it belongs to a long outage.
+    pub(super) fn is_too_old(&self, header: &SampleHeader) -> bool {
+        // A noncritical lane has a limit of its own, and late joiners may need any sample of a history.
+        if self.class != TrafficClass::Critical || self.history.is_some() {
+            return false;
+        }
+        let age_ns = clock::monotonic().since(header.age_from());
+        let lifespan_ms = self.offer.qos.lifespan_ms.unwrap_or(0);
+        let last = self.boards.ingress(self.route).map_or(0, |ingress| ingress.published);
+        is_stale(age_ns, lifespan_ms)
+            || (last.saturating_sub(header.sequence) >= ANY_AGE_SAMPLES
+                && is_stale(self.started_at.since(header.published_at), CATCH_UP_MS))
+    }
+}
