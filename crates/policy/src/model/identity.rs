@@ -20,7 +20,7 @@ pub struct LaneIdentity {
     /// 1 while the process that took it over has not run for long: the next one does not, in case that was
     /// the reason why this one ended.
     pub unproven: u64,
-    /// The [`checksum`](Self::checksum) of the rest.
+    /// The `checksum` of the rest.
     pub checksum: u64,
 }
 
@@ -32,7 +32,7 @@ pub struct WriterIdentity {
     pub count: u64,
     /// A hash of participant, topic, type and QoS.
     pub offer: u64,
-    /// The [`checksum`](Self::checksum) of the rest.
+    /// The `checksum` of the rest.
     pub checksum: u64,
 }
 
