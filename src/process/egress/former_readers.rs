@@ -47,7 +47,7 @@ impl FormerReaders {
     }
 
     /// Whether samples have to wait for those that are missing. Not for readers that the board had no room
-    /// for: nobody knows when the last one of them has matched.
+    /// for: no event tells when the last one of them has matched.
     pub fn holds(&self, now: MonotonicNs) -> bool {
         !self.missing.is_empty() && now < self.hold_ends_at
     }

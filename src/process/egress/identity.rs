@@ -44,16 +44,16 @@ pub(super) struct Identity {
 
 impl Identity {
     /// Joins the domain, as the participant of the former process if that is possible. Returns the identity
-    /// to keep, and whether it is that of the former process.
+    /// to keep.
     pub fn join(
         role: &mut Role,
         settings: &Settings,
         index: usize,
         options: &ParticipantOptions,
-    ) -> Result<(Participant, Option<Self>, bool), RoleError> {
+    ) -> Result<(Participant, Option<Self>), RoleError> {
         let lane = &settings.lanes[index];
         if lane.class() != TrafficClass::Critical || std::env::var_os(SWITCH).is_none() {
-            return Ok((role.join(options)?, None, false));
+            return Ok((role.join(options)?, None));
         }
         let mut identity = Self {
             board: role.boards.lane_identity_writer(index),
@@ -90,7 +90,7 @@ impl Identity {
         role.adopt(&participant);
         identity.record(&participant, continued);
         info!(lane = lane.name.as_str(), participant = ?participant.guid(), continued, "identity");
-        Ok((participant, Some(identity), continued))
+        Ok((participant, Some(identity)))
     }
 
     /// What the former process has left, if this one may continue it.

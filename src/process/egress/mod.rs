@@ -56,8 +56,6 @@ const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 /// thread takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
 
-/// How long a lane that continues its former participant waits for its readers before the first sample.
-const FORMER_READERS_MS: u64 = 200;
 /// How often a lane checks whether the readers have matched that its samples wait for after a restart.
 const HOLD_POLL_MS: u64 = 5;
 
@@ -142,16 +140,13 @@ impl Egress {
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
-        let (mut participant, identity, is_continued) = Identity::join(&mut role, settings, index, &options)?;
+        let (mut participant, identity) = Identity::join(&mut role, settings, index, &options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;
         for output in &lane.outputs {
             more_urgent.push(lane.outputs.partition_point(|other| priority(other) > priority(output)));
             outputs.push(Output::open(&role, &mut participant, settings, index, output)?);
-        }
-        if is_continued {
-            await_former_readers(&mut outputs);
         }
         let now = clock::monotonic();
         let noncritical = match &lane.forwarding {
@@ -372,22 +367,6 @@ impl Egress {
             // The next process counts as unconfirmed what is not acknowledged now.
             output.record_readers(clock::monotonic());
         }
-    }
-}
-
-/// Waits until the readers of the former process, which know the writers, are matched on this side as well:
-/// what is written before counts as without a reader. The library does that on threads of its own.
-fn await_former_readers(outputs: &mut [Output]) {
-    let give_up_at = clock::monotonic().plus_ms(FORMER_READERS_MS);
-    loop {
-        let now = clock::monotonic();
-        let missing =
-            outputs.iter_mut().filter_map(|output| (!output.has_former_readers_back(now)).then_some(()));
-        if missing.count() == 0 || now >= give_up_at {
-            return;
-        }
-        #[allow(clippy::disallowed_methods, reason = "the lane starts")]
-        std::thread::sleep(Duration::from_millis(1));
     }
 }
 

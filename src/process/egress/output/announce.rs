@@ -9,18 +9,12 @@ use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
 use super::Output;
 use crate::dds::{Participant, RawWriter};
-use crate::model::{DdsType, DropReason, Durability, Guid, MonotonicNs};
+use crate::model::{DdsType, DropReason, Durability, Guid};
 
 impl Output {
     /// Whether the readers of its writer can be served by the next process as if nothing had happened.
     pub fn may_be_continued(&self) -> bool {
         self.offer.qos.durability == Durability::Volatile && !self.has_keys && !self.topic.is_place
-    }
-
-    /// Handles matches until all readers of the former process are matched; returns whether they are.
-    pub fn has_former_readers_back(&mut self, now: MonotonicNs) -> bool {
-        self.follow_matching(now);
-        self.former_readers.is_empty()
     }
 
     /// Whether the publishers offer TRANSIENT_LOCAL and the output does not, though it follows them.
