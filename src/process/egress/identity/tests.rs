@@ -101,7 +101,7 @@ fn an_identity_is_given_up_if_others_may_not_know_it_or_it_has_changed() {
 fn a_lane_that_is_not_told_to_keeps_no_identity() {
     let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(LANE), "egress", 72, SCAN);
     let options = participant_options(&settings, &settings.lanes[LANE].network, "egress");
-    let (participant, identity, continued) = Identity::join(&mut role, &settings, LANE, &options).unwrap();
-    assert!(identity.is_none() && !continued);
+    let (participant, identity) = Identity::join(&mut role, &settings, LANE, &options).unwrap();
+    assert!(identity.is_none());
     assert!(WriterRecord::of(&role, &participant, LANE, 0).is_none());
 }
