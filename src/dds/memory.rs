@@ -13,10 +13,10 @@ const SEND_SOCKETS: u64 = 2;
 /// (`systemd/sysctl.d/00-adaptive-bridge.conf`): twice the 4 MiB that a program asks for.
 const SOCKET_BYTES: u64 = 8 * MIB;
 
-/// Participants and endpoints at the limits of discovery, and those that are gone and remembered: 301 MiB
+/// Participants and endpoints at the limits of discovery, and those that are gone and remembered: 209 MiB
 /// with the largest announcements that it accepts (`a_full_database_takes_a_bounded_amount_of_memory` of
 /// RustDDS).
-const DISCOVERED_BYTES: u64 = 320 * MIB;
+const DISCOVERED_BYTES: u64 = 240 * MIB;
 /// Topics of discovery, of which a participant has a RELIABLE reader.
 const DISCOVERY_TOPICS: u64 = 4;
 /// Announcements of one of them that were read (16 MiB), that wait for an earlier one (16 MiB), and

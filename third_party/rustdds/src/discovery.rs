@@ -1,4 +1,5 @@
 pub(crate) mod announced;
+pub(crate) mod attic;
 pub(crate) mod builtin_endpoint;
 pub(crate) mod content_filter_property;
 #[allow(clippy::module_inception)]

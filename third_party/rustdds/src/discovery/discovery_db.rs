@@ -33,6 +33,7 @@ use crate::{
   RepresentationIdentifier,
 };
 use super::{
+  attic::Attic,
   sedp_messages::{
     topics_inconsistent, DiscoveredReaderData, DiscoveredTopicData, DiscoveredWriterData,
     ParticipantMessageData, ReaderProxy, SubscriptionBuiltinTopicData, TopicBuiltinTopicData,
@@ -51,10 +52,6 @@ const DEFAULT_PARTICIPANT_LEASE_DURATION: Duration = Duration::from_secs(60);
 
 // How much longer to wait than lease duration before pronouncing lost.
 const PARTICIPANT_LEASE_DURATION_TOLERANCE: Duration = Duration::from_secs(0);
-
-// How many participants that are gone are remembered, with their readers and writers.
-// They may come back.
-const MAX_PARTICIPANTS_IN_ATTIC: usize = 256;
 
 // TODO: Let DiscoveryDB itself become thread-safe and support smaller-scope
 // lock
@@ -78,13 +75,8 @@ pub(crate) struct DiscoveryDB {
   external_topic_readers: BTreeMap<GUID, DiscoveredReaderData>,
   external_topic_writers: BTreeMap<GUID, DiscoveredWriterData>,
 
-  // These are "attic" storages for readers and writers whose participant
-  // was lost due to time-out. If we have a
-  external_topic_readers_attic: BTreeMap<GUID, DiscoveredReaderData>,
-  external_topic_writers_attic: BTreeMap<GUID, DiscoveredWriterData>,
-  participant_attic: BTreeMap<GuidPrefix, SpdpDiscoveredParticipantData>,
-  // Whose endpoints are in the attics, the one that has been gone for longest first.
-  attic_order: VecDeque<GuidPrefix>,
+  // The readers and writers of participants that are gone, which may come back.
+  attic: Attic,
 
   // Database of topic updates:
   // Outer level key is topic name
@@ -119,15 +111,10 @@ pub(crate) enum DiscoveredVia {
   SelfDefined,  // not discovered, but defined by the local DomainParticipant
 }
 
-fn move_by_guid_prefix<D>(
-  guid_prefix: GuidPrefix,
-  from: &mut BTreeMap<GUID, D>,
-  to: &mut BTreeMap<GUID, D>,
-) {
-  let to_move: Vec<GUID> = from.range(guid_prefix.range()).map(|(g, _)| *g).collect();
-  for guid in to_move {
-    from.remove(&guid).map(|d| to.insert(guid, d));
-  }
+// Removes what belongs to a participant.
+fn take_by_guid_prefix<D>(guid_prefix: GuidPrefix, from: &mut BTreeMap<GUID, D>) -> Vec<D> {
+  let guids: Vec<GUID> = from.range(guid_prefix.range()).map(|(g, _)| *g).collect();
+  guids.iter().filter_map(|guid| from.remove(guid)).collect()
 }
 
 // Bytes of the announcement of an endpoint without its locators, each of which takes 28.
@@ -180,10 +167,7 @@ impl DiscoveryDB {
       local_topic_readers: BTreeMap::new(),
       external_topic_readers: BTreeMap::new(),
       external_topic_writers: BTreeMap::new(),
-      external_topic_readers_attic: BTreeMap::new(),
-      external_topic_writers_attic: BTreeMap::new(),
-      participant_attic: BTreeMap::new(),
-      attic_order: VecDeque::new(),
+      attic: Attic::default(),
       topics: BTreeMap::new(),
       topic_updated_sender,
       participant_status_sender,
@@ -242,21 +226,10 @@ impl DiscoveryDB {
       // This may be a rediscovery: Participant lease time timed out, but then
       // came back, e.g. by network outage. We then restore readers/writers from
       // attic to discovery DB.
-      move_by_guid_prefix(
-        guid.prefix,
-        &mut self.external_topic_readers_attic,
-        &mut self.external_topic_readers,
-      );
-      move_by_guid_prefix(
-        guid.prefix,
-        &mut self.external_topic_writers_attic,
-        &mut self.external_topic_writers,
-      );
+      // After it has left the attic, which the evicted one enters.
+      self.restore_endpoints_of(guid.prefix);
       self.restore_topics_of(guid.prefix);
 
-      // After the new one has left the attic, which the evicted one enters.
-      self.participant_attic.remove(&guid.prefix);
-      self.attic_order.retain(|prefix| *prefix != guid.prefix);
       if let Some(evicted) = evicted {
         self.counters.participants_evicted.increment();
         self.remove_participant(evicted, true);
@@ -348,7 +321,7 @@ impl DiscoveryDB {
         "Participant alive update for unknown {guid_prefix:?}. This is normal, if the message \
          does not repeat."
       );
-      self.participant_attic.remove(&guid_prefix)
+      self.attic.take_announcement(guid_prefix)
     }
   }
 
@@ -364,6 +337,7 @@ impl DiscoveryDB {
   pub fn remove_participant(&mut self, guid_prefix: GuidPrefix, active_disposal: bool) -> bool {
     info!("removing participant {guid_prefix:?}");
     let participant_data = self.participant_proxies.remove(&guid_prefix);
+    let is_present = participant_data.is_some();
     self.participant_last_life_signs.remove(&guid_prefix);
     self.discovery_order.retain(|prefix| *prefix != guid_prefix);
     #[cfg(feature = "security")]
@@ -371,46 +345,33 @@ impl DiscoveryDB {
 
     self.forget_topics_of(guid_prefix);
 
-    if participant_data.is_some() {
-      self.remember_in_attic(guid_prefix);
-    }
-    if active_disposal {
-      // A datagram that it sent before is no sign of life.
-      self.participant_attic.remove(&guid_prefix);
-    } else if let Some(participant_data) = participant_data {
-      self.participant_attic.insert(guid_prefix, participant_data);
-    }
-    if !self.attic_order.contains(&guid_prefix) {
-      // Endpoints of a participant that was never discovered.
-      let endpoints = |db: &Self| db.external_topic_readers.len() + db.external_topic_writers.len();
-      let before = endpoints(self);
-      self.remove_topic_reader_with_prefix(guid_prefix);
-      self.remove_topic_writer_with_prefix(guid_prefix);
-      return endpoints(self) < before;
-    }
-    move_by_guid_prefix(
-      guid_prefix,
-      &mut self.external_topic_readers,
-      &mut self.external_topic_readers_attic,
+    // A datagram that it sent before it said goodbye is no sign of life.
+    let announcement = participant_data.filter(|_| !active_disposal);
+    let is_known = is_present || self.restore_endpoints_of(guid_prefix);
+    let endpoints = (
+      take_by_guid_prefix(guid_prefix, &mut self.external_topic_readers),
+      take_by_guid_prefix(guid_prefix, &mut self.external_topic_writers),
     );
-    move_by_guid_prefix(
-      guid_prefix,
-      &mut self.external_topic_writers,
-      &mut self.external_topic_writers_attic,
-    );
-    self.limit_attic();
+    if !is_known {
+      // Endpoints of a participant that was never discovered are not remembered.
+      return !endpoints.0.is_empty() || !endpoints.1.is_empty();
+    }
+    self.attic.remember(guid_prefix, &endpoints, announcement);
     true
   }
 
-  // No more endpoints than of participants that are there. Those that have been gone for
-  // longest are forgotten.
-  fn limit_attic(&mut self) {
-    while self.external_topic_readers_attic.len() > MAX_ENDPOINTS
-      || self.external_topic_writers_attic.len() > MAX_ENDPOINTS
-    {
-      let Some(forgotten) = self.attic_order.pop_front() else { return };
-      self.remove_from_attic(forgotten);
+  // Returns whether the participant was in the attic. What was announced since it was gone stays.
+  fn restore_endpoints_of(&mut self, guid_prefix: GuidPrefix) -> bool {
+    let Some((readers, writers)) = self.attic.take(guid_prefix) else { return false };
+    for reader in readers {
+      let guid = reader.reader_proxy.remote_reader_guid;
+      self.external_topic_readers.entry(guid).or_insert(reader);
     }
+    for writer in writers {
+      let guid = writer.writer_proxy.remote_writer_guid;
+      self.external_topic_writers.entry(guid).or_insert(writer);
+    }
+    true
   }
 
   // What the participant and its endpoints announced of topics. A topic with another
@@ -456,26 +417,6 @@ impl DiscoveryDB {
     }
   }
 
-  fn remember_in_attic(&mut self, guid_prefix: GuidPrefix) {
-    self.attic_order.retain(|prefix| *prefix != guid_prefix);
-    self.attic_order.push_back(guid_prefix);
-    if self.attic_order.len() > MAX_PARTICIPANTS_IN_ATTIC {
-      if let Some(forgotten) = self.attic_order.pop_front() {
-        self.remove_from_attic(forgotten);
-      }
-    }
-  }
-
-  fn remove_from_attic(&mut self, guid_prefix: GuidPrefix) {
-    self.participant_attic.remove(&guid_prefix);
-    self
-      .external_topic_readers_attic
-      .retain(|guid, _| guid.prefix != guid_prefix);
-    self
-      .external_topic_writers_attic
-      .retain(|guid, _| guid.prefix != guid_prefix);
-  }
-
   pub fn find_participant_proxy(
     &self,
     guid_prefix: GuidPrefix,
@@ -495,19 +436,6 @@ impl DiscoveryDB {
       .collect()
   }
 
-  fn remove_topic_reader_with_prefix(&mut self, guid_prefix: GuidPrefix) {
-    // TODO: Implement this using .drain_filter() in BTreeMap once it lands in
-    // stable.
-    let to_remove: Vec<GUID> = self
-      .external_topic_readers
-      .range(guid_prefix.range())
-      .map(|(g, _)| *g)
-      .collect();
-    for guid in to_remove {
-      self.external_topic_readers.remove(&guid);
-    }
-  }
-
   pub fn remove_topic_reader(&mut self, guid: GUID) {
     info!("remove_topic_reader {guid:?}");
     if let Some(reader) = self.external_topic_readers.remove(&guid) {
@@ -522,19 +450,6 @@ impl DiscoveryDB {
   #[cfg(feature = "security")]
   pub fn get_topic_writer(&self, guid: &GUID) -> Option<&DiscoveredWriterData> {
     self.external_topic_writers.get(guid)
-  }
-
-  fn remove_topic_writer_with_prefix(&mut self, guid_prefix: GuidPrefix) {
-    // TODO: Implement this using .drain_filter() in BTreeMap once it lands in
-    // stable.
-    let to_remove: Vec<GUID> = self
-      .external_topic_writers
-      .range(guid_prefix.range())
-      .map(|(g, _)| *g)
-      .collect();
-    for guid in to_remove {
-      self.external_topic_writers.remove(&guid);
-    }
   }
 
   pub fn remove_topic_writer(&mut self, guid: GUID) {
@@ -1167,6 +1082,7 @@ pub(crate) mod tests {
       topic::TopicKind,
       with_key::simpledatareader::ReaderCommand,
     },
+    discovery::attic::{MAX_ATTIC_BYTES, MAX_PARTICIPANTS_IN_ATTIC},
     mio_source,
     polling::{wake_channel, LoopWaker},
     serialization::CDRSerializerAdapter,
@@ -1247,7 +1163,7 @@ pub(crate) mod tests {
     assert_eq!(evicted[0], unmatched.participant_guid.prefix);
     assert!(db.participant_proxies.contains_key(&matched.participant_guid.prefix));
     assert_eq!(db.discovery_order.len(), MAX_PARTICIPANTS);
-    assert!(db.attic_order.len() <= MAX_PARTICIPANTS_IN_ATTIC);
+    assert!(db.attic.participants() <= MAX_PARTICIPANTS_IN_ATTIC);
     assert_eq!(db.counters().counts().participants_evicted, evicted.len() as u64);
   }
 
@@ -1260,7 +1176,7 @@ pub(crate) mod tests {
     db.update_subscription(&new_reader(returning.participant_guid, 1, "theirs"));
     db.remove_participant(prefix, false);
     // It is the oldest one in the attic, which is full.
-    while db.attic_order.len() < MAX_PARTICIPANTS_IN_ATTIC {
+    while db.attic.participants() < MAX_PARTICIPANTS_IN_ATTIC {
       let other = new_participant();
       db.update_participant(&other);
       db.remove_participant(other.participant_guid.prefix, true);
@@ -1271,7 +1187,7 @@ pub(crate) mod tests {
     let update = db.update_participant(&returning);
     assert!(matches!(update, ParticipantUpdate::New { evicted: Some(_) }), "{update:?}");
     assert_eq!(db.endpoints_of(prefix).0.len(), 1);
-    assert!(db.participant_attic.get(&prefix).is_none() && !db.attic_order.contains(&prefix));
+    assert!(!db.attic.contains(prefix));
   }
 
   #[test]
@@ -1353,22 +1269,46 @@ pub(crate) mod tests {
   fn the_endpoints_of_participants_that_are_gone_are_limited() {
     let mut db = database();
     let mut gone = Vec::new();
-    for _ in 0..6 {
+    for _ in 0..4 {
       let participant = new_participant();
       db.update_participant(&participant);
       for number in 0..MAX_ENDPOINTS_PER_PARTICIPANT {
-        db.update_subscription(&new_reader(participant.participant_guid, number as u32, "theirs"));
+        let mut reader = new_reader(participant.participant_guid, number as u32, "theirs");
+        reader.user_data = vec![0; 1_500];
+        assert!(db.update_subscription(&reader).is_some());
       }
       db.remove_participant(participant.participant_guid.prefix, true);
       gone.push(participant);
     }
-    assert_eq!(db.external_topic_readers_attic.len(), MAX_ENDPOINTS);
+    assert!(db.attic.bytes() > MAX_ATTIC_BYTES / 2 && db.attic.bytes() <= MAX_ATTIC_BYTES);
     let restored = |db: &mut DiscoveryDB, participant: &SpdpDiscoveredParticipantData| {
       db.update_participant(participant);
       db.endpoints_of(participant.participant_guid.prefix).0.len()
     };
     assert_eq!(restored(&mut db, &gone[0]), 0, "the one that has been gone for longest");
-    assert_eq!(restored(&mut db, &gone[5]), MAX_ENDPOINTS_PER_PARTICIPANT);
+    for participant in &gone[2..] {
+      assert_eq!(restored(&mut db, participant), MAX_ENDPOINTS_PER_PARTICIPANT);
+    }
+    assert_eq!(db.attic.bytes(), 0);
+  }
+
+  #[test]
+  fn an_endpoint_of_one_that_is_gone_stays_with_the_others_of_it() {
+    let mut db = database();
+    let participant = new_participant();
+    let prefix = participant.participant_guid.prefix;
+    db.update_participant(&participant);
+    db.update_subscription(&new_reader(participant.participant_guid, 1, "theirs"));
+    db.remove_participant(prefix, false);
+    // It is announced before its participant returns, and its topic has changed.
+    db.update_subscription(&new_reader(participant.participant_guid, 1, "another"));
+    db.update_subscription(&new_reader(participant.participant_guid, 2, "theirs"));
+    assert!(db.remove_participant(prefix, true));
+    assert_eq!(db.endpoints_of(prefix).0.len(), 0);
+    db.update_participant(&participant);
+    let readers = db.endpoints_of(prefix).0;
+    let topics: Vec<_> = readers.iter().map(|r| r.subscription_topic_data.topic_name()).collect();
+    assert_eq!(topics, ["another", "theirs"]);
   }
 
   #[test]
@@ -1414,7 +1354,7 @@ pub(crate) mod tests {
     for prefix in db.participant_prefixes(|_| true) {
       db.remove_participant(prefix, true);
     }
-    assert_eq!(db.external_topic_writers_attic.len(), MAX_ENDPOINTS);
+    assert!(db.attic.bytes() > MAX_ATTIC_BYTES / 2);
     db.topic_cleanup();
     fill_with_large_announcements(&mut db, MAX_PARTICIPANTS);
     assert_eq!(db.external_topic_writers.len(), MAX_ENDPOINTS);
@@ -1510,7 +1450,7 @@ pub(crate) mod tests {
       let other = announce(&mut db).participant_guid.prefix;
       db.remove_participant(other, true);
     }
-    assert_eq!(db.external_topic_readers_attic.len(), MAX_PARTICIPANTS_IN_ATTIC);
+    assert_eq!(db.attic.participants(), MAX_PARTICIPANTS_IN_ATTIC);
     db.update_participant(&participant);
     assert_eq!(db.endpoints_of(prefix).0.len(), 0);
   }

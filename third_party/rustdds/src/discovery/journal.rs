@@ -18,11 +18,11 @@ use crate::{
 /// A longer journal is not read.
 pub(crate) const MAX_JOURNAL_BYTES: usize = 256 << 10;
 
-const ENCODING: RepresentationIdentifier = RepresentationIdentifier::PL_CDR_LE;
+pub(crate) const ENCODING: RepresentationIdentifier = RepresentationIdentifier::PL_CDR_LE;
 // The kinds of records. A record is its kind, the length of the announcement, and the
 // announcement as it goes over the network, without an encapsulation header.
 const PARTICIPANT: u8 = 1;
-const READER: u8 = 2;
+pub(crate) const READER: u8 = 2;
 
 /// A record of a journal.
 #[derive(Debug)]
@@ -46,13 +46,23 @@ pub(crate) fn write(db: &DiscoveryDB, own: GuidPrefix) -> Vec<u8> {
   journal
 }
 
-fn append(journal: &mut Vec<u8>, kind: u8, announcement: &impl PlCdrSerialize) {
+pub(crate) fn append(journal: &mut Vec<u8>, kind: u8, announcement: &impl PlCdrSerialize) {
   let Ok(bytes) = announcement.to_pl_cdr_bytes(ENCODING) else {
     return; // it cannot be announced either
   };
   journal.push(kind);
   journal.extend((bytes.len() as u32).to_le_bytes());
   journal.extend(bytes);
+}
+
+/// The kind and the announcement of the first record, which is taken off. `None` if it is torn.
+pub(crate) fn next_record<'a>(journal: &mut &'a [u8]) -> Option<(u8, &'a [u8])> {
+  let (&kind, rest) = journal.split_first()?;
+  let (length, rest) = rest.split_first_chunk()?;
+  let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
+  let (announcement, rest) = rest.split_at_checked(length)?;
+  *journal = rest;
+  Some((kind, announcement))
 }
 
 /// Reads a journal as what comes from the network, and all of it: `None` if any record is
@@ -63,11 +73,8 @@ pub(crate) fn read(mut journal: &[u8], own: GuidPrefix) -> Option<Vec<Known>> {
   }
   let mut known = Vec::new();
   let mut prefixes = BTreeSet::new();
-  while let Some((&kind, rest)) = journal.split_first() {
-    let (length, rest) = rest.split_first_chunk()?;
-    let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
-    let (bytes, rest) = rest.split_at_checked(length)?;
-    journal = rest;
+  while !journal.is_empty() {
+    let (kind, bytes) = next_record(&mut journal)?;
     known.push(match kind {
       PARTICIPANT => {
         let data = SpdpDiscoveredParticipantData::from_pl_cdr_bytes(bytes, ENCODING).ok()?;
