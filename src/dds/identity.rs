@@ -1,7 +1,10 @@
 //! What a participant and its writers take over from those of a killed process.
 
-use super::rustdds::{self, ContinuedWriter};
-use crate::model::Guid;
+use bytes::Bytes;
+
+use super::rustdds::{self, ContinuedSample, ContinuedWriter, GUID};
+use super::writer::{encoding, timestamp};
+use crate::model::{Encapsulation, Guid, SourceTimestamp};
 
 /// The identity of a participant. A participant that takes it over is the same one to others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,8 +51,40 @@ pub struct WriterContinuation {
     /// The first sample gets the number after this one, which the former writer must have sent last: readers
     /// discard lower ones without a word. 0 for a new writer.
     pub highest_number: i64,
-    /// Called with each number before anything with it is sent, by any thread; must return at once.
-    pub on_number: Box<dyn Fn(i64) + Send + Sync>,
+    /// The last samples of the former writer, in the order of their numbers; a number between them was that
+    /// of a sample that was withdrawn. The former readers that lack them get them.
+    pub samples: Vec<FormerSample>,
+    /// Of the numbers of the former writer, those after this one are sent again.
+    pub sent_through: i64,
+    /// The readers of the former writer.
+    pub readers: Vec<Guid>,
+    /// Called with each number before anything with it is sent, by any thread, and with whether it is that of
+    /// a sample that is written: one that is begun early may be withdrawn. Must return at once.
+    pub on_number: Box<dyn Fn(i64, bool) + Send + Sync>,
+}
+
+/// A sample that a killed process has written.
+pub struct FormerSample {
+    /// Its RTPS sequence number.
+    pub number: i64,
+    /// Its payload.
+    pub payload: Bytes,
+    /// The encapsulation of the payload.
+    pub encapsulation: Encapsulation,
+    /// Its source timestamp.
+    pub timestamp: SourceTimestamp,
+}
+
+impl FormerSample {
+    fn into_rustdds(self) -> ContinuedSample {
+        ContinuedSample {
+            number: self.number,
+            payload: self.payload,
+            encoding: encoding(self.encapsulation),
+            encoding_options: self.encapsulation.options(),
+            source_timestamp: timestamp(self.timestamp),
+        }
+    }
 }
 
 impl WriterContinuation {
@@ -57,6 +92,9 @@ impl WriterContinuation {
         ContinuedWriter {
             entity_key: self.key,
             highest_number: self.highest_number,
+            samples: self.samples.into_iter().map(FormerSample::into_rustdds).collect(),
+            sent_through: self.sent_through,
+            readers: self.readers.iter().map(|reader| GUID::from_bytes(reader.0)).collect(),
             on_number: self.on_number,
         }
     }

@@ -184,7 +184,10 @@ impl Participant {
         let continuation = WriterContinuation {
             key: GRAPH_KEY,
             highest_number: graph_number,
-            on_number: Box::new(move |number| told.store(number, Ordering::Relaxed)),
+            samples: Vec::new(),
+            sent_through: graph_number,
+            readers: Vec::new(),
+            on_number: Box::new(move |number, _| told.store(number, Ordering::Relaxed)),
         };
         let graph = make_writer(
             &participant,

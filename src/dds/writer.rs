@@ -309,21 +309,28 @@ impl SerializerAdapter<RawPayload> for PayloadEncoder {
     }
 
     fn output_encapsulation(value: &RawPayload) -> (RepresentationIdentifier, [u8; 2]) {
-        let representation = value.encapsulation.representation();
-        // The conversion needs two bytes, so it cannot fail; CDR_LE is the most common encapsulation.
-        let encoding =
-            RepresentationIdentifier::from_bytes(&representation).unwrap_or(RepresentationIdentifier::CDR_LE);
-        (encoding, value.encapsulation.options())
+        (encoding(value.encapsulation), value.encapsulation.options())
     }
 }
 
+/// The representation of a payload.
+pub(super) fn encoding(encapsulation: Encapsulation) -> RepresentationIdentifier {
+    // The conversion needs two bytes, so it cannot fail; CDR_LE is the most common encapsulation.
+    RepresentationIdentifier::from_bytes(&encapsulation.representation())
+        .unwrap_or(RepresentationIdentifier::CDR_LE)
+}
+
+/// A source timestamp, if there is one.
+pub(super) fn timestamp(timestamp: SourceTimestamp) -> Option<Timestamp> {
+    (timestamp != SourceTimestamp::NONE).then(|| Timestamp::from_ticks(timestamp.0))
+}
+
 /// The options of a sample with that source timestamp.
-fn stamped(timestamp: SourceTimestamp) -> WriteOptionsBuilder {
+fn stamped(source: SourceTimestamp) -> WriteOptionsBuilder {
     let options = WriteOptionsBuilder::new();
-    if timestamp == SourceTimestamp::NONE {
-        options
-    } else {
-        options.source_timestamp(Timestamp::from_ticks(timestamp.0))
+    match timestamp(source) {
+        Some(timestamp) => options.source_timestamp(timestamp),
+        None => options,
     }
 }
 

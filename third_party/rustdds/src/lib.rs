@@ -241,7 +241,7 @@ pub use network_counts::{NetworkCounters, NetworkCounts};
 /// What a datagram claims to hold, for one who looks at it.
 pub use rtps::arriving::sample_arriving;
 pub use rtps::{
-  identity::{ContinuedWriter, ParticipantIdentity},
+  identity::{ContinuedSample, ContinuedWriter, ParticipantIdentity},
   reader_progress::MatchedReader,
 };
 /// Part of RTPS DATA submessage: 4-byte header + serialized data

@@ -2205,7 +2205,10 @@ mod tests {
       crate::ContinuedWriter {
         entity_key: [0xff, 1, 2],
         highest_number,
-        on_number: Box::new(move |n| told.store(n, std::sync::atomic::Ordering::Relaxed)),
+        samples: Vec::new(),
+        sent_through: highest_number,
+        readers: Vec::new(),
+        on_number: Box::new(move |n, _| told.store(n, std::sync::atomic::Ordering::Relaxed)),
       }
     };
     type Adapter = CDRSerializerAdapter<RandomData, LittleEndian>;

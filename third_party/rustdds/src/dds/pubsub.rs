@@ -264,8 +264,8 @@ impl Publisher {
   where
     SA: adapters::no_key::SerializerAdapter<D>,
   {
-    if !(0..i64::MAX / 2).contains(&continued.highest_number) {
-      return create_error_bad_parameter!("highest number {}", continued.highest_number);
+    if !continued.is_valid() {
+      return create_error_bad_parameter!("numbers up to {}", continued.highest_number);
     }
     let entity_id = EntityId::new(continued.entity_key, writer_kind(topic));
     let inner = self.inner_lock();
@@ -609,9 +609,7 @@ impl InnerPublisher {
     )
     .numbered_with(dp.numbers());
     let send_buffer = match continued {
-      Some(ContinuedWriter { highest_number, on_number, .. }) => {
-        send_buffer.continue_after(highest_number.into(), on_number)
-      }
+      Some(continued) => send_buffer.continue_former(continued),
       None => send_buffer,
     };
     // A KEEP_LAST writer never waits for a reader: what DDS calls KEEP_LAST is that
@@ -760,6 +758,7 @@ impl InnerPublisher {
 
     // Send writer ingredients to DP event loop, where the actual writer will be
     // constructed
+    let has_unsent = send_buffer.has_unsent();
     let new_writer = WriterIngredients {
       guid,
       send_buffer,
@@ -774,6 +773,10 @@ impl InnerPublisher {
       .add_writer_sender
       .send(new_writer)
       .or_else(|e| create_error_poisoned!("Adding a new writer failed: {}", e))?;
+    if has_unsent {
+      // Samples of a former writer. The event loop has the writer before it reads this.
+      doorbell.ring();
+    }
 
     // Return the DataWriter to user
     Ok(data_writer)

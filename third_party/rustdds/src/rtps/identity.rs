@@ -3,7 +3,17 @@
 
 use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
 
-use crate::structure::sequence_number::SequenceNumber;
+use bytes::Bytes;
+
+use crate::{
+  dds::{
+    ddsdata::DDSData,
+    with_key::datawriter::{WriteOptions, WriteOptionsBuilder},
+  },
+  messages::submessages::elements::serialized_payload::SerializedPayload,
+  structure::{guid::GUID, sequence_number::SequenceNumber},
+  RepresentationIdentifier, Timestamp,
+};
 
 /// The identity of a participant. Another process may continue it once its process is gone
 /// and has not said goodbye: readers and writers of others then stay matched.
@@ -40,10 +50,73 @@ pub struct ContinuedWriter {
   /// the highest number that the former writer sent: of a lower one readers discard samples
   /// without a word, and of a higher one they report samples as lost.
   pub highest_number: i64,
+  /// The last samples of the former writer, in the order of their numbers and up to
+  /// `highest_number`. A number between them that is missing is that of a sample that was
+  /// withdrawn. Only for VOLATILE writers of topics without keys.
+  pub samples: Vec<ContinuedSample>,
+  /// The samples up to this number were sent; the others are sent now, again if they were.
+  pub sent_through: i64,
+  /// The readers that were matched with the former writer. They are offered `samples`; others
+  /// are offered what is sent after they were matched.
+  pub readers: Vec<GUID>,
   /// Called with each number before the first datagram with it is sent, by the thread that
-  /// writes or by the event loop. It must return at once and call nothing of the library.
-  pub on_number: Box<dyn Fn(i64) + Send + Sync>,
+  /// writes or by the event loop, and with whether it is that of a written sample: another one
+  /// may still be withdrawn. It must return at once and call nothing of the library.
+  pub on_number: Box<dyn Fn(i64, bool) + Send + Sync>,
 }
+
+/// A sample of a former writer.
+pub struct ContinuedSample {
+  /// Its sequence number.
+  pub number: i64,
+  /// The payload without its encapsulation header.
+  pub payload: Bytes,
+  /// The encapsulation of the payload.
+  pub encoding: RepresentationIdentifier,
+  /// The options in the encapsulation header.
+  pub encoding_options: [u8; 2],
+  /// The source timestamp, if it has one.
+  pub source_timestamp: Option<Timestamp>,
+}
+
+impl ContinuedSample {
+  pub(crate) fn into_data(self) -> (WriteOptions, DDSData) {
+    let mut payload = SerializedPayload::new_from_bytes(self.encoding, self.payload);
+    payload.representation_options = self.encoding_options;
+    let options = WriteOptionsBuilder::new();
+    let options = match self.source_timestamp {
+      Some(timestamp) => options.source_timestamp(timestamp),
+      None => options,
+    };
+    (options.build(), DDSData::new(payload))
+  }
+}
+
+impl ContinuedWriter {
+  pub(crate) fn is_valid(&self) -> bool {
+    let numbers = || self.samples.iter().map(|sample| sample.number);
+    (0..i64::MAX / 2).contains(&self.highest_number)
+      && numbers().all(|number| (1..=self.highest_number).contains(&number))
+      && numbers().zip(numbers().skip(1)).all(|(one, next)| one < next)
+      && numbers().next().is_none_or(|first| self.highest_number - first < MAX_CONTINUED)
+  }
+
+  // A writer that has no samples of the former one.
+  #[cfg(test)]
+  pub(crate) fn after(highest_number: i64) -> Self {
+    Self {
+      entity_key: [0xff, 1, 2],
+      highest_number,
+      samples: Vec::new(),
+      sent_through: highest_number,
+      readers: Vec::new(),
+      on_number: Box::new(|_, _| ()),
+    }
+  }
+}
+
+// The most numbers from the first sample of a former writer to its last one.
+const MAX_CONTINUED: i64 = 1_024;
 
 /// The numbers that a participant has used, above those that it takes over.
 #[derive(Debug, Default)]

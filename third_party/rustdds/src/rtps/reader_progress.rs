@@ -36,6 +36,7 @@ pub(crate) struct ReaderProgress {
   reader: GUID,
   reliable: bool,
   first_offered: SequenceNumber,
+  first_if_reset: SequenceNumber,
   history: Option<OfferedHistory>,
   // Samples that had been withdrawn when the reader was matched.
   withdrawn_before: u64,
@@ -70,6 +71,7 @@ impl ReaderProgress {
       reader,
       reliable,
       first_offered,
+      first_if_reset: first_offered,
       history: None,
       withdrawn_before: 0,
       acked_before: AtomicI64::new(first_offered.into()),
@@ -81,6 +83,19 @@ impl ReaderProgress {
   pub fn with_history(mut self, history: Option<OfferedHistory>) -> Self {
     self.history = history;
     self
+  }
+
+  /// A reader of the writer that this one continues. If it has lost its state meanwhile, it is a
+  /// new one, to which nothing from before its match is sent.
+  #[must_use]
+  pub fn or_if_reset(mut self, first: SequenceNumber) -> Self {
+    self.first_if_reset = first;
+    self
+  }
+
+  /// The first sample for a reader that has no state of the writer.
+  pub fn first_if_reset(&self) -> SequenceNumber {
+    self.first_if_reset
   }
 
   /// Of a Writer that had withdrawn so many samples when the reader was matched.

@@ -297,6 +297,19 @@ impl RtpsReaderProxy {
     false
   }
 
+  /// A joining reader of the writer that this one continues, which has lost its state of that
+  /// one, gets nothing from before it was matched.
+  pub fn begin_anew_if_reset(&mut self, acknack: &AckNack) {
+    let one = SequenceNumber::from(1);
+    if let Some(progress) = self.progress.as_ref() {
+      let first = progress.first_if_reset();
+      if acknack.reader_sn_state.base() <= one && progress.first_offered() > one {
+        self.all_acked_before = self.all_acked_before.max(first);
+        progress.set_acked_before(self.all_acked_before);
+      }
+    }
+  }
+
   /// The first sample that the reader is offered.
   pub fn first_offered(&self) -> SequenceNumber {
     self

@@ -1591,6 +1591,7 @@ impl Writer {
           }
 
           if reader_proxy.ends_joining(an) {
+            reader_proxy.begin_anew_if_reset(an);
             self.start_sending_to(reader_guid);
           } else if reader_proxy.is_joining() {
             self.offer_to_new_reader(reader_guid);
@@ -4165,6 +4166,22 @@ mod tests {
 
     // One whose samples are numbered from the next number on.
     fn keep_last_after(highest: i64) -> Fixture {
+      let mut f = keep_last_continuing(crate::ContinuedWriter::after(highest));
+      let has_nothing = AckNack {
+        reader_id: f.reader_guid.entity_id,
+        writer_id: f.writer.my_guid.entity_id,
+        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(highest + 1)),
+        count: 0,
+      };
+      let proxy = f.writer.readers.get_mut(&f.reader_guid).unwrap();
+      while proxy.is_joining() {
+        proxy.ends_joining(&has_nothing);
+      }
+      f
+    }
+
+    // One that continues another one, and a reader that is joining.
+    fn keep_last_continuing(continued: crate::ContinuedWriter) -> Fixture {
       let qos = QosPolicyBuilder::new()
         .reliability(Reliability::Reliable {
           max_blocking_time: Duration::ZERO,
@@ -4184,20 +4201,9 @@ mod tests {
         10,
       )
       .keep_last(10)
-      .continue_after(SequenceNumber::new(highest), Box::new(|_| ()));
+      .continue_former(continued);
       let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
-      let mut f = Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None);
-      let has_nothing = AckNack {
-        reader_id: reader,
-        writer_id: guid,
-        reader_sn_state: SequenceNumberSet::new_empty(SequenceNumber::new(highest + 1)),
-        count: 0,
-      };
-      let proxy = f.writer.readers.get_mut(&f.reader_guid).unwrap();
-      while proxy.is_joining() {
-        proxy.ends_joining(&has_nothing);
-      }
-      f
+      Fixture::with_buffer(buffer, guid, qos.clone(), reader, &qos, 0, 0, None)
     }
 
     fn only_reader(f: &Fixture) -> crate::MatchedReader {
@@ -5030,6 +5036,46 @@ mod tests {
       let reader = only_reader(&f);
       assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (3, 0, 0));
       assert_eq!(f.writer.send_buffer.retained_len(), 0);
+    }
+
+    #[test]
+    fn a_former_reader_gets_what_it_lacks_unless_it_has_lost_its_state() {
+      let continuing = || {
+        let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
+        let sample = |number| crate::ContinuedSample {
+          number,
+          payload: bytes::Bytes::from_static(&[0; 8]),
+          encoding: RepresentationIdentifier::CDR_LE,
+          encoding_options: [0, 0],
+          source_timestamp: None,
+        };
+        keep_last_continuing(crate::ContinuedWriter {
+          samples: [37, 38, 40, 41].map(sample).into(),
+          readers: vec![GUID::new(GuidPrefix::new(&[2; 12]), reader)],
+          ..crate::ContinuedWriter::after(41)
+        })
+      };
+      let mut f = continuing();
+      assert_eq!(only_reader(&f).unacknowledged, 4);
+      acknowledge(&mut f, 38, &[], 1);
+      assert_eq!(f.repair_round(), 4, "of 39 it gets a GAP");
+      acknowledge(&mut f, 42, &[], 2);
+      let reader = only_reader(&f);
+      assert_eq!((reader.unacknowledged, reader.overrun), (0, 0));
+      assert_eq!(f.writer.send_buffer.retained_len(), 0);
+
+      for base in [0, 1] {
+        let mut f = continuing();
+        let mut count = 0;
+        while f.writer.readers[&f.reader_guid].is_joining() {
+          count += 1;
+          acknowledge(&mut f, base, &[], count);
+        }
+        assert_eq!(f.unsent(), 0, "nothing is sent again: {base}");
+        assert_eq!(only_reader(&f).unacknowledged, 0);
+        write(&f, 1, 8);
+        assert_eq!(only_reader(&f).unacknowledged, 1);
+      }
     }
 
     // A message of a RELIABLE Writer ends with a HEARTBEAT, whose number shows that it was built.

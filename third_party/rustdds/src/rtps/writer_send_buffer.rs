@@ -16,7 +16,7 @@ use crate::{
       DEFAULT_WRITER_MAX_SAMPLES, KEEP_LAST_MAX_RETAINED_BYTES, MAX_ADVERTISED_EVICTED_SAMPLES,
     },
     direct_send::DirectSend,
-    identity::UsedNumbers,
+    identity::{ContinuedWriter, UsedNumbers},
     reader_progress::{MatchedReader, OfferedHistory, ReaderProgress},
     source_history::SourceHistory,
   },
@@ -66,6 +66,11 @@ struct Inner {
 
   // What late joiners get beside `changes`, if the samples come from several sources.
   history: SourceHistory,
+
+  // Of the writer that this one continues, those that have not matched yet: what they may
+  // lack is kept, until then at most.
+  former_readers: BTreeSet<GUID>,
+  former_readers_until: Option<Instant>,
 
   // What each matched reader was offered and has acknowledged.
   readers: BTreeMap<GUID, Arc<ReaderProgress>>,
@@ -138,6 +143,9 @@ impl Early {
       && begun.write_options.source_timestamp() == write_options.source_timestamp()
   }
 }
+
+// They are known from the journal of discovery, and match with the writer's creation.
+const FORMER_READERS_MATCH_WITHIN: StdDuration = StdDuration::from_secs(5);
 
 // A reader that acknowledges nothing may ask for a number for as long as it is matched;
 // without the record it counts as one more that the reader missed.
@@ -225,7 +233,7 @@ struct Shared {
   volatile: bool,
   topic_name: String,
   // See `ContinuedWriter`.
-  on_number: Option<Box<dyn Fn(i64) + Send + Sync>>,
+  on_number: Option<Box<dyn Fn(i64, bool) + Send + Sync>>,
 }
 
 /// A shared, flow-controlled buffer of samples between a `DataWriter`
@@ -260,6 +268,8 @@ impl WriterSendBuffer {
           changes: BTreeMap::new(),
           retained_bytes: 0,
           written_bytes: 0,
+          former_readers: BTreeSet::new(),
+          former_readers_until: None,
           readers: BTreeMap::new(),
           left_overrun: 0,
           early: None,
@@ -311,22 +321,43 @@ impl WriterSendBuffer {
     self
   }
 
-  /// Gives the first sample the number after this one, and tells `on_number` of each number
-  /// before it is sent. To be called before the buffer is shared.
+  /// Continues the writer of a former process, with its last samples. To be called before
+  /// the buffer is shared.
   #[must_use]
-  pub fn continue_after(
-    mut self,
-    highest: SequenceNumber,
-    on_number: Box<dyn Fn(i64) + Send + Sync>,
-  ) -> Self {
-    match Arc::get_mut(&mut self.shared) {
-      Some(shared) => {
-        Self::begin_after(shared, highest);
-        shared.on_number = Some(on_number);
+  pub fn continue_former(mut self, continued: ContinuedWriter) -> Self {
+    let Some(shared) = Arc::get_mut(&mut self.shared) else {
+      error!("WriterSendBuffer: it was to continue a former one after it was shared");
+      return self;
+    };
+    let highest = SequenceNumber::new(continued.highest_number);
+    Self::begin_after(shared, highest);
+    if let (Ok(inner), Some(first)) = (shared.inner.get_mut(), continued.samples.first()) {
+      let first = SequenceNumber::new(first.number);
+      (inner.first_seq, inner.begins_with, inner.acked_before) = (first, first, first);
+      let sent = SequenceNumber::new(continued.sent_through);
+      inner.sent_frontier = sent.clamp(first - SequenceNumber::new(1), highest);
+      shared.direct_send.set_last_sent(inner.sent_frontier);
+      for sample in continued.samples {
+        let number = SequenceNumber::new(sample.number);
+        let (options, data) = sample.into_data();
+        let change = CacheChange::new(shared.writer_guid, number, options, data);
+        inner.retained_bytes += change.data_value.payload_size();
+        inner.changes.insert(number, change);
       }
-      None => error!("WriterSendBuffer: the first number was set after the buffer was shared"),
+      let withdrawn = SequenceNumber::range_inclusive(first, highest);
+      inner.withdrawn = withdrawn.filter(|number| !inner.changes.contains_key(number)).collect();
+      inner.withdrawn_total = inner.withdrawn.len() as u64;
+      inner.former_readers = continued.readers.into_iter().collect();
+      inner.former_readers_until = Some(Instant::now() + FORMER_READERS_MATCH_WITHIN);
     }
+    shared.on_number = Some(continued.on_number);
     self
+  }
+
+  /// Whether there are samples of a former writer that it may not have sent.
+  pub fn has_unsent(&self) -> bool {
+    let inner = self.shared.inner.lock().unwrap();
+    self.shared.direct_send.last_sent() < inner.last_seq
   }
 
   fn begin_after(shared: &mut Shared, highest: SequenceNumber) {
@@ -338,9 +369,9 @@ impl WriterSendBuffer {
     }
   }
 
-  fn report_number(shared: &Shared, number: SequenceNumber) {
+  fn report_number(shared: &Shared, number: SequenceNumber, is_written: bool) {
     if let Some(on_number) = &shared.on_number {
-      on_number(number.into());
+      on_number(number.into(), is_written);
     }
     if shared.is_builtin {
       shared.direct_send.numbers().use_number(number);
@@ -528,7 +559,7 @@ impl WriterSendBuffer {
       }
     }
     let seq = inner.last_seq.plus_1();
-    Self::report_number(shared, seq);
+    Self::report_number(shared, seq, true);
     if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
       inner.history.record(&write_options, seq, depth);
     }
@@ -622,7 +653,7 @@ impl WriterSendBuffer {
       return false;
     };
     early.is_begun = true;
-    Self::report_number(&self.shared, early.change.sequence_number);
+    Self::report_number(&self.shared, early.change.sequence_number, false);
     true
   }
 
@@ -760,8 +791,9 @@ impl WriterSendBuffer {
     let next = inner.last_seq.plus_1();
     let first_unsent = self.shared.direct_send.last_sent().plus_1().min(next);
     let mut history = None;
+    let is_former = inner.former_readers.remove(&reader);
     let first_offered = if !wants_history {
-      first_unsent
+      if is_former { inner.first_seq.min(first_unsent) } else { first_unsent }
     } else if let Some(mut listed) = inner.history.numbers() {
       listed.split_off(&first_unsent);
       let first = listed.first().copied().unwrap_or(first_unsent);
@@ -773,9 +805,11 @@ impl WriterSendBuffer {
     } else {
       Self::history_first_locked(&self.shared, &inner)
     };
+    let withdrawn = inner.withdrawn.range(first_offered..).count() as u64;
     let progress = ReaderProgress::new(reader, reliable, first_offered)
       .with_history(history)
-      .without_withdrawn(inner.withdrawn_total);
+      .or_if_reset(if wants_history { first_offered } else { first_unsent })
+      .without_withdrawn(inner.withdrawn_total - withdrawn);
     let progress = Arc::new(progress);
     inner.readers.insert(reader, progress.clone());
     progress
@@ -915,6 +949,12 @@ impl WriterSendBuffer {
   /// joiners: the last `depth` ones, or all of a KEEP_ALL writer.
   pub fn release_acknowledged(&self, acked_before: SequenceNumber) {
     let mut inner = self.shared.inner.lock().unwrap();
+    if !inner.former_readers.is_empty() {
+      if inner.former_readers_until.is_some_and(|until| Instant::now() < until) {
+        return;
+      }
+      inner.former_readers.clear();
+    }
     let remove_before = match (self.shared.volatile, self.shared.keep_last) {
       (true, _) => acked_before,
       (false, Some(depth)) => {
@@ -989,6 +1029,8 @@ fn register_waker(wakers: &mut Vec<Waker>, waker: &Waker) {
 #[cfg(test)]
 mod tests {
   use std::time::Duration as StdDuration;
+
+  use bytes::Bytes;
 
   use super::*;
   use crate::{
@@ -1097,10 +1139,10 @@ mod tests {
     let told = Arc::new(Mutex::new(Vec::new()));
     let tell = Arc::clone(&told);
     let buf = small_buffer(EntityKind::WRITER_NO_KEY_USER_DEFINED)
-      .continue_after(
-        SequenceNumber::new(41),
-        Box::new(move |number| tell.lock().unwrap().push(number)),
-      );
+      .continue_former(ContinuedWriter {
+        on_number: Box::new(move |number, written| tell.lock().unwrap().push((number, written))),
+        ..ContinuedWriter::after(41)
+      });
     assert_eq!(buf.last_change_sequence_number(), SequenceNumber::new(41));
     assert_eq!(buf.direct_send().last_sent(), SequenceNumber::new(41));
     assert_eq!(buf.advertised_first(), SequenceNumber::new(42));
@@ -1110,18 +1152,71 @@ mod tests {
     assert_eq!(buf.advertised_first(), SequenceNumber::new(42));
     assert!(admit_now(&buf, WriteOptions::default()));
     assert!(buf.get_by_sn(SequenceNumber::new(42)).is_some());
-    assert_eq!(*told.lock().unwrap(), [42]);
+    assert_eq!(*told.lock().unwrap(), [(42, true)]);
 
     // A number of which fragments are sent before the sample is written, or withdrawn.
     assert!(buf.begin_early(WriteOptions::default(), sample(), 8));
-    assert_eq!(*told.lock().unwrap(), [42]);
+    assert_eq!(*told.lock().unwrap(), [(42, true)]);
     assert!(buf.mark_early_sent(buf.early().unwrap().id));
-    assert_eq!(*told.lock().unwrap(), [42, 43]);
+    assert_eq!(*told.lock().unwrap(), [(42, true), (43, false)]);
     assert!(buf.withdraw_early());
     buf.set_acked_frontier(Some(SequenceNumber::new(44)));
     buf.set_sent_frontier(SequenceNumber::new(43));
     assert!(admit_now(&buf, WriteOptions::default()));
-    assert_eq!(*told.lock().unwrap(), [42, 43, 44]);
+    assert_eq!(*told.lock().unwrap(), [(42, true), (43, false), (44, true)]);
+  }
+
+  // It has the samples of the former writer until all readers of that one have acknowledged them.
+  #[test]
+  fn a_continued_writer_has_the_samples_of_the_former_one() {
+    let number = SequenceNumber::new;
+    let reader = |id: u8| GUID::new(GuidPrefix::new(&[id; 12]), EntityId::PARTICIPANT);
+    let sample = |number: i64| crate::ContinuedSample {
+      number,
+      payload: Bytes::from(vec![number as u8; 8]),
+      encoding: RepresentationIdentifier::CDR_LE,
+      encoding_options: [0, 0],
+      source_timestamp: None,
+    };
+    let buf = small_buffer(EntityKind::WRITER_NO_KEY_USER_DEFINED).continue_former(ContinuedWriter {
+      samples: [37, 38, 40, 41].map(sample).into(),
+      sent_through: 40,
+      readers: vec![reader(1), reader(2)],
+      ..ContinuedWriter::after(41)
+    });
+    assert!(buf.has_unsent());
+    assert_eq!((buf.direct_send().last_sent(), buf.retained_len()), (number(40), 4));
+    assert_eq!(buf.advertised_first(), number(37));
+    assert!(buf.is_withdrawn(number(39)));
+    let offered = |id: u8| buf.reader_matched(reader(id), true, false).first_offered();
+    assert_eq!((offered(1), offered(3)), (number(37), number(41)), "a former reader and a new one");
+    let of = |id: u8| buf.matched_readers().into_iter().find(|r| r.guid == reader(id)).unwrap();
+    assert_eq!((of(1).offered, of(3).offered), (4, 1), "39 was withdrawn");
+    buf.set_acked_frontier(Some(number(41)));
+    buf.release_acknowledged(number(41));
+    assert_eq!(buf.retained_len(), 4, "another former reader may lack them");
+    assert_eq!(offered(2), number(37));
+    buf.release_acknowledged(number(41));
+    assert_eq!(buf.retained_len(), 1);
+  }
+
+  #[test]
+  fn the_numbers_of_a_former_writer_are_checked() {
+    let with = |numbers: &[i64], highest: i64| {
+      let sample = |number: &i64| crate::ContinuedSample {
+        number: *number,
+        payload: Bytes::new(),
+        encoding: RepresentationIdentifier::CDR_LE,
+        encoding_options: [0, 0],
+        source_timestamp: None,
+      };
+      let samples = numbers.iter().map(sample).collect();
+      ContinuedWriter { samples, ..ContinuedWriter::after(highest) }.is_valid()
+    };
+    assert!(with(&[], 0) && with(&[1], 1) && with(&[5, 7], 9));
+    assert!(!with(&[], -1) && !with(&[], i64::MAX));
+    assert!(!with(&[0], 1) && !with(&[2], 1) && !with(&[2, 2], 3) && !with(&[3, 2], 3));
+    assert!(!with(&[1], 5_000));
   }
 
   #[test]
